@@ -15,7 +15,7 @@ from benchmarks.table import figure, spread, table
 SIZES = {1: 10.0, 3: 10.0, 10: 6.0, 30: 3.0, 100: 1.5}  # drones: simulated seconds
 TIMEOUT_S = 300.0
 CPU = "CPU ms per drone-second"
-ONBOARD = {"plain": "extra `agents`", "numba": "extra `agents`, with numba"}
+ONBOARD = {"plain": "extra `agents`, numba taken out", "numba": "extra `agents`"}
 
 
 def measure(repeats: int) -> Sheet:

@@ -18,7 +18,7 @@ from benchmarks.exchange.lap import free_port
 from benchmarks.peers import FOLDER, ROOT
 from benchmarks.run import CLI
 
-VARIANTS: dict[str, tuple[str, ...]] = {"plain": (), "numba": ("numba",)}  # what is installed beside the extra `agents`
+VARIANTS: dict[str, tuple[str, ...]] = {"plain": ("numba", "llvmlite"), "numba": ()}  # what is taken out of the extra `agents`
 SHORT_S, LONG_S = 5.0, 45.0  # simulated; their difference is free of the start
 TIMEOUT_S = 180.0
 
@@ -33,9 +33,12 @@ def install(variant: str) -> Path:
     python = folder / "bin" / "python"
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
-    pip = [str(python), "-m", "pip", "install", "-q", "--disable-pip-version-check"]
-    for wanted in ([f"{ROOT}[agents]", *VARIANTS[variant]], ["--force-reinstall", "--no-deps", str(ROOT)]):
-        done = subprocess.run([*pip, *wanted], capture_output=True, text=True, check=False)
+    pip = [str(python), "-m", "pip", "--disable-pip-version-check"]
+    install, remove = ["install", "-q"], ["uninstall", "-q", "-y"]
+    steps = [[*install, f"{ROOT}[agents]"], [*install, "--force-reinstall", "--no-deps", str(ROOT)]]
+    steps += [[*remove, *VARIANTS[variant]]] if VARIANTS[variant] else []
+    for step in steps:
+        done = subprocess.run([*pip, *step], capture_output=True, text=True, check=False)
         if done.returncode:
             raise RefusedError(f"pip: {done.stderr.strip()[-160:]}")
     return python

@@ -54,7 +54,7 @@ def _prepare() -> None:
         from zsim_deploy.roles import roles, warm_up  # noqa: F401
 
         cli.command().commands["record"].make_context("record", [], resilient_parsing=True)
-        warm_up.main()
+        warm_up.main(warm_up.WITH_WORLD)
     gc.collect()
     gc.freeze()
 

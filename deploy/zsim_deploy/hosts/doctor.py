@@ -32,6 +32,7 @@ REACH_S = 60.0  # wall time to measure a path; 9 pings and at most 9 bulks take 
 NO_MODULE = "no module named"  # in Python's error, in lower case
 NO_PROGRAM = ("not found", "no such file")  # in the errors of shells, in lower case …
 NO_PROGRAM_CODES = (126, 127)  # … and the codes with which they end; POSIX, 2.8.2
+NEEDED_TO_COMPUTE = "scipy"  # without it a host runs no world and no agent; a router, or a recorder, does without
 OFFSET_ASKS = 3  # the answer with the shortest round trip gives the clock's offset best
 
 
@@ -111,11 +112,29 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
     """Return what keeps the hosts from flying together, and what is only worth knowing, a line each."""
     faults = [line for name, report in reports.items() for line in _faults(name, report)]
     warnings = [line for name, report in reports.items() for line in _warnings(name, report)]
+    computing = {name: report for name, report in reports.items() if NEEDED_TO_COMPUTE in report.facts["parts"]}
+    return faults, [*warnings, *_different_fingerprints(computing)]
+
+
+def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
+    """Yield that hosts compute with different fingerprints, with what of them differs, and which lacks a package."""
     prints = {name: report.facts["fingerprint"] for name, report in reports.items()}
-    if len(set(prints.values())) > 1:
-        shown = ", ".join(f"{name} {text[:8]}" for name, text in prints.items())
-        warnings.append(f"the hosts compute with different numeric fingerprints ({shown}); same bits are not promised")
-    return faults, warnings
+    if len(set(prints.values())) < 2:
+        return
+    shown = ", ".join(f"{name} {text[:8]}" for name, text in prints.items())
+    parts = {name: report.facts["parts"] for name, report in reports.items()}
+    names = dict.fromkeys(part for each in parts.values() for part in each)
+    differing = [part for part in names if len({each.get(part) for each in parts.values()}) > 1]
+    causes = "; ".join(f"{part}: {_values(part, parts)}" for part in differing)
+    yield f"the hosts compute with different numeric fingerprints ({shown}); same bits are not promised; {causes}"
+    for name, report in reports.items():
+        lacking = " and ".join(part for part in differing if part not in parts[name])
+        if lacking:
+            yield f"{name}: has no {lacking}, with which others compute; {report.remedy}"
+
+
+def _values(part: str, parts: dict[str, dict[str, str]]) -> str:
+    return ", ".join(f"{name} {each.get(part, 'none')}" for name, each in parts.items())
 
 
 def _faults(name: str, report: HostReport) -> Iterator[str]:

@@ -10,7 +10,7 @@ import asyncssh
 
 from zsim.errors import HostsError, ZsimError
 from zsim_deploy.hosts.host_link import CLOSE_S, EventLoopThread, HostLink
-from zsim_deploy.hosts.ssh_connection import json_answer
+from zsim_deploy.hosts.ssh_connection import json_answer, start_sftp
 from zsim_deploy.inventory.inventory import InventoryFile
 
 OPEN_S = 10.0  # until the host lets us read; a few round trips of a poor link
@@ -161,13 +161,13 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
         into: path here; beside it lies what has come, with .part at the end.
 
     Raises:
-        HostsError: it cannot be read, the host does not answer, or nothing came any more.
+        HostsError: it cannot be read, the host has no SFTP or does not answer, or nothing came any more.
         OSError: it cannot be written here.
     """
     part = into.with_name(f"{into.name}.part")
     try:
         async with link.channel() as connection:
-            sftp = await asyncio.wait_for(connection.start_sftp_client(), OPEN_S)
+            sftp = await asyncio.wait_for(start_sftp(link.name, connection), OPEN_S)
             try:
                 await _copy(sftp, source.removeprefix("~/"), part)
             finally:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from zsim import __version__
-from zsim.contract.fingerprint import fingerprint
+from zsim.contract.fingerprint import fingerprint, parts
 
 GOVERNORS = "/sys/devices/system/cpu"  # Linux, cpufreq
 PINGS = 9
@@ -42,6 +42,7 @@ def about(folder: Path) -> dict[str, Any]:
         "python": platform.python_version(),
         "zsim": __version__,
         "fingerprint": fingerprint(),
+        "parts": parts(),
         "cores": os.cpu_count() or 1,
         "load": os.getloadavg()[0],
         "governors": governors(Path(GOVERNORS)),

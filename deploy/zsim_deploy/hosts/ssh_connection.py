@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import asyncssh
+from asyncssh.constants import OPEN_REQUEST_SESSION_FAILED
 
 from zsim.errors import HostsError
 from zsim_deploy.inventory.inventory import SSH_PORT, Host
@@ -21,6 +22,7 @@ from zsim_deploy.inventory.inventory import SSH_PORT, Host
 CONNECT_S = 10.0  # wall time; a host on a poor link answers within a few round trips
 KEEPALIVE_S = 15.0  # asked when nothing came for so long …
 KEEPALIVE_COUNT = 4  # … and given up after a minute: a link that is cut for 20 s keeps its connection
+NO_SFTP = "its sshd has no SFTP; set `Subsystem sftp internal-sftp` in sshd_config there and restart sshd"
 
 
 async def connect(name: str, host: Host, base: Path) -> asyncssh.SSHClientConnection:
@@ -41,6 +43,25 @@ async def connect(name: str, host: Host, base: Path) -> asyncssh.SSHClientConnec
         refused = client.refused or await _shown(host, error)
         reason = _changed(name, host, base, refused) or _reason(name, host, base, error)
         raise HostsError(f"{name}: {reason}") from error
+
+
+async def start_sftp(name: str, connection: asyncssh.SSHClientConnection) -> asyncssh.SFTPClient:
+    """Return a way to copy files over a connection.
+
+    Raises:
+        HostsError: the host has no SFTP.
+        asyncssh.Error: the connection broke.
+    """
+    try:
+        return await connection.start_sftp_client()
+    except asyncssh.ChannelOpenError as error:
+        if error.code != OPEN_REQUEST_SESSION_FAILED:
+            raise
+        raise HostsError(f"{name}: {NO_SFTP}") from error
+    except (asyncssh.SFTPConnectionLost, asyncssh.SFTPEOFError) as error:
+        if connection.is_closed():
+            raise
+        raise HostsError(f"{name}: {NO_SFTP}") from error
 
 
 class Refused(NamedTuple):

@@ -25,7 +25,7 @@ START_S = 30.0  # wall time to start a Python on a small computer, over a poor l
 BEAT_S = 5.0  # how often the launcher shows that it lives
 SILENT_S = 60.0  # wall time without that, after which the program ends by itself; a link may be cut for shorter
 WAIT_S = 1800.0  # wall time for another push to end; as long as it may take to install and to compile
-OLDEST = (3, 11)  # pyproject.toml, requires-python
+OLDEST_MINOR = 11  # pyproject.toml, requires-python
 NEWEST_MINOR = 14  # the last Python whose name is tried
 PLAIN = "python3"
 ANSWER = re.compile(r"(python3(?:\.\d+)?) (\d+)\.(\d+)\.(\d+) (/.*)")  # command, version, path
@@ -66,7 +66,7 @@ class WheelTarget(NamedTuple):
 
 def interpreter_query() -> str:
     """Return a line of POSIX shell that prints command, version and path of every Python of a host."""
-    names = [PLAIN, *(f"python3.{minor}" for minor in range(NEWEST_MINOR, OLDEST[1] - 1, -1))]
+    names = [PLAIN, *(f"python3.{minor}" for minor in range(NEWEST_MINOR, OLDEST_MINOR - 1, -1))]
     code = 'import sys; print("%d.%d.%d" % sys.version_info[:3], sys.executable)'
     return f"for p in {' '.join(names)}; do facts=$($p -c '{code}' 2>/dev/null) && echo $p $facts; done; true"
 
@@ -78,20 +78,22 @@ def parse_interpreters(answer: str) -> list[Interpreter]:
 
 
 def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
-    """Return the Python to install for: the launcher's minor version if it is there, else `python3`, else the newest.
+    """Return the Python to install for: of the launcher's minor version, `python3` rather than another.
 
     Raises:
-        HostsError: none is new enough.
+        HostsError: there is none; no run takes a host with another one, as its bits would differ.
     """
-    fit = [each for each in interpreters if each.version[:2] >= OLDEST]
+    fit = [each for each in interpreters if each.version[:2] == here]
     if fit:
-        return max(fit, key=lambda each: (each.version[:2] == here, each.command == PLAIN, each.version))
-    least = ".".join(map(str, OLDEST))
+        return max(fit, key=lambda each: (each.command == PLAIN, each.version))
+    wanted = ".".join(map(str, here))
     if not interpreters:
-        raise HostsError(f"{name}: has no python3; must be >= {least}; install it there")
-    version = ".".join(map(str, interpreters[0].version))
+        raise HostsError(f"{name}: has no python3; must be Python {wanted} as here; install python{wanted} there")
+    by_version = {".".join(map(str, each.version)): each.command for each in reversed(interpreters)}
+    found = ", ".join(f"{command} {version}" for version, command in by_version.items())
     raise HostsError(
-        f"{name}: {interpreters[0].command} is {version}; must be >= {least}; install a newer one beside it"
+        f"{name}: has {found}; must be Python {wanted} as here, for the same bits; install python{wanted} beside it, "
+        "or start zsim here with a Python that it has"
     )
 
 

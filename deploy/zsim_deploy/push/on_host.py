@@ -6,7 +6,7 @@ gone: whatever is being done is ended.
 
 {"act": "look"}                      what decides which wheels fit, what is installed, wheels that are there
 {"act": "install", ...}              make FOLDER/venv what is wanted
-{"act": "warm_up", "module": NAME}   run a module of what is installed
+{"act": "warm_up", ...}              run a module of what is installed, with the extras as its arguments
 
 Only one of it works in a folder at a time; another one reports who does, and waits.
 """
@@ -161,7 +161,7 @@ def execute(folder: Path, order: dict, children: CommandRunner) -> dict:
         if order["act"] == "install":
             install(folder, order, children)
         else:
-            children.run([str(folder / "venv" / "bin" / "python"), "-P", "-m", order["module"]])
+            children.run([str(folder / "venv" / "bin" / "python"), "-P", "-m", order["module"], *order["extras"]])
         return {"done": True}
     except Exception as error:
         return {"error": str(error) if isinstance(error, (CommandError, OSError)) else repr(error)}

@@ -18,7 +18,7 @@ from rich.text import Text
 from zsim import __version__
 from zsim.errors import HostsError, InventoryError
 from zsim_deploy.hosts.host_link import HostLink
-from zsim_deploy.hosts.ssh_connection import shell_line
+from zsim_deploy.hosts.ssh_connection import shell_line, start_sftp
 from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.inventory.processes import MODULES, known_extras, needed_extras
 from zsim_deploy.push.installer import (
@@ -125,7 +125,7 @@ async def _install(
     await there.install(needed)
     if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
         progress("compiling what flies")
-        await there.warm_up()
+        await there.warm_up(needed.extras)
     progress(f"{described} installed")
     return True
 
@@ -173,8 +173,9 @@ class HostInstallation:
         }
         await self._program.ask("install", INSTALL_S, **order)
 
-    async def warm_up(self) -> None:
-        await self._program.ask("warm_up", COMPILE_S, module=warm_up.__name__)
+    async def warm_up(self, extras: Sequence[str]) -> None:
+        """Compile what the roles run that need these extras."""
+        await self._program.ask("warm_up", COMPILE_S, module=warm_up.__name__, extras=extras)
 
     async def copy(self, wheels: Sequence[Wheel], progress: Callable[[str], None]) -> None:
         """Copy wheels to the host; what broke off is not mistaken for a wheel."""
@@ -196,7 +197,7 @@ class HostInstallation:
                 await sftp.posix_rename(part, part.removesuffix(".part"))
 
         try:
-            async with (await self._link.open()).start_sftp_client() as sftp:
+            async with await start_sftp(self.name, await self._link.open()) as sftp:
                 await sftp.makedirs(folder, exist_ok=True)
                 await asyncio.gather(*(one(sftp, wheel) for wheel in wheels))
         except (asyncssh.Error, OSError) as error:

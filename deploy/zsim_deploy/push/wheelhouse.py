@@ -1,6 +1,7 @@
 """The wheels that hosts need, gathered on the launcher's machine by pip, once for each content.
 
 CACHE/wheels/*.whl           wheels of other projects, for all hosts
+CACHE/build/*.whl            wheels of what builds this project, for this machine
 CACHE/houses/KEY.json        names of the wheels that one kind of host needs; KEY is a hash of what was asked
 CACHE/zsim/KEY/zsim-*.whl    this project, built; KEY is a hash of its sources
 """
@@ -12,11 +13,10 @@ import json
 import os
 import re
 import shutil
-import sys
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,110 +25,11 @@ from urllib.parse import urldefrag
 import zsim
 from zsim.errors import HostsError
 from zsim_deploy.push.installer import WheelTarget
+from zsim_deploy.push.wheel_download import PipError, Progress, UnreachableError, download_wheels, is_kept, pip
 
 PROJECT = "zsim"
 KEY_DIGITS = 16  # 64 bits of a SHA-256; what one person builds never collides
 PIP = "pip"  # installs on a host that has none; never held to the version here, which may be too old for a newer Python
-RETRIES = "1"  # of pip, for each page of an index; with its own 5 it takes minutes where there is no network
-LINE_BYTES = 1 << 20  # of the longest line that pip prints
-NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # pip, before it tries again, with the reason
-
-Progress = Callable[[str], None]
-
-
-class PipError(Exception):
-    """pip failed; with its error line."""
-
-
-class UnreachableError(Exception):
-    """The package index does not answer."""
-
-
-async def download_wheels(
-    wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], progress: Progress
-) -> bool:
-    """Download wheels for a target; where a project has only sources, build them here.
-
-    The versions are those of this machine where there are such wheels for the target, because equal versions are a
-    condition for equal bits.
-
-    Args:
-        wanted: requirements, as for pip.
-        into: folder, for the wheels only.
-        held: constraints, as for pip.
-        progress: called with what is being done.
-
-    Returns:
-        Whether the versions had to differ from the held ones.
-
-    Raises:
-        PipError: there are no wheels for the target.
-        UnreachableError: nobody knows whether there are.
-    """
-    fit = ("download", "--only-binary=:all:", *target.options(), "--dest", str(into))
-    with tempfile.TemporaryDirectory() as aside:
-        limits = Path(aside, "constraints.txt")
-        limits.write_text("\n".join(held))
-        try:
-            await _fetch(fit, (*wanted, "--constraint", str(limits)), f"{aside}/same", progress)
-            return False
-        except PipError:
-            progress("looking for other versions than those here")
-            await _fetch(fit, wanted, f"{aside}/other", progress)
-            return True
-
-
-async def _fetch(fit: Sequence[str], wanted: Sequence[str], built: str, progress: Progress) -> None:
-    """Download wheels; if that fails, build what has only sources into a folder, and take it from there."""
-    try:
-        await pip(*fit, *wanted, progress=progress)
-    except PipError:
-        progress("building here what has only sources")
-        await pip("wheel", "--wheel-dir", built, *wanted, progress=progress)
-        await pip(*fit, "--find-links", built, *wanted, progress=progress)
-
-
-async def pip(*arguments: str, progress: Progress) -> None:
-    """Run pip of this Python, as the user has configured it but for how often it tries again.
-
-    Args:
-        progress: takes a line when an index does not answer.
-
-    Raises:
-        PipError: with its last line.
-        UnreachableError: with the reason why an index did not answer.
-    """
-    options = ("--disable-pip-version-check", "--no-input", "-q")
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "pip", *arguments, *options, stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT, limit=LINE_BYTES,
-        env={**os.environ, "PIP_RETRIES": RETRIES},
-    )  # fmt: skip
-    assert process.stdout is not None
-    lines: list[str] = []
-    unanswered = ""
-    try:
-        async for line in process.stdout:
-            lines.append(line.decode(errors="replace").strip())
-            if (match := NO_INDEX.search(lines[-1])) and not unanswered:
-                unanswered = _reason(match[1])
-                progress(f"the package index does not answer ({unanswered}); asking once more")
-        await process.wait()
-    finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
-    if process.returncode and unanswered:
-        raise UnreachableError(unanswered)
-    if process.returncode:
-        lines = [line for line in lines if line] or ["it printed nothing"]
-        raise PipError(next((line for line in lines if line.startswith("ERROR: ")), lines[-1]).removeprefix("ERROR: "))
-
-
-def _reason(error: str) -> str:
-    """Return what the arguments of an error that pip shows say, without what surrounds it."""
-    last = re.split(r"[:,] ", error)[-1].strip("\"')")
-    return re.sub(r"\[Errno -?\d+\] ", "", last) + (")" if "(" in last else "")
 
 
 class Wheel(NamedTuple):
@@ -166,8 +67,8 @@ class Wheelhouse:
         self._folder, self._progress = folder, progress
         self._unreachable = ""
         self._lock = asyncio.Lock()
-        self._wheels = folder / "wheels"
-        for made in (self._wheels, folder / "houses"):
+        self._wheels, self._builders = folder / "wheels", folder / "build"
+        for made in (self._wheels, self._builders, folder / "houses"):
             made.mkdir(parents=True, exist_ok=True)
 
     async def wheel_set(self, host: str, target: WheelTarget, extras: Iterable[str]) -> WheelSet:
@@ -206,12 +107,21 @@ class Wheelhouse:
             self._progress(f"building the wheel of {PROJECT}")
             with tempfile.TemporaryDirectory(dir=self._folder) as made:
                 try:
-                    await pip("wheel", "--no-deps", "--wheel-dir", f"{made}/wheel", source, progress=self._progress)
+                    await self._build(source, _build_requirements(checkout), f"{made}/wheel")
                 except PipError as error:
                     raise HostsError(f"launcher: no wheel of {PROJECT} from {source}: {error}") from error
                 folder.parent.mkdir(exist_ok=True)
                 _move(Path(made, "wheel"), folder)
         return next(folder.glob("*.whl"))
+
+    async def _build(self, source: str, needs: Sequence[str], into: str) -> None:
+        """Build the wheel; what that needs is kept, so that the next time no index is asked."""
+        build = ("wheel", "--no-deps", "--wheel-dir", into, source)
+        if await is_kept(self._builders, build, self._progress):
+            return
+        if needs:
+            await pip("download", "--dest", str(self._builders), *needs, progress=self._progress)
+        await pip(*build, "--find-links", str(self._builders), progress=self._progress)
 
     def _known(self, key: str) -> list[str]:
         """Return the names of a house that was gathered before; none if a wheel of it is missing."""
@@ -226,7 +136,9 @@ class Wheelhouse:
         wanted = f"{project}[{','.join(extras)}]" if extras else str(project)
         with tempfile.TemporaryDirectory(dir=self._folder) as made:
             try:
-                other_versions = await download_wheels([wanted, PIP], target, Path(made), constraints(), self._progress)
+                other_versions = await download_wheels(
+                    [wanted, PIP], target, Path(made), constraints(), self._wheels, self._progress
+                )
             except PipError as error:
                 raise HostsError(f"{host}: {_lacking(error, target)}") from error
             names = sorted(path.name for path in Path(made).glob("*.whl") if path.name != project.name)
@@ -282,6 +194,11 @@ def _checkout() -> Path | None:
     description = root / "pyproject.toml"
     known = tomllib.loads(description.read_text()) if description.exists() else {}
     return root if known.get("project", {}).get("name") == PROJECT else None
+
+
+def _build_requirements(checkout: Path | None) -> list[str]:
+    """Return what a checkout is built with; nothing where its wheel comes from elsewhere."""
+    return tomllib.loads((checkout / "pyproject.toml").read_text())["build-system"]["requires"] if checkout else []
 
 
 def _sources(root: Path) -> list[tuple[str, str]]:

@@ -1,33 +1,75 @@
-"""Compile what flies, once on a machine, so that a run starts at once there: `python -m zsim_deploy.roles.warm_up`.
+"""Compile what flies, once on a machine, so that a run starts at once there.
 
-Where numba is missing nothing is compiled, and there is nothing to do. `zsim push` runs this on a host.
+python -m zsim_deploy.roles.warm_up EXTRA...    what the roles run that need these extras; `zsim push` runs it on a host
+
+Where numba is missing nothing is compiled, and there is nothing to do.
 """
 
 import importlib.util
 import math
+import sys
 import time
+from collections.abc import Collection
 from typing import Any
 
+from zsim import CONTRACT, __version__
+from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
 from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
 
 SIZES = {"pair": 2, "triad": 3, "template": 5}  # drones of the kinds of cluster: each has code of its own
 ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}  # as good as many
 NESTED = ("groups", 2, 3)  # name, groups, drones of each
+WITH_WORLD = {"world", "sweep", "all", "dev"}  # extras that bring it …
+WITH_AGENTS = WITH_WORLD | {"agents"}  # … and them; pyproject.toml
 APART_M = 4.0  # on circles, so that no formation stands in a line
 
 
-def main() -> None:
-    """Build the world and one of each agent, as far as they are installed, and let them compile."""
-    if not (_has("numba") and _has("psutil")):
+def main(extras: Collection[str]) -> None:
+    """Build the world and one of each agent, as far as they need the extras, and let them compile."""
+    if importlib.util.find_spec("numba") is None:
         return
+    if WITH_WORLD & {*extras}:
+        _build_world()
+    if WITH_AGENTS & {*extras}:
+        _rehearse_agents()
+
+
+def _build_world() -> None:
     from zsim_world.flight.world import World
 
-    info = World(scenario_file.resolve(ALONE), "lockstep", 0.0, time.monotonic_ns, None).info()
-    if not _has("filterpy"):
-        return
+    World(scenario_file.resolve(ALONE), "lockstep", 0.0, time.monotonic_ns, None)
+
+
+def _rehearse_agents() -> None:
     from zsim_agents.hosting import hosted
 
-    hosted(info, scenario_file.resolve(formations()), ["*"]).rehearse()
+    scenario = scenario_file.resolve(formations())
+    hosted(_info(scenario), scenario, ["*"]).rehearse()
+
+
+def _info(scenario: Scenario) -> Info:
+    """Return what agents are made of without a world, whose kernel a host of agents does not need compiled."""
+    return Info(
+        t_ns=0,
+        seq=0,
+        contract=CONTRACT,
+        run_id=scenario.name,
+        federation=scenario.federation,
+        mode="lockstep",
+        rate=0.0,
+        gate_ns=round(scenario.time.gate_ms * 1e6),
+        physics_dt_ns=round(scenario.time.physics_dt_ms * 1e6),
+        command_delay_ns=0,
+        seed=scenario.seed,
+        origin=Origin(0.0, 0.0, 0.0),
+        drones=tuple(DroneInfo(drone.name, drone.model) for drone in scenario.drones),
+        clusters=tuple(ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in scenario.clusters),
+        scenario="",
+        scenario_sha256="",
+        version=__version__,
+        fingerprint="",
+    )
 
 
 def formations() -> dict[str, Any]:
@@ -45,9 +87,5 @@ def _place(i: int, row: int) -> list[float]:
     return [APART_M * math.cos(i), APART_M * math.sin(i) + 4 * APART_M * row, 0.0]
 
 
-def _has(module: str) -> bool:
-    return importlib.util.find_spec(module) is not None
-
-
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -32,6 +32,7 @@ SOUND = {
     "python": platform.python_version(),
     "zsim": __version__,
     "fingerprint": "a" * 16,
+    "parts": {"libc": "glibc-2.36", "numba": "0.68.1", "scipy": "1.17.1"},
     "cores": 2,
     "load": 0.1,
     "governors": ["performance"],
@@ -78,6 +79,22 @@ def test_what_slows_or_differs_is_a_warning(found, terms):
     faults, warnings = compare_reports({"h1": found, "h2": report()})
     assert faults == []
     assert [has_terms(line, *terms) for line in warnings] == [True]
+
+
+def test_a_package_that_one_host_lacks_is_named_as_the_cause_of_another_fingerprint():
+    parts = {"libc": "glibc-2.31", "scipy": "1.17.1"}
+    faults, (different, lacking) = compare_reports({"h1": report(fingerprint="b" * 16, parts=parts), "h2": report()})
+    assert faults == []
+    assert has_terms(
+        different, "h1 bbbbbbbb", "libc", "h1 glibc-2.31", "h2 glibc-2.36", "numba", "h1 none", "h2 0.68.1"
+    )
+    assert has_terms(lacking, "h1", "numba", "zsim push --hosts")
+    assert "libc" not in lacking
+
+
+def test_a_host_that_computes_nothing_has_no_fingerprint_to_compare():
+    router = report(fingerprint="b" * 16, parts={"libc": "glibc-2.31"})
+    assert compare_reports({"h1": router, "h2": report()}) == ([], [])
 
 
 def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():

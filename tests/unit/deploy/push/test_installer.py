@@ -30,24 +30,26 @@ def found(**versions: str) -> list[Interpreter]:
     return parse_interpreters("\n".join(lines))
 
 
-def test_the_launchers_minor_version_is_taken_then_python3_then_the_newest() -> None:
-    assert (
-        choose_interpreter("h", found(python3="3.13.2", python3_12="3.12.1", python3_11="3.11.9"), HERE).command
-        == "python3.11"
-    )
-    assert choose_interpreter("h", found(python3="3.12.1", python3_13="3.13.0"), HERE).command == "python3"
-    assert (
-        choose_interpreter("h", found(python3="3.9.2", python3_12="3.12.1", python3_13="3.13.0"), HERE).command
-        == "python3.13"
-    )
+def test_the_launchers_minor_version_is_taken_as_python3_where_it_is_that() -> None:
+    several = found(python3="3.13.2", python3_12="3.12.1", python3_11="3.11.9")
+    assert choose_interpreter("h", several, HERE).command == "python3.11"
+    assert choose_interpreter("h", found(python3="3.11.2", python3_11="3.11.9"), HERE).command == "python3"
 
 
-def test_a_python_that_is_too_old_is_a_line() -> None:
-    with pytest.raises(HostsError) as caught:
-        choose_interpreter("onboard1", found(python3="3.9.2"), HERE)
-    assert has_terms(str(caught.value), "onboard1", "python3", "3.9.2", ">=", "3.11")
-    with refused(HostsError, "onboard1", "python3", ">=", "3.11"):
-        choose_interpreter("onboard1", [], HERE)
+@pytest.mark.parametrize(
+    ("there", "terms"),
+    [
+        (found(python3="3.9.2"), ("python3 3.9.2", "3.11", "python3.11")),
+        (found(python3="3.13.2", python3_13="3.13.2", python3_12="3.12.1"), ("python3.12 3.12.1", "python3 3.13.2", "3.11")),
+        ([], ("python3", "3.11", "python3.11")),
+    ],
+)  # fmt: skip
+def test_a_python_of_another_minor_version_is_a_line_before_anything_is_copied(
+    there: list[Interpreter], terms: tuple[str, ...]
+) -> None:
+    """No run takes a host with another one."""
+    with refused(HostsError, "onboard1", *terms):
+        choose_interpreter("onboard1", there, HERE)
 
 
 def test_the_question_finds_the_pythons_of_a_machine() -> None:

@@ -17,9 +17,10 @@ import pytest
 from refused import has_terms, refused
 
 from zsim.errors import HostsError
-from zsim_deploy.push import wheelhouse
+from zsim_deploy.push import wheel_download, wheelhouse
 from zsim_deploy.push.installer import WheelTarget, wheel_target
-from zsim_deploy.push.wheelhouse import PipError, Wheelhouse, WheelSet, download_wheels, pip, requirement
+from zsim_deploy.push.wheel_download import PipError, download_wheels, pip
+from zsim_deploy.push.wheelhouse import Wheelhouse, WheelSet, requirement
 
 BACKEND = """
 # A build backend without dependencies: a wheel with one module.
@@ -99,19 +100,19 @@ def checkout(index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 def test_a_wheel_that_does_not_exist_is_what_pip_says(index: Path, tmp_path: Path) -> None:
     with refused(PipError, "requirement numpy"):
-        asyncio.run(download_wheels(["numpy"], ELSEWHERE, tmp_path / "into", [], print))
+        asyncio.run(download_wheels(["numpy"], ELSEWHERE, tmp_path / "into", [], tmp_path, print))
 
 
 @pytest.mark.parametrize("aim", [here(), ELSEWHERE], ids=["here", "elsewhere"])
 def test_a_project_without_wheels_is_built_here_also_for_others(index: Path, tmp_path: Path, aim: WheelTarget) -> None:
     into = tmp_path / "into"
-    assert not asyncio.run(download_wheels(["gadget"], aim, into, [], print))
+    assert not asyncio.run(download_wheels(["gadget"], aim, into, [], tmp_path, print))
     assert [path.name for path in into.iterdir()] == ["gadget-1.0-py3-none-any.whl"]
 
 
 def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: Path, tmp_path: Path) -> None:
-    assert not asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "same", ["gadget==1.0"], print))
-    assert asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "other", ["gadget==0.9"], print))
+    assert not asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "same", ["gadget==1.0"], tmp_path, print))
+    assert asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "other", ["gadget==0.9"], tmp_path, print))
 
 
 def house(folder: Path, extras: list[str], host: str = "h") -> tuple[WheelSet, list[str]]:
@@ -185,7 +186,8 @@ def test_an_index_that_cannot_be_reached_is_no_missing_wheel(
         calls.append(arguments)
         await pip(*arguments, **options)
 
-    monkeypatch.setattr(wheelhouse, "pip", counted)
+    for module in (wheelhouse, wheel_download):
+        monkeypatch.setattr(module, "pip", counted)
     lines: list[str] = []
     kept = Wheelhouse(tmp_path / "cache", lines.append)
     for _ in range(2):
@@ -195,6 +197,35 @@ def test_an_index_that_cannot_be_reached_is_no_missing_wheel(
         assert has_terms(str(caught.value), "launcher", "index", os.strerror(errno.ECONNREFUSED), *remedy)
     assert [arguments[0] for arguments in calls] == ["wheel", "download"]
     assert has_terms(lines[-1], "index", os.strerror(errno.ECONNREFUSED), "once more")
+
+
+def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave pip an index at which nobody listens, and no folder."""
+    monkeypatch.delenv("PIP_NO_INDEX", raising=False)
+    monkeypatch.delenv("PIP_FIND_LINKS")
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:1/simple")  # tcpmux; nobody has it
+
+
+def test_wheels_that_are_kept_need_no_index(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where something else has been installed here since, by which the house would be another."""
+    first, _ = house(tmp_path / "cache", ["agents"])
+    nowhere(monkeypatch)
+    monkeypatch.setattr(wheelhouse, "constraints", lambda: ["gadget==1.0", "widget==2.0"])
+    again, lines = house(tmp_path / "cache", ["agents"])
+    assert again == first
+    assert not [line for line in lines if has_terms(line, "index")]
+
+
+def test_what_builds_the_project_is_kept(
+    checkout: Path, index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (checkout / "pyproject.toml").write_text(PYPROJECT.replace("requires = []", 'requires = ["gadget"]'))
+    house(tmp_path / "cache", [])
+    nowhere(monkeypatch)
+    (checkout / "source/flight.py").write_text("height_m = 5\n")
+    _, lines = house(tmp_path / "cache", [])
+    (line,) = lines
+    assert has_terms(line, "building", "zsim")
 
 
 def test_what_is_in_a_folder_needs_no_index(checkout: Path, no_index: None, tmp_path: Path) -> None:
@@ -210,7 +241,7 @@ def test_what_is_in_a_folder_needs_no_index(checkout: Path, no_index: None, tmp_
     ],
 )  # fmt: skip
 def test_why_an_index_does_not_answer_is_said_without_what_surrounds_it(shown: str, terms: tuple[str, ...]) -> None:
-    assert has_terms(wheelhouse._reason(shown), *terms)
+    assert has_terms(wheel_download._reason(shown), *terms)
 
 
 class Installed:
