@@ -18,7 +18,7 @@ from benchmarks.exchange.lap import free_port
 from benchmarks.peers import FOLDER, ROOT
 from benchmarks.run import CLI
 
-VARIANTS: dict[str, tuple[str, ...]] = {"plain": ("numba", "llvmlite"), "numba": ()}  # what is taken out of the extra `agents`
+REMOVED: dict[str, tuple[str, ...]] = {"plain": ("numba", "llvmlite"), "numba": ()}  # by variant, of extra `agents`
 SHORT_S, LONG_S = 5.0, 45.0  # simulated; their difference is free of the start
 TIMEOUT_S = 180.0
 
@@ -36,7 +36,7 @@ def install(variant: str) -> Path:
     pip = [str(python), "-m", "pip", "--disable-pip-version-check"]
     install, remove = ["install", "-q"], ["uninstall", "-q", "-y"]
     steps = [[*install, f"{ROOT}[agents]"], [*install, "--force-reinstall", "--no-deps", str(ROOT)]]
-    steps += [[*remove, *VARIANTS[variant]]] if VARIANTS[variant] else []
+    steps += [[*remove, *REMOVED[variant]]] if REMOVED[variant] else []
     for step in steps:
         done = subprocess.run([*pip, *step], capture_output=True, text=True, check=False)
         if done.returncode:

@@ -101,6 +101,7 @@ def push(lab: Lab, hosts: Path, *options: str) -> subprocess.CompletedProcess[st
 
 def test_hosts_without_internet_get_what_their_roles_need_once(lab: Lab, hosts: Path) -> None:
     gather(lab, hosts, "h1", "h2")
+    lab.environment("h1", NUMBA_DISABLE_JIT="1")  # compiling takes longer than all the rest
     first = push(lab, hosts, "--host", "h1", "--host", "h2")
     assert first.returncode == 0, first.stderr
     assert "2 of 2" in first.stdout

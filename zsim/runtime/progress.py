@@ -26,6 +26,11 @@ _NUMBER = re.compile(r"-?[0-9][0-9.]*")
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
+def cell(text: str) -> Text:
+    """Return a text for rich: its brackets are no markup, and codes that a terminal acts on are written out."""
+    return Text(printable(text))
+
+
 class ProgressSink(Protocol):
     """Whoever takes progress."""
 
@@ -144,7 +149,7 @@ class Screen:
     def clock(self, line: dict[str, Any]) -> None:
         text = describe(line, self._duration_s)
         if self._is_live:
-            self._live.update(Text(printable(text)))
+            self._live.update(cell(text))
             return
         waiting = bool(line["waiting_for"])
         if (line["t_s"] >= self._next_plain_s or waiting) and text != self._last_plain:

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from zsim.errors import RecordError, ReportError
 from zsim.record.record_reader import RECORD
+from zsim.runtime.progress import cell
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.flight import RecordedFlight, read_flight
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
@@ -122,11 +123,11 @@ def table(summary: RunSummary, cluster: str | None = None) -> Table:
     start, end = summary.window_s
     whose = f" of {name}" if name else ""
     title = f"Formation errors{whose} from {start:g} to {end:g} s, beside Table I of the paper"
-    shown = Table(title=title, caption="est. = estimate − desired, true = truth − desired", title_justify="left")
+    shown = Table(title=cell(title), caption="est. = estimate − desired, true = truth − desired", title_justify="left")
     for column in COLUMNS:
         shown.add_column(column, justify="left" if column == "parameter" else "right")
     for parameter, errors in (summary.clusters[name].errors if name else {}).items():
-        shown.add_row(*cells(parameter, errors, summary.paper_table_1.get(parameter)))
+        shown.add_row(*map(cell, cells(parameter, errors, summary.paper_table_1.get(parameter))))
     return shown
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from zsim.errors import ReportError
+from zsim.runtime.progress import cell
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.summary import PAPER_NOTE, PAPER_TABLE_1
@@ -152,12 +153,12 @@ def make_sweep_report(directory: Path, progress: Callable[[str], None] = lambda 
 def table(summary: SweepSummary) -> Table:
     """Return the table of all points, for the terminal."""
     caption = f"± and [ ]: {100 * summary.level:g} % confidence intervals"
-    shown = Table(title=f"{summary.scenario}: {summary.finished} of {summary.runs} runs", caption=caption)
-    shown.add_column(summary.grid)
+    shown = Table(title=cell(f"{summary.scenario}: {summary.finished} of {summary.runs} runs"), caption=caption)
+    shown.add_column(cell(summary.grid))
     for column in OVERVIEW:
         shown.add_column(column, justify="right")
     for point in summary.flown[:SHOWN_MAX]:
-        shown.add_row(point.label, *overview(point))
+        shown.add_row(cell(point.label), *overview(point))
     if len(summary.flown) > SHOWN_MAX:
         shown.add_row(f"… and {len(summary.flown) - SHOWN_MAX} more")
     return shown

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from zsim.runtime.progress import Throttle
+from zsim.runtime.progress import Throttle, cell
 from zsim_analysis.sweep.design import SweepPlan
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
 from zsim_analysis.sweep.sweep_folder import SweepFolder, locked
@@ -56,7 +56,7 @@ class SweepScreen:
 
     def say(self, text: str) -> None:
         """Show a line that stays."""
-        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
+        self.console.print(cell(text), soft_wrap=True)
 
     def finished(self, failed: bool) -> None:
         """Count a run."""
@@ -79,7 +79,7 @@ class SweepScreen:
         return text + (f"  {self._failed} failed" if self._failed else "")
 
     def _text(self) -> Text:
-        return Text(self.line())
+        return cell(self.line())
 
 
 def span(seconds: float) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim.errors import RunError, SessionError
+from zsim.errors import RunError, SessionError, printable
 from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
 from zsim_deploy.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, participant_options, positive, require
 
@@ -132,7 +132,7 @@ def ros1(
     try:
         serve_runs(own_name, bridge, reach)
     except NodeShutdownError as error:
-        print(error)
+        print(printable(str(error)))
 
 
 @app.command(rich_help_panel=TRANSLATE)
@@ -184,4 +184,4 @@ def _write_package(folder: Path) -> None:
     except OSError as error:
         why = f"cannot be written ({error.strerror}); give --write-package another folder"
         raise RunError(f"{folder}: {why}") from error
-    print(f"wrote {folder}; build it with colcon in a ROS workspace")
+    print(printable(f"wrote {folder}; build it with colcon in a ROS workspace"))

@@ -144,12 +144,12 @@ def validate(scenario: ScenarioPath, set_: Set = None) -> None:
     """Check a scenario and print what it resolves to; every fault is a line."""
     from zsim.scenario import scenario_file
 
-    print(scenario_file.to_text(load_scenario(scenario, set_)), end="")
+    print(printable(scenario_file.to_text(load_scenario(scenario, set_))), end="")
 
 
 def _version(wanted: bool) -> None:
     if wanted:
-        print(f"zsim {__version__}")
+        print(printable(f"zsim {__version__}"))
         raise typer.Exit
 
 
@@ -212,7 +212,8 @@ def _show_usage(error: Any) -> None:
         text = " ".join(error.format_message().split()).replace("Value error, ", "")  # newer typers ask pydantic
     command = error.ctx.command_path if error.ctx else "zsim"
     if text:
-        print(f"{command}: {text[0].lower()}{text[1:].rstrip('.')}; see `{command} --help`", file=sys.stderr)
+        line = f"{command}: {text[0].lower()}{text[1:].rstrip('.')}; see `{command} --help`"
+        print(printable(line), file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def keys(reach: WorldAccess) -> None:
 
     with connected(reach) as (link, _):
         for key, kind, count in inspection.list_keys(link):
-            print(f"{printable(key):<36} {kind:<14} {count:>6}")
+            print(printable(f"{key:<36} {kind:<14} {count:>6}"))
 
 
 @app.command(rich_help_panel=PANEL)
@@ -92,7 +92,7 @@ def pub(
 
     with connected(reach) as (link, info):
         sent = inspection.publish(link, info, key, message, count, rate_hz)
-    print(f"published {sent} on {key}")
+    print(printable(f"published {sent} on {key}"))
 
 
 @app.command(rich_help_panel=PANEL)
@@ -175,7 +175,7 @@ def add(
     with connected(reach) as (link, _):
         done = _ask(link, "fault_add", args)
     until = "until it is cleared" if done["until_ns"] is None else f"to {done['until_ns'] / 1e9:.2f} s"
-    print(f"fault {done['id']}: {kind} of {target} from {done['from_ns'] / 1e9:.2f} s {until}")
+    print(printable(f"fault {done['id']}: {kind} of {target} from {done['from_ns'] / 1e9:.2f} s {until}"))
 
 
 @faults.command()
@@ -187,7 +187,8 @@ def clear(
     """End faults: all, or those of a number, a target or a kind."""
     with connected(reach) as (link, info):
         done = _ask(link, "fault_clear", selector(which, info.scenario))
-    print(f"cleared {', '.join(map(str, done['cleared'])) or 'nothing: no fault was planned or acting'}")
+    cleared = ", ".join(map(str, done["cleared"])) or "nothing: no fault was planned or acting"
+    print(printable(f"cleared {cleared}"))
 
 
 @faults.command("list")
@@ -218,7 +219,7 @@ def kinds(
 
     own = declarations(scenario_file.load(scenario).drones) if scenario else {}
     for name, kind in fault_kinds.kinds_of(own).items():
-        print(f"{name:<17} {kind.strikes:<8} {'  '.join(_parameters(kind)) or '-'}")
+        print(printable(f"{name:<17} {kind.strikes:<8} {'  '.join(_parameters(kind)) or '-'}"))
 
 
 def selector(which: str, scenario: str) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from zsim.errors import printable
 from zsim_deploy.arguments import HOSTS, FlightOptions, Insecure, flight_options
 
 app = typer.Typer()
@@ -92,7 +93,7 @@ def logs(
     federation: Federation = "zsim",
 ) -> None:
     """Print the log of a process of the run that is up; progress and events are shown by `zsim up` itself."""
-    from zsim.errors import RunError, printable
+    from zsim.errors import RunError
     from zsim_deploy.hosts import control_socket
 
     where = control_socket.ask(federation, "where")
@@ -100,7 +101,7 @@ def logs(
         raise RunError(f"role is {role!r}; must be one of {', '.join(where['roles'])}")
     path = Path(where["out"]) / "logs" / f"{role}.log"
     if not path.exists():
-        print(_silent(role), file=sys.stderr)
+        print(printable(_silent(role)), file=sys.stderr)
     for text in _written(path, follow, lambda: _is_up(federation, where["out"])):
         sys.stdout.write(printable(text))
         sys.stdout.flush()
@@ -147,7 +148,7 @@ def restart(role: Role, federation: Federation = "zsim") -> None:
     """Start a process of the run anew where it is; it takes over from its former self."""
     from zsim_deploy.hosts import control_socket
 
-    print(f"restarting {control_socket.ask(federation, 'restart', role=role)}")
+    print(printable(f"restarting {control_socket.ask(federation, 'restart', role=role)}"))
 
 
 def move(
@@ -158,7 +159,7 @@ def move(
     """Let another host run a process of the run from now on."""
     from zsim_deploy.hosts import control_socket
 
-    print(f"moving {control_socket.ask(federation, 'move', role=role, host=host)}")
+    print(printable(f"moving {control_socket.ask(federation, 'move', role=role, host=host)}"))
 
 
 def doctor(
@@ -178,7 +179,7 @@ def doctor(
     for shown in result.tables:
         console.print(shown)
     for warning in result.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        print(printable(f"warning: {warning}"), file=sys.stderr)
     if result.faults:
         raise HostsError("\n".join(result.faults))
     print("all hosts are ready")
@@ -209,7 +210,8 @@ def push(
     with PushProgress() as stages:
         done = asyncio.run(push_to(placed, host or [], extra or [], stages.update, default_cache()))
     changed = sum(done.values())
-    print(f"installed on {changed} of {len(done)} hosts" if changed else "nothing to do; all hosts have what they need")
+    nothing = "nothing to do; all hosts have what they need"
+    print(printable(f"installed on {changed} of {len(done)} hosts" if changed else nothing))
 
 
 for _command in (push, doctor, up, ps, logs, restart, move, down):

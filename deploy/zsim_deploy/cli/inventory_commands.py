@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from zsim.errors import printable
 from zsim.transport.tls import DAYS
 from zsim_deploy.arguments import FlightOptions, Set, flight_options, load_scenario
 
@@ -68,7 +69,7 @@ def init(
         content = json.dumps(rules, indent=2) + "\n"
         certificates.write(folder / host / f"{process}.access.json", content.encode())
     _warn(placed)
-    print(f"{folder}: {made} certificates made, {kept} kept; zsim certs show {hosts} lists them")
+    print(printable(f"{folder}: {made} certificates made, {kept} kept; zsim certs show {hosts} lists them"))
 
 
 @certs.command()
@@ -87,10 +88,11 @@ def show(hosts: Inventory) -> None:
         until = f"{status.until:%Y-%m-%d %H:%M}Z"
         where = ", ".join(status.addresses)
         state = status.fault or _soon(status, now)
-        print(f"{status.host:<16} {status.process:<32} {until:<18} {where:<40} {state}".rstrip())
+        cells = f"{status.host:<16} {status.process:<32} {until:<18} {where:<40} {state}"
+        print(printable(cells.rstrip()))
     over = any(_soon(status, now) or certificates.EXPIRED in status.fault for status in statuses)
     if over or any(status.fault for status in statuses):
-        print(f"make them anew with `{init_command(placed, renew=over)}`", file=sys.stderr)
+        print(printable(f"make them anew with `{init_command(placed, renew=over)}`"), file=sys.stderr)
     _warn(placed)
 
 
@@ -116,7 +118,7 @@ def _warn(placed: "InventoryFile") -> None:
     from zsim_deploy.inventory.enrolment import exposed_keys
 
     if warning := exposed_keys(placed):
-        print(f"warning: {warning}", file=sys.stderr)
+        print(printable(f"warning: {warning}"), file=sys.stderr)
 
 
 @rendering.command()
@@ -159,7 +161,7 @@ def _read(hosts: Path, flight: FlightOptions) -> tuple[Any, Any]:
     loaded = flight.scenario(elsewhere=True)
     placed = inventory.load(hosts)
     for remark in own_programs(placed, loaded):
-        print(remark, file=sys.stderr)
+        print(printable(remark), file=sys.stderr)
     return placed, loaded
 
 
@@ -168,4 +170,4 @@ def _write(out: Path, target: str, texts: Mapping[str, str]) -> None:
 
     removed = write(out, target, texts)
     more = f"; removed of an earlier rendering: {', '.join(removed)}" if removed else ""
-    print(f"{len(texts)} files in {out}{more}")
+    print(printable(f"{len(texts)} files in {out}{more}"))

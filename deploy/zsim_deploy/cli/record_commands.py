@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from zsim.errors import ZsimError
+from zsim.errors import ZsimError, printable
 from zsim_analysis.export import Format
 from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import RUN, Duration, From, Keys, ScenarioPath, Seed, Set, To, check_range, require
@@ -31,16 +31,19 @@ Place = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, or 
 def conclude(outcome: Any, out: Path, report: bool) -> None:
     """Print how a run ended, make its report, and end with the exit code for it."""
     if outcome.failed or outcome.interrupted:
-        print(f"ended: {outcome.reason}", file=sys.stderr)
+        print(printable(f"ended: {outcome.reason}"), file=sys.stderr)
     recorded = (out / "run.mcap").exists()
     if outcome.interrupted:
         if recorded:
-            print(f"the record so far is {out / 'run.mcap'}; `zsim report {out}` makes its report", file=sys.stderr)
+            print(
+                printable(f"the record so far is {out / 'run.mcap'}; `zsim report {out}` makes its report"),
+                file=sys.stderr,
+            )
         sys.exit(INTERRUPTED)
     if report and recorded:
         _report_at_the_end(out, outcome.failed)
     if outcome.failed:
-        print(f"logs are in {out / 'logs'}", file=sys.stderr)
+        print(printable(f"logs are in {out / 'logs'}"), file=sys.stderr)
         raise typer.Exit(1)
 
 
@@ -50,9 +53,9 @@ def _report_at_the_end(out: Path, failed: bool) -> None:
     except ZsimError as error:
         if not failed:
             raise
-        print(error, file=sys.stderr)
+        print(printable(str(error)), file=sys.stderr)
     except KeyboardInterrupt:
-        print(f"interrupted; the record is complete, `zsim report {out}` makes its report", file=sys.stderr)
+        print(printable(f"interrupted; the record is complete, `zsim report {out}` makes its report"), file=sys.stderr)
         sys.exit(INTERRUPTED)
 
 
@@ -85,6 +88,7 @@ def _report(folder: Path) -> None:
     require("report", REPORT_NEEDS)
     from rich.console import Console
 
+    from zsim.runtime.progress import cell
     from zsim_analysis.sweep.design import is_sweep
 
     if is_sweep(folder):
@@ -94,15 +98,16 @@ def _report(folder: Path) -> None:
         from zsim_analysis.report.make_report import make_report as make
         from zsim_analysis.report.make_report import table
     with Console(stderr=True).status("reading …") as status:
-        summary: Any = make(folder, lambda text: status.update(text))
+        summary: Any = make(folder, lambda text: status.update(cell(text)))
     Console().print(table(summary))
-    print(f"report: {folder / 'report.html'}")
+    print(printable(f"report: {folder / 'report.html'}"))
 
 
 def _compare(directories: list[Path], out: Path | None) -> None:
     from rich.console import Console
 
     from zsim.record.record_reader import record_in
+    from zsim.runtime.progress import cell
     from zsim_analysis.report.make_report import compare, comparison_path
     from zsim_analysis.sweep.design import is_sweep
 
@@ -112,8 +117,8 @@ def _compare(directories: list[Path], out: Path | None) -> None:
         record_in(directory)
     page = out or comparison_path(directories)
     with Console(stderr=True).status("reading the records …") as status:
-        compare(directories, page, lambda text: status.update(text))
-    print(f"report: {page}")
+        compare(directories, page, lambda text: status.update(cell(text)))
+    print(printable(f"report: {page}"))
 
 
 @app.command(rich_help_panel=RUN)
@@ -152,7 +157,10 @@ def sweep(
     try:
         rows = fly(SweepRequest(plan, folder, workers, dask))
     except KeyboardInterrupt:
-        print(f"interrupted; the same command with --out {folder} goes on, the table so far is in it", file=sys.stderr)
+        print(
+            printable(f"interrupted; the same command with --out {folder} goes on, the table so far is in it"),
+            file=sys.stderr,
+        )
         sys.exit(INTERRUPTED)
     _conclude(folder, [row["failure"] for row in rows if row["failure"]], len(rows), report)
 
@@ -186,10 +194,10 @@ def _plan(
 def _conclude(folder: Path, failures: list[str], runs: int, report: bool) -> None:
     """Print what did not end well, make the report, and fail if no run ended well."""
     for failure in sorted(set(failures), key=failures.count, reverse=True)[:5]:
-        print(f"{failures.count(failure)} of {runs} runs failed: {failure}", file=sys.stderr)
+        print(printable(f"{failures.count(failure)} of {runs} runs failed: {failure}"), file=sys.stderr)
     if report:
         _report(folder)
-    print(f"table: {folder / 'sweep.parquet'}")
+    print(printable(f"table: {folder / 'sweep.parquet'}"))
     if len(failures) == runs:
         raise typer.Exit(1)
 
@@ -237,10 +245,10 @@ def export(
 
 def _show(done: "ExportResult") -> None:
     for note in done.notes:
-        print(f"note: {note}", file=sys.stderr)
+        print(printable(f"note: {note}"), file=sys.stderr)
     for name, rows in done.tables.items():
-        print(f"{name:<40} {rows:>10}")
-    print("written: " + " ".join(map(str, done.paths)))
+        print(printable(f"{name:<40} {rows:>10}"))
+    print(printable("written: " + " ".join(map(str, done.paths))))
 
 
 @app.command(rich_help_panel=RUN)
@@ -254,5 +262,11 @@ def rerun(
     require("rerun", RERUN_NEEDS)
     from zsim_analysis.rerun import rerun_record
 
-    if not rerun_record(directory, commands_only, print, lambda text: print(text, file=sys.stderr)):
+    def show(text: str) -> None:
+        print(printable(text))
+
+    def warn(text: str) -> None:
+        print(printable(text), file=sys.stderr)
+
+    if not rerun_record(directory, commands_only, show, warn):
         raise typer.Exit(1)

@@ -9,10 +9,10 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 from rich.table import Table
-from rich.text import Text
 
 from zsim import __version__
 from zsim.errors import HostsError, ZsimError
+from zsim.runtime.progress import cell
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.host_links import ProgramEndedError, RemoteProgram, open_program
 from zsim_deploy.hosts.host_plan import leftovers, port_in_use
@@ -285,14 +285,14 @@ def _hosts_table(reports: dict[str, HostReport]) -> Table:
             ", ".join(facts["governors"]) or "-",
             facts["fingerprint"][:8],
         )
-        shown.add_row(*map(Text, cells))  # a host's answer may have brackets
+        shown.add_row(*map(cell, cells))
     return shown
 
 
 def _paths_table(paths: list[NetworkPath]) -> Table:
     shown = Table("from", "to", "port", "round trip", "bandwidth", box=None)
     for path in paths:
-        shown.add_row(*map(Text, (path.source, path.target, str(path.port), *_path_figures(path.figures))))
+        shown.add_row(*map(cell, (path.source, path.target, str(path.port), *_path_figures(path.figures))))
     return shown
 
 

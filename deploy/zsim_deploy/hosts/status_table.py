@@ -7,10 +7,8 @@ from typing import Any
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
-from rich.text import Text
 
-from zsim.errors import printable
-from zsim.runtime.progress import Screen, describe
+from zsim.runtime.progress import Screen, cell, describe
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.remote_process import RemoteProcess
 
@@ -110,7 +108,7 @@ class StatusTable(Screen):
 
     def _render(self) -> Group:
         clock = self._clock
-        head = Text(printable(describe(clock, self._duration_s)) if clock else "starting …")
+        head = cell(describe(clock, self._duration_s) if clock else "starting …")
         return Group(head, table(self.rows()))
 
 
@@ -123,10 +121,10 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
     shown = Table(*COLUMNS, box=None, pad_edge=False)
     for row in rows:
         shown.add_row(
-            row["role"],
-            row["host"],
+            cell(row["role"]),
+            cell(row["host"]),
             str(row["pid"] or "-"),
-            Text(printable(row["state"])),  # it may hold output of a process, with brackets
+            cell(row["state"]),  # it may hold output of a process
             _figure(row["lag_ms"], "{:.0f} ms"),
             _figure(row["messages_per_s"], "{:.0f}"),
             _figure(row["round_trip_ms"], "{:.1f} ms"),

@@ -13,10 +13,10 @@ import asyncssh
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
-from rich.text import Text
 
 from zsim import __version__
 from zsim.errors import HostsError, InventoryError
+from zsim.runtime.progress import cell
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.ssh_connection import shell_line, start_sftp
 from zsim_deploy.inventory.inventory import Host, InventoryFile
@@ -233,10 +233,10 @@ class PushProgress:
         kind, last = (re.sub(r"\d+ of", "", each) for each in (text, self._now.get(host, "")))
         self._now[host] = text
         if not self._console.is_terminal and kind != last:
-            self._console.print(f"{host}: {text}", highlight=False, markup=False, soft_wrap=True)
+            self._console.print(cell(f"{host}: {text}"), soft_wrap=True)
 
     def _table(self) -> Table:
         table = Table.grid(padding=(0, 2))
         for host, text in self._now.items():
-            table.add_row(Text(host, style="bold"), Text(text))
+            table.add_row(cell(host), cell(text))
         return table

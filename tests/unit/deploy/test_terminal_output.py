@@ -1,0 +1,104 @@
+"""Nothing that others have said reaches a terminal with codes that it acts on."""
+
+import ast
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from zsim.errors import printable
+from zsim.runtime.progress import cell
+from zsim_deploy.cli import hosts_commands
+from zsim_deploy.hosts import control_socket, doctor, status_table
+from zsim_deploy.hosts.doctor import CheckResult, HostReport, NetworkPath
+from zsim_deploy.push.push import PushProgress
+
+ROOT = Path(__file__).parents[3]
+PACKAGES = ("zsim", "world", "agents", "deploy")
+ANSWERS = {"probe.py", "on_host.py"}  # they print JSON for a launcher, no terminal
+SAFE = ("printable", "json.dumps", "cell")  # what takes the codes out
+NASTY = "\x1b]0;owned\x07\x9b2J\u202e[red]x"
+CODES = {"\x1b", "\x07", "\x9b", "\u202e"}
+
+
+def calls() -> Iterator[tuple[str, ast.Call]]:
+    """Yield every call in the program, with its place."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            if path.name not in ANSWERS:
+                for node in ast.walk(ast.parse(path.read_text())):
+                    if isinstance(node, ast.Call):
+                        yield f"{path.relative_to(ROOT)}:{node.lineno}", node
+
+
+def is_safe(text: ast.expr) -> bool:
+    """Return whether a text is a constant, a choice of such, or has its codes taken out."""
+    if isinstance(text, ast.IfExp):
+        return is_safe(text.body) and is_safe(text.orelse)
+    return isinstance(text, ast.Constant) or (isinstance(text, ast.Call) and ast.unparse(text.func) in SAFE)
+
+
+def test_all_that_is_printed_has_no_codes() -> None:
+    printed = [(place, call) for place, call in calls() if ast.unparse(call.func) == "print" and call.args]
+    assert len(printed) > 30
+    assert [place for place, call in printed if not is_safe(call.args[0])] == []
+
+
+def test_all_that_rich_shows_has_no_codes() -> None:
+    texts = [(place, call) for place, call in calls() if ast.unparse(call.func) == "Text"]
+    assert texts
+    assert [place for place, call in texts if not is_safe(call.args[0])] == []
+
+
+def shown(renderable: Any) -> str:
+    console = Console(file=io.StringIO(), width=300, force_terminal=True, color_system=None)
+    console.print(renderable)
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+FACTS = {"python": NASTY, "zsim": NASTY, "fingerprint": "ab", "cores": 2, "load": 0.1, "governors": [NASTY]}
+ROW = {"role": NASTY, "host": NASTY, "pid": 1, "state": NASTY, "lag_ms": None, "messages_per_s": None}
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        doctor._hosts_table({NASTY: HostReport(FACTS, 0.001, 0.0)}),
+        doctor._paths_table([NetworkPath(NASTY, NASTY, 7447, {"error": NASTY})]),
+        status_table.table([{**ROW, "round_trip_ms": None, "restarts": 0}]),
+        cell(NASTY),
+    ],
+)
+def test_a_table_of_what_hosts_say_holds_no_codes(table: Any) -> None:
+    text = shown(table)
+    assert not CODES & set(text)
+    assert printable(NASTY) in text
+
+
+def test_a_push_shows_no_codes() -> None:
+    console = Console(file=io.StringIO(), width=300)
+    PushProgress(console).update("h1", f"waiting for the push of {NASTY}")
+    terminal = PushProgress(Console(file=io.StringIO(), force_terminal=True))
+    terminal.update("h1", NASTY)
+    text = console.file.getvalue() + shown(terminal._table())  # type: ignore[attr-defined]
+    assert not CODES & set(text)
+    assert text.count(printable(NASTY)) == 2
+
+
+def test_what_a_launcher_and_hosts_answer_holds_no_codes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(control_socket, "ask", lambda *_, **__: NASTY)
+    hosts_commands.restart("estimator.drone1")
+    hosts_commands.move("estimator.drone1", "h2")
+    (tmp_path / "hosts.yaml").write_text("hosts: {h1: {address: 192.0.2.1}}\nroles: {world: h1}\n")
+    found = CheckResult([], [], [NASTY])
+    monkeypatch.setattr(doctor, "check_hosts", lambda *_: found)
+    hosts_commands.doctor(tmp_path / "hosts.yaml")
+    output, errors = capsys.readouterr()
+    assert not CODES & set(output + errors)
+    assert output.count(printable(NASTY)) == 2
+    assert printable(NASTY) in errors
