@@ -2,14 +2,16 @@
 
     RecordWriter(path).add(key, payload, encoding, t_ns, wall_ns)   tick(wall_ns)   close()
     RecordReader(path).messages()   topics()   last(key)
+    completeness(reader)            says which gates are missing
     repair(path)                    finishes a file whose writer died
 
 Topic = key without the federation's prefix, message encoding `msgpack`, log time = simulated time, publish
 time = wall clock of the recorder. Other MCAP tools open it. Imports contract.
 """
 
+from zsim.record.completeness import Completeness, completeness
 from zsim.record.record_end import repair
 from zsim.record.record_reader import Recorded, RecordReader
 from zsim.record.record_writer import RecordWriter
 
-__all__ = ["RecordReader", "RecordWriter", "Recorded", "repair"]
+__all__ = ["Completeness", "RecordReader", "RecordWriter", "Recorded", "completeness", "repair"]

@@ -1,7 +1,7 @@
 """Reads a record, whole or cut at any byte, from a file or the folder of a run."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from mmap import ACCESS_READ, mmap
 from operator import itemgetter
 from pathlib import Path
@@ -30,6 +30,7 @@ from zsim.record.mcap_layout import (
 from zsim.record.record_end import check_magic
 
 RECORD = "run.mcap"  # in the folder of a run
+SHOWN = 3  # gaps, or damaged chunks, in one line; how many more there are is shown
 OVERLAP_NS = 1_000_000_000  # simulated time; a chunk begins less than that before the end of the one before it
 
 
@@ -57,8 +58,8 @@ class RecordReader:
 
     Attributes:
         complete: the record was closed, not cut.
-        damaged: what was met so far and passed over: chunks whose check sum differs, and, as one, everything
-            behind a length that cannot be right.
+        damaged: what was met so far and passed over, each with its place: chunks whose check sum differs, and, as one,
+            everything behind a length that cannot be right.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -73,8 +74,8 @@ class RecordReader:
         check_magic(self._source, self.path)
         self.complete = is_complete(self._source)
         self._keys: dict[int, str] = {}
-        self._rest_damaged = self._is_rest_damaged()
-        self._damaged: set[int] = set()  # where damaged chunks begin
+        self._rest = self._damaged_rest()
+        self._damaged: set[RecordSpan] = set()  # chunks
         self._chunks = list(self._scan())
 
     def topics(self) -> dict[str, int]:
@@ -104,9 +105,14 @@ class RecordReader:
         return self.messages()
 
     @property
-    def damaged(self) -> int:
-        """Return how many damaged chunks were met so far; everything behind unreadable records is one."""
-        return len(self._damaged) + self._rest_damaged
+    def damaged(self) -> tuple[str, ...]:
+        """Return what was met so far that is damaged; everything behind unreadable records is one."""
+        rest = () if self._rest is None else (f"everything from byte {self._rest} on",)
+        return (*(self._named(place) for place in sorted(self._damaged)), *rest)
+
+    def _named(self, place: RecordSpan) -> str:
+        head = chunk_head(self._source, place)
+        return f"the chunk at byte {place.start}, {head.first_ns / 1e9:.2f} to {head.last_ns / 1e9:.2f} s"
 
     def last(self, key: str) -> Recorded | None:
         """Return the message of a key that was written last, None if there is none."""
@@ -141,15 +147,16 @@ class RecordReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _is_rest_damaged(self) -> bool:
-        """Tell whether something follows that cannot be read; note the channels, which may be in the summary only."""
+    def _damaged_rest(self) -> int | None:
+        """Return from where on nothing can be read, if so; note the channels, which may be in the summary only."""
         opcode, end = 0, len(MAGIC)
         for place in places(self._source):
             opcode, end = place.opcode, place.end
             if opcode == Opcode.CHANNEL:
                 channel = unpacked(Channel, self._source, place)
                 self._keys[channel.id] = channel.topic
-        return opcode != Opcode.FOOTER and (self.complete or not is_cut(self._source, end))
+        is_damaged = opcode != Opcode.FOOTER and (self.complete or not is_cut(self._source, end))
+        return end if is_damaged else None
 
     def _scan(self) -> Iterator[_Chunk]:
         known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
@@ -166,14 +173,14 @@ class RecordReader:
         """Return the messages per channel of a chunk whose message indexes may have been cut."""
         content = content_of(self._source, group.place)
         if content is None:
-            self._damaged.add(group.place.start)
+            self._damaged.add(group.place)
         return {channel: len(entries) // 2 for channel, entries in indexes_of(content or b"").items()}
 
     def _as_written(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         for chunk in chunks:
             content = content_of(self._source, chunk.place)
             if content is None:
-                self._damaged.add(chunk.place.start)
+                self._damaged.add(chunk.place)
                 continue
             yield from _recorded(content, wanted)
 
@@ -266,16 +273,17 @@ def record_at(place: Path) -> Path:
     return place / RECORD
 
 
-def record_notes(complete: bool, damaged: int) -> list[str]:
-    """Return what a reader of a record has to know of its state, a line each.
-
-    Args:
-        complete: it was closed, not cut.
-        damaged: how many of its chunks cannot be read.
-    """
+def record_notes(reader: RecordReader) -> list[str]:
+    """Return what has to be known of the state of a record that was read, a line each."""
     notes = []
-    if not complete:
+    if not reader.complete:
         notes.append("the record was cut: its writer did not close it; everything up to the cut was read")
-    if damaged:
-        notes.append(f"{damaged} chunks of the record are damaged and were passed over")
+    if reader.damaged:
+        notes.append(f"the record is damaged, and this was passed over: {shown(reader.damaged)}")
     return notes
+
+
+def shown(texts: Sequence[str]) -> str:
+    """Return the first few of many texts, and how many more there are."""
+    more = len(texts) - SHOWN
+    return ", ".join(texts[:SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -98,7 +98,7 @@ def _tables(
             written = sink.finish()
         if not written:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
-        notes = [*record_notes(reader.complete, reader.damaged), *_refused(decoded.refused)]
+        notes = [*record_notes(reader), *_refused(decoded.refused)]
         if form is not Format.MAT:
             (new / MANIFEST).write_bytes(_manifest(reader, selection, written, notes))
     return ExportResult((target,), {table.file: table.rows for table in written}, notes)
@@ -127,7 +127,7 @@ def _foxglove(
         topics, refused = convert(reader, selection, new, new_layout, progress)
         if not topics:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
-    return ExportResult((target, layout), topics, [*record_notes(reader.complete, reader.damaged), *_refused(refused)])
+    return ExportResult((target, layout), topics, [*record_notes(reader), *_refused(refused)])
 
 
 def _refused(count: int) -> list[str]:

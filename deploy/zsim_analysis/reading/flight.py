@@ -16,7 +16,7 @@ from zsim.contract.flight_messages import Quaternion
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Bye, Event, Join
-from zsim.record import Recorded, RecordReader
+from zsim.record import Completeness, Recorded, RecordReader, completeness
 from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Vector3
 from zsim_analysis.reading.recorded_run import scenario_of
@@ -90,10 +90,9 @@ class RecordedFlight:
 
     Attributes:
         messages: on record, all keys.
-        complete: the record was closed, not cut.
+        completeness: of the record.
         wall_s: wall time from the first truth to the last, as they reached the recorder.
         undecoded: payloads that are not of the type of their key.
-        damaged: chunks of the record that cannot be read.
     """
 
     info: Info | None
@@ -103,10 +102,9 @@ class RecordedFlight:
     events: list[Event]
     processes: list[RecordedProcess]
     messages: int
-    complete: bool
+    completeness: Completeness
     wall_s: float
     undecoded: int = 0
-    damaged: int = 0
 
     @property
     def end(self) -> dict[str, Any] | None:
@@ -165,7 +163,7 @@ def read_flight(path: Path) -> RecordedFlight:
         wanted = [key for key in reader.topics() if flight.handler(key)]
         for message in reader.messages(wanted, by_time=False):
             flight.add(message)
-        return flight.flight(sum(reader.topics().values()), reader.complete, reader.damaged)
+        return flight.flight(sum(reader.topics().values()), completeness(reader))
 
 
 class FlightReader:
@@ -252,7 +250,7 @@ class FlightReader:
         process.incarnations += 1
         process.left = ""
 
-    def flight(self, messages: int = 0, complete: bool = True, damaged: int = 0) -> RecordedFlight:
+    def flight(self, messages: int = 0, completeness: Completeness | None = None) -> RecordedFlight:
         """Return the flight when all messages are added; the arguments describe its record, if there is one."""
         info = self._infos[-1] if self._infos else None
         names = [drone.name for drone in info.drones] if info else sorted(self._truth)
@@ -265,10 +263,9 @@ class FlightReader:
             events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
             processes=list(self._processes.values()),
             messages=messages,
-            complete=complete,
+            completeness=completeness or Completeness(),
             wall_s=(self._last_wall_ns - (self._first_wall_ns or 0)) / 1e9,
             undecoded=self._undecoded,
-            damaged=damaged,
         )
 
     def _track(self, name: str) -> Track:

@@ -49,9 +49,8 @@ def judge(
     progress("reading the record")
     flight = read_flight(record)
     if all(len(track.t_ns) == 0 for track in flight.tracks):
-        damaged = f" ({flight.damaged} of its chunks are damaged)" if flight.damaged else ""
         content = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
-        raise RecordError(f"{record}: {content}{damaged}; there is nothing to report")
+        raise RecordError(f"{record}: {content} ({flight.completeness}); there is nothing to report")
     progress("computing the formation's errors")
     formations = formations_of(flight)
     return flight, formations, summarise(flight, formations, record)
@@ -101,6 +100,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Scenario", f"{summary.scenario or 'not known'}, seed {seed}"),
         ("Mode", summary.mode or "not known"),
         ("Ended", summary.ended),
+        ("Record", summary.record.state),
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
         ("Deadlines missed", _misses(summary)),
         ("Command age", ages),
@@ -170,7 +170,7 @@ def _more(run: ComparedRun) -> list[tuple[str, str]]:
         ("Clusters", ", ".join(f"{c.name} of {len(c.drones)}" for c in flight.clusters) or "none"),
         ("Versions", versions or "not known"),
         ("Scenario's hash", flight.info.scenario_sha256[:16] if flight.info else "not known"),
-        ("Record", f"{summary.record.messages} messages{'' if summary.record.complete else ', cut short'}"),
+        ("Messages", f"{summary.record.messages}"),
     ]
 
 

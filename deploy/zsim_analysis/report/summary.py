@@ -11,7 +11,6 @@ from msgspec import Struct
 from zsim import __version__
 from zsim.contract.fingerprint import TruthHash
 from zsim.contract.run_messages import Event
-from zsim.record.record_reader import record_notes
 from zsim_analysis.reading.flight import TRUTH_WIDTH, RecordedFlight, RecordedProcess
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m, window
 from zsim_analysis.reading.recorded_run import command_age_ms
@@ -59,10 +58,24 @@ class ClusterErrors(Struct, frozen=True):
     errors: dict[str, ParameterErrors]
 
 
+class GapLine(Struct, frozen=True):
+    """Gates that are missing one behind the other, with the times of the first and the last of them."""
+
+    gates: int
+    from_s: float
+    to_s: float
+
+
 class RecordFacts(Struct, frozen=True):
     """What the report was made from.
 
     Attributes:
+        complete: nothing that the world published is missing, nor the end of the run.
+        state: that, and what is missing, in words.
+        gates: on record.
+        gates_missing: by the clocks.
+        gaps: where these are.
+        messages_missing: of the world, by their numbers.
         undecoded: messages that are not of the type of their key.
         truth_instants: truth messages that went into the hash.
         truth_missing: truth messages that a whole run of this length would have besides.
@@ -71,6 +84,11 @@ class RecordFacts(Struct, frozen=True):
 
     messages: int
     complete: bool
+    state: str
+    gates: int
+    gates_missing: int
+    gaps: list[GapLine]
+    messages_missing: int
     undecoded: int
     truth_instants: int
     truth_missing: int
@@ -153,7 +171,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
 
 def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
     """Return what is on record of a flight whose last instant is at `last_ns` as far as it is known."""
-    tracks = flight.tracks
+    tracks, state = flight.tracks, flight.completeness
     t_ns = np.concatenate([track.t_ns for track in tracks] or [np.zeros(0, np.int64)])
     states = np.concatenate([track.truth for track in tracks] or [np.zeros((0, TRUTH_WIDTH))])
     drone = np.repeat(np.arange(len(tracks)), [len(track.t_ns) for track in tracks])
@@ -161,7 +179,12 @@ def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
     truth.add(t_ns[order], states[order])
     return RecordFacts(
         messages=flight.messages,
-        complete=flight.complete,
+        complete=state.complete,
+        state=str(state),
+        gates=state.gates,
+        gates_missing=state.gates_missing,
+        gaps=[GapLine(gap.gates, gap.from_ns / 1e9, gap.to_ns / 1e9) for gap in state.gaps],
+        messages_missing=state.messages_missing,
         undecoded=flight.undecoded,
         truth_instants=len(t_ns),
         truth_missing=_missing(flight, last_ns),
@@ -205,7 +228,7 @@ def _ended(flight: RecordedFlight) -> str:
     if flight.end:
         return str(flight.end.get("reason", "ended"))
     at = f"{flight.last_ns / 1e9:.2f} s"
-    return f"the record {'ends here at' if flight.complete else 'was cut after'} {at}: no end is on record"
+    return f"the record {'ends here at' if flight.completeness.closed else 'was cut after'} {at}: no end is on record"
 
 
 def _lines(events: list[Event]) -> tuple[list[EventLine], dict[str, int]]:
@@ -238,7 +261,8 @@ def _record_notes(flight: RecordedFlight) -> list[str]:
         notes.append(f"This is a replay of run {flight.replay_of}, no flight of its own.")
     if flight.end is None:
         notes.append("The world did not report the run's end; times and command age are worked out from the record.")
-    notes += [f"{note[0].upper()}{note[1:]}." for note in record_notes(flight.complete, flight.damaged)]
+    if not flight.completeness.complete:
+        notes.append(f"The record is {flight.completeness}.")
     if flight.undecoded:
         notes.append(f"{flight.undecoded} messages on record are not what their key promises and were passed over.")
     if flight.info is None:

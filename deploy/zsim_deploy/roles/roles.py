@@ -108,6 +108,7 @@ def _also(made: Agent) -> str:
 
 def recorder(path: Path, reach: WorldAccess) -> None:
     """Record the run of a world into a file."""
+    from zsim.record.completeness import record_completeness
     from zsim_agents.recorder import record
 
     launched, who = reach.launched, reach.who._replace(process=RECORDER)
@@ -121,7 +122,7 @@ def recorder(path: Path, reach: WorldAccess) -> None:
     with connection as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned)
-    say(f"recorder: {path} is complete, {reason}")
+    say(f"recorder: {path}: {'closed' if launched else record_completeness(path)}, {reason}")
     stop.exit_if_terminated()
 
 

@@ -187,7 +187,7 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
             where = f"{scenario.federation!r} on {', '.join(options.endpoints)}"
             text = f"replay of run {info.run_id} as {where}; Ctrl-C ends it"
             run(playback, options.endpoints, stop.reason, world_progress(screen), lambda: screen.say(text), who)
-            for note in record_notes(reader.complete, reader.damaged):
+            for note in record_notes(reader):
                 screen.say(note)
             screen.say(f"ended: {playback.ended}")
 

@@ -23,7 +23,8 @@ from zsim.contract.messages import Imu
 from zsim.contract.run_messages import Clock
 from zsim.errors import RecordError
 from zsim.record import Recorded, RecordReader, RecordWriter, repair
-from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, places
+from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, chunk_head, places
+from zsim.record.record_reader import record_notes
 from zsim.record.record_writer import CHUNK_BYTES
 
 GATE_NS = 20_000_000
@@ -200,9 +201,30 @@ def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path):
     data = bytearray(path.read_bytes())
     data[sizes[CHUNK_MESSAGES - 1] - 3000] ^= 0xFF  # inside the first chunk's compressed content
     path.write_bytes(data)
+    first = next(place for place in places(bytes(data)) if place.opcode == Opcode.CHUNK)
     with RecordReader(path) as reader:
         assert list(reader.messages(by_time=False)) == recorded[CHUNK_MESSAGES:]
-        assert reader.damaged == 1
+        (damage,) = reader.damaged
+        assert has_terms(damage, "byte", str(first.start))
+        assert has_terms(record_notes(reader)[0], "damaged", str(first.start))
+
+
+def test_a_chunk_whose_check_sum_was_changed_is_named(tmp_path):
+    """Its content is whole, and so nothing but the sum tells."""
+    path = tmp_path / "run.mcap"
+    write(path, recorded := flight(200))
+    data = bytearray(path.read_bytes())
+    second = [place for place in places(bytes(data)) if place.opcode == Opcode.CHUNK][1]
+    crc = second.body + CHUNK_HEAD.size - 8
+    assert int.from_bytes(data[crc : crc + 4], "little") == chunk_head(bytes(data), second).crc
+    for changed in (b"\x01\x02\x03\x04", b"\0\0\0\0"):  # MCAP has 0 for no sum; a record of ours always has one
+        data[crc : crc + 4] = changed
+        path.write_bytes(data)
+        with RecordReader(path) as reader:
+            found = list(reader.messages(by_time=False))
+            assert found == recorded[:CHUNK_MESSAGES] + recorded[2 * CHUNK_MESSAGES :]
+            (damage,) = reader.damaged
+            assert has_terms(damage, "byte", str(second.start))
 
 
 def test_a_damaged_chunk_before_a_cut_is_counted_before_anything_is_read(tmp_path):
@@ -213,9 +235,9 @@ def test_a_damaged_chunk_before_a_cut_is_counted_before_anything_is_read(tmp_pat
     data[last.end - 20] ^= 4
     path.write_bytes(data)
     with RecordReader(path) as reader:
-        assert reader.damaged == 1
+        assert len(reader.damaged) == 1
         assert list(reader.messages(by_time=False)) == recorded[:CHUNK_MESSAGES]
-        assert reader.damaged == 1
+        assert len(reader.damaged) == 1
 
 
 def test_a_length_that_cannot_be_right_hides_what_follows_and_is_counted(tmp_path):
@@ -230,7 +252,7 @@ def test_a_length_that_cannot_be_right_hides_what_follows_and_is_counted(tmp_pat
         with RecordReader(path) as reader:
             assert reader.complete
             assert list(reader.messages(by_time=False)) == recorded[: 2 * CHUNK_MESSAGES]
-            assert reader.damaged == 1
+            assert len(reader.damaged) == 1
 
 
 @pytest.mark.parametrize("bit", [4, 14, 20, 62])
@@ -246,7 +268,7 @@ def test_a_length_that_leads_behind_a_cut_is_not_told_as_the_cut(tmp_path, bit):
         with RecordReader(path) as reader:
             found = list(reader.messages(by_time=False))
             assert found == recorded[: len(found)]
-            assert (reader.complete, len(found) <= 3 * CHUNK_MESSAGES, reader.damaged >= 1) == (False, True, True)
+            assert (reader.complete, len(found) <= 3 * CHUNK_MESSAGES, len(reader.damaged) >= 1) == (False, True, True)
 
 
 def test_a_chunk_whose_head_is_damaged_is_passed_over_and_left_out_of_the_summary(tmp_path):
@@ -261,7 +283,7 @@ def test_a_chunk_whose_head_is_damaged_is_passed_over_and_left_out_of_the_summar
     assert repair(path)
     with RecordReader(path) as reader:
         assert list(reader.messages(by_time=False)) == sound
-        assert reader.damaged == 1
+        assert len(reader.damaged) == 1
     with open(path, "rb") as file:
         assert sum(1 for _ in make_reader(file).iter_messages()) == len(sound)
 

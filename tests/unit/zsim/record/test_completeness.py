@@ -1,0 +1,127 @@
+"""Completeness of a record: by the numbers that the world gives to gates and messages, and by its end."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import pytest
+from mcap.opcode import Opcode
+from msgspec.structs import replace
+from refused import has_terms
+
+from zsim.contract import keys
+from zsim.contract.messages import DroneInfo, Imu, Info, Origin
+from zsim.contract.run_messages import Clock
+from zsim.record import Completeness, RecordReader, RecordWriter, completeness
+from zsim.record.completeness import GateGap
+from zsim.record.mcap_layout import places
+
+GATE_NS = 20_000_000
+INFO = Info(
+    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0.0, 0.0, 0.0), (DroneInfo("d1", "any"),), (),
+    "", "", "", "",
+)  # fmt: skip
+IMU = keys.sensor("d1", "imu")
+
+
+def clocks(*steps: int, first_seq: int = 0) -> list[Clock]:
+    """Return a clock for each step, numbered in order."""
+    return [Clock(step * GATE_NS, first_seq + i, "r", step, "running", 1.0) for i, step in enumerate(steps)]
+
+
+def stopped(clock: Clock) -> Clock:
+    return replace(clock, seq=clock.seq + 1, state="stopped")
+
+
+def whole(gates: int) -> list[Clock]:
+    found = clocks(*range(gates))
+    return [*found, stopped(found[-1])]
+
+
+def judged(
+    path: Path, on_clock: Sequence[Clock], imus: Iterable[int] = (), info: Info = INFO, strange: Sequence[bytes] = ()
+) -> Completeness:
+    with RecordWriter(path) as writer:
+        writer.add_message(keys.INFO, info, 1)
+        for payload in strange:
+            writer.add(keys.CLOCK, payload, "", 0, 1)
+        for clock in on_clock:
+            writer.add_message(keys.CLOCK, clock, 1)
+        for seq in imus:
+            writer.add_message(IMU, Imu(0, seq, 0, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)), 1)
+    with RecordReader(path) as reader:
+        return completeness(reader)
+
+
+def test_a_record_without_gaps(tmp_path: Path) -> None:
+    found = judged(tmp_path / "run.mcap", whole(10), range(40), strange=[b"\xc1", b"\x91" * 5000])
+    assert (found.complete, found.gates, found.gaps, found.messages_missing) == (True, 10, (), 0)
+    assert str(found) == "complete: 10 gates"
+
+
+def test_gates_that_are_missing(tmp_path: Path) -> None:
+    on_clock = [clock for clock in whole(20) if clock.step not in (0, 1, 7, 12, 13, 14)]
+    found = judged(tmp_path / "run.mcap", on_clock)
+    assert found.gaps == (
+        GateGap(2, 0, GATE_NS),
+        GateGap(1, 7 * GATE_NS, 7 * GATE_NS),
+        GateGap(3, 12 * GATE_NS, 14 * GATE_NS),
+    )
+    assert (found.complete, found.gates, found.gates_missing) == (False, 14, 6)
+    assert has_terms(str(found), "incomplete", "6", "20", "2", "0.00", "0.02", "0.14", "3", "0.24", "0.28")
+
+
+def test_many_gaps_are_counted(tmp_path: Path) -> None:
+    found = judged(
+        tmp_path / "run.mcap", [clock for clock in whole(40) if clock.step % 2 == 0 or clock.state == "stopped"]
+    )
+    assert (found.gates_missing, len(found.gaps)) == (19, 19)
+    assert has_terms(str(found), "19", "40", "0.10", "16")
+
+
+def test_time_that_stood_and_time_that_was_moved_lack_nothing(tmp_path: Path) -> None:
+    """While time stands its clock is repeated; a replay may begin anywhere, and seeks."""
+    assert judged(tmp_path / "stood.mcap", [*clocks(0, 1, 1, 1, 2), stopped(clocks(2, first_seq=4)[0])]).complete
+    replay = replace(INFO, replay_of="other")
+    seeks = clocks(50, 51, 10, 11, 90)
+    assert judged(tmp_path / "sought.mcap", [*seeks, stopped(seeks[-1])], (200, 240), replay).complete
+    del seeks[3]
+    assert judged(tmp_path / "gap.mcap", [*seeks, stopped(seeks[-1])], (), replay).gates_missing == 79
+
+
+def test_messages_in_another_order_are_there(tmp_path: Path) -> None:
+    swapped = whole(10)
+    swapped[4:6] = swapped[5], swapped[4]
+    assert judged(tmp_path / "run.mcap", swapped, [0, 2, 1, 4, 3]).complete
+
+
+@pytest.mark.parametrize(("imus", "missing"), [([0, 1, 3, 4], 1), ([5, 6], 5), ([0, 1, 2, 2, 2, 4], 1)])
+def test_numbers_of_a_key_that_are_missing(tmp_path: Path, imus: list[int], missing: int) -> None:
+    found = judged(tmp_path / "run.mcap", whole(3), imus)
+    assert (found.complete, found.messages_missing, found.gaps) == (False, missing, ())
+    assert has_terms(str(found), "incomplete", str(missing), "messages")
+
+
+def test_a_record_without_an_end(tmp_path: Path) -> None:
+    found = judged(tmp_path / "run.mcap", clocks(*range(11)))
+    assert (found.complete, found.ended, found.gaps) == (False, False, ())
+    assert has_terms(str(found), "incomplete", "end", "0.20")
+
+
+def test_an_empty_record(tmp_path: Path) -> None:
+    assert not judged(tmp_path / "run.mcap", []).complete
+
+
+def test_what_is_damaged_or_cut_is_incomplete(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    assert judged(path, whole(500)).complete
+    data = path.read_bytes()
+    path.write_bytes(data[:-9])
+    with RecordReader(path) as reader:
+        assert (completeness(reader).complete, completeness(reader).closed) == (False, False)
+    for place in (place for place in places(data) if place.opcode == Opcode.CHUNK):
+        at = (place.start + place.end) // 2
+        path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+        with RecordReader(path) as reader:
+            found = completeness(reader)
+        assert not found.complete
+        assert has_terms(str(found), "damaged", "byte", str(place.start))

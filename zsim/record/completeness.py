@@ -1,0 +1,200 @@
+"""Whether a record has everything that the world published: every gate, every number of its keys, and the end.
+
+The world numbers what it publishes without gaps, so what is missing shows in the record itself. What others publish
+is not counted: a number that is missing there may never have reached the world, and what did not is not missing here.
+"""
+
+from array import array
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from zsim.contract import keys, messages, run_messages
+from zsim.errors import DecodeError
+from zsim.record.record_reader import RecordReader, shown
+
+
+class GateGap(Struct, frozen=True):
+    """Gates that are missing one behind the other: how many, and the first and the last of them [ns]."""
+
+    gates: int
+    from_ns: int
+    to_ns: int
+
+    def __str__(self) -> str:
+        if self.gates == 1:
+            return f"1 at {self.from_ns / 1e9:.2f} s"
+        return f"{self.gates} from {self.from_ns / 1e9:.2f} to {self.to_ns / 1e9:.2f} s"
+
+
+class GateCount:
+    """Counts gates by the clocks of a run in the order in which they passed the world.
+
+    Args:
+        after: the clock behind which it begins; from the start of the run if not given.
+
+    Attributes:
+        gates: that were counted.
+        gaps: that were met.
+        ended: whether the clock has stopped.
+    """
+
+    def __init__(self, after: run_messages.Clock | None = None) -> None:
+        self.gates = 0
+        self.gaps: list[GateGap] = []
+        self.ended = False
+        self._step, self._seq = (after.step, after.seq) if after else (-1, -1)
+
+    def add(self, clock: run_messages.Clock) -> GateGap | None:
+        """Count the gate of a clock; return what is missing before it."""
+        gap = self.gap_before(clock)
+        if gap is not None:
+            self.gaps.append(gap)
+        self.gates += clock.step != self._step
+        self.ended = clock.state == "stopped"
+        self._step, self._seq = clock.step, clock.seq
+        return gap
+
+    def gap_before(self, clock: run_messages.Clock) -> GateGap | None:
+        """Return the gates that are missing between the clock that was added last and this one.
+
+        A clock that has the next number missed nothing, however far time was moved, as by a replay that seeks.
+        """
+        missing = clock.step - self._step - 1
+        if missing <= 0 or clock.seq == self._seq + 1:
+            return None
+        gate_ns = clock.t_ns // clock.step
+        return GateGap(missing, clock.t_ns - missing * gate_ns, clock.t_ns - gate_ns)
+
+
+class Completeness(Struct, frozen=True):
+    """What a record has, and what it lacks.
+
+    Attributes:
+        gates: on record.
+        gaps: gates that are missing.
+        messages_missing: of the world, by their numbers; those of missing gates among them.
+        ended: the end of the run is on record.
+        closed: its writer has closed it; it was not cut.
+        last_ns: its last gate [ns].
+        damaged: what cannot be read of it, each with its place.
+    """
+
+    gates: int = 0
+    gaps: tuple[GateGap, ...] = ()
+    messages_missing: int = 0
+    ended: bool = True
+    closed: bool = True
+    last_ns: int = 0
+    damaged: tuple[str, ...] = ()
+
+    @property
+    def complete(self) -> bool:
+        """Tell whether nothing is missing."""
+        return not self.faults()
+
+    @property
+    def gates_missing(self) -> int:
+        return sum(gap.gates for gap in self.gaps)
+
+    def faults(self) -> list[str]:
+        """Return what is missing, a text each; nothing of a record that is complete."""
+        faults = []
+        if self.gaps:
+            of = self.gates + self.gates_missing
+            faults.append(f"{self.gates_missing} of {of} gates are missing: {shown([str(gap) for gap in self.gaps])}")
+        elif self.messages_missing:
+            faults.append(f"{self.messages_missing} messages of the world are missing")
+        if not self.ended:
+            faults.append(f"the end of the run is not on record, which ends at {self.last_ns / 1e9:.2f} s")
+        if self.damaged:
+            faults.append(f"damaged: {shown(self.damaged)}")
+        if not self.closed:
+            faults.append("it was cut: its writer did not close it")
+        return faults
+
+    def __str__(self) -> str:
+        return f"incomplete: {'; '.join(faults)}" if (faults := self.faults()) else f"complete: {self.gates} gates"
+
+
+class _Numbered(Struct):
+    seq: int
+
+
+class _Numbers:
+    """Collects the numbers of the messages of some keys; in whatever order they stand, from 0 on all must be there.
+
+    Args:
+        wanted: keys that are numbered.
+    """
+
+    def __init__(self, wanted: Iterable[str]) -> None:
+        self._found = {key: array("q") for key in wanted}
+        self._decode = msgspec.msgpack.Decoder(_Numbered).decode
+
+    def add(self, key: str, payload: bytes) -> None:
+        """Take a message; garbage has no number, and other keys are not numbered."""
+        found = self._found.get(key)
+        if found is not None:
+            with suppress(*messages.REFUSALS, OverflowError):
+                found.append(self._decode(payload).seq)
+
+    def missing(self) -> int:
+        """Return how many numbers are missing below the highest one of each key."""
+        unique = (np.unique(np.frombuffer(found, np.int64)) for found in self._found.values() if found)
+        return sum(int(numbers[-1]) + 1 - len(numbers) for numbers in unique)
+
+
+def completeness(reader: RecordReader) -> Completeness:
+    """Return whether a record has everything: all of it is read, and every check sum compared."""
+    is_replay = _is_replay(reader)
+    numbers = _Numbers(() if is_replay else filter(_is_numbered, reader.topics()))
+    clocks: list[run_messages.Clock] = []
+    decode = msgspec.msgpack.Decoder(run_messages.Clock).decode
+    for recorded in reader.messages(by_time=False):
+        if recorded.key == keys.CLOCK:
+            with suppress(*messages.REFUSALS):  # garbage by somebody else, recorded as it came
+                clocks.append(decode(recorded.payload))
+        else:
+            numbers.add(recorded.key, recorded.payload)
+    gates = GateCount()
+    for clock in sorted(clocks, key=lambda clock: (clock.seq if is_replay else clock.t_ns, clock.seq)):
+        gates.add(clock)
+    return Completeness(
+        gates=gates.gates,
+        gaps=tuple(gates.gaps),
+        messages_missing=numbers.missing(),
+        ended=gates.ended,
+        closed=reader.complete,
+        last_ns=max((clock.t_ns for clock in clocks), default=0),
+        damaged=reader.damaged,
+    )
+
+
+def record_completeness(path: Path) -> Completeness:
+    """Return whether the record at a path has everything.
+
+    Raises:
+        RecordError: there is none, or it cannot be read.
+    """
+    with RecordReader(path) as reader:
+        return completeness(reader)
+
+
+def _is_replay(reader: RecordReader) -> bool:
+    """Tell whether a record is of a replay: that has clocks of its own, and numbers of the run that it played."""
+    info = reader.last(keys.INFO)
+    try:
+        return info is not None and bool(messages.decode(keys.INFO, info.payload).replay_of)
+    except DecodeError:
+        return False
+
+
+def _is_numbered(key: str) -> bool:
+    """Tell whether only the world publishes on a key, in one run of numbers."""
+    group, _, what = keys.parts(key)
+    return key == keys.EVENT or (group == "drone" and (what == "truth" or what.startswith("sensor/")))
