@@ -6,7 +6,7 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState, Command, Estimate
 from zsim.contract.run_messages import ClusterRequest
 from zsim.errors import DecodeError
-from zsim.record import RecordReader
+from zsim.record import Recorded, RecordReader
 
 OUTPUTS = (Command, Estimate, ClusterState, ClusterRequest)
 KNOWN_MAX = 2_000_000  # messages remembered: 7 s of 1000 drones
@@ -33,14 +33,14 @@ class KnownMessages:
         if len(self._known) > KNOWN_MAX:
             del self._known[next(iter(self._known))]
 
-    def add_tail(self, path: Path) -> int:
-        """Remember what stands at the end of a record; return the time of the newest clock there [ns]."""
+    def add_tail(self, path: Path) -> Recorded | None:
+        """Remember what stands at the end of a record; return the newest clock there."""
         with RecordReader(path) as reader:
             last = reader.last(keys.CLOCK)
             last_ns = last.t_ns if last else 0
             for recorded in reader.messages(by_time=False, from_ns=max(0, last_ns - TAIL_NS)):
                 self.add(recorded.key, recorded.payload)
-        return last_ns
+        return last
 
     def keep_outputs(self) -> None:
         """Forget all but outputs of participants, who repeat them after a rejoin; anything else that comes is new."""

@@ -11,7 +11,7 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import msgspec
@@ -21,11 +21,12 @@ from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages, run_key_table
 from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
 from zsim.record import RecordWriter
+from zsim.record.completeness import GateCount
 from zsim.record.record_writer import CHANNELS_MAX
 from zsim.runtime.health import HealthMeter
 from zsim.schema import message
 from zsim.transport.connection import read_info
-from zsim.transport.session import Session
+from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import Passed, Traffic, replay, samples
 from zsim_agents.known_messages import KnownMessages, is_of_run
 
@@ -90,6 +91,7 @@ class Recorder:
         self._head = msgspec.msgpack.Decoder(_Head)
         self._clock = msgspec.msgpack.Decoder(run_messages.Clock)
         self._known = KnownMessages()
+        self._gates = GateCount()
         self._caught_up = False
         self._known_until_ns = 0
         self._over = threading.Event()
@@ -111,7 +113,7 @@ class Recorder:
         self._link.declare_token(keys.token(self._name))
         self._link.on_link(self._on_link)
         if self._writer.messages:
-            self._now_ns = self._known.add_tail(self._writer.path)
+            self._resume()
             self._print(f"{self._name}: goes on with {self._writer.path} after t = {self._now_ns / 1e9:.2f} s")
         else:
             self._write_lasting()
@@ -161,9 +163,7 @@ class Recorder:
         if info.run_id != self._info.run_id:
             return True
         self._incarnation = secrets.randbits(62)
-        self._writer.flush()
-        self._known.add_tail(self._writer.path)
-        self._catch_up()
+        self._fetch_missed()
         self._join()
         return False
 
@@ -172,11 +172,9 @@ class Recorder:
             arrived = list(self._traffic.receive())
             if self._is_another_run():  # before what has arrived: it may have passed after what was missed
                 return ANOTHER_RUN
-            for passed in arrived:
-                self._write_passed(passed)
+            self._write_arrived(arrived)
             time.sleep(PAUSE_S)
-            for passed in self._traffic.drain():
-                self._write_passed(passed)
+            self._write_arrived(self._traffic.drain())
             for sample in self._views.drain():
                 self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
@@ -215,6 +213,37 @@ class Recorder:
         self._publish("done", run_messages.Done(t_ns, seq, run_id, self._incarnation, t_ns, 0))
 
     # Catching up
+
+    def _resume(self) -> None:
+        """Learn what the record of the process that died has at its end."""
+        if last := self._known.add_tail(self._writer.path):
+            self._now_ns = last.t_ns
+            self._gates = GateCount(self._clock_in(last.payload))
+
+    def _fetch_missed(self) -> None:
+        """Write what passed since the newest message on record, as far as the world still has it."""
+        self._writer.flush()
+        self._known.add_tail(self._writer.path)
+        self._catch_up()
+
+    def _write_arrived(self, arrived: Iterable[Passed]) -> None:
+        """Write what has arrived; where gates are missing before it, what the world still has of them comes first.
+
+        What stands before a clock is held until that is looked at: it may have passed after gates that are missing.
+        """
+        held: list[Passed] = []
+        for passed in arrived:
+            held.append(passed)
+            if isinstance(passed, ReceivedSample) and passed.key == keys.CLOCK:
+                if (clock := self._clock_in(passed.payload)) and self._gates.gap_before(clock):
+                    self._fetch_missed()
+                self._write_all(held)
+                held.clear()
+        self._write_all(held)
+
+    def _write_all(self, held: Iterable[Passed]) -> None:
+        for passed in held:
+            self._write_passed(passed)
 
     def _catch_up(self) -> None:
         """Write what was published while this process was not there: the world keeps it for a while."""
@@ -271,12 +300,26 @@ class Recorder:
             self.health.refused += 1
             return self._now_ns
 
-    def _on_clock(self, payload: bytes) -> None:
+    def _clock_in(self, payload: bytes) -> run_messages.Clock | None:
+        """Return the clock of this run; None for garbage by somebody else on `clock`, which is recorded as it came."""
         try:
             clock = self._clock.decode(payload)
         except messages.REFUSALS:
-            return  # garbage by somebody else on `clock`; recorded as it came
-        if clock.state == "stopped" and clock.run_id == self._info.run_id and self._ended_s is None:
+            return None
+        return clock if clock.run_id == self._info.run_id else None
+
+    def _count(self, payload: bytes) -> run_messages.Clock | None:
+        """Count the gate of a clock of this run, and return it; print at once which gates are missing before it."""
+        clock = self._clock_in(payload)
+        if clock is not None and (gap := self._gates.add(clock)):
+            self._print(f"{self._name}: gates are missing on record, the world has them no longer: {gap}")
+        return clock
+
+    def _on_clock(self, payload: bytes) -> None:
+        clock = self._count(payload)
+        if clock is None:
+            return
+        if clock.state == "stopped" and self._ended_s is None:
             self._ended_s = time.monotonic()
         elif self._caught_up and clock.t_ns > self._known_until_ns:
             self._known.clear()

@@ -17,7 +17,8 @@ from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.contract.messages import DroneInfo, Imu, Info, Origin
 from zsim.contract.run_messages import RUN_ENDED, Clock, ControlAnswer, Faults
 from zsim.errors import RecordError
-from zsim.record import RecordReader, RecordWriter
+from zsim.record import Completeness, RecordReader, RecordWriter, completeness
+from zsim.record.completeness import GateGap
 from zsim.record.mcap_layout import places
 from zsim_agents import known_messages, recorder
 from zsim_agents.recorder import record
@@ -63,7 +64,7 @@ def recorded(
     """Record a run that answers replays, has last values, and sends batches; return what is in the record."""
     link, left = FakeLink(), iter(answers)
     link.last = last or {}
-    link.on_request = lambda key, args: next(left)
+    link.on_request = lambda key, args: next(left, page([]))  # the world has no more of the gates before the last one
     for passed in (*batches, [clock(99, "stopped")]):
         link.deliver(keys.BATCH, encode_batch(passed))
     assert record(link, INFO, path) == "the run ended"  # type: ignore[arg-type]
@@ -162,7 +163,7 @@ def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monke
     monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
     link, lines = FakeLink(), []
     link.on_request = lambda key, args: page([])
-    link.deliver(keys.BATCH, encode_batch([imu(1), clock(1), imu(2), clock(3, "stopped")]))
+    link.deliver(keys.BATCH, encode_batch([imu(0), clock(0), imu(1), clock(1, "stopped")]))
     link.deliver("view/drones", b"\x81\xa4t_ns\x01")
     made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False, lines.append)  # type: ignore[arg-type]
     assert made.run() == RUN_ENDED
@@ -178,6 +179,11 @@ def test_what_has_no_time_is_recorded_at_the_worlds_whatever_strangers_stamp(tmp
     with RecordReader(path) as reader:
         times = {message.key: message.t_ns for message in reader.messages() if message.key.startswith("my/")}
     assert times == {"my/thing": 2**61, "my/raw": 4 * GATE_NS}
+
+
+def completed(path: Path) -> Completeness:
+    with RecordReader(path) as reader:
+        return completeness(reader)
 
 
 # Without a gap
@@ -228,7 +234,7 @@ def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
     def answer(key: str, args: dict[str, Any]) -> ControlAnswer:
         answered = next(replays)
         if len(joins := link.published_on("process/recorder/join")):
-            link.deliver(keys.BATCH, encode_batch([*gates(3, 4), clock(99, "stopped")]))
+            link.deliver(keys.BATCH, encode_batch([*gates(3, 4), clock(5, "stopped")]))
             assert len(joins) == 1
         return answered
 
@@ -244,9 +250,47 @@ def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
     with RecordReader(path) as reader:
         found = [(message.key, message.payload) for message in reader.messages()]
     assert stamps(found, IMU) == list(range(5))
-    assert stamps(found, keys.CLOCK) == [*range(5), 99]
+    assert stamps(found, keys.CLOCK) == [*range(6)]
     first, second = link.published_on("process/recorder/join")
     assert first.incarnation != second.incarnation
+
+
+def test_gates_that_did_not_come_are_asked_for_and_stand_before_what_came_after_them(tmp_path: Path):
+    """No link was lost as far as anybody noticed: the batch of gate 3 went nowhere."""
+    path, strange = tmp_path / "run.mcap", ("drone/d1/cmd/velocity", b"of gate 5")
+    answers = [page(gates(0, 1)), page([*gates(1, 2, 3), strange, *gates(4)])]
+    found = recorded(path, answers, gates(2), [strange, *whole(4)], whole(5), [clock(6)])
+    assert stamps(found, IMU) == list(range(6))
+    with RecordReader(path) as reader:
+        written = [message.key for message in reader.messages([keys.CLOCK, strange[0]], by_time=False)]
+    assert written == [*[keys.CLOCK] * 4, strange[0], *[keys.CLOCK] * 4]
+
+
+def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path):
+    """Printed in a line while the run goes on, and read off the record afterwards."""
+    path, link, lines = tmp_path / "run.mcap", FakeLink(), []
+    replays = iter([page([pair(keys.INFO, INFO), *gates(0)]), page(gates(8, 9))])
+    link.on_request = lambda key, args: next(replays)
+    for passed in (gates(1), gates(2), whole(9), whole(10), [clock(11, "stopped")]):
+        link.deliver(keys.BATCH, encode_batch(passed))
+    made: Any = recorder.Recorder(link, INFO, path, "recorder", lambda: False, lines.append)  # type: ignore[arg-type]
+    assert made.run() == RUN_ENDED
+    (line,) = lines
+    assert has_terms(line, "recorder", "5", "0.06", "0.14")
+    found = completed(path)
+    assert found.gaps == (GateGap(5, 3 * GATE_NS, 7 * GATE_NS),)
+    assert (found.complete, found.gates, found.gates_missing, found.messages_missing) == (False, 7, 5, 5)
+
+
+def test_who_goes_on_with_a_record_counts_from_its_end(tmp_path: Path):
+    path, link, lines = tmp_path / "run.mcap", FakeLink(), []
+    died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2)])
+    link.on_request = lambda key, args: page(gates(5))
+    link.deliver(keys.BATCH, encode_batch([*gates(5, 6), clock(7, "stopped")]))
+    made: Any = recorder.Recorder(link, INFO, path, "recorder", lambda: False, lines.append)  # type: ignore[arg-type]
+    assert made.run() == RUN_ENDED
+    assert [has_terms(line, "2", "0.06", "0.08") for line in lines] == [False, True]
+    assert completed(path).gaps == (GateGap(2, 3 * GATE_NS, 4 * GATE_NS),)
 
 
 def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
@@ -261,7 +305,7 @@ def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
 
     link.on_publish = look
     link.on_request = lambda key, args: page(gates(*range(60)))
-    link.deliver(keys.BATCH, encode_batch([*gates(*range(59, 130)), clock(131, "stopped")]))
+    link.deliver(keys.BATCH, encode_batch([*gates(*range(59, 130)), clock(130, "stopped")]))
     assert record(link, INFO, path) == RUN_ENDED  # type: ignore[arg-type]
     assert on_disk[0] == (59 * GATE_NS, 59 * GATE_NS)
     assert all(done_ns == last_ns for done_ns, last_ns in on_disk)
@@ -273,7 +317,7 @@ def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
 def test_a_batch_of_a_stranger_ends_nothing(tmp_path: Path, garbage: bytes):
     link = FakeLink()
     link.on_request = lambda key, args: page([])
-    for payload in (garbage, encode_batch([clock(3, "stopped")])):
+    for payload in (garbage, encode_batch([clock(0, "stopped")])):
         link.deliver(keys.BATCH, payload)
     made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False)  # type: ignore[arg-type]
     assert made.run() == RUN_ENDED
