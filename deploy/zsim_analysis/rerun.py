@@ -43,8 +43,8 @@ class RerunResult(NamedTuple):
     first_output: str
 
 
-def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> bool:
-    """Fly the run of a record again; return whether truth is the same, to the bit.
+def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
+    """Fly the run of a record again; return why truth is not the same, empty if it is, to the bit.
 
     Args:
         place: folder of the run, or its record.
@@ -66,10 +66,10 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> bool:
             return _judge(agents.truth_sha256, _fly(record, _without_agents(agents)), _state(record.reader), say)
         say(f"run again: world, {', '.join(map(str, agents.processes))}")
         again = _fly(record, agents)
-        same = _judge(agents.truth_sha256, again, _state(record.reader), say)
+        fault = _judge(agents.truth_sha256, again, _state(record.reader), say)
         if again.compared.first is not None:
             _find_cause(again.first_output, _fly(record, _without_agents(agents)), say)
-        return same
+        return fault
 
 
 def _without_agents(agents: RecordedAgents) -> RecordedAgents:
@@ -137,8 +137,8 @@ def _state(reader: RecordReader) -> RecordState:
     return "whole" if reader.complete else "cut"
 
 
-def _judge(recorded: str | None, result: RerunResult, state: RecordState, say: Say) -> bool:
-    """Print how truth compares; return whether it is the same, at all instants of a record that is not damaged."""
+def _judge(recorded: str | None, result: RerunResult, state: RecordState, say: Say) -> str:
+    """Print how truth compares; return why it is not the same, empty if it is at all instants of a sound record."""
     compared = result.compared
     for refusal in result.refused:
         say(f"was done on record, and is refused now: {refusal}")
@@ -148,17 +148,17 @@ def _judge(recorded: str | None, result: RerunResult, state: RecordState, say: S
     say(f"               last  {compared.last}; {compared.instants} instants compared")
     if state == "damaged":
         say("the record is damaged: what it lacks may be the difference")
-    return False
+    return f"truth differs, first {compared.first}"
 
 
-def _judge_same(recorded: str | None, result: RerunResult, state: RecordState, say: Say) -> bool:
-    """Print how far truth was compared, no instant of which differs; return whether that was the whole run."""
+def _judge_same(recorded: str | None, result: RerunResult, state: RecordState, say: Say) -> str:
+    """Print how far truth was compared, no instant of which differs; return why not to the end, empty if it was."""
     if recorded == result.sha256 and not result.until:
         say(f"truth_sha256 is the same: {result.sha256}")
-        return True
+        return ""
     reason = _end_of(recorded, result.until, state)
     say(f"{reason}; truth is the same at all {result.compared.instants} instants before, to the bit")
-    return recorded is None and not result.until and state != "damaged"
+    return "" if recorded is None and not result.until and state != "damaged" else reason
 
 
 def _end_of(recorded: str | None, until: str, state: RecordState) -> str:

@@ -68,7 +68,7 @@ def traffic(flown: Flown) -> Iterator[tuple[str, Message, int]]:
     for event in flown.events:
         yield keys.EVENT, event, 1_000_000 * last
     if flown.end is not None:
-        event = run_messages.Event(last * GATE_NS, 99, "end", "world", "world", "the end", flown.end)
+        event = run_messages.Event(last * GATE_NS, len(flown.events), "end", "world", "world", "the end", flown.end)
         yield keys.EVENT, event, 1_000_000 * last
 
 

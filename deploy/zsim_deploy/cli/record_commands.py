@@ -30,33 +30,48 @@ Place = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, or 
 
 def conclude(outcome: Any, out: Path, report: bool) -> None:
     """Print how a run ended, make its report, and end with the exit code for it."""
-    if outcome.failed or outcome.interrupted:
-        print(printable(f"ended: {outcome.reason}"), file=sys.stderr)
-    recorded = (out / "run.mcap").exists()
+    record = out / "run.mcap"
     if outcome.interrupted:
-        if recorded:
-            print(
-                printable(f"the record so far is {out / 'run.mcap'}; `zsim report {out}` makes its report"),
-                file=sys.stderr,
-            )
+        print(printable(f"ended: {outcome.reason}"), file=sys.stderr)
+        if record.exists():
+            print(printable(f"the record so far is {record}; `zsim report {out}` makes its report"), file=sys.stderr)
         sys.exit(INTERRUPTED)
-    if report and recorded:
-        _report_at_the_end(out, outcome.failed)
-    if outcome.failed:
-        print(printable(f"logs are in {out / 'logs'}"), file=sys.stderr)
-        raise typer.Exit(1)
+    record_fault = _judged_at_the_end(out, report, outcome.failed) if record.exists() else "nothing was recorded"
+    if fault := outcome.reason if outcome.failed else record_fault:
+        if (out / "logs").exists():
+            print(printable(f"logs are in {out / 'logs'}"), file=sys.stderr)
+        raise _failed(f"ended: {fault}")
 
 
-def _report_at_the_end(out: Path, failed: bool) -> None:
+def _failed(cause: str) -> typer.Exit:
+    """Print why a command ends with exit code 1, in its last line; return the exception to raise."""
+    print(printable(cause), file=sys.stderr)
+    return typer.Exit(1)
+
+
+def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
+    """Make the report of a run if that is wanted; return what its record lacks, empty if nothing."""
+    from zsim.record.completeness import record_completeness
+
     try:
-        _report(out)
+        if report:
+            return _report(out)
+        state = record_completeness(out / "run.mcap")
+        return _show_record(state.complete, str(state))
     except ZsimError as error:
         if not failed:
             raise
         print(printable(str(error)), file=sys.stderr)
+        return str(error)
     except KeyboardInterrupt:
-        print(printable(f"interrupted; the record is complete, `zsim report {out}` makes its report"), file=sys.stderr)
+        print(printable(f"interrupted; the record is kept, `zsim report {out}` makes its report"), file=sys.stderr)
         sys.exit(INTERRUPTED)
+
+
+def _show_record(complete: bool, state: str) -> str:
+    """Print whether a record is complete; return what it lacks, empty if nothing."""
+    print(f"record: {state}")
+    return "" if complete else f"the record is {state}"
 
 
 @app.command(rich_help_panel=RUN)
@@ -83,8 +98,8 @@ def report(
     _report(directory)
 
 
-def _report(folder: Path) -> None:
-    """Make the report of a run or of a sweep, and print its table."""
+def _report(folder: Path) -> str:
+    """Make the report of a run or of a sweep, and print its table; return what the run's record lacks."""
     require("report", REPORT_NEEDS)
     from rich.console import Console
 
@@ -100,7 +115,9 @@ def _report(folder: Path) -> None:
     with Console(stderr=True).status("reading …") as status:
         summary: Any = make(folder, lambda text: status.update(cell(text)))
     Console().print(table(summary))
+    fault = "" if is_sweep(folder) else _show_record(summary.record.complete, summary.record.state)
     print(printable(f"report: {folder / 'report.html'}"))
+    return fault
 
 
 def _compare(directories: list[Path], out: Path | None) -> None:
@@ -199,7 +216,7 @@ def _conclude(folder: Path, failures: list[str], runs: int, report: bool) -> Non
         _report(folder)
     print(printable(f"table: {folder / 'sweep.parquet'}"))
     if len(failures) == runs:
-        raise typer.Exit(1)
+        raise _failed(f"none of {runs} runs ended well: {failures[0]}")
 
 
 @app.command(rich_help_panel=RUN)
@@ -268,5 +285,5 @@ def rerun(
     def warn(text: str) -> None:
         print(printable(text), file=sys.stderr)
 
-    if not rerun_record(directory, commands_only, show, warn):
-        raise typer.Exit(1)
+    if fault := rerun_record(directory, commands_only, show, warn):
+        raise _failed(fault)

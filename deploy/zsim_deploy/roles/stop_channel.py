@@ -164,6 +164,8 @@ class StopChannel:
             self._lease.release()
         self._stop(reason)
         time.sleep(GRACE_S)
+        with contextlib.suppress(OSError):  # its log may be gone too
+            os.write(2, f"{reason}; this process did not end within {GRACE_S:g} s and is ended\n".encode())
         os._exit(1)
 
 

@@ -1,13 +1,17 @@
-"""What is said, and with which exit code, when a run is over."""
+"""What is shown, and with which exit code, when a run is over."""
 
+import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
+import synthetic_record
 import typer
-from refused import has_terms
+from refused import has_terms, without_tags
 
+from zsim.contract import keys, run_messages
 from zsim.errors import RecordError
+from zsim.record import RecordWriter
 from zsim_deploy.cli import record_commands
 from zsim_deploy.launch.supervisor import Outcome
 
@@ -45,7 +49,7 @@ def test_ctrl_c_in_the_report(recorded: Path, capsys: pytest.CaptureFixture[str]
     monkeypatch.setattr(record_commands, "_report", raising(KeyboardInterrupt()))
     with pytest.raises(SystemExit, match="130"):
         record_commands.conclude(Outcome("over"), recorded, True)
-    assert has_terms(capsys.readouterr().err, "interrupted", "complete", f"zsim report {recorded}")
+    assert has_terms(capsys.readouterr().err, "interrupted", "record", f"zsim report {recorded}")
 
 
 def test_a_failed_run_of_which_nothing_can_be_reported(
@@ -55,6 +59,107 @@ def test_a_failed_run_of_which_nothing_can_be_reported(
     with pytest.raises(typer.Exit) as ended:
         record_commands.conclude(DIED, recorded, True)
     assert ended.value.exit_code == 1
-    assert f"ended: {DIED.reason}\n{NO_MESSAGE}\n" in capsys.readouterr().err
+    lines = capsys.readouterr().err.splitlines()
+    assert (str(NO_MESSAGE) in lines, lines[-1]) == (True, f"ended: {DIED.reason}")
     with pytest.raises(RecordError):
         record_commands.conclude(Outcome("ended"), recorded, True)
+
+
+# What a record lacks
+
+
+def write(path: Path, missing: range = range(0), gates: int = 50, end: bool = True) -> Path:
+    """Write the record of a run of so many gates that lacks some."""
+    flown = synthetic_record.Flown(duration_s=(gates - 1) * 0.02)
+    with RecordWriter(path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown):
+            if message.t_ns // synthetic_record.GATE_NS not in missing or key == keys.INFO:
+                writer.add_message(key, message, wall_ns)
+        if end:
+            last = gates - 1
+            clock = run_messages.Clock(last * synthetic_record.GATE_NS, gates, "run", last, "stopped", 1.0)
+            writer.add_message(keys.CLOCK, clock, 1)
+    return path
+
+
+class Judged(NamedTuple):
+    """What is shown of a record: the exit code, the terminal's lines, summary.json and the report's head."""
+
+    code: int
+    out: str
+    err: str
+    summary: dict[str, Any]
+    page: str
+
+
+def judged(
+    folder: Path, capsys: pytest.CaptureFixture[str], outcome: Outcome | None = None, report: bool = True
+) -> Judged:
+    code = 0
+    try:
+        record_commands.conclude(outcome or Outcome("the scenario's duration is over"), folder, report)
+    except typer.Exit as ended:
+        code = ended.exit_code
+    shown = capsys.readouterr()
+    if not report:
+        return Judged(code, shown.out, shown.err, {}, "")
+    summary = json.loads((folder / "summary.json").read_text())
+    return Judged(code, shown.out, shown.err, summary["record"], without_tags((folder / "report.html").read_text()))
+
+
+CASES = {
+    "whole": ({}, ("complete", "50")),
+    "gap": ({"missing": range(20, 24)}, ("incomplete", "4", "50", "0.40", "0.46")),
+    "no end": ({"end": False}, ("incomplete", "end", "0.98")),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_summary_page_terminal_and_exit_code_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str):
+    options, terms = CASES[case]
+    shown = judged(write(tmp_path, **options), capsys)
+    assert has_terms(shown.summary["state"], *terms)
+    assert (shown.summary["complete"], shown.code) == ((True, 0) if case == "whole" else (False, 1))
+    assert shown.summary["state"] in shown.page
+    assert f"record: {shown.summary['state']}" in shown.out.splitlines()
+    if case != "whole":
+        assert shown.err.splitlines()[-1].endswith(shown.summary["state"])
+    if case == "gap":
+        assert (shown.summary["gates"], shown.summary["gates_missing"]) == (46, 4)
+        assert shown.summary["gaps"] == [{"gates": 4, "from_s": 0.4, "to_s": 0.46}]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_without_a_report_the_same_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str):
+    options, terms = CASES[case]
+    shown = judged(write(tmp_path, **options), capsys, report=False)
+    assert shown.code == (case != "whole")
+    assert has_terms(shown.out, "record", *terms)
+    assert case == "whole" or has_terms(shown.err.splitlines()[-1], *terms)
+
+
+@pytest.mark.parametrize("report", [True, False])
+def test_the_last_line_is_why_a_run_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str], report: bool):
+    (tmp_path / "logs").mkdir()
+    shown = judged(write(tmp_path, end=False), capsys, DIED, report)
+    assert shown.code == 1
+    assert has_terms(shown.err.splitlines()[-1], DIED.reason)
+
+
+def test_a_run_of_which_nothing_was_recorded_has_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    shown = judged(tmp_path, capsys, report=False)
+    assert shown.code == 1
+    assert has_terms(shown.err.splitlines()[-1], "nothing", "recorded")
+
+
+def test_a_rerun_and_a_sweep_that_fail_end_with_why(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setattr("zsim_analysis.rerun.rerun_record", lambda *_: "truth differs")
+    with pytest.raises(typer.Exit) as ended:
+        record_commands.rerun(tmp_path)
+    assert (ended.value.exit_code, capsys.readouterr().err.splitlines()[-1]) == (1, "truth differs")
+    with pytest.raises(typer.Exit) as ended:
+        record_commands._conclude(tmp_path, ["too heavy", "too heavy"], 2, report=False)
+    assert ended.value.exit_code == 1
+    assert has_terms(capsys.readouterr().err.splitlines()[-1], "2", "too heavy")
