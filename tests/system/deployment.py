@@ -44,15 +44,16 @@ class Deployment:
         if secure:
             self.zsim("certs", "init", self.hosts, "--scenario", str(STEP)).ends(with_code=0)
 
-    def zsim(self, *arguments: str) -> Role:
+    def zsim(self, *arguments: str, prefix: tuple[str, ...] = ()) -> Role:
         """Start a command where the launcher is."""
-        role = Role(list(arguments), self.lab.prefix(LAUNCHER), self._env)
+        role = Role(list(arguments), (*self.lab.prefix(LAUNCHER), *prefix), self._env)
         self._roles.append(role)
         return role
 
-    def up(self, *options: str) -> Role:
+    def up(self, *options: str, prefix: tuple[str, ...] = ()) -> Role:
         """Start a run."""
-        return self.zsim("up", str(STEP), "--hosts", self.hosts, "--out", str(self.out), "--no-report", *options)
+        where = ["--hosts", self.hosts, "--out", str(self.out)]
+        return self.zsim("up", str(STEP), *where, "--no-report", *options, prefix=prefix)
 
     def cut(self, name: str) -> float:
         """Cut a host off; return the wall time."""

@@ -14,6 +14,7 @@ from lab import LAUNCHER, Lab
 from refused import has_terms
 
 from zsim.transport.tls import KEY
+from zsim_deploy.launch.end_signals import UNREAD
 
 ROLES = {"world": "h1", "recorder": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2"]}
 SPARE = "h3"
@@ -98,6 +99,19 @@ def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
         assert f"ended: {reason}\n" in (deployment.out / "up.log").read_text()
         nothing_stays(deployment)
         follower.ends(with_code=0, within_s=START_S)
+
+
+@pytest.mark.soak
+def test_a_pipe_that_nobody_reads_any_more_ends_the_run_and_fetches_its_record(lab: Lab) -> None:
+    """As in `zsim up … 2>&1 | head`."""
+    with closing(Deployment(lab, ROLES, secure=False)) as deployment:
+        piped = '"$@" 2>&1 | sed "/ real time/q"'
+        run = deployment.up("--rate", "4", "--duration", "3600", prefix=("sh", "-c", piped, "sh"))
+        run.ends(with_code=0, within_s=START_S)
+        deployment.nobody_left()
+        assert deployment.record().end()["reason"] == UNREAD
+        assert f"ended: {UNREAD}\n" in (deployment.out / "up.log").read_text()
+        nothing_stays(deployment)
 
 
 def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:

@@ -10,6 +10,8 @@ import pytest
 from federation import PAIR, Federation, Record, Role
 from wire import Client, Received, Subscription
 
+from zsim_deploy.launch.end_signals import UNREAD
+
 REASONS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "terminated"}
 SEEN_DEAD = ("death", "superseded")  # the second where it is back before its death is noticed
 GATE_NS = 20_000_000
@@ -283,6 +285,22 @@ def test_a_terminal_that_is_closed(federation: Federation, options: tuple[str, .
     assert record.complete
     assert "closed" in record.end()["reason"]
     assert re.search("ended: .*closed", (federation.out / "run.log").read_text())
+
+
+@pytest.mark.parametrize("options", [("--in-process",), ()], ids=["one process", "processes"])
+def test_a_pipe_that_nobody_reads_any_more(federation: Federation, tmp_path: Path, options: tuple[str, ...]) -> None:
+    """As in `zsim run … 2>&1 | head`: whoever reads leaves in flight."""
+    where = options or ("--listen", federation.endpoint)
+    command = ["run", federation.write(PAIR), "--out", str(federation.out), "--duration", "100000", *where]
+    code = tmp_path / "code"
+    piped = '{ "$@" 2>&1; echo $? >"$0"; } | sed "/10.* real time/q"'
+    federation.start(*command, prefix=("sh", "-c", piped, str(code))).ends(with_code=0)
+    assert code.read_text() == "130\n"
+    federation.nobody_left()
+    record = federation.record()
+    assert record.complete
+    assert record.end()["reason"] == UNREAD
+    assert f"ended: {UNREAD}" in (federation.out / "run.log").read_text()
 
 
 def test_interrupt_while_time_stands(federation: Federation) -> None:

@@ -115,11 +115,19 @@ class JsonProgress:
             return  # the launcher is gone; its stop channel ends this process
 
 
+class PipedConsole(Console):
+    """A console whose reader may go: what nobody reads is dropped, and nothing ends because of it."""
+
+    def on_broken_pipe(self) -> None:
+        """Write nothing more."""
+        self.quiet = True
+
+
 class Screen:
     """Shows progress on a terminal; on anything else, a line every ten simulated seconds and events."""
 
     def __init__(self, duration_s: float, console: Console | None = None) -> None:
-        self.console = console or Console(stderr=True)
+        self.console = console or PipedConsole(stderr=True)
         self._duration_s = duration_s
         self._live = Live(Text("starting …"), console=self.console, refresh_per_second=5, transient=True)
         self._is_live = self.console.is_terminal

@@ -1,11 +1,12 @@
 """The command line: thin commands that read options, call one function, and print one line for a fault."""
 
+import os
 import signal
 import sys
 from functools import cache
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.main import get_command
@@ -32,6 +33,7 @@ from zsim_deploy.cli import (
     record_commands,
     role_commands,
 )
+from zsim_deploy.launch.end_signals import STREAMS, is_unread
 from zsim_deploy.roles.stop_channel import REASONS
 
 app = typer.Typer(
@@ -44,6 +46,7 @@ app = typer.Typer(
 )
 
 UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
+UNREAD = 128 + 13  # exit code of a command whose output nobody reads any more: that of SIGPIPE
 USER_FAULT = 2  # exit code of whatever a person has to put right
 EXIT_CODES = {SupersededError: 3, BehindError: 1}  # of the faults after which somebody else goes on; see supervisor.py
 
@@ -183,6 +186,18 @@ def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
     _replace_unprintable()
     try:
+        try:
+            _run()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError as error:
+        _drop_output()
+        ended = error.__context__
+        sys.exit((isinstance(ended, SystemExit) and ended.code) or UNREAD)
+
+
+def _run() -> NoReturn:
+    try:
         code = command()(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
         print(printable(str(error)), file=sys.stderr)
@@ -195,6 +210,13 @@ def main() -> None:
     if code == INTERRUPTED:
         print("interrupted", file=sys.stderr)
     sys.exit(code)
+
+
+def _drop_output() -> None:
+    """Let what nobody reads any more go nowhere, as behind `| head`."""
+    into = os.open(os.devnull, os.O_WRONLY)
+    for stream in filter(is_unread, STREAMS):
+        os.dup2(into, stream)
 
 
 def _replace_unprintable() -> None:

@@ -75,8 +75,7 @@ def ps(
     as_json: Annotated[bool, typer.Option("--json", help="As a JSON line.")] = False,
 ) -> None:
     """Show the processes of the run that is up: role, host, pid, state, lag, messages/s, round trip, restarts."""
-    from rich.console import Console
-
+    from zsim.runtime.progress import PipedConsole
     from zsim_deploy.hosts import control_socket
     from zsim_deploy.hosts.status_table import table
 
@@ -84,7 +83,7 @@ def ps(
     if as_json:
         print(json.dumps(status))
     else:
-        Console().print(table(status["rows"]))
+        PipedConsole().print(table(status["rows"]))
 
 
 def logs(
@@ -167,15 +166,14 @@ def doctor(
     scenario: Annotated[Path | None, typer.Argument(help="Scenario whose roles are to be placed.")] = None,
 ) -> None:
     """Check every host: ssh, versions, clock, load, and how the hosts reach each other."""
-    from rich.console import Console
-
     from zsim.errors import HostsError
+    from zsim.runtime.progress import PipedConsole
     from zsim_deploy.hosts.doctor import check_hosts
     from zsim_deploy.inventory import inventory
 
     placed = inventory.load(hosts)
     result = check_hosts(placed, _placement(placed, scenario))
-    console = Console()
+    console = PipedConsole()
     for shown in result.tables:
         console.print(shown)
     for warning in result.warnings:

@@ -103,7 +103,7 @@ def _report(folder: Path) -> str:
     require("report", REPORT_NEEDS)
     from rich.console import Console
 
-    from zsim.runtime.progress import cell
+    from zsim.runtime.progress import PipedConsole, cell
     from zsim_analysis.sweep.design import is_sweep
 
     if is_sweep(folder):
@@ -114,7 +114,7 @@ def _report(folder: Path) -> str:
         from zsim_analysis.report.make_report import table
     with Console(stderr=True).status("reading …") as status:
         summary: Any = make(folder, lambda text: status.update(cell(text)))
-    Console().print(table(summary))
+    PipedConsole().print(table(summary))
     fault = "" if is_sweep(folder) else _show_record(summary.record.complete, summary.record.state)
     print(printable(f"report: {folder / 'report.html'}"))
     return fault

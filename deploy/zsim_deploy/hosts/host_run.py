@@ -26,7 +26,7 @@ from zsim_deploy.hosts.ssh_connection import shell_word
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory.enrolment import exposed_keys
 from zsim_deploy.inventory.inventory import InventoryFile
-from zsim_deploy.launch.end_signals import CLOSED, EndSignals
+from zsim_deploy.launch.end_signals import EndSignals
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
 
 CONNECT_S = 30.0  # how long all hosts together may take to let us in, …
@@ -79,6 +79,7 @@ class HostRun:
         self._loop = EventLoopThread()
         self._links = HostLinks(options.placed, self._plan.hosts(), self._loop)
         self._record_stays = False
+        self._signals = EndSignals(options.out / "up.log", status.hang_up)
 
     def run(self) -> Outcome:
         """Run to the end; whatever happens, no process or key of it is left on any host that can be reached.
@@ -88,7 +89,7 @@ class HostRun:
             HostsError: with a line for every certificate that is missing, or every host that cannot take part.
         """
         try:
-            with EndSignals(self._options.out / "up.log", self._hang_up), self._control_socket():
+            with self._signals, self._control_socket():
                 self._refuse_unless_certified()
                 self._timed("connect", lambda: self._links.on_all(HostLink.open, CONNECT_S))
                 self._timed("check", self._check)
@@ -100,9 +101,12 @@ class HostRun:
                 self._links.close()
             self._loop.close()
 
-    def _hang_up(self) -> None:
-        self._status.hang_up()
-        self._supervisor.interrupt(CLOSED)
+    def _look(self) -> None:
+        """End the run where nobody sees it any more; show which hosts are silent."""
+        self._signals.look()
+        if self._signals.reason:
+            self._supervisor.interrupt(self._signals.reason)
+        self._status.report_silent_hosts()
 
     def _refuse_unless_certified(self) -> None:
         if faults := self._plan.certificate_faults(datetime.now(UTC)):
@@ -122,14 +126,14 @@ class HostRun:
         self._status.stages_s[what] = time.monotonic() - start_s
 
     def _check(self) -> None:
-        looks = self._links.on_all(self._look, CHECK_S)
+        looks = self._links.on_all(self._inspect, CHECK_S)
         faults, warnings = compare_reports({name: look.report for name, look in looks.items()})
         for warning in [*warnings, *(line for look in looks.values() for line in look.left)]:
             self._status.say(f"warning: {warning}")
         if faults := [*faults, *(line for look in looks.values() for line in look.taken)]:
             raise HostsError("\n".join(faults))
 
-    async def _look(self, link: HostLink) -> HostInspection:
+    async def _inspect(self, link: HostLink) -> HostInspection:
         python = self._plan.python(link.name)
         report = await host_report(link, python, self._options.placed.word)
         taken = await port_faults(link, python, self._plan.ports(link.name))
@@ -148,8 +152,9 @@ class HostRun:
         self._status.members, self._status.links = self._supervisor.members, self._links.by_name
         self._links.listen()
         self._record_stays = True
+        self._look()
         try:
-            outcome = self._supervisor.run(self._status.report_silent_hosts)
+            outcome = self._supervisor.run(self._look)
             fault = self._fetch()
         except KeyboardInterrupt:
             where = self._plan.way_to_record()

@@ -19,7 +19,7 @@ from zsim_agents.hosting import agents_of
 from zsim_deploy.arguments import CONSOLE_PORT, load_scenario, pace_options
 from zsim_deploy.launch import interrupted_run
 from zsim_deploy.launch.child_process import ChildProcess
-from zsim_deploy.launch.end_signals import CLOSED, EndSignals
+from zsim_deploy.launch.end_signals import EndSignals
 from zsim_deploy.launch.interrupted_run import JOURNAL, Launch
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
@@ -208,11 +208,12 @@ def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLa
     supervisor = Supervisor(options.scenario.processes.on_death, screen)
     supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
 
-    def end_with_terminal() -> None:
-        if signals.closed:
-            supervisor.interrupt(CLOSED)
+    def end_with_output() -> None:
+        signals.look()
+        if signals.reason:
+            supervisor.interrupt(signals.reason)
 
-    return supervisor.run(end_with_terminal)
+    return supervisor.run(end_with_output)
 
 
 def _run_on_free_port(
@@ -259,7 +260,8 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
         stop = StopChannel()
 
         def reason() -> str | None:
-            return CLOSED if signals.closed else stop.reason()
+            signals.look()
+            return signals.reason or stop.reason()
 
         try:
             ended = fly(options.scenario, options.out / "run.mcap", reason, screen)

@@ -16,6 +16,7 @@ from zsim_deploy.hosts import host_run as module
 from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory import inventory
+from zsim_deploy.launch.end_signals import CLOSED, UNREAD
 from zsim_deploy.launch.supervisor import Outcome
 
 SCENARIO = "name: one\nduration_s: 1\ndrones: [{name: drone1, position_m: [0, 0, 0]}]\nprocesses: {expect: []}\n"
@@ -119,9 +120,15 @@ def test_a_record_that_stays_away_fails_a_run_that_ended_well(
     assert up._record_stays
 
 
-def test_a_closed_terminal_ends_the_run_and_lines_are_shown_from_then_on(up: Any, board: Said) -> None:
+@pytest.mark.parametrize("reason", [CLOSED, UNREAD])
+def test_a_run_that_nobody_sees_any_more_is_ended_and_lines_are_shown_from_then_on(
+    up: Any, board: Said, reason: str
+) -> None:
     with board:
-        up._hang_up()
-        assert has_terms(up._supervisor.run().reason, "terminal", "closed")
+        up._signals.reason = reason
+        up._signals._hung_up()
+        up._look()
+        outcome = up._supervisor.run()
+        assert (outcome.reason, outcome.interrupted) == (reason, True)
         board.say("fetching")
     assert board.text() == "fetching\n"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from refused import has_terms
 
-from zsim_deploy.launch.end_signals import EndSignals
+from zsim_deploy.launch.end_signals import UNREAD, EndSignals
 from zsim_deploy.roles.stop_channel import interruptible
 
 
@@ -41,7 +41,7 @@ TALKS = """
 import signal, sys
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests may be under nohup
 from pathlib import Path
-from zsim_deploy.launch.end_signals import EndSignals
+from zsim_deploy.launch.end_signals import UNREAD, EndSignals
 told = []
 with EndSignals(Path(sys.argv[1]), lambda: told.append(1)):
     print("ready", flush=True)
@@ -82,6 +82,35 @@ def test_a_terminal_that_is_there_still_is_told_where_the_rest_is(tmp_path: Path
     assert output == ""
     assert has_terms(complained, "terminal", "closed", str(log))
     assert log.read_text().splitlines() == ["fetching", "ended"]
+
+
+LOOKS = """
+import sys
+from pathlib import Path
+from zsim_deploy.launch.end_signals import UNREAD, EndSignals
+told = []
+with EndSignals(Path(sys.argv[1]), lambda: told.append(1)) as signals:
+    print("ready", flush=True)
+    while not signals.reason:
+        signals.look()
+    print(signals.reason, flush=True)
+    print("fetching", len(told), flush=True)
+"""
+
+
+@pytest.mark.parametrize("both", [False, True], ids=["stdout", "both"])
+def test_who_is_read_by_nobody_notices_without_writing(tmp_path: Path, both: bool) -> None:
+    log = tmp_path / "up.log"
+    read, write = os.pipe()
+    errors = write if both else subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", LOOKS, str(log)], stdout=write, stderr=errors) as talker:
+        os.close(write)
+        with os.fdopen(read) as reader:
+            assert reader.readline() == "ready\n"
+        complained = talker.communicate(timeout=60.0)[1]
+    assert talker.returncode == 0
+    assert log.read_text().splitlines() == [UNREAD, f"fetching {int(both)}"]  # the screen is on standard error
+    assert both or has_terms(complained.decode(), UNREAD, str(log))
 
 
 def test_under_nohup_nothing_happens(tmp_path: Path) -> None:
