@@ -270,6 +270,8 @@ class Supervisor:
                 continue
         recorder = next(child for child in self.members if child.role == "recorder")
         if recorder.code not in (0, None) and recorder.name not in self._dead:
+            if not self._failed and not self._interrupted:
+                self._reason = ""  # an end in order: what the world reported is not all
             self._fail(f"the recorder ended: {recorder.outcome()}")
 
     def _left_s(self) -> float:
