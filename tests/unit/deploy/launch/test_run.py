@@ -120,4 +120,4 @@ def test_a_folder_that_takes_no_files_is_a_line(tmp_path: Path):
     made = options(tmp_path)
     (tmp_path / "scenario.yaml").mkdir()
     with refused(RunError, "written"):
-        run._write_scenario(made, logs=True)
+        run._write_scenario(made, in_process=False)
