@@ -71,12 +71,12 @@ class Deployment:
         role.ends(with_code=0)
         return {row["role"]: row for row in json.loads(role.text().splitlines()[-1])["rows"]}
 
-    def kill(self, role: str) -> None:
-        """Send SIGKILL to a role."""
+    def kill(self, role: str, number: int = signal.SIGKILL) -> None:
+        """Send a role a signal."""
         for host in self.lab.names:
             for pid, line in self.lab.processes(host).items():
                 if re.match(rf"\S*python\S* .*/{re.escape(role)}( |$)", line):  # its certificate's folder
-                    os.kill(pid, signal.SIGKILL)
+                    os.kill(pid, number)
                     return
         pytest.fail(f"{role} runs on no host")
 
