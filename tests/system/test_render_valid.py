@@ -192,7 +192,7 @@ def units(out: Path, state: Path) -> Iterator[Unit]:
     """Yield the units of all hosts; `state` is in the place of StateDirectory=."""
     for path in sorted(out.glob("*/*.service")):
         (line,) = re.findall(r"^ExecStart=(.*)$", path.read_text(), re.MULTILINE)
-        line = line.replace("${INVOCATION_ID}", "f00d").replace(systemd.STATE, str(state))
+        line = line.replace(systemd.STATE, str(state))
         words = [word.replace("%%", "%").replace("$$", "$") for word in shlex.split(line)]
         yield Unit(path.stem.removeprefix("zsim-"), words)
 
@@ -263,7 +263,7 @@ def test_a_certificate_that_is_not_there_is_a_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("insecure", [False, pytest.param(True, marks=pytest.mark.soak)], ids=["tls", "insecure"])
 @pytest.mark.usefixtures("compiled")
 def test_the_units_of_three_hosts_fly(tmp_path: Path, insecure: bool) -> None:
-    """All units at once, in whatever order they come up, until the world ends the run."""
+    """All units at once, in whatever order they come up, until the world ends the run; the recorder dies once."""
     found = laid_out(tmp_path, PAIR.replace("duration_s: 12", "duration_s: 6"), insecure)
     assert set(found) == {
         "world",
@@ -275,13 +275,19 @@ def test_the_units_of_three_hosts_fly(tmp_path: Path, insecure: bool) -> None:
     }
     with ExitStack() as stack:
         roles = {name: stack.enter_context(started(unit())) for name, unit in sorted(found.items())}
+        assert roles["recorder"].stdout is not None
+        assert any("pair-" in line for line in roles["recorder"].stdout)
+        roles["recorder"].kill()
+        roles["recorder"] = stack.enter_context(started(found["recorder"]()))
         printed = {
             name: role.communicate(timeout=PATIENCE_S)[0] for name, role in roles.items() if name != "router.yard"
         }
         roles["router.yard"].terminate()
         printed["router.yard"] = roles["router.yard"].communicate(timeout=PATIENCE_S)[0]
         assert {name: role.returncode for name, role in roles.items()} == dict.fromkeys(found, 0), printed
-    with RecordReader(tmp_path / "state/runs/pair-f00d/run.mcap") as record:
+    (folder,) = (tmp_path / "state/runs").iterdir()
+    assert folder.name.startswith("pair-")
+    with RecordReader(folder / "run.mcap") as record:
         assert record.complete
         assert record.topics()["drone/drone2/estimate"] >= 300
 

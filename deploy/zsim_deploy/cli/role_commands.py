@@ -11,6 +11,7 @@ from zsim.scenario.role_table import AGENTS, Role
 from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
     RUN,
+    RUN_ID,
     Access,
     Connect,
     Federation,
@@ -123,13 +124,15 @@ def host_agents(
 @participant_options
 def record(
     reach: WorldAccess,
-    out: Annotated[Path, typer.Option(help="Folder for run.mcap.")] = Path("."),
+    out: Annotated[Path, typer.Option(help=f"Folder for run.mcap; {RUN_ID} in its name is the id of the run.")] = Path(
+        "."
+    ),
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
 
     roles.lower_priority()
-    roles.recorder(out / "run.mcap", reach)
+    roles.recorder(out, reach)
 
 
 @app.command(rich_help_panel=ROLES)

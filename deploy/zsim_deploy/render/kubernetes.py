@@ -14,6 +14,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import CERTIFICATES as IDENTITY_FILES
+from zsim_deploy.arguments import RUN_ID
 from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.inventory.processes import (
     STOP_S,
@@ -262,13 +263,12 @@ def _pod_template(process: PlannedProcess, image: str, restart: str) -> dict[str
 
 
 def _box(process: PlannedProcess, image: str) -> dict[str, Any]:
-    name = {"name": "POD_NAME", "valueFrom": {"fieldRef": {"fieldPath": "metadata.name"}}}
-    files = ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, f"{RUNS}/$(POD_NAME)")
+    files = ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, f"{RUNS}/{RUN_ID}")
     box = {
         "name": process.role,
         "image": image,
         "args": command(process, files),
-        "env": [name, *({"name": key, "value": value} for key, value in ENVIRONMENT.items())],
+        "env": [{"name": key, "value": value} for key, value in ENVIRONMENT.items()],
         "resources": {
             "requests": {"cpu": CPU, "memory": f"{MEMORY_MIB}Mi"},
             "limits": {"memory": f"{MEMORY_MAX_MIB}Mi"},

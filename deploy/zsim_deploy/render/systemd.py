@@ -12,6 +12,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
+from zsim_deploy.arguments import RUN_ID
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.inventory.processes import (
@@ -158,10 +159,10 @@ def _run(scenario: Scenario, process: PlannedProcess, host: Host) -> list[str]:
         scenario=f"{here}/scenario.yaml",
         identity=f"{here}/certs/{process.name}",
         access=f"{here}/certs/{access_file(process)}",
-        out=f"{STATE}/runs/{scenario.name}-${{INVOCATION_ID}}",  # set by systemd, new at each start
+        out=f"{STATE}/runs/{scenario.name}-{RUN_ID}",
     )
     python = _absolute(host, inv.python(host))
-    words = [word if word == files.out else _word(word) for word in (python, *command(process, files))]
+    words = map(_word, (python, *command(process, files)))
     settings = {**SINGLE_THREADED, "NUMBA_CACHE_DIR": CACHE}
     return [
         "Type=exec",

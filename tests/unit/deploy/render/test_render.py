@@ -297,9 +297,11 @@ def test_units_read_certificates_and_write_nowhere_else(hosts: InventoryFile, st
     assert option(words["router.yard"][1], "--access") == "/home/pi/.zsim/certs/router.yard.access.json"
 
 
-def test_every_start_of_the_recorder_has_a_folder_of_its_own(hosts: InventoryFile, step: Scenario) -> None:
-    words = of_systemd(systemd.render(hosts, step))["recorder"][1]
-    assert option(words, "--out") == "/var/lib/zsim/runs/step-${INVOCATION_ID}"
+def test_a_recorder_that_is_started_again_has_the_folder_of_its_run(hosts: InventoryFile, step: Scenario) -> None:
+    """Nothing in it changes with a start: neither an invocation's id nor a Pod's name."""
+    assert option(of_systemd(systemd.render(hosts, step))["recorder"][1], "--out") == "/var/lib/zsim/runs/step-{run}"
+    assert option(of_kubernetes(kubernetes.render(hosts, step))["recorder"][1], "--out") == "/runs/{run}"
+    assert option(of_compose(compose.render(hosts, step))["recorder"][1], "--out") == "/runs/${ZSIM_RUN:-step}"
 
 
 def test_systemd_restarts_what_on_death_says(hosts: InventoryFile) -> None:
