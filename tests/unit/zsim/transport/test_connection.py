@@ -12,6 +12,7 @@ from refused import has_terms
 from zsim.errors import NoWorldError, SessionError
 from zsim.transport import connection
 from zsim.transport.connection import find_world
+from zsim.transport.permissions import Permissions
 from zsim.transport.tls import Identity
 
 
@@ -47,6 +48,14 @@ def test_who_is_not_let_in_is_told_that_it_may_be_that(monkeypatch: pytest.Monke
     text = said("tls/127.0.0.1:7447", Identity("h1", Path("certs/h1/operator.eve")))
     assert has_terms(text, "another", "refused", "--federation")
     assert "start one" not in text
+
+
+def test_who_is_let_in_is_told_nothing_of_rights(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "connect", silent)
+    monkeypatch.setattr(Silent, "permissions", Permissions("world", "operator.eve", {"read": ("zsim/**",)}))
+    text = said("tls/127.0.0.1:7447", Identity("h1", Path("certs/h1/operator.eve")))
+    assert has_terms(text, "another", "--federation")
+    assert "refused" not in text
 
 
 def test_without_certificates_nobody_is_told_of_rights(monkeypatch: pytest.MonkeyPatch) -> None:
