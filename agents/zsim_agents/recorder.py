@@ -215,10 +215,13 @@ class Recorder:
     # Catching up
 
     def _resume(self) -> None:
-        """Learn what the record of the process that died has at its end."""
+        """Learn what the record of the process that died has at its end, which may be that of the run."""
         if last := self._known.add_tail(self._writer.path):
             self._now_ns = last.t_ns
-            self._gates = GateCount(self._clock_in(last.payload))
+            clock = self._clock_in(last.payload)
+            self._gates = GateCount(clock)
+            if clock is not None and clock.state == "stopped":
+                self._ended_s = time.monotonic()
 
     def _fetch_missed(self) -> None:
         """Write what passed since the newest message on record, as far as the world still has it."""

@@ -8,14 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 from federation import PAIR, Federation, Record, Role
-from wire import Client, Received, Subscription
+from wire import PATIENCE_S, Client, Received, Subscription
 
+from zsim.record import repair
+from zsim.record.completeness import record_completeness
 from zsim_deploy.launch.end_signals import UNREAD
 
 REASONS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "terminated"}
 SEEN_DEAD = ("death", "superseded")  # the second where it is back before its death is noticed
 GATE_NS = 20_000_000
 ENGAGED_NS, END_NS = 6_000_000_000, 12_000_000_000
+LATE_NS = 7_900_000_000  # of 8 s
+FROZEN_S = 14  # longer than LEASE_READER_MS
 UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes waits half a second or more in a recorder
 
 
@@ -171,6 +175,56 @@ def test_a_recorder_that_is_killed_again_and_again_leaves_no_gap(
     check_whole(record)
     for drone, wanted in undisturbed.items():
         assert np.array_equal(record.positions(drone)[: len(wanted)], wanted)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_recorder_that_ends_just_before_the_run(federation: Federation, number: signal.Signals) -> None:
+    """The last gates are written by the one in its place, or the run has failed, and says why."""
+    run = federation.run(PAIR, "--rate", "4", "--duration", "8")
+    federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= LATE_NS)
+    federation.kill("recorder", number)
+    code = run.process.wait(PATIENCE_S)
+    assert code is not None
+    run.ends(with_code=code)
+    federation.nobody_left()
+    repair(federation.out / "run.mcap")
+    found = record_completeness(federation.out / "run.mcap")
+    assert (code, f"record: {found}" in run.text()) == (0 if found.complete else 1, True)
+    if code:
+        assert "recorder" in run.text().splitlines()[-1] or str(found) in run.text().splitlines()[-1]
+    else:
+        check_whole(federation.record())
+
+
+@pytest.mark.soak
+def test_a_world_that_was_frozen(federation: Federation) -> None:
+    """For longer than any reader's link lives; what of it the recorder missed it asks for."""
+    flight = Flight(federation)
+    federation.kill("world", signal.SIGSTOP)
+    federation.role("echo", "clock", "--wait", str(FROZEN_S)).ends(with_code=2, within_s=2 * PATIENCE_S)
+    federation.kill("world", signal.SIGCONT)
+    flight.finish()
+    check_whole(check_end(federation, whole=True))
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("name", ["world", "recorder"])
+def test_gates_that_nobody_has_any_more_are_missed_aloud(federation: Federation, name: str) -> None:
+    """In realtime nobody waits: a recorder, or a world, that was stopped for long may cost gates, and these are named."""
+    run = federation.run(PAIR, "--realtime", "--duration", "40")
+    federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= ENGAGED_NS // 6)
+    federation.kill(name, signal.SIGSTOP)
+    waiting = federation.role("echo", "nobody/publishes/this", "--federation", "other", "--wait", str(FROZEN_S))
+    waiting.ends(with_code=2, within_s=2 * PATIENCE_S)
+    federation.kill(name, signal.SIGCONT)
+    code = run.process.wait(2 * PATIENCE_S)
+    assert code is not None
+    run.ends(with_code=code)
+    found = record_completeness(federation.out / "run.mcap")
+    steps = {clock["step"] for clock in federation.record().all("clock")}
+    assert found.gates_missing == len(set(range(max(steps) + 1)) - steps)
+    assert code == (0 if found.complete else 1)
+    assert found.complete or str(found) in run.text().splitlines()[-1]
 
 
 @pytest.mark.soak

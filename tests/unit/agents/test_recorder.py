@@ -293,6 +293,15 @@ def test_who_goes_on_with_a_record_counts_from_its_end(tmp_path: Path):
     assert completed(path).gaps == (GateGap(2, 3 * GATE_NS, 4 * GATE_NS),)
 
 
+def test_who_goes_on_with_the_record_of_a_run_that_is_over_leaves(tmp_path: Path):
+    path, link = tmp_path / "run.mcap", FakeLink()
+    before = [pair(keys.INFO, INFO), *gates(0, 1, 2), clock(3, "stopped")]
+    died(path, before)
+    link.on_request = lambda key, args: page(before)
+    assert record(link, INFO, path) == RUN_ENDED  # type: ignore[arg-type]
+    assert completed(path).complete
+
+
 def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
     path, link = tmp_path / "run.mcap", FakeLink()
     on_disk: list[tuple[int, int]] = []

@@ -24,6 +24,7 @@ from zsim_world.flight.run_clock import Operation, RunClock, number
 from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox
 from zsim_world.flight.run_statistics import RunStatistics
 
+RETURNS = ("restart", "wait")  # of on_death: a process that died comes back, or may
 ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
 
 
@@ -259,6 +260,11 @@ class Coordinator(ABC):
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
             return tuple(p.waiting(wall_ns) for p in self.barrier.participants.values() if p.away or not p.alive)
         return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self._start_wall_ns)
+
+    def is_waiting_to_leave(self) -> bool:
+        """Tell, after the end, whether a participant has yet to leave, or a dead recorder to come back for the rest."""
+        participants = self.barrier.participants.values()
+        return any(p.alive or (p.join.slack_ns > 0 and self._on_death(p) in RETURNS) for p in participants)
 
     # Publication
 

@@ -193,13 +193,13 @@ class WorldProcess:
         return {keys.process(p.name, "done") for p in self._pipelining.blocking()}
 
     def _end(self) -> None:
-        """Publish the end, then wait until every participant that lives has published bye."""
+        """Publish the end, then wait until nobody has to be waited for any more, BYE_S at most."""
         self._turn_wall_ns = 0
         self._await_return()
         self._world.publish_end()
         self._outputs.flush()
         until_s = time.monotonic() + BYE_S
-        while time.monotonic() < until_s and any(p.alive for p in self._world.barrier.participants.values()):
+        while time.monotonic() < until_s and self._world.is_waiting_to_leave():
             self._inputs.wait(TICK_S)
             self._take_in()
             self._serve_others()

@@ -1,5 +1,6 @@
 """The watch over a run's processes, with processes that only say how they end."""
 
+import json
 import signal
 import threading
 from typing import Any
@@ -92,6 +93,15 @@ def test_a_run_that_ends_well():
     outcome = team.go()
     assert (outcome.failed, outcome.interrupted) == (False, False)
     assert all(member.closed for member in team.members)
+
+
+def test_a_recorder_that_fails_at_the_end_is_why_the_run_failed():
+    team = Team()
+    team.recorder = team.watch.members[1] = Member("recorder", 143, lives_for=21)
+    team.watch.handle_line(json.dumps({"event": {"kind": "end", "text": "over", "data": {}}}))
+    outcome = team.go()
+    assert outcome.failed
+    assert has_terms(outcome.reason, "recorder", "143")
 
 
 def test_a_dead_estimator_is_started_again():

@@ -251,3 +251,25 @@ def test_a_diverged_state_ends_the_run_for_everybody(monkeypatch: pytest.MonkeyP
     assert has_terms(end.text, "d1", "0.080", "finite")
     assert end.data["last_ns"] == 3 * GATE_NS
     assert link.published_on(keys.CLOCK)[-1].state == "stopped"
+
+
+# The end
+
+
+@pytest.mark.parametrize(("action", "waits"), [("restart", True), ("wait", True), ("end", False), ("drop", False)])
+def test_the_end_waits_for_a_recorder_that_died_where_it_comes_back(action: str, waits: bool):
+    """It has the last gates to write; others have nothing to do any more."""
+    text = SCENARIO.replace("{expect: []}", f"{{expect: [], on_death: {{recorder: {action}}}}}")
+    made = World(scenario_file.from_text(text), run_id="run1")
+    join = Join(0, 0, "run1", 1, "recorder", "here", 1, 0, slack_ns=GATE_NS)
+    made.handle(keys.process("recorder", "join"), join, 0)
+    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "tester", "here", 2, GATE_NS), 0)
+    made.publish_end()
+    made.handle(keys.process(ME, "bye"), run_messages.Bye(0, 0, "over"), 0)
+    assert made.is_waiting_to_leave()
+    made.handle_death("recorder", 0)
+    assert made.is_waiting_to_leave() is waits
+    made.handle(keys.process("recorder", "join"), Join(0, 1, "run1", 2, "recorder", "here", 3, 0, slack_ns=GATE_NS), 0)
+    assert made.is_waiting_to_leave()
+    made.handle(keys.process("recorder", "bye"), run_messages.Bye(0, 0, "over"), 0)
+    assert not made.is_waiting_to_leave()
