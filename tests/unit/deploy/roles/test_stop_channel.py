@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from refused import has_terms
 
 from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import KeyLease, key_lease
@@ -71,3 +72,20 @@ def test_a_key_of_the_hosts_own_is_not_lent(key: Path) -> None:
     for tls, launched in ((None, "run1"), (key.parent, None), (key.parent, "run2"), (certs, "run1")):
         assert key_lease(Identity(tls=tls), launched) is None
     assert key_lease(Identity(tls=key.parent), "run1") is not None
+
+
+HANGS = """
+import threading
+from zsim_deploy.roles import stop_channel
+stop_channel.GRACE_S = 0.01
+stop_channel.StopChannel("run1")
+threading.Event().wait()
+"""
+
+
+def test_who_hangs_after_its_launcher_is_gone_is_ended_and_its_log_ends_with_why() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", HANGS], input="", capture_output=True, text=True, timeout=60.0, check=False
+    )
+    assert done.returncode == 1
+    assert has_terms(done.stderr.splitlines()[-1], "launcher", "0.01")
