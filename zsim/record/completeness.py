@@ -171,7 +171,7 @@ def completeness(reader: RecordReader) -> Completeness:
         ended=gates.ended,
         closed=reader.complete,
         last_ns=max((clock.t_ns for clock in clocks), default=0),
-        damaged=reader.damaged,
+        damaged=reader.damaged or (("the name of a key, or an index",) if reader.differs() else ()),
     )
 
 

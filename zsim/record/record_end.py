@@ -107,7 +107,7 @@ def finish(file: FileIO) -> None:
     summary = RecordSummary()
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary.take(source)
-    data_end = packed(DataEnd(0))
+        data_end = packed(DataEnd(zlib.crc32(source)))
     start = file.seek(0, 2) + len(data_end)
     write_all(file, data_end + b"".join(_ending(summary, start)))
 

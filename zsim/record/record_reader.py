@@ -1,5 +1,7 @@
 """Reads a record, whole or cut at any byte, from a file or the folder of a run."""
 
+import struct
+import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from mmap import ACCESS_READ, mmap
@@ -31,6 +33,7 @@ from zsim.record.record_end import check_magic
 
 RECORD = "run.mcap"  # in the folder of a run
 SHOWN = 3  # gaps, or damaged chunks, in one line; how many more there are is shown
+CRC = struct.Struct("<I")  # of all that stands before the data's end; MCAP has 0 where none was computed
 OVERLAP_NS = 1_000_000_000  # simulated time; a chunk begins less than that before the end of the one before it
 
 
@@ -113,6 +116,17 @@ class RecordReader:
     def _named(self, place: RecordSpan) -> str:
         head = chunk_head(self._source, place)
         return f"the chunk at byte {place.start}, {head.first_ns / 1e9:.2f} to {head.last_ns / 1e9:.2f} s"
+
+    def differs(self) -> bool:
+        """Tell whether a closed record differs from what its writer closed; all of the file is read for it.
+
+        Names of keys, and indexes, have no check sum of their own.
+        """
+        for place in places(self._source) if self.complete else ():
+            if place.opcode == Opcode.DATA_END:
+                stated = CRC.unpack_from(self._source, place.body)[0]
+                return stated not in (0, zlib.crc32(memoryview(self._source)[: place.start]))
+        return False
 
     def last(self, key: str) -> Recorded | None:
         """Return the message of a key that was written last, None if there is none."""

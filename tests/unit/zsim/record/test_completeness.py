@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from mcap.opcode import Opcode
+from mcap.stream_reader import StreamReader
 from msgspec.structs import replace
 from refused import has_terms
 
@@ -125,3 +126,17 @@ def test_what_is_damaged_or_cut_is_incomplete(tmp_path: Path) -> None:
             found = completeness(reader)
         assert not found.complete
         assert has_terms(str(found), "damaged", "byte", str(place.start))
+
+
+def test_the_name_of_a_key_that_was_changed_is_damage(tmp_path: Path) -> None:
+    """A name stands outside of the chunks and their sums."""
+    path = tmp_path / "run.mcap"
+    assert judged(path, whole(9), range(36)).complete
+    data = path.read_bytes()
+    with open(path, "rb") as file:
+        assert len(list(StreamReader(file, validate_crcs=True).records)) > 0  # as the library computes it
+    path.write_bytes(data.replace(b"drone/d1/sensor/imu", b"drone/d2/sensor/imu"))
+    with RecordReader(path) as reader:
+        found = completeness(reader)
+    assert (found.complete, found.gates, found.messages_missing) == (False, 9, 0)
+    assert has_terms(str(found), "incomplete", "damaged", "key")
