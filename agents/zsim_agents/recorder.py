@@ -238,11 +238,17 @@ class Recorder:
         for passed in arrived:
             held.append(passed)
             if isinstance(passed, ReceivedSample) and passed.key == keys.CLOCK:
-                if (clock := self._clock_in(passed.payload)) and self._gates.gap_before(clock):
+                clock = self._clock_in(passed.payload)
+                if clock is not None and self._gates.gap_before(clock) and self._reaches_run():
                     self._fetch_missed()
                 self._write_all(held)
                 held.clear()
         self._write_all(held)
+
+    def _reaches_run(self) -> bool:
+        """Tell whether the world of this run still answers."""
+        info = read_info(self._link)
+        return info is not None and info.run_id == self._info.run_id
 
     def _write_all(self, held: Iterable[Passed]) -> None:
         for passed in held:

@@ -259,7 +259,8 @@ def test_gates_that_did_not_come_are_asked_for_and_stand_before_what_came_after_
     """No link was lost as far as anybody noticed: the batch of gate 3 went nowhere."""
     path, strange = tmp_path / "run.mcap", ("drone/d1/cmd/velocity", b"of gate 5")
     answers = [page(gates(0, 1)), page([*gates(1, 2, 3), strange, *gates(4)])]
-    found = recorded(path, answers, gates(2), [strange, *whole(4)], whole(5), [clock(6)])
+    last = dict([pair(keys.INFO, INFO)])
+    found = recorded(path, answers, gates(2), [strange, *whole(4)], whole(5), [clock(6)], last=last)
     assert stamps(found, IMU) == list(range(6))
     with RecordReader(path) as reader:
         written = [message.key for message in reader.messages([keys.CLOCK, strange[0]], by_time=False)]
@@ -269,7 +270,7 @@ def test_gates_that_did_not_come_are_asked_for_and_stand_before_what_came_after_
 def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path):
     """Printed in a line while the run goes on, and read off the record afterwards."""
     path, link, lines = tmp_path / "run.mcap", FakeLink(), []
-    replays = iter([page([pair(keys.INFO, INFO), *gates(0)]), page(gates(8, 9))])
+    replays, link.last = iter([page(gates(0)), page(gates(8, 9))]), dict([pair(keys.INFO, INFO)])
     link.on_request = lambda key, args: next(replays)
     for passed in (gates(1), gates(2), whole(9), whole(10), [clock(11, "stopped")]):
         link.deliver(keys.BATCH, encode_batch(passed))
@@ -280,6 +281,16 @@ def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path
     found = completed(path)
     assert found.gaps == (GateGap(5, 3 * GATE_NS, 7 * GATE_NS),)
     assert (found.complete, found.gates, found.gates_missing, found.messages_missing) == (False, 7, 5, 5)
+
+
+def test_another_run_is_not_asked_for_gates_that_are_missing(tmp_path: Path):
+    path, link = tmp_path / "run.mcap", FakeLink()
+    replays = iter([page(gates(0))])
+    link.on_request = lambda key, args: next(replays)
+    link.last = dict([pair(keys.INFO, replace(INFO, run_id="other"))])
+    link.deliver(keys.BATCH, encode_batch([*gates(1), *gates(4), clock(5, "stopped")]))
+    assert record(link, INFO, path) == RUN_ENDED  # type: ignore[arg-type]
+    assert completed(path).gates_missing == 2
 
 
 def test_who_goes_on_with_a_record_counts_from_its_end(tmp_path: Path):
