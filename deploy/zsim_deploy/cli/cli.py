@@ -185,15 +185,25 @@ def command() -> Any:
 def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
     _replace_unprintable()
+    code = _exit_code()
     try:
-        try:
-            _run()
-        finally:
-            sys.stdout.flush()
-    except BrokenPipeError as error:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        code = code or UNREAD
         _drop_output()
-        ended = error.__context__
-        sys.exit((isinstance(ended, SystemExit) and ended.code) or UNREAD)
+    sys.exit(code)
+
+
+def _exit_code() -> int | str | None:
+    """Run the command line; return its exit code, UNREAD where nobody reads the output: click has 1, without a word."""
+    try:
+        _run()
+    except BrokenPipeError:
+        if not any(map(is_unread, STREAMS)):
+            raise  # of a connection
+        return UNREAD
+    except SystemExit as ended:
+        return UNREAD if isinstance(ended.__context__, BrokenPipeError) else ended.code
 
 
 def _run() -> NoReturn:

@@ -113,6 +113,16 @@ def test_who_is_read_by_nobody_notices_without_writing(tmp_path: Path, both: boo
     assert both or has_terms(complained.decode(), UNREAD, str(log))
 
 
+def test_a_command_behind_a_head_has_the_exit_code_of_shells(tmp_path: Path) -> None:
+    """As Click has it, that would be 1, without a word."""
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "zsim_deploy.cli", "fault", "kinds"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, timeout=60.0, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
 def test_under_nohup_nothing_happens(tmp_path: Path) -> None:
     former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
