@@ -101,6 +101,7 @@ class Recorder:
         self._now_ns = 0
         self._on_disk_ns = 0  # when everything taken was put there last
         self._incarnation = secrets.randbits(62)
+        self._incarnations = {self._incarnation}
         self._seq = {"join": 0, "done": 0, "bye": 0, "health": 0}
         self._left_out = 0
         self._leavers: set[str] = set()
@@ -162,9 +163,8 @@ class Recorder:
         self._must_look = False
         if info.run_id != self._info.run_id:
             return True
-        self._incarnation = secrets.randbits(62)
         self._fetch_missed()
-        self._join()
+        self._join_again()
         return False
 
     def _loop(self) -> str:
@@ -341,9 +341,12 @@ class Recorder:
         except DecodeError:
             return  # garbage by somebody else; recorded as it came
         data = event.data
-        if event.subject != self._name or event.kind != "superseded" or data.get("pid") == os.getpid():
+        if event.subject != self._name or event.kind != "superseded":
             return
-        if data.get("former_pid") == os.getpid():
+        if (data.get("host"), data.get("pid")) == (self._link.host, os.getpid()):
+            if data.get("incarnation") not in self._incarnations:
+                self._join_again()  # somebody else has joined as this process
+        elif data.get("former_pid") == os.getpid():
             self._successor = f"{data.get('host')} (pid {data.get('pid')})"
 
     def _on_process(self, key: str) -> None:
@@ -360,6 +363,12 @@ class Recorder:
         join = join_of(name, host, run_id, self._incarnation, seq, self._now_ns, calculates=False, slack_ns=SLACK_NS)
         self._publish("join", join)
         self._put_on_disk()
+
+    def _join_again(self) -> None:
+        """Join by a new incarnation, the newest of which counts."""
+        self._incarnation = secrets.randbits(62)
+        self._incarnations.add(self._incarnation)
+        self._join()
 
     def _bye(self, reason: str) -> None:
         self._publish("bye", run_messages.Bye(self._now_ns, self._next("bye"), reason))

@@ -1,5 +1,6 @@
 """A process of a run that shows and commands but never gates: its join, health and bye."""
 
+import os
 import secrets
 
 from zsim.contract import keys, messages, run_messages
@@ -35,6 +36,7 @@ class ObserverProcess:
         self.now_ns = 0
         self.health = HealthMeter(name.split(".", 1)[0], host=link.host)
         self.end_reason = ""
+        self._process = link.host, os.getpid()
         self._incarnation = secrets.randbits(62)
         self._admitted = self._superseded = False
         self._must_join = self._was_link_lost = False
@@ -100,7 +102,9 @@ class ObserverProcess:
             return
         is_own = event.data.get("incarnation") == self._incarnation
         self._admitted = self._admitted or is_own
-        if self._admitted and not is_own:
+        if self._admitted and not is_own and (event.data.get("host"), event.data.get("pid")) == self._process:
+            self._must_join = True  # somebody else has joined as this process
+        elif self._admitted and not is_own:
             self._superseded = True
             address = f"{event.data.get('host')} (pid {event.data.get('pid')})"
             self.end_reason = f"another process of this name joined from {address}"

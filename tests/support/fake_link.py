@@ -4,6 +4,7 @@ import queue
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import msgspec
 from msgspec import Struct
 
 from zsim.contract import keys, messages
@@ -51,9 +52,11 @@ class FakeLink:
         on_request: answers a request by its key and arguments.
         requests: (key, arguments) of all requests.
         last: what a get is answered, by key.
+        holders: sessions that hold the token of each process, by its name; a query of the admin space finds them.
     """
 
     host = "laptop"
+    federation = "zsim"
     guarded = False
 
     def __init__(self) -> None:
@@ -62,6 +65,7 @@ class FakeLink:
         self.on_request: Callable[[str, dict[str, Any]], ControlAnswer] = lambda key, args: UNANSWERED
         self.requests: list[tuple[str, dict[str, Any]]] = []
         self.last: dict[str, bytes] = {}
+        self.holders: dict[str, list[str]] = {}
         self._subscriptions: list[FakeSubscription] = []
         self._early: list[ReceivedSample] = []
         self._callbacks: list[tuple[str, Callable[[RawSample], None]]] = []
@@ -123,6 +127,20 @@ class FakeLink:
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample]:
         return [ReceivedSample(key, payload) for key, payload in self.last.items() if keys.matches(expression, key)]
+
+    def unprefixed(self) -> "FakeLink":
+        return self
+
+    def zid(self) -> str:
+        return "hub"
+
+    def query(self, expression: str, timeout_s: float = 2.0) -> list[RawSample]:
+        head, _, asked = expression.partition("/router/token/")
+        return [
+            RawSample("PUT", f"{head}/router/token/zsim/{key}", msgspec.json.encode({"clients": sessions}), "", None)
+            for key, sessions in ((keys.token(name), sessions) for name, sessions in self.holders.items())
+            if keys.matches(asked, f"zsim/{key}")
+        ]
 
     def has_subscribers(self, key: str) -> bool:
         return True

@@ -62,6 +62,7 @@ class Membership:
         self._say = say
         self._wall_s = wall_s
         self._incarnation = secrets.randbits(62)
+        self._incarnations = {self._incarnation}
         self._done_key = keys.process(agent.name, "done")
         ahead = info.command_delay_ns // info.gate_ns
         self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
@@ -225,6 +226,9 @@ class Membership:
                 f"{self._agent.name}: another process of this name joined from {entry.host} "
                 f"(pid {entry.pid}); this one ends. Give each process its own name."
             )
+        elif entry.pid == os.getpid() and entry.host == self._link.host and entry.incarnation not in self._incarnations:
+            self._say(f"{self._agent.name}: somebody else has joined as this process; it joins again")
+            self.come_back()
 
     def ask_again(self, t_ns: int, missing: str) -> None:
         """Fetch the rest of a gate of which messages did not come, as after a link that was cut."""
@@ -243,6 +247,7 @@ class Membership:
     def come_back(self) -> None:
         """Take part again by a new incarnation, now that the link is back."""
         self._incarnation = secrets.randbits(62)
+        self._incarnations.add(self._incarnation)
         self._must_rejoin = True
         self._retry_s = 0.0
         self.settle()

@@ -57,6 +57,7 @@ def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
     return {
         "listen/endpoints": json.dumps(list(endpoints)),
         "listen/exit_on_failure": "true",
+        "adminspace/enabled": "true",  # whose token it is, and who subscribes to what, is known there alone
         _CLOSE_AFTER: str(HUB_CLOSE_AFTER_US),
         **_security(identity, endpoints, "listen on"),
     }

@@ -138,6 +138,8 @@ class Supervisor:
             self._reason = self._reason or event["text"]
         elif event["kind"] == "death" and event["data"].get("on_death") == "end":
             self._fail(f"{event['subject']} died")
+        elif event["kind"] == "death" and event["data"].get("on_death") == "restart":
+            self.submit(lambda: self._restart_superseded(event["subject"]))
 
     # Watching
 
@@ -250,6 +252,15 @@ class Supervisor:
         if policy == "end":
             self._fail(f"{child.name} ended: {child.outcome()}")
             world.request_stop(self._reason)
+
+    def _restart_superseded(self, name: str) -> None:
+        """Start a process again that has left its place to one that is dead now, and that nobody else would start."""
+        for child in self.members:
+            if child.name == name and child.code == SUPERSEDED and name in self._dead:
+                self._show.say(f"{name} is started again, since who took its place is dead")
+                self._dead.discard(name)
+                child.restarts += 1
+                child.start()
 
     def _too_often(self, child: RunProcess) -> bool:
         """Count a death; return whether there were too many in a row for another restart."""

@@ -1,5 +1,6 @@
 """The recorder: what was sent before it came, once and without a gap, and garbage as it came."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from refused import has_terms, refused
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.contract.messages import DroneInfo, Imu, Info, Origin
-from zsim.contract.run_messages import RUN_ENDED, Clock, ControlAnswer, Faults
+from zsim.contract.run_messages import RUN_ENDED, Clock, ControlAnswer, Event, Faults
 from zsim.errors import RecordError
 from zsim.record import Completeness, RecordReader, RecordWriter, completeness
 from zsim.record.completeness import GateGap
@@ -215,6 +216,16 @@ def test_what_its_last_chunk_lacks_is_asked_for(tmp_path: Path, cut: int):
     died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2)], cut)
     found = recorded(path, [page(gates(0, 1, 2, 3))], gates(4), last=dict([pair(keys.INFO, INFO)]))
     assert stamps(found, IMU) == list(range(5))
+
+
+def test_news_of_a_join_of_its_own_process_that_it_did_not_publish_are_answered_by_a_newer_one(tmp_path: Path):
+    link = FakeLink()
+    news = {"incarnation": 7, "host": link.host, "pid": os.getpid(), "former_pid": os.getpid()}
+    superseded = pair(keys.EVENT, Event(0, 0, "superseded", "recorder", "recorder", "", news))
+    link.on_request = lambda key, args: page([])
+    link.deliver(keys.BATCH, encode_batch([superseded, clock(1), clock(2, "stopped")]))
+    record(link, INFO, tmp_path / "run.mcap")  # type: ignore[arg-type]
+    assert len({join.incarnation for join in link.published_on("process/recorder/join")} - {7}) == 2
 
 
 def test_the_record_of_another_run_is_left_alone(tmp_path: Path):

@@ -29,6 +29,8 @@ class Participant:
         done_seq: number of its newest done, None before the first of its process.
         lost_done: whether a done was lost, and with it the count of the outputs before it.
         rejoined: whether another incarnation of its name was there before.
+        repeats: whether it may publish once more what was counted before.
+        successor: whether that one lived, and has ended for it.
         since_wall_ns: when it last joined, sent a done or died.
         joined_wall_ns: when this incarnation joined.
         deadline_misses: dones that were late in realtime.
@@ -44,6 +46,8 @@ class Participant:
     done_seq: int | None = None
     lost_done: bool = False
     rejoined: bool = False
+    repeats: bool = False
+    successor: bool = False
     alive: bool = True
     since_wall_ns: int = 0
     joined_wall_ns: int = 0
@@ -59,8 +63,8 @@ class Participant:
         return self.gating or self.join.slack_ns > 0
 
     def is_process_of(self, join: Join) -> bool:
-        """Tell whether another join comes from the same process."""
-        return (self.join.host, self.join.pid) == (join.host, join.pid)
+        """Tell whether another join comes from the same process, which takes part as before."""
+        return _identity(self.join) == _identity(join)
 
     @property
     def served_names(self) -> set[str]:
@@ -109,8 +113,8 @@ class Participant:
         A surplus would hide the next loss: outputs that belong to the next done do not come while some are missing. Of
         what is repeated after a rejoin, some was counted before it: that is not missing.
         """
-        missing = 0 if self.rejoined else self.missing
-        self.missing, self.surplus, self.lost_done, self.rejoined = 0, 0, False, False
+        missing = 0 if self.repeats else self.missing
+        self.missing, self.surplus, self.lost_done, self.repeats = 0, 0, False, False
         return missing
 
     def waiting(self, wall_ns: int) -> Waiting:
@@ -127,6 +131,11 @@ class Participant:
             "done_ns": self.done_ns,
         }
         return {**entry, "serves": self.join.serves} if self.join.serves else entry
+
+
+def _identity(join: Join) -> tuple[Any, ...]:
+    """Return what a process has in common with itself whenever it joins."""
+    return join.host, join.pid, join.role, join.period_ns, join.slack_ns, join.serves
 
 
 class Barrier:
@@ -189,8 +198,17 @@ class Barrier:
             deadline_misses=former.deadline_misses if former else 0,
             done_seq=former.done_seq if former and former.is_process_of(message) else None,
             rejoined=former is not None,
+            repeats=former is not None,
+            successor=former is not None and former.alive and not former.is_process_of(message),
         )
         return None
+
+    def takes_place(self, name: str, message: Join) -> bool:
+        """Tell whether a join would put a process into the place of another one."""
+        if self._join_refusal(name, message):
+            return False
+        former = self.participants.get(name)
+        return (former is not None and not former.is_process_of(message)) or bool(self.replaced(name, message))
 
     def replaced(self, name: str, message: Join) -> list[Participant]:
         """Return the dead whose work a newcomer of another name is to do."""

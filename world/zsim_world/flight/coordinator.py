@@ -168,11 +168,15 @@ class Coordinator(ABC):
             return
         self.outbox.event("leave", name, f"{name} left: {message.reason}", {"reason": message.reason}, name)
         self._release_drones(name)
-        if self.clock.state == "waiting":
-            for each in (name, *participant.join.serves):
-                if each in self._expected:
-                    self.barrier.expect(each)
+        self._expect_again(participant)
         self._after_bye(participant, message.reason)
+
+    def _expect_again(self, participant: Participant) -> None:
+        """Wait at the start for whom a process that is gone has stood for."""
+        if self.clock.state == "waiting":
+            for each in self._expected:
+                if each in participant.served_names:
+                    self.barrier.expect(each)
 
     def _after_bye(self, participant: Participant, reason: str) -> None:
         """Do what the leave of a process means for the run."""
@@ -198,6 +202,27 @@ class Coordinator(ABC):
             self.outbox.event("drop", name, f"{name} is waited for no longer", {"from_ns": self.now_ns})
         if action == "end":
             self.clock.stop(f"{name} died")
+
+    def handle_false_join(self, name: str, join: run_messages.Join, fault: str) -> None:
+        """Take it that nobody is behind a join in the place of a process, which keeps it."""
+        data = {"host": join.host, "pid": join.pid, "incarnation": join.incarnation}
+        text = f"a join as {name} from {join.host} (pid {join.pid}) {fault}; it takes nobody's place"
+        self.outbox.event("no_show", name, text, data)
+
+    def handle_no_show(self, name: str, fault: str, wall_ns: int) -> None:
+        """Take it that a process which joined is not there: what it stands for is as if it had not come."""
+        participant = self.barrier.participants.get(name)
+        if participant is None or not participant.alive:
+            return
+        host, pid = participant.join.host, participant.join.pid
+        self.outbox.event("no_show", name, f"{name} on {host} (pid {pid}) {fault}", {"host": host, "pid": pid})
+        if participant.rejoined:
+            self.handle_death(name, wall_ns)
+            return
+        self.barrier.remove(name)
+        self._release_drones(name)
+        self._expect_again(participant)
+        self.outbox.event("drop", name, f"{name} is waited for no longer", {"from_ns": self.now_ns})
 
     def _on_death(self, participant: Participant) -> str:
         """Return the action when a process has died."""
@@ -254,6 +279,16 @@ class Coordinator(ABC):
     def blocking(self, ahead_ns: int = 0) -> list[Participant]:
         """Return the participants whose dones are missing for the next gate, or for one so much later."""
         return self.barrier.blocking(self.clock.required_ns + ahead_ns)
+
+    def standing_for(self) -> list[Participant]:
+        """Return for whom time stands in lockstep, which else would go on."""
+        clock = self.clock
+        waits = clock.mode == "lockstep" and clock.state == "running" and not clock.is_halted
+        return self.blocking() if waits else []
+
+    def must_wait_for(self, participant: Participant) -> bool:
+        """Tell whether the scenario has a process that is waited for however long its first step takes."""
+        return not participant.successor and not participant.served_names.isdisjoint(self._expected)
 
     def waiting_for(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
         """Return whom the world waits for now."""

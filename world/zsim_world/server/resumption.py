@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zsim.contract import keys, messages
-from zsim.contract.run_messages import ControlRequest
+from zsim.contract.run_messages import ControlRequest, Join
 from zsim.errors import RunError
 from zsim.transport.session import ReceivedSample
 from zsim_world.flight.coordinator import Coordinator
@@ -15,8 +15,11 @@ from zsim_world.server.run_journal import (
     Controlled,
     Died,
     Entry,
+    FalselyJoined,
     GivenUp,
+    Joined,
     Kept,
+    NotShown,
     Resumed,
     RunJournal,
     Taken,
@@ -74,6 +77,12 @@ class Resumption:
             case Advanced(wall_ns, late):
                 self.world.statistics.world_misses += late
                 self.world.advance(wall_ns)
+            case Joined(wall_ns, name, join):
+                self.world.handle(keys.process(name, "join"), _join(join), wall_ns)
+            case FalselyJoined(name, join, reason):
+                self.world.handle_false_join(name, _join(join), reason)
+            case NotShown(wall_ns, name, reason):
+                self.world.handle_no_show(name, reason, wall_ns)
             case Died(wall_ns, name):
                 self.world.handle_death(name, wall_ns)
             case Controlled(request):
@@ -88,3 +97,7 @@ class Resumption:
             case _:
                 raise AssertionError(entry)
         self.outputs.gather()
+
+
+def _join(payload: bytes) -> Join:
+    return messages.decode_as(Join, payload, "join")

@@ -89,7 +89,31 @@ class Resumed(Entry, tag=6):
     all_died: bool
 
 
-_Entry = Taken | Advanced | Died | Controlled | GivenUp | Kept | Resumed
+class Joined(Entry, tag=7):
+    """A join that was admitted."""
+
+    wall_ns: int
+    name: str
+    join: bytes
+
+
+class FalselyJoined(Entry, tag=8):
+    """A join in the place of another, behind which nobody is."""
+
+    name: str
+    join: bytes
+    reason: str
+
+
+class NotShown(Entry, tag=9):
+    """A participant that never showed that it is there."""
+
+    wall_ns: int
+    name: str
+    reason: str
+
+
+_Entry = Taken | Advanced | Died | Controlled | GivenUp | Kept | Resumed | Joined | FalselyJoined | NotShown
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(list[_Entry]).decode
 

@@ -18,6 +18,7 @@ from zsim.scenario.rights import WORLD
 from zsim.transport.session import ReceivedSample, Session, Subscription
 from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
+from zsim_world.server.admission import Admission
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
 from zsim_world.server.run_journal import GivenUp, RunJournal, Taken
@@ -186,6 +187,7 @@ class MessageIntake:
     outputs: WorldOutputs  # hands recorders what has passed
     history: MessageHistory
     liveliness: LivelinessMonitor
+    admission: Admission  # hands the world the joins
     health: HealthMeter  # counts what is received and refused
     progress: ProgressCallback
     journal: RunJournal
@@ -197,18 +199,17 @@ class MessageIntake:
         key = sample.key
         if key.startswith(OWN):
             return  # the world's own health, kept when it was published
-        kind = messages.type_of(key)
-        if kind is run_messages.Join:
-            self._settle_former(key, sample.payload)
         self.take_again(wall_ns, sample)
         if self.world.ended is None:
             self.journal.note(Taken(wall_ns, key, sample.payload))
+        if messages.type_of(key) is run_messages.Join:
+            self._take_join(key, sample.payload, wall_ns)
 
-    def _settle_former(self, key: str, payload: bytes) -> None:
-        """Take the death of the process before that of a join first."""
-        with contextlib.suppress(DecodeError):
+    def _take_join(self, key: str, payload: bytes, wall_ns: int) -> None:
+        with contextlib.suppress(DecodeError):  # refused already
             join: run_messages.Join = messages.decode(key, payload)
             self.liveliness.before_join(keys.thing(key), join)
+            self.admission.take(keys.thing(key), join, wall_ns)
 
     def take_again(self, wall_ns: int, sample: ReceivedSample) -> None:
         """Take one message, or refuse it, as another incarnation of the world has."""
@@ -236,7 +237,8 @@ class MessageIntake:
         """Hand the world a message that it acts on."""
         message = messages.decode(key, payload)
         self.history.add(key, payload, message.t_ns)
-        self.world.handle(key, message, wall_ns)
+        if type(message) is not run_messages.Join:  # that is for `take` to admit, or for the journal to repeat
+            self.world.handle(key, message, wall_ns)
         if type(message) is run_messages.Health:
             self.liveliness.health_received(keys.thing(key))
             self.progress("health", message, keys.thing(key))

@@ -17,11 +17,13 @@ from zsim.runtime.health import HealthMeter
 from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
+from zsim.transport.admin_space import AdminSpace
 from zsim.transport.session import Query, Session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.world import World
+from zsim_world.server.admission import Admission
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
 from zsim_world.server.pacing import Pacer, Pipelining
@@ -70,8 +72,17 @@ class WorldProcess:
         self._pipelining = Pipelining(world)
         self._outputs = WorldOutputs(link, world, self._history, self._on_message, self._journal)
         self._liveliness = LivelinessMonitor(link, world.barrier, self._handle_death, self._take_in)
+        self._admission = Admission(AdminSpace(link), world, link.guarded, self._journal)
         self._intake = MessageIntake(
-            link, world, self._outputs, self._history, self._liveliness, self.health, self._progress, self._journal
+            link,
+            world,
+            self._outputs,
+            self._history,
+            self._liveliness,
+            self._admission,
+            self.health,
+            self._progress,
+            self._journal,
         )
         self._queries: deque[Query] = deque()
         self._over = threading.Event()
@@ -249,6 +260,7 @@ class WorldProcess:
         while self._queries:
             self._serve(self._queries.popleft())
         self._liveliness.check_due()
+        self._admission.check_due(time.monotonic_ns())
         if self.health.due():
             self._liveliness.count_second()
             self._publish_health()

@@ -111,6 +111,25 @@ def test_a_dead_estimator_is_started_again():
     assert "on_death: restart" in team.show.lines[0]
 
 
+def test_who_has_left_its_place_takes_it_back_when_its_successor_is_dead():
+    team = Team(Member("estimator.d1", SUPERSEDED, None))
+    death = {"event": {"kind": "death", "subject": "estimator.d1", "text": "", "data": {"on_death": "restart"}}}
+
+    def look() -> None:
+        if team.others[0].code == SUPERSEDED:
+            team.watch.handle_line(json.dumps(death))
+
+    assert not team.go(look).failed
+    assert team.others[0].restarts == 1
+
+
+def test_nobody_is_started_twice_for_one_death():
+    team = Team(Member("estimator.d1", None))
+    death = {"event": {"kind": "death", "subject": "estimator.d1", "text": "", "data": {"on_death": "restart"}}}
+    team.go(lambda: team.watch.handle_line(json.dumps(death)))
+    assert team.others[0].restarts == 0
+
+
 def test_too_many_deaths_in_a_row_end_the_run():
     team = Team(Member("estimator.d1", *[1] * 20), looks=100)
     outcome = team.go()

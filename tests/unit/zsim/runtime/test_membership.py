@@ -1,15 +1,17 @@
 """A process's place in a run: what the world does not answer stays owed, and is not asked for all the time."""
 
+import os
 from typing import Any
 
 import pytest
 from fake_link import UNANSWERED, FakeLink
 from refused import refused
 
-from zsim.contract import keys
+from zsim.contract import keys, messages
 from zsim.contract.framing import decode_batch, pairs_of
 from zsim.contract.messages import Info, Origin
 from zsim.contract.run_messages import ControlAnswer
+from zsim.contract.world_events import ProcessEntry
 from zsim.errors import DecodeError, NoWorldError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.membership import RETRY_S, Membership, replay
@@ -60,6 +62,20 @@ def test_another_gate_is_asked_for_at_once():
     for gate in (3, 4):
         member.ask_again(gate * GATE_NS, "drone/d1/truth")
     assert [args["from_ns"] // GATE_NS for _, args in link.requests] == [2, 3]
+
+
+def test_who_did_not_join_as_the_news_of_its_own_process_say_joins_again():
+    link = FakeLink()
+    link.last = {keys.INFO: messages.encode(INFO)}
+    member = Membership(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    member.enter()
+    member.taken_in(ProcessEntry(7, link.host, os.getpid(), 0, former_pid=os.getpid()))
+    first, second = link.published_on("process/*/join")
+    assert second.incarnation not in {first.incarnation, 7}
+    for own in (first, second):
+        member.taken_in(ProcessEntry(own.incarnation, link.host, os.getpid(), 0, former_pid=os.getpid()))
+    assert len(link.published_on("process/*/join")) == 2
+    assert member.failure is None
 
 
 # The pages of a replay

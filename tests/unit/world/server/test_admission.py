@@ -1,0 +1,191 @@
+"""Whose join counts: a join that nobody is behind costs nobody his place, and time for a while only."""
+
+import pytest
+from fake_link import FakeLink
+
+from zsim.contract import keys
+from zsim.contract.run_messages import Done, Join
+from zsim.scenario import scenario_file
+from zsim.transport.admin_space import AdminSpace
+from zsim_world.flight.world import World
+from zsim_world.server.admission import DONE_NS, LOOK_NS, TOKEN_NS, Admission
+
+GATE_NS = 20_000_000
+ME = "estimator.d1"
+VISITOR = "tester.one"
+SCENARIO = """
+name: one
+duration_s: 1
+drones: [{name: d1, position_m: [0, 0, 0]}]
+processes: {expect: [estimator.d1]}
+"""
+KINDS = {"join", "restart", "superseded", "no_show", "death", "drop"}
+
+
+class Case:
+    """A world, who holds which token, and a wall clock that a test turns."""
+
+    def __init__(self, trusts: bool = False) -> None:
+        self.link = FakeLink()
+        self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
+        self.admission = Admission(AdminSpace(self.link), self.world, trusts)  # type: ignore[arg-type]
+        self.wall_ns = TOKEN_NS
+        self._dones = 0
+
+    def join(self, name: str, pid: int, incarnation: int, host: str = "h", period_ns: int = GATE_NS) -> None:
+        role = name.split(".")[0]
+        join = Join(0, 0, "run1", incarnation, role, host, pid, period_ns)
+        self.admission.take(name, join, self.wall_ns)
+
+    def done(self, name: str, t_ns: int, incarnation: int) -> None:
+        done = Done(t_ns, self._dones, "run1", incarnation, t_ns, 0)
+        self._dones += 1
+        self.world.handle(keys.process(name, "done"), done, self.wall_ns)
+
+    def passes(self, wall_ns: int) -> None:
+        """Let wall time pass, look by look."""
+        for _ in range(wall_ns // LOOK_NS + 1):
+            self.wall_ns += LOOK_NS
+            self.admission.check_due(self.wall_ns)
+
+    def advance(self) -> None:
+        while self.world.may_advance():
+            self.world.advance(self.wall_ns)
+
+    def fly(self) -> None:
+        """Go on for a few gates, as far as others than ME allow it."""
+        for _ in range(3):
+            self.done(ME, self.world.now_ns, incarnation=1)
+            self.advance()
+        self.done(ME, self.world.now_ns, incarnation=1)
+
+    def kinds(self, name: str = ME) -> list[str]:
+        events = (message for key, message in self.world.outbox.pending if key == keys.EVENT)
+        return [event.kind for event in events if event.subject == name and event.kind in KINDS]
+
+    def incarnation(self, name: str = ME) -> int:
+        return self.world.barrier.participants[name].join.incarnation
+
+
+@pytest.fixture
+def case() -> Case:
+    """A run in which ME takes part, with a token, and has published a done."""
+    made = Case()
+    made.link.holders[ME] = ["a"]
+    made.join(ME, pid=7, incarnation=1)
+    made.advance()
+    made.done(ME, 0, incarnation=1)
+    made.passes(LOOK_NS)
+    return made
+
+
+@pytest.mark.parametrize("forged", [{"pid": 8}, {"pid": 7, "host": "elsewhere"}, {"pid": 7, "period_ns": 0}])
+def test_a_join_without_a_token_takes_nobody_s_place(case: Case, forged: dict[str, int]) -> None:
+    case.join(ME, incarnation=2, **forged)  # type: ignore[arg-type]
+    case.passes(TOKEN_NS)
+    assert case.kinds() == ["join", "no_show"]
+    assert (case.incarnation(), case.world.barrier.participants[ME].gating) == (1, True)
+
+
+def test_one_that_is_repeated_is_named_as_soon(case: Case) -> None:
+    for incarnation in range(2, 2 + TOKEN_NS // LOOK_NS):
+        case.join(ME, pid=8, incarnation=incarnation)
+        case.passes(0)
+    case.passes(LOOK_NS)
+    assert case.kinds() == ["join", "no_show"]
+
+
+def test_one_with_a_token_of_its_own_takes_over_at_once(case: Case) -> None:
+    case.link.holders[ME] = ["a", "b"]
+    case.join(ME, pid=8, incarnation=2)
+    assert case.kinds() == ["join", "superseded"]
+    case.join(ME, pid=9, incarnation=3)  # of nobody, while both tokens are there
+    case.link.holders[ME] = ["b"]
+    case.passes(TOKEN_NS)
+    assert case.incarnation() == 2
+
+
+def test_one_whose_token_comes_late_over_a_router_takes_over_then(case: Case) -> None:
+    case.join(ME, pid=8, incarnation=2)
+    case.passes(TOKEN_NS // 2)
+    case.link.holders[ME] = ["a", "b"]
+    case.passes(LOOK_NS)
+    assert case.kinds() == ["join", "superseded"]
+
+
+def test_the_same_process_rejoins_without_another_token(case: Case) -> None:
+    case.join(ME, pid=7, incarnation=2)
+    assert case.kinds() == ["join", "superseded"]
+
+
+def test_nobody_restarts_the_dead_without_a_token(case: Case) -> None:
+    case.world.handle_death(ME, case.wall_ns)
+    case.link.holders[ME] = []
+    case.join(ME, pid=8, incarnation=2)
+    case.passes(TOKEN_NS)
+    assert case.kinds() == ["join", "death", "no_show"]
+    case.link.holders[ME] = ["b"]
+    case.join(ME, pid=9, incarnation=3)
+    assert case.kinds()[-1] == "restart"
+
+
+def test_access_control_is_trusted() -> None:
+    case = Case(trusts=True)
+    case.join(ME, pid=7, incarnation=1)
+    case.join(ME, pid=8, incarnation=2)
+    case.passes(TOKEN_NS)
+    assert case.kinds() == ["join", "superseded"]
+
+
+def test_who_joins_without_a_token_is_dropped(case: Case) -> None:
+    case.join(VISITOR, pid=9, incarnation=1)
+    case.fly()
+    assert [waiting.name for waiting in case.world.waiting_for(case.wall_ns)] == [VISITOR]
+    case.passes(TOKEN_NS)
+    assert case.kinds(VISITOR) == ["join", "no_show", "drop"]
+    assert VISITOR not in case.world.barrier.participants
+
+
+def test_who_never_publishes_a_done_is_dropped(case: Case) -> None:
+    case.link.holders[VISITOR] = ["v"]
+    case.join(VISITOR, pid=9, incarnation=1)
+    case.fly()
+    case.passes(DONE_NS // 2)
+    assert case.kinds(VISITOR) == ["join"]
+    case.passes(DONE_NS // 2)
+    assert case.kinds(VISITOR) == ["join", "no_show", "drop"]
+
+
+def test_but_not_while_time_stands_for_another_too(case: Case) -> None:
+    case.link.holders[VISITOR] = ["v"]
+    case.join(VISITOR, pid=9, incarnation=1)
+    case.advance()  # until ME is waited for as well: it may be for ME that the visitor has published nothing
+    case.passes(2 * DONE_NS)
+    assert case.kinds(VISITOR) == ["join"]
+
+
+def test_nor_one_of_the_scenario_however_long_its_first_step_takes() -> None:
+    case = Case()
+    case.link.holders[ME] = ["a"]
+    case.join(ME, pid=7, incarnation=1)
+    case.advance()
+    case.passes(2 * DONE_NS)
+    assert case.kinds() == ["join"]
+
+
+def test_a_successor_that_publishes_nothing_is_dead(case: Case) -> None:
+    case.link.holders[ME] = ["a", "b"]
+    case.join(ME, pid=8, incarnation=2)
+    case.advance()
+    case.passes(DONE_NS + LOOK_NS)
+    assert case.kinds() == ["join", "superseded", "no_show", "death"]
+    assert [waiting.name for waiting in case.world.waiting_for(case.wall_ns)] == [ME]
+
+
+def test_before_the_start_the_scenario_s_process_is_waited_for_again() -> None:
+    case = Case()
+    case.world.barrier.expect("recorder")
+    case.join(ME, pid=8, incarnation=2)  # by nobody
+    case.passes(TOKEN_NS)
+    assert case.kinds() == ["join", "no_show", "drop"]
+    assert set(case.world.barrier.absent()) == {ME, "recorder"}
