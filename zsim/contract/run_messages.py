@@ -14,11 +14,15 @@ PRIORITY_MAX = 100  # programs have 0, operators 10
 
 
 class Waiting(Struct, frozen=True):
-    """A process that the world waits for, its host, and the wall time since when [s]."""
+    """A process that the world waits for, its host, and the wall time since when [s].
+
+    `held_by` names those among the others whose outputs it reads: it is not the cause, and may only wait for them.
+    """
 
     name: str
     host: str
     since_wall_s: Number
+    held_by: tuple[str, ...] = ()
 
 
 class Clock(Message, frozen=True):

@@ -184,6 +184,7 @@ def describe(line: dict[str, Any], duration_s: float) -> str:
     if line["state"] != "running":
         text += f"  {line['state']}"
     waiting = [w for w in line["waiting_for"] if line["state"] == "waiting" or w["since_wall_s"] > 0.5]
+    waiting = [w for w in waiting if not w.get("held_by")] or waiting  # causes alone
     if waiting:
         named = ", ".join(_name(w) for w in waiting[:4]) + (" …" if len(waiting) > 4 else "")
         text += f"  waiting for {named}"

@@ -27,6 +27,8 @@ STATE_COLOURS = {
 EVENT_COLOURS = {
     "refused": RED,
     "death": RED,
+    "silent": RED,
+    "no_show": RED,
     "collision": RED,
     "fault": AMBER,
     "fault_end": AMBER,
@@ -119,6 +121,7 @@ def clock_line(now: Clock | None, t_ns: int, silent_s: float = 0.0) -> str:
     if now is None:
         return f"<div style='{STYLE};padding:2px 4px'>no clock yet</div>"
     waiting = [w for w in now.waiting_for if now.state == "waiting" or w.since_wall_s > 0.5]
+    waiting = [w for w in waiting if not w.held_by] or waiting  # causes alone
     colour = {"running": GREEN, "paused": AMBER}.get(now.state, GREY)
     t_s = (t_ns or now.t_ns) / 1e9
     time, pace = (f"{t_s:.1f}", f" × {now.rate:.1f} real time") if now.state == "running" else (f"{t_s:.2f}", "")

@@ -20,7 +20,7 @@ EVENTS_KEPT = 200
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
 POLL_S = 0.25  # wall; rarely, since a message of each gate costs the world time
 ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
-SILENT_S = 2.0  # wall; without an answer for so long, what is shown may be long past
+SILENT_S = 1.7  # wall; without an answer for so long what is shown may be long past: a stop is shown within 2 s
 SPAN_NS = 1_000_000_000  # simulated, over which at least a rate is taken
 
 Counts = Mapping[str, tuple[int, int]]

@@ -9,6 +9,7 @@ from rich.live import Live
 from rich.table import Table
 
 from zsim.runtime.progress import Screen, cell, describe
+from zsim.scenario.rights import WORLD
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.remote_process import RemoteProcess
 
@@ -16,6 +17,7 @@ FIRST_S = 1.0  # simulated; from then on it flies
 SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second …
 ROUND_TRIPS = 2.0  # … and so many of its round trips more: over a slow link every answer takes long
 WAITED_S = 0.5  # a process that is waited for longer is shown so; waiting for less is what lockstep is
+SILENT_PROCESS_S = 1.8  # health comes once a second; so one that is stopped is shown within 2 s
 STALE_S = 3.0  # health comes once a second; older figures are not shown
 COLUMNS = ("role", "host", "pid", "state", "lag", "messages/s", "round trip", "restarts")
 
@@ -101,10 +103,27 @@ class StatusTable(Screen):
     def _state(self, member: RemoteProcess, link: HostLink) -> str:
         if member.state == "running" and _is_silent(link):
             return f"host silent {link.silent_s():.0f} s"
+        if member.state == "running" and (silent_s := self._no_sign_s(member.name, link)):
+            return f"no sign of life for {silent_s:.0f} s"
         waited = [w for w in (self._clock or {}).get("waiting_for", ()) if w["name"] == member.name]
+        if member.state == "running" and waited and waited[0].get("held_by"):
+            return f"waits for {', '.join(waited[0]['held_by'])}"
         if member.state == "running" and waited and waited[0]["since_wall_s"] > WAITED_S:
             return f"waited for {waited[0]['since_wall_s']:.0f} s"
         return f"ended ({member.outcome()})" if member.state == "ended" and member.code else member.state
+
+    def _no_sign_s(self, name: str, link: HostLink) -> float:
+        """Return for how long a process has been silent, 0 where that is not long [s, wall].
+
+        All that is known of the others comes from the world: while that is silent only it is known to be.
+        """
+        now_s, patience_s = time.monotonic(), SILENT_PROCESS_S + ROUND_TRIPS * link.round_trip_s
+        heard_s = self._health[name]["wall_s"] if name in self._health else None
+        world_s = max([health["wall_s"] for health in self._health.values()], default=now_s)
+        world_s = max(world_s, (self._clock or {}).get("wall_s", world_s))
+        last_s = world_s if name == WORLD else heard_s if now_s - world_s < patience_s else None
+        silent_s = 0.0 if last_s is None else now_s - last_s
+        return silent_s if silent_s >= patience_s else 0.0
 
     def _render(self) -> Group:
         clock = self._clock

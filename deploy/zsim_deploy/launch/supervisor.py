@@ -17,6 +17,7 @@ from zsim.errors import RunError
 from zsim.runtime.progress import ProgressSink
 from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import OnDeath
+from zsim_deploy.launch.world_watch import WorldWatch
 from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
 POLL_S = 0.05  # how often the processes are looked at
@@ -83,6 +84,7 @@ class Supervisor:
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
         self._gone: list[RunProcess] = []  # nobody waits for them any more
+        self._world_watch = WorldWatch()
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
     def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
@@ -122,6 +124,7 @@ class Supervisor:
             return  # not progress: something printed by a library
         if not isinstance(line, dict):
             return  # a number that was printed is JSON too
+        self._world_watch.received(time.monotonic())
         if "clock" in line:
             self._flies = self._flies or line["clock"].get("state") == "running"
             self._show.clock(line["clock"])
@@ -157,6 +160,8 @@ class Supervisor:
                     self._on_exit(child, world)
             self._carry_out_requests()
             self._release_replaced()
+            if line := self._world_watch.change(time.monotonic(), world.pid):
+                self._show.say(line)
             look()
             world.wait(POLL_S)
         if world.code != 0:

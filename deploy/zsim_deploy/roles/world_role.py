@@ -121,7 +121,10 @@ def world_progress(show: ProgressSink) -> Callable[[str, Any, str], None]:
 
 
 def _clock_line(clock: run_messages.Clock, phase: str) -> dict[str, Any]:
-    waiting = [{"name": w.name, "host": w.host, "since_wall_s": round(w.since_wall_s, 1)} for w in clock.waiting_for]
+    waiting = [
+        {"name": w.name, "host": w.host, "since_wall_s": round(w.since_wall_s, 1), "held_by": w.held_by}
+        for w in clock.waiting_for
+    ]
     return {
         "t_s": clock.t_ns / 1e9,
         "rate": clock.rate,

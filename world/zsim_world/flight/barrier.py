@@ -4,6 +4,7 @@ Pure bookkeeping: no session, no clock; wall times are passed in. To integrate f
 every gating participant's done for t minus the command delay. That is the only wait there is.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +36,7 @@ class Participant:
         joined_wall_ns: when this incarnation joined.
         deadline_misses: dones that were late in realtime.
         away: whether it has yet to come back to a world that was started again.
+        silent_wall_ns: when its last health came, if it has fallen silent since.
     """
 
     name: str
@@ -53,6 +55,12 @@ class Participant:
     joined_wall_ns: int = 0
     deadline_misses: int = 0
     away: bool = False
+    silent_wall_ns: int | None = None
+
+    @property
+    def is_missed(self) -> bool:
+        """Tell whether it is dead, silent, or has yet to come back."""
+        return not self.alive or self.away or self.silent_wall_ns is not None
 
     @property
     def gating(self) -> bool:
@@ -117,9 +125,14 @@ class Participant:
         self.missing, self.surplus, self.lost_done, self.repeats = 0, 0, False, False
         return missing
 
-    def waiting(self, wall_ns: int) -> Waiting:
+    def waiting(self, wall_ns: int, held_by: tuple[str, ...] = ()) -> Waiting:
         """Return the entry of `clock` that names it as waited for."""
-        return Waiting(self.name, self.join.host, (wall_ns - self.since_wall_ns) / 1e9)
+        return Waiting(self.name, self.join.host, (wall_ns - self.since_wall_ns) / 1e9, held_by)
+
+    def missed(self, wall_ns: int) -> Waiting:
+        """Return the entry of `clock` that names it as dead or silent, where nobody is waited for."""
+        since_ns = self.since_wall_ns if not self.alive or self.silent_wall_ns is None else self.silent_wall_ns
+        return Waiting(self.name, self.join.host, (wall_ns - since_ns) / 1e9)
 
     def entry(self) -> dict[str, Any]:
         """Return the data of the event of its join."""
@@ -314,13 +327,22 @@ class Barrier:
         """Return of whom outputs or a done were lost, or are still on their way."""
         return [p for p in self.participants.values() if p.incomplete]
 
-    def waiting_for(self, need_ns: int, wall_ns: int, start_wall_ns: int) -> tuple[Waiting, ...]:
+    def waiting_for(
+        self, need_ns: int, wall_ns: int, start_wall_ns: int, feeds: Callable[[str, str], bool] = lambda *_: False
+    ) -> tuple[Waiting, ...]:
         """Return whom the world waits for, as `clock` names them: first the dead, then who is silent for longest.
 
-        Who only waits for another's outputs published after that one, and is expected after it.
+        Who only waits for another's outputs published after that one, and is expected after it; `feeds` tells who does.
         """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
         rank = {name: place for place, name in enumerate(self._expected)}
         awaited = {p.name: p for p in (*self.away(), *self.blocking(need_ns))}.values()
         late = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
-        return (*absent, *(p.waiting(wall_ns) for p in late))
+        return (*absent, *(p.waiting(wall_ns, _holders_up(p, late, feeds)) for p in late))
+
+
+def _holders_up(victim: Participant, late: list[Participant], feeds: Callable[[str, str], bool]) -> tuple[str, ...]:
+    """Return for whose outputs one of several that are late may only wait itself."""
+    read_by = victim.served_names if victim.gating and victim.alive and not victim.away else ()
+    others = (p for p in late if p is not victim and p.gating)
+    return tuple(p.name for p in others if any(feeds(w, r) for w in p.served_names for r in read_by))

@@ -20,6 +20,7 @@ from zsim.scenario.rights import WORLD
 from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Barrier, Participant
+from zsim_world.flight.data_flow import DataFlow
 from zsim_world.flight.run_clock import Operation, RunClock, number
 from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox
 from zsim_world.flight.run_statistics import RunStatistics
@@ -69,6 +70,7 @@ class Coordinator(ABC):
         self.statistics = RunStatistics()
         self.diverged: RunError | None = None
         self._expected = expected
+        self._data_flow = DataFlow(scenario)
         self._start_wall_ns = wall_ns()
         self._operations: dict[str, Operation] = self.clock.operations()
 
@@ -203,6 +205,19 @@ class Coordinator(ABC):
         if action == "end":
             self.clock.stop(f"{name} died")
 
+    def handle_silence(self, name: str, since_wall_ns: int | None) -> None:
+        """Take it that a process publishes its health no longer, since its last; or does again (None)."""
+        participant = self.barrier.participants.get(name)
+        if participant is None or not participant.alive:
+            return
+        participant.silent_wall_ns = since_wall_ns
+        who = f"{name} on {participant.join.host} (pid {participant.join.pid})"
+        data = {"host": participant.join.host, "pid": participant.join.pid}
+        if since_wall_ns is None:
+            self.outbox.event("silent_end", name, f"{who} is back", data)
+        else:
+            self.outbox.event("silent", name, f"{who} shows no sign of life; it is stopped, or its host is gone", data)
+
     def handle_false_join(self, name: str, join: run_messages.Join, fault: str) -> None:
         """Take it that nobody is behind a join in the place of a process, which keeps it."""
         data = {"host": join.host, "pid": join.pid, "incarnation": join.incarnation}
@@ -293,8 +308,15 @@ class Coordinator(ABC):
     def waiting_for(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
         """Return whom the world waits for now."""
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
-            return tuple(p.waiting(wall_ns) for p in self.barrier.participants.values() if p.away or not p.alive)
-        return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self._start_wall_ns)
+            return self.missed(wall_ns)
+        return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self._start_wall_ns, self._data_flow.feeds)
+
+    def missed(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
+        """Return who is dead, silent or not back yet in realtime, where nobody else is waited for."""
+        if self.clock.mode != "realtime":
+            return ()
+        all_of_them = self.barrier.participants.values()
+        return tuple(p.missed(wall_ns) for p in all_of_them if p.is_missed)
 
     def is_waiting_to_leave(self) -> bool:
         """Tell, after the end, whether a participant has yet to leave, or a dead recorder to come back for the rest."""

@@ -175,7 +175,7 @@ class World(Coordinator):
         self._hash.add(self.now_ns, self.fleet.bodies.state)
         self.outbox.put(keys.GATE, self._publication.gate(self.queue.commanders()))
         self.statistics.gate(self.now_ns, wall_ns)
-        self.outbox.put(keys.CLOCK, self.clock_message())
+        self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
 
     def result(self) -> dict[str, Any]:
         """Return the figures of the run so far."""

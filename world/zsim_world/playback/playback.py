@@ -185,7 +185,7 @@ class Playback(Coordinator):
         if of_drones:
             self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
         self.statistics.gate(gate.t_ns, wall_ns)
-        self.outbox.put(keys.CLOCK, self.clock_message())
+        self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
         for recorded in (m for m in gate.messages if m.key not in self._place and m.key != keys.FAULTS):
             if not (live and author(recorded) in live):
                 self._publish(recorded)

@@ -9,6 +9,7 @@ from zsim.contract import keys
 from zsim.contract.run_messages import Join
 from zsim.transport.session import Session
 from zsim_world.flight.barrier import Barrier
+from zsim_world.server.health_watch import HealthWatch
 
 BYE_NS = 100_000_000  # wall time by which a bye may come after the loss of its process's token
 RETURN_NS = 5_000_000_000  # wall time in which a process is back at a world that was started again; 1 s measured
@@ -33,10 +34,16 @@ class LivelinessMonitor:
         barrier: who takes part.
         handle_death: called with name and wall time of each death.
         take_in: reads what has arrived; a bye may be among it.
+        handle_silence: as for HealthWatch.
     """
 
     def __init__(
-        self, link: Session, barrier: Barrier, handle_death: Callable[[str, int], None], take_in: Callable[[], None]
+        self,
+        link: Session,
+        barrier: Barrier,
+        handle_death: Callable[[str, int], None],
+        take_in: Callable[[], None],
+        handle_silence: Callable[[str, int | None], None],
     ) -> None:
         self._link = link
         self._participants = barrier.participants
@@ -44,6 +51,7 @@ class LivelinessMonitor:
         self._take_in = take_in
         self._lost: deque[str] = deque()  # news of other threads: whose token seems lost
         self._checks: dict[str, _Check] = {}
+        self._health = HealthWatch(handle_silence)
         self._silent_s: dict[str, int] = {}  # of those that publish their health
 
     def token_lost(self, name: str) -> None:
@@ -53,6 +61,7 @@ class LivelinessMonitor:
     def health_received(self, name: str) -> None:
         """Note that a process has published its health."""
         self._silent_s[name] = 0
+        self._health.received(name, time.monotonic_ns())
 
     def count_second(self) -> None:
         """Count a second in which the world itself ran.
@@ -88,6 +97,10 @@ class LivelinessMonitor:
         """Check those processes of which it is time."""
         self._take_lost()
         now_ns = time.monotonic_ns()
+        for name in self._health.look(now_ns):
+            participant = self._participants.get(name)
+            if participant is None or not participant.alive:
+                self._health.forget(name)
         for name in [name for name, check in self._checks.items() if check.due_ns <= now_ns]:
             self._take_in()
             if name in self._checks:  # a join that was taken in settles it

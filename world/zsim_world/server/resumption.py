@@ -16,6 +16,7 @@ from zsim_world.server.run_journal import (
     Died,
     Entry,
     FalselyJoined,
+    FellSilent,
     GivenUp,
     Joined,
     Kept,
@@ -87,6 +88,8 @@ class Resumption:
                 self.world.handle_death(name, wall_ns)
             case Controlled(request):
                 self.world.control(messages.decode_as(ControlRequest, request, keys.CONTROL))
+            case FellSilent(name, since_wall_ns):
+                self.world.handle_silence(name, since_wall_ns)
             case GivenUp(name):
                 self.world.give_up_outputs(name)
             case Resumed(wall_ns, all_died):

@@ -113,7 +113,16 @@ class NotShown(Entry, tag=9):
     reason: str
 
 
-_Entry = Taken | Advanced | Died | Controlled | GivenUp | Kept | Resumed | Joined | FalselyJoined | NotShown
+class FellSilent(Entry, tag=10):
+    """That a process publishes its health no longer since a wall time, or does again."""
+
+    name: str
+    since_wall_ns: int | None
+
+
+_Entry = (
+    Taken | Advanced | Died | Controlled | GivenUp | Kept | Resumed | Joined | FalselyJoined | NotShown | FellSilent
+)
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(list[_Entry]).decode
 

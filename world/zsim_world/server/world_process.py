@@ -28,7 +28,7 @@ from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
 from zsim_world.server.pacing import Pacer, Pipelining
 from zsim_world.server.resumption import Resumption
-from zsim_world.server.run_journal import Advanced, Controlled, Died, Resumed, RunJournal
+from zsim_world.server.run_journal import Advanced, Controlled, Died, FellSilent, Resumed, RunJournal
 from zsim_world.server.world_inputs import TICK_S, MessageIntake, ProgressCallback, open_inputs
 from zsim_world.server.world_outputs import WorldOutputs
 
@@ -71,7 +71,9 @@ class WorldProcess:
         self._pacer = Pacer(world.clock)
         self._pipelining = Pipelining(world)
         self._outputs = WorldOutputs(link, world, self._history, self._on_message, self._journal)
-        self._liveliness = LivelinessMonitor(link, world.barrier, self._handle_death, self._take_in)
+        self._liveliness = LivelinessMonitor(
+            link, world.barrier, self._handle_death, self._take_in, self._handle_silence
+        )
         self._admission = Admission(AdminSpace(link), world, link.guarded, self._journal)
         self._intake = MessageIntake(
             link,
@@ -144,6 +146,11 @@ class WorldProcess:
         self._world.handle_death(name, wall_ns)
         if self._world.ended is None:
             self._journal.note(Died(wall_ns, name))
+
+    def _handle_silence(self, name: str, since_wall_ns: int | None) -> None:
+        self._world.handle_silence(name, since_wall_ns)
+        if self._world.ended is None:
+            self._journal.note(FellSilent(name, since_wall_ns))
 
     def _add_checkpoint(self, wall_ns: int) -> None:
         """Put the state of the run into the journal, now that nothing is pending."""

@@ -112,3 +112,31 @@ def test_what_a_process_said_is_shown_as_it_is(board, last_line):
     console = Console(file=io.StringIO(), width=200)
     console.print(table(board.rows()))
     assert f"ended ({last_line})" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_process_without_a_sign_of_life_is_shown_within_two_seconds(board, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    board.health({"name": "estimator.d1", "lag_ns": 0, "received": 100})
+    now[0] = 101.9
+    board.health({"name": "world", "lag_ns": 0, "received": 100})
+    assert has_terms(board.rows()[0]["state"], "no sign of life")
+
+
+def test_while_the_world_is_silent_only_the_world_is_said_to_be(board, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    world: Any = SimpleNamespace(name="world", host="h1", pid=8, state="running", code=None, restarts=0)
+    board.members = [*board.members, world]
+    board.health({"name": "estimator.d1", "lag_ns": 0, "received": 100})
+    board.clock(clock(1.0))
+    now[0] = 102.0
+    states = [row["state"] for row in board.rows()]
+    assert states[0] == "running"
+    assert has_terms(states[1], "no sign of life", "2 s")
+
+
+def test_who_waits_for_another_s_outputs_is_not_the_one_waited_for(board):
+    waiting = {"name": "estimator.d1", "host": "h1", "since_wall_s": 3.2, "held_by": ["planner.d1"]}
+    board.clock(clock(1.0, waiting_for=[waiting]))
+    assert board.rows()[0]["state"] == "waits for planner.d1"

@@ -33,6 +33,7 @@ class Case:
             self.world.barrier,
             self.world.handle_death,
             lambda: self.take_in(),
+            self.world.handle_silence,
         )
         self.period_ns = period_ns
         self.join(incarnation=1, pid=7)

@@ -1,23 +1,30 @@
-"""Time is stopped by nobody who does not take part: joins that nobody is behind."""
+"""Time is stopped by nobody who does not take part, and who stops it is named."""
+
+import signal
 
 from federation import PAIR, Federation
 from wire import Client, Subscription
 
-CONTROLLER, VISITOR = "controller.main", "tester.one"
+CONTROLLER, ESTIMATOR, VISITOR = "controller.main", "estimator.drone1", "tester.one"
 GATE_NS = 20_000_000
 
 
 class Watched:
     """PAIR under way, and what a stranger sees of it."""
 
-    def __init__(self, federation: Federation) -> None:
-        self.federation = federation
-        self.run = federation.run(PAIR, "--rate", "4", "--duration", "100000")
+    def __init__(self, federation: Federation, *pace: str) -> None:
+        self._federation = federation
+        self.run = federation.run(PAIR, *(pace or ("--rate", "4")), "--duration", "100000")
         self.client: Client = federation.client()
         self.clock: Subscription = self.client.subscribe("clock")
         self.events: Subscription = self.client.subscribe("world/event")
         self.info = self.client.info()
         self.clock.until(lambda m: m["t_ns"] >= 1e9)
+
+    def stop(self, name: str) -> None:
+        """Stop a process that has shown a sign of life."""
+        self.client.subscribe(f"process/{name}/health").until(lambda m: True)
+        self._federation.kill(name, signal.SIGSTOP)
 
     def join_as(self, name: str, **about: object) -> None:
         """Publish a join, and nothing else: no token, no done."""
@@ -70,4 +77,38 @@ def test_who_takes_a_place_and_does_nothing_gives_it_back(federation: Federation
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("death", CONTROLLER))
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("restart", CONTROLLER))
     token.undeclare()
+    watched.flies_on()
+
+
+# Who is stopped
+
+
+def test_a_stopped_estimator_is_named_and_not_the_controller_that_waits_for_it(federation: Federation) -> None:
+    watched = Watched(federation)
+    watched.stop(ESTIMATOR)
+    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent", ESTIMATOR))
+    standing = watched.clock.until(lambda m: len(m["waiting_for"]) == 2).message["waiting_for"]
+    assert {w["name"]: w["held_by"] for w in standing} == {ESTIMATOR: [], CONTROLLER: [ESTIMATOR]}
+    watched.run.line(f"waiting for {ESTIMATOR} on [^,]*$")
+    federation.kill(ESTIMATOR, signal.SIGCONT)
+    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent_end", ESTIMATOR))
+    watched.flies_on()
+
+
+def test_a_stopped_recorder_is_named_in_realtime(federation: Federation) -> None:
+    watched = Watched(federation, "--realtime")
+    watched.stop("recorder")
+    watched.clock.until(lambda m: [w["name"] for w in m["waiting_for"]] == ["recorder"])
+    watched.run.line("silent: recorder")
+    federation.kill("recorder", signal.SIGCONT)
+    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent_end", "recorder"))
+    watched.flies_on()
+
+
+def test_a_stopped_world_is_named(federation: Federation) -> None:
+    watched = Watched(federation)
+    watched.stop("world")
+    watched.run.line(f"world .pid {federation.pid('world')}. shows no sign of life")
+    federation.kill("world", signal.SIGCONT)
+    watched.run.line("world .* is back")
     watched.flies_on()
