@@ -55,8 +55,10 @@ class Resumption:
         world.keep_truth(self.journal.keep_truth, self.journal.truth(checkpoint.truth_bytes))
         if checkpoint.state is not None:
             self._restore(world, checkpoint.state)
+        self.intake.replaying = True
         for entry in self.journal.entries():
             self._hand(entry)
+        self.intake.replaying = False
         self.outputs.gather()
         self.outputs.forget()
         return True

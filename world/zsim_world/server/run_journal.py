@@ -120,11 +120,10 @@ class FellSilent(Entry, tag=10):
     since_wall_ns: int | None
 
 
-_Entry = (
-    Taken | Advanced | Died | Controlled | GivenUp | Kept | Resumed | Joined | FalselyJoined | NotShown | FellSilent
-)
+_OfWorld = Advanced | Kept | Resumed
+_OfOthers = Taken | Died | Controlled | GivenUp | Joined | FalselyJoined | NotShown | FellSilent
 _encode = msgspec.msgpack.Encoder().encode
-_decode = msgspec.msgpack.Decoder(list[_Entry]).decode
+_decode = msgspec.msgpack.Decoder(list[_OfWorld | _OfOthers]).decode
 
 
 class _Head(msgspec.Struct, array_like=True):

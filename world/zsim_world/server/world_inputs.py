@@ -191,6 +191,7 @@ class MessageIntake:
     health: HealthMeter  # counts what is received and refused
     progress: ProgressCallback
     journal: RunJournal
+    replaying: bool = False  # what another incarnation of the world has taken
     phase: str = ""  # of the cluster whose state was read last
     _states: Counter[str] = field(default_factory=Counter[str])
 
@@ -239,7 +240,7 @@ class MessageIntake:
         self.history.add(key, payload, message.t_ns)
         if type(message) is not run_messages.Join:  # that is for `take` to admit, or for the journal to repeat
             self.world.handle(key, message, wall_ns)
-        if type(message) is run_messages.Health:
+        if type(message) is run_messages.Health and not self.replaying:
             self.liveliness.health_received(keys.thing(key))
             self.progress("health", message, keys.thing(key))
 
