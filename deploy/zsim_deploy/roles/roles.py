@@ -5,7 +5,6 @@ The console and the gateway are of the latter kind.
 
 import gc
 import os
-import re
 import signal
 import sys
 import time
@@ -16,7 +15,7 @@ from pathlib import Path
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import NoWorldError, RecordError, SessionError, SupersededError, printable
+from zsim.errors import NoWorldError, SessionError, SupersededError, printable
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
 from zsim.runtime.runner import Runner
@@ -33,10 +32,9 @@ from zsim_agents.hosting import agent_class, chosen, hosted, made
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.process_identity import check_certificate
+from zsim_deploy.roles.record_folder import RECORD, make, record_folder
 from zsim_deploy.roles.stop_channel import StopChannel
 
-RECORD = "run.mcap"
-RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # an id of a run that is part of a folder's name
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
 ANY = "*"  # in a name, for a number
@@ -121,37 +119,16 @@ def recorder(out: Path, reach: WorldAccess) -> None:
     launched, who = reach.launched, reach.who._replace(process=RECORDER)
     stop = StopChannel(launched, who)
     say = log_printer(launched)
-    _make(out.parent if RUN_ID in out.name else out)
+    make(out.parent if RUN_ID in out.name else out)
     connection = find_world(reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, True, launched, who)
     with connection as (link, info):
         folder = record_folder(out, info.run_id)
-        _make(folder)
+        make(folder)
         path = folder / RECORD
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned)
     say(f"recorder: {path}: {'closed' if launched else record_completeness(path)}, {reason}")
     stop.exit_if_terminated()
-
-
-def record_folder(out: Path, run_id: str) -> Path:
-    """Return the folder of a run's record.
-
-    Raises:
-        RecordError: the id, which the world gives, would lead to another folder.
-    """
-    if RUN_ID not in out.name:
-        return out
-    if not RUN_NAME.fullmatch(run_id):
-        allowed = f"must be 1 to 64 of A-Z a-z 0-9 _ -; give --out without {RUN_ID}"
-        raise RecordError(f"{out}: run is {run_id[:40]!r}; {allowed}")
-    return out.with_name(out.name.replace(RUN_ID, run_id))
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
 
 
 def router(
