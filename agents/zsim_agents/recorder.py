@@ -11,7 +11,7 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -37,6 +37,7 @@ TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
 REPLAY_S = 5.0  # a hub answers within milliseconds
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
 STOP_DRAIN_S = 0.5  # after a stop is requested, how long the end of the run is waited for: both may be stopped at once
+QUIET_S = 1.5  # a world whose time stands publishes its clock once a second
 FLUSH_NS = 1_000_000_000  # simulated time after which what was taken is put on disk
 REPEATED_NS = 1_000_000_000  # simulated, after catching up, in which others may repeat what they had published before
 SLACK_NS = 4_000_000_000  # that the world may be ahead of it; its history has 5 s
@@ -98,6 +99,7 @@ class Recorder:
         self._successor: str | None = None
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
+        self._quiet_since_s: float | None = None  # since when no clock has come, after a lost link in realtime
         self._now_ns = 0
         self._on_disk_ns = 0  # when everything taken was put there last
         self._incarnation = secrets.randbits(62)
@@ -163,7 +165,10 @@ class Recorder:
         self._must_look = False
         if info.run_id != self._info.run_id:
             return True
-        self._fetch_missed()
+        if self._info.mode == "lockstep":
+            self._fetch_missed()
+        else:  # the world may be far ahead of what is on its way
+            self._quiet_since_s = time.monotonic()
         self._join_again()
         return False
 
@@ -175,6 +180,7 @@ class Recorder:
             self._write_arrived(arrived)
             time.sleep(PAUSE_S)
             self._write_arrived(self._traffic.drain())
+            self._fetch_when_quiet()
             for sample in self._views.drain():
                 self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
@@ -223,11 +229,17 @@ class Recorder:
             if clock is not None and clock.state == "stopped":
                 self._ended_s = time.monotonic()
 
-    def _fetch_missed(self) -> None:
-        """Write what passed since the newest message on record, as far as the world still has it."""
+    def _fetch_missed(self, before: run_messages.Clock | None = None) -> None:
+        """Write what passed since the newest message on record, or up to a clock, as far as the world still has it."""
         self._writer.flush()
         self._known.add_tail(self._writer.path)
-        self._catch_up()
+        self._catch_up(before)
+
+    def _fetch_when_quiet(self) -> None:
+        """Fetch what nothing comes after, as the end of the run, when no clock has come since a link is back."""
+        if self._quiet_since_s is not None and time.monotonic() - self._quiet_since_s > QUIET_S:
+            self._quiet_since_s = None
+            self._fetch_missed()
 
     def _write_arrived(self, arrived: Iterable[Passed]) -> None:
         """Write what has arrived; where gates are missing before it, what the world still has of them comes first.
@@ -240,7 +252,7 @@ class Recorder:
             if isinstance(passed, ReceivedSample) and passed.key == keys.CLOCK:
                 clock = self._clock_in(passed.payload)
                 if clock is not None and self._gates.gap_before(clock) and self._reaches_run():
-                    self._fetch_missed()
+                    self._fetch_missed(clock)
                 self._write_all(held)
                 held.clear()
         self._write_all(held)
@@ -254,17 +266,30 @@ class Recorder:
         for passed in held:
             self._write_passed(passed)
 
-    def _catch_up(self) -> None:
+    def _catch_up(self, before: run_messages.Clock | None = None) -> None:
         """Write what was published while this process was not there: the world keeps it for a while."""
         self._caught_up = False
         while not self._caught_up and not self._stopped():
             try:
-                for key, payload in replay(self._link, self._name, -1, ["**"], REPLAY_S):
+                for key, payload in self._replayed(before):
                     self._write(key, payload)
                     self._known.add(key, payload)
                 self._caught_up, self._known_until_ns = True, self._now_ns + REPEATED_NS
             except NoWorldError:
                 self._over.wait(TICK_S)
+
+    def _replayed(self, before: run_messages.Clock | None) -> Iterator[tuple[str, bytes]]:
+        """Yield what the world replays, up to a clock that has arrived: what came after that is on its way as well."""
+        held: list[tuple[str, bytes]] = []
+        for entry in replay(self._link, self._name, -1, ["**"], REPLAY_S):
+            held.append(entry)
+            clock = self._clock_in(entry[1]) if before is not None and entry[0] == keys.CLOCK else None
+            if before is not None and clock is not None and clock.seq >= before.seq:
+                yield from held[:-1] if clock.seq == before.seq else ()
+                return
+            if before is None or clock is not None:
+                yield from held
+                held.clear()
 
     def _write_lasting(self) -> None:
         """Write of what run this is, and the newest faults: published long ago, the replay has them no longer."""
@@ -328,6 +353,8 @@ class Recorder:
         clock = self._count(payload)
         if clock is None:
             return
+        if self._quiet_since_s is not None:
+            self._quiet_since_s = time.monotonic()
         if clock.state == "stopped" and self._ended_s is None:
             self._ended_s = time.monotonic()
         elif self._caught_up and clock.t_ns > self._known_until_ns:

@@ -294,6 +294,37 @@ def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path
     assert (found.complete, found.gates, found.gates_missing, found.messages_missing) == (False, 7, 5, 5)
 
 
+def test_a_world_that_is_far_ahead_changes_no_order_and_doubles_nothing(tmp_path: Path):
+    """It replays gates that are on their way still, behind the ones that are missing."""
+    path, last = tmp_path / "run.mcap", dict([pair(keys.INFO, INFO)])
+    on_their_way = [each for gate in range(5, 30) for each in whole(gate)]
+    found = recorded(path, [page(gates(0)), page(gates(20, 21, 22, 23))], on_their_way, [clock(30)], last=last)
+    with RecordReader(path) as reader:
+        written = [message.t_ns // GATE_NS for message in reader.messages([IMU], by_time=False)]
+    assert written == [0, *range(5, 30)] == stamps(found, IMU)
+    assert completed(path).gaps[0] == GateGap(4, GATE_NS, 4 * GATE_NS)
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_the_end_of_a_run_that_passed_while_the_link_was_lost_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+):
+    monkeypatch.setattr(recorder, "QUIET_S", 0.0)
+    path, link, info = tmp_path / "run.mcap", FakeLink(), replace(INFO, mode=mode)
+    replays = iter([page(gates(0)), page([*gates(0, 1, 2), clock(3, "stopped")])])
+    link.on_request = lambda key, args: next(replays)
+    link.last = dict([pair(keys.INFO, info)])
+
+    def cut(key: str, payload: bytes) -> None:
+        if key == "process/recorder/join" and len(link.published_on(key)) == 1:
+            link.cut(False)
+            link.cut(True)
+
+    link.on_publish = cut
+    assert record(link, info, path) == RUN_ENDED  # type: ignore[arg-type]
+    assert completed(path).complete
+
+
 def test_another_run_is_not_asked_for_gates_that_are_missing(tmp_path: Path):
     path, link = tmp_path / "run.mcap", FakeLink()
     replays = iter([page(gates(0))])
