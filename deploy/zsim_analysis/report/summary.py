@@ -58,14 +58,6 @@ class ClusterErrors(Struct, frozen=True):
     errors: dict[str, ParameterErrors]
 
 
-class GapLine(Struct, frozen=True):
-    """Gates that are missing one behind the other, with the times of the first and the last of them."""
-
-    gates: int
-    from_s: float
-    to_s: float
-
-
 class RecordFacts(Struct, frozen=True):
     """What the report was made from.
 
@@ -74,7 +66,7 @@ class RecordFacts(Struct, frozen=True):
         state: that, and what is missing, in words.
         gates: on record.
         gates_missing: by the clocks.
-        gaps: where these are.
+        gaps: `gates` that are missing one behind the other, `from_s` the first of them `to_s` the last.
         messages_missing: of the world, by their numbers.
         undecoded: messages that are not of the type of their key.
         truth_instants: truth messages that went into the hash.
@@ -87,7 +79,7 @@ class RecordFacts(Struct, frozen=True):
     state: str
     gates: int
     gates_missing: int
-    gaps: list[GapLine]
+    gaps: list[dict[str, float]]
     messages_missing: int
     undecoded: int
     truth_instants: int
@@ -183,7 +175,7 @@ def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
         state=str(state),
         gates=state.gates,
         gates_missing=state.gates_missing,
-        gaps=[GapLine(gap.gates, gap.from_ns / 1e9, gap.to_ns / 1e9) for gap in state.gaps],
+        gaps=[{"gates": g.gates, "from_s": g.from_ns / 1e9, "to_s": g.to_ns / 1e9} for g in state.gaps],
         messages_missing=state.messages_missing,
         undecoded=flight.undecoded,
         truth_instants=len(t_ns),
