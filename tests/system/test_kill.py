@@ -20,6 +20,7 @@ GATE_NS = 20_000_000
 ENGAGED_NS, END_NS = 6_000_000_000, 12_000_000_000
 LATE_NS = 7_900_000_000  # of 8 s
 FROZEN_S = 14  # longer than LEASE_READER_MS
+IN_FLIGHT = r" [1-9][0-9]*\.[0-9] . 100000 s"  # a line of progress after the first second
 UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes waits half a second or more in a recorder
 
 
@@ -330,7 +331,7 @@ def test_a_terminal_that_is_closed(federation: Federation, options: tuple[str, .
     where = options or ("--listen", federation.endpoint)
     command = ["run", federation.write(PAIR), "--out", str(federation.out), "--duration", "100000", *where]
     run = federation.start(*command, prefix=("env", "--default-signal=HUP"))  # the tests may run under nohup
-    run.line("10.* real time")
+    run.line(IN_FLIGHT)
     run.signal(signal.SIGHUP)
     run.signal(signal.SIGHUP)  # shells send it more than once
     run.ends(with_code=130)
@@ -347,7 +348,7 @@ def test_a_pipe_that_nobody_reads_any_more(federation: Federation, tmp_path: Pat
     where = options or ("--listen", federation.endpoint)
     command = ["run", federation.write(PAIR), "--out", str(federation.out), "--duration", "100000", *where]
     code = tmp_path / "code"
-    piped = '{ "$@" 2>&1; echo $? >"$0"; } | sed "/10.* real time/q"'
+    piped = '{ "$@" 2>&1; echo $? >"$0"; } | sed -E "/' + IN_FLIGHT + '/q"'
     federation.start(*command, prefix=("sh", "-c", piped, str(code))).ends(with_code=0)
     assert code.read_text() == "130\n"
     federation.nobody_left()
