@@ -117,6 +117,15 @@ def test_wait(federation: Federation, name: str) -> None:
     assert [event["subject"] for event in check_end(federation, whole=True).events("restart")] == [name]
 
 
+def test_who_does_not_come_back_in_its_time_ends_the_run(federation: Federation) -> None:
+    flight = Flight(federation, "--set", "processes.on_death={estimator: wait}", "--set", "processes.return_s=1.5")
+    federation.kill("estimator.drone1")
+    flight.event("overdue", "estimator.drone1")
+    flight.run.ends(with_code=1)
+    assert "estimator.drone1 has not come back within 1.5 s" in flight.run.text()
+    assert (federation.out / "journal").exists()
+
+
 @pytest.mark.parametrize("name", [pytest.param("estimator.drone1", marks=pytest.mark.soak), "controller.main"])
 def test_drop(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: drop}}")

@@ -203,6 +203,7 @@ class Processes(Spec, frozen=True, kw_only=True):
 
     expect: list[Name] | None = None
     on_death: dict[str, OnDeath] = {}
+    return_s: Positive | None = None  # wall; how long one that is to come back may stay away
     snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s for who goes on
 
 

@@ -27,6 +27,7 @@ STATE_COLOURS = {
 EVENT_COLOURS = {
     "refused": RED,
     "death": RED,
+    "overdue": RED,
     "silent": RED,
     "no_show": RED,
     "collision": RED,

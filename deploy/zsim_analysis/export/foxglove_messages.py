@@ -61,6 +61,7 @@ LEVELS = {  # of events; the others are information
     "outputs_missing": LogLevel.Warning,
     "fault": LogLevel.Warning,
     "death": LogLevel.Error,
+    "overdue": LogLevel.Error,
     "collision": LogLevel.Error,
     "diverged": LogLevel.Error,
 }

@@ -139,6 +139,8 @@ class Supervisor:
         self._show.event(event)
         if event["kind"] == "end":
             self._reason = self._reason or event["text"]
+        elif event["kind"] == "overdue":
+            self._fail(event["text"])
         elif event["kind"] == "death" and event["data"].get("on_death") == "end":
             self._fail(f"{event['subject']} died")
         elif event["kind"] == "death" and event["data"].get("on_death") == "restart":

@@ -205,6 +205,20 @@ class Coordinator(ABC):
         if action == "end":
             self.clock.stop(f"{name} died")
 
+    def overdue(self, wall_ns: int) -> str | None:
+        """Return who has died and had its time to come back, None if nobody has."""
+        return_s = self.scenario.processes.return_s
+        if return_s is None:
+            return None
+        dead = (p for p in self.barrier.participants.values() if not p.alive and self._on_death(p) in RETURNS)
+        return next((p.name for p in dead if wall_ns - p.since_wall_ns > return_s * 1e9), None)
+
+    def handle_overdue(self, name: str) -> None:
+        """End the run for a process that has not come back in its time."""
+        text = f"{name} has not come back within {self.scenario.processes.return_s:g} s"
+        self.outbox.event("overdue", name, text)
+        self.clock.stop(text)
+
     def handle_silence(self, name: str, since_wall_ns: int | None) -> None:
         """Take it that a process publishes its health no longer, since its last; or does again (None)."""
         participant = self.barrier.participants.get(name)

@@ -267,6 +267,8 @@ class WorldProcess:
         while self._queries:
             self._serve(self._queries.popleft())
         self._liveliness.check_due()
+        if name := self._world.overdue(time.monotonic_ns()):
+            self._world.handle_overdue(name)
         self._admission.check_due(time.monotonic_ns())
         if self.health.due():
             self._liveliness.count_second()
