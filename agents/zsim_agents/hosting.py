@@ -66,6 +66,26 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
         raise ScenarioError(faults)
 
 
+def check_plans(scenario: Scenario, source: str) -> None:
+    """Refuse a scenario with a plan that its controller would refuse: an expression, a name, a template.
+
+    A run leaves this to its controllers, which load the mathematics of formations anyway.
+
+    Raises:
+        ScenarioError: the reasons, a line for each cluster.
+    """
+    from zsim_agents.formation.engagement_setup import check_plan
+
+    faults = []
+    for cluster in scenario.clusters:
+        try:
+            check_plan(scenario, cluster)
+        except RunError as error:
+            faults.append(f"{source}: {error}")
+    if faults:
+        raise ScenarioError(faults)
+
+
 def _formation_classes(scenario: Scenario, source: str) -> Iterator[Callable[[], Any]]:
     """Yield what loads each cluster space and control law that is a class of the user's own."""
     for cluster in scenario.clusters:

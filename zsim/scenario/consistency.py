@@ -12,7 +12,7 @@ import numpy as np
 from zsim.contract import messages
 from zsim.scenario import fault_check
 from zsim.scenario.fault_kinds import kinds_of
-from zsim.scenario.obstacle import nearest, row_of
+from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, space_name
 from zsim.schema.checker import Fault, show
@@ -119,6 +119,8 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
     """Yield what is wrong with obstacles: names, sizes, and drones that start in one."""
     yield from _name_faults("environment.obstacles", obstacles)
     names = _names(drones)
+    placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
+    starts = [(index, drone.position_m, _clearance_m(drone, vehicles)) for index, drone in placed]
     for index, obstacle in obstacles:
         path = f"environment.obstacles[{index}]"
         if obstacle.name in names:
@@ -134,17 +136,17 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
             if name not in wanted:
                 yield f"{path}.{name}", f"is given; must be left out of a {obstacle.shape}"
         if sorted(fields) == sorted(wanted) and _known(obstacle.position_m, obstacle.yaw_deg):
-            yield from _buried_faults(obstacle, drones, vehicles)
+            yield from _buried_faults(obstacle, starts)
 
 
-def _buried_faults(obstacle: Any, drones: _Entries, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
+def _buried_faults(obstacle: Any, starts: list[tuple[int, Any, float]]) -> Iterator[Fault]:
+    """Yield the drones that start in an obstacle or too near; `starts` has index, place and clearance of each."""
     row = row_of(obstacle)
-    for index, drone in drones:
-        if drone.position_m is not None:
-            distance, least = nearest(row, *drone.position_m)[0], _clearance_m(drone, vehicles)
-            if distance < least:
-                place = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
-                yield f"drones[{index}].position_m", f"{place}; must be >= {least:g} m"
+    x, reach = row[CENTRE], sum(row[HALF:])  # no point of it is farther from its centre, whatever its yaw
+    for index, p_W, least in starts:
+        if abs(p_W[0] - x) < reach + least and (distance := nearest(row, *p_W)[0]) < least:
+            place = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
+            yield f"drones[{index}].position_m", f"{place}; must be >= {least:g} m"
 
 
 def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, get_args
 
 from msgspec import Struct, structs
@@ -10,6 +11,7 @@ from zsim.scenario.scenario import Document
 from zsim.schema.checker import show
 
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
+PATH_MAX = 1000  # characters; the longest of a scenario has a tenth of that
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # one step of a path: a word, or anything between brackets
 _FIRST = re.compile(r"[^.\[\]]+")
 _PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
@@ -24,6 +26,8 @@ def apply(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> s
         parse: turns the text of a value into the value; its ValueError says what is wrong.
     """
     path, equals, value_text = text.partition("=")
+    if len(path) > PATH_MAX:
+        return f"{_name(text)}: is a path of {len(path)} characters; must have at most {PATH_MAX}"
     if not equals or not _PATH.fullmatch(path):
         return f"{_name(text)}: is no assignment; must be {SYNTAX}"
     try:
@@ -52,6 +56,7 @@ def whole_path(path: str) -> str:
     return f"{owners[0]}.{path}" if len(owners) == 1 else path
 
 
+@cache
 def _fields(kind: Any) -> Sequence[Any]:
     """Return the fields of a section, none of any other type; a section may be one that need not be given."""
     sections = [each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, Struct)]

@@ -18,7 +18,12 @@ TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to na
 DRONES_MAX = 1000  # one world integrates them all
 OBSTACLES_MAX = 1000  # every drone is compared with each, in every step
 FAULTS_MAX = 1000  # injected ones, planned and active; each is looked at wherever one begins or ends
+CLUSTERS_MAX = DRONES_MAX // 2  # each has two drones at least, which no other has
+PROCESSES_MAX = 4 * DRONES_MAX  # an estimator a drone, a controller a cluster, and twice as many of a user's own
+WAYPOINTS_MAX = 10_000  # an hour of them at 3 a second
+CONSTANTS_MAX = 100  # of a user, for the expressions of a trajectory
 ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
+VARIABLES_MAX = 4 * ROBOTS_MAX  # of a formation: four a robot
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
 Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
@@ -114,25 +119,29 @@ class Gains(Spec, frozen=True, kw_only=True):
     separation_alarm_m: NonNegative = 1.5  # about three hulls
 
 
+Values = Annotated[dict[str, Real], Meta(max_length=VARIABLES_MAX)]
+"""Numbers by the names of a formation's variables."""
+
+
 class Waypoint(Spec, frozen=True, kw_only=True):
     at_s: NonNegative
-    values: dict[str, Real]
+    values: Values
 
 
 class Trajectory(Spec, frozen=True, kw_only=True):
     """A reference as expressions of t (seconds since `start_s`) or as waypoints."""
 
     start_s: NonNegative = 0.0
-    constants: dict[str, Real] = {}
-    expressions: dict[str, str] = {}
-    waypoints: list[Waypoint] = []
+    constants: Annotated[dict[str, Real], Meta(max_length=CONSTANTS_MAX)] = {}
+    expressions: Annotated[dict[str, str], Meta(max_length=VARIABLES_MAX)] = {}
+    waypoints: Annotated[list[Waypoint], Meta(max_length=WAYPOINTS_MAX)] = []
 
 
 class ClusterPlan(Spec, frozen=True, kw_only=True):
     """What the controller does by itself."""
 
     takeoff_s: NonNegative | None = None
-    target: dict[str, Real] = {}
+    target: Values = {}
     target_over_s: Positive | None = None
     trajectory: Trajectory | None = None
     land_s: NonNegative | None = None
@@ -143,6 +152,7 @@ SpaceName = Annotated[
     Meta(pattern=rf"^(triad|template)\Z|{CLASS_NAME}", description="one of triad, template, or package.module:Class"),
 ]
 """How the variables of a formation follow from its robots; a robot is a drone, or a group of them."""
+Template = Annotated[list[Vector3], Meta(max_length=ROBOTS_MAX)]
 LawName = Annotated[
     str, Meta(pattern=rf"^proportional\Z|{CLASS_NAME}", description="one of proportional, or package.module:Class")
 ]
@@ -154,17 +164,17 @@ class ClusterGroup(Spec, frozen=True, kw_only=True):
     name: Name
     size: Annotated[int, Meta(ge=2)]
     space: SpaceName | None = None
-    template_m: list[Vector3] = []
+    template_m: Template = []
 
 
 class Cluster(Spec, frozen=True, kw_only=True):
     name: Name
     drones: Annotated[list[Name], Meta(min_length=2, max_length=ROBOTS_MAX)]
-    groups: list[ClusterGroup] = []
+    groups: Annotated[list[ClusterGroup], Meta(max_length=ROBOTS_MAX // 2)] = []
     """Empty: every drone is a robot of the cluster by itself."""
     space: SpaceName | None = None
     """None: see `space_name`."""
-    template_m: list[Vector3] = []
+    template_m: Template = []
     """Places of the robots, x ahead and y left of the formation; empty: as they stand at the start."""
     law: LawName | UnsetType = UNSET
     """Unset: proportional. Left out of the resolved text then, which names the scenario by its hash."""
@@ -201,8 +211,8 @@ class Estimation(Spec, frozen=True, kw_only=True):
 class Processes(Spec, frozen=True, kw_only=True):
     """Who takes part. `expect: null` means an estimator per drone and a controller per cluster."""
 
-    expect: list[Name] | None = None
-    on_death: dict[str, OnDeath] = {}
+    expect: Annotated[list[Name], Meta(max_length=PROCESSES_MAX)] | None = None
+    on_death: Annotated[dict[str, OnDeath], Meta(max_length=PROCESSES_MAX)] = {}
     return_s: Positive | None = None  # wall; how long one that is to come back may stay away
     snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s for who goes on
 
@@ -233,7 +243,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
     environment: Environment = Environment()
     silence: Silence = Silence()
     drones: Annotated[list[Drone], Meta(min_length=1, max_length=DRONES_MAX)]
-    clusters: list[Cluster] = []
+    clusters: Annotated[list[Cluster], Meta(max_length=CLUSTERS_MAX)] = []
     estimation: Estimation = Estimation()
     processes: Processes = Processes()
     faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []

@@ -3,6 +3,7 @@
 import hashlib
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,12 @@ from zsim.scenario import overrides as override
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.scenario import DRONES_MAX, Document, Scenario
 from zsim.schema import plugin, yaml_file
-from zsim.schema.checker import Fault, faults, sound
+from zsim.schema.checker import Fault, faults, first_lines, sound
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
 from zsim.vehicles import vehicle_catalogue
 from zsim.vehicles.vehicle import DEFAULTS, Vehicle
 
 EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
-FAULTS_MAX = 100  # lines; what follows is counted
 
 
 def load(path: str | Path, overrides: Iterable[str] = (), **values: Any) -> Scenario:
@@ -53,17 +53,12 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
 def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenario:
     vehicles, unknown = _vehicles(document)
     document, unsound = _separate_sensors(_expand_presets(document, vehicles))
-    flaws = [*faults(document, Document), *unknown, *unsound, *cross_faults(sound(document, Scenario), vehicles)]
-    lines += [f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws]
-    if lines:
-        raise ScenarioError(_shortened(lines))
+    flaws = chain(faults(document, Document), unknown, unsound, cross_faults(sound(document, Scenario), vehicles))
+    found = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
+    if found:
+        raise ScenarioError(found)
     del document["sensors"]
     return msgspec.convert(document, Scenario)
-
-
-def _shortened(lines: list[str]) -> list[str]:
-    more = len(lines) - FAULTS_MAX
-    return [*lines[:FAULTS_MAX], f"… and {more} more faults"] if more > 0 else lines
 
 
 def from_text(text: str) -> Scenario:
@@ -92,7 +87,8 @@ def _vehicles(document: dict[str, Any]) -> tuple[dict[str, Vehicle], list[Fault]
     """
     vehicles, unknown = dict(vehicle_catalogue.STOCK), []
     drones = document.get("drones")
-    for index, drone in enumerate(drones if isinstance(drones, list) else ()):
+    entries = drones if isinstance(drones, list) and len(drones) <= DRONES_MAX else []
+    for index, drone in enumerate(entries):
         model = drone.get("model") if isinstance(drone, dict) else None
         if isinstance(model, str) and model not in vehicles and not _is_resolved(drone):
             try:

@@ -6,8 +6,9 @@ msgspec stops at the first fault; a user who corrects a scenario needs them all 
 import math
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
+from itertools import islice
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,8 @@ import msgspec
 from msgspec import inspect as types
 
 SHOWN_MAX = 60  # characters of what was found that fit into a line
+FAULTS_MAX = 100  # lines; further faults are counted
+COUNTED_MAX = 10_000  # of further faults: a document of 1 MB can have many more, each of which takes time
 NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # of the representation only
 
 Fault = tuple[str, str]
@@ -29,6 +32,14 @@ def faults(value: Any, description: Any, path: str = "") -> Iterator[Fault]:
 def first_fault(value: Any, description: Any) -> Fault | None:
     """Return the first place where `value` does not fit, None if it does."""
     return next(faults(value, description), None)
+
+
+def first_lines(lines: Iterable[str]) -> list[str]:
+    """Return the lines of the first faults, and one with how many more there are, as far as they are counted."""
+    rest = iter(lines)
+    first = list(islice(rest, FAULTS_MAX))
+    more = sum(1 for _ in islice(rest, COUNTED_MAX))
+    return [*first, f"… and {'at least ' if more == COUNTED_MAX else ''}{more} more faults"] if more else first
 
 
 def sound(value: Any, description: Any) -> Any:
@@ -102,13 +113,17 @@ def _check_list(value: Any, info: types.ListType | types.VarTupleType, path: str
     if not isinstance(value, list | tuple):
         yield path, f"is {show(value)}; must be a list"
         return
-    least, most = info.min_length or 0, info.max_length
-    if len(value) < least or (most is not None and len(value) > most):
-        yield path, f"has {len(value)} entries; must have {_length(least, most)}"
-    if most is not None and len(value) > most:
+    yield from _length_fault(value, info, path)
+    if len(value) > (info.max_length or len(value)):
         return
     for index, item in enumerate(value):
         yield from _check(item, info.item_type, f"{path}[{index}]")
+
+
+def _length_fault(value: Any, info: types.ListType | types.VarTupleType | types.DictType, path: str) -> Iterator[Fault]:
+    least, most = info.min_length or 0, info.max_length
+    if len(value) < least or (most is not None and len(value) > most):
+        yield path, f"has {len(value)} entries; must have {_length(least, most)}"
 
 
 def _length(least: int, most: int | None) -> str:
@@ -128,6 +143,9 @@ def _check_tuple(value: Any, info: types.TupleType, path: str) -> Iterator[Fault
 def _check_dict(value: Any, info: types.DictType, path: str) -> Iterator[Fault]:
     if not isinstance(value, dict):
         yield path, f"is {show(value)}; must be a map"
+        return
+    yield from _length_fault(value, info, path)
+    if len(value) > (info.max_length or len(value)):
         return
     for key, item in value.items():
         where = field_path(path, key)

@@ -1,21 +1,30 @@
 """YAML documents that people write: read with a limit, one line per fault, no aliases, no tags, words of YAML 1.2."""
 
 import re
-from collections.abc import Iterable
-from itertools import product
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
-from yaml.composer import ComposerError
-from yaml.constructor import ConstructorError
-from yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
+from yaml.error import MarkedYAMLError
+from yaml.events import (
+    AliasEvent,
+    DocumentEndEvent,
+    DocumentStartEvent,
+    MappingEndEvent,
+    ScalarEvent,
+    SequenceEndEvent,
+    SequenceStartEvent,
+    StreamEndEvent,
+    StreamStartEvent,
+)
 
 from zsim.errors import DocumentError
 from zsim.schema.checker import show
 
-FILE_SIZE_MAX = 1_000_000  # bytes; a scenario of 1000 drones with every field given is below this
-DEPTH_MAX = 50  # of what C code reads; a scenario has 6
+FILE_SIZE_MAX = 4_000_000  # bytes; a resolved scenario of 1000 drones has 2.2 million
+VALUES_MAX = 400_000  # keys and values of a document; a resolved scenario of 1000 drones has 280 000, read in 1 s
+DEPTH_MAX = 50  # of maps and lists; a scenario has 6
 
 
 def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any]:
@@ -62,8 +71,7 @@ def dump(plain: Any) -> str:
 def value(text: str) -> Any:
     """Return the content of a YAML text; ValueError, a line long, if it is not YAML."""
     try:
-        _check_events(text)
-        return yaml.load(text, Loader=_Loader)
+        return _Reader(text).document()
     except RecursionError:
         raise ValueError("is nested too deep") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:
@@ -73,62 +81,116 @@ def value(text: str) -> Any:
         raise ValueError(f"{where}is not YAML ({problem[:100]})") from error
 
 
-def _check_events(text: str) -> None:
-    """Refuse aliases, which can expand without end, tags, and a depth for which C code has no limit of its own."""
-    depth = 0
-    events: Iterable[Any] = yaml.parse(text, Loader=_Base)
-    for event in events:
-        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-        if depth > DEPTH_MAX:
-            raise RecursionError
-        if isinstance(event, AliasEvent):
-            raise _refusal("aliases are not allowed", event)
-        if getattr(event, "tag", None) is not None:
-            raise _refusal("tags are not allowed", event)
-
-
-def _refusal(problem: str, event: Any) -> ComposerError:
-    return ComposerError(None, None, problem, event.start_mark)
-
-
 _Base: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader  # libyaml: 3 to 5 times as fast
 
 
-class _Loader(_Base):
-    """Refuses keys that are given twice; takes words for what YAML 1.2 says (its core schema, section 10.3.2).
+class _Reader:
+    """Makes values of YAML's events as they come; so the first thing that is refused ends the work.
 
-    So 1e3 and 010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
+    Refused are aliases, which can expand without end, tags, directives, keys that are given twice, and a depth or a
+    number of values for which C code has no limit of its own. Words mean what YAML 1.2 says (its core schema, section
+    10.3.2): 1e3 and 010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
+
+    Args:
+        text: to be read.
     """
 
-    yaml_implicit_resolvers: ClassVar[dict[str | None, Any]] = {}
+    def __init__(self, text: str) -> None:
+        if _DIRECTIVE.search(text):  # libyaml compares each with all before
+            raise ValueError("directives are not allowed")
+        self._events: Iterator[Any] = yaml.parse(text, Loader=_Base)
+        self._count = 0
 
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            key = key_node.value
-            if isinstance(key, str) and key in seen:
-                raise ConstructorError(None, None, f"key {show(key)} is given twice", key_node.start_mark)
-            seen.add(key if isinstance(key, str) else None)
-        return super().construct_mapping(node, deep)
+    def document(self) -> Any:
+        """Return the content of the only document; None of an empty text."""
+        content, event = None, self._after(StreamStartEvent)
+        if isinstance(event, DocumentStartEvent):
+            content = self._node(next(self._events), 0)
+            event = self._after(DocumentEndEvent)
+        if not isinstance(event, StreamEndEvent):
+            raise _refusal("a second document is not allowed", event)
+        return content
 
-    def construct_whole(self, node: Any) -> int:
-        """Return a whole number: decimal, 0o for octal, 0x for hexadecimal."""
-        text = node.value
-        return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+    def _after(self, kind: type[Any]) -> Any:
+        """Return the event that follows the next one, which is of a kind."""
+        event = next(self._events)
+        assert isinstance(event, kind), event
+        return next(self._events)
+
+    def _node(self, event: Any, depth: int) -> Any:
+        """Return what begins with an event."""
+        self._count += 1
+        if isinstance(event, AliasEvent):
+            raise _refusal("aliases are not allowed", event)
+        if event.tag is not None:
+            raise _refusal("tags are not allowed", event)
+        if self._count > VALUES_MAX:
+            raise _refusal(f"there are more than {VALUES_MAX} keys and values", event)
+        if isinstance(event, ScalarEvent):
+            return _word(event.value) if event.implicit[0] else event.value
+        if depth == DEPTH_MAX:
+            raise RecursionError
+        return self._list(depth + 1) if isinstance(event, SequenceStartEvent) else self._map(depth + 1)
+
+    def _list(self, depth: int) -> list[Any]:
+        items: list[Any] = []
+        while not isinstance(event := next(self._events), SequenceEndEvent):
+            items.append(self._node(event, depth))
+        return items
+
+    def _map(self, depth: int) -> dict[Any, Any]:
+        content: dict[Any, Any] = {}
+        written: set[str] = set()
+        while not isinstance(event := next(self._events), MappingEndEvent):
+            key = self._node(event, depth)
+            if isinstance(key, list | dict):
+                raise _refusal(f"a key is {show(key)}; must be text or a number", event)
+            if event.value in written:
+                raise _refusal(f"key {show(event.value)} is given twice", event)
+            written.add(event.value)
+            content[key] = self._node(next(self._events), depth)
+        return content
+
+
+def _refusal(problem: str, event: Any) -> MarkedYAMLError:
+    return MarkedYAMLError(None, None, problem, event.start_mark)
+
+
+def _word(text: str) -> Any:
+    """Return what a text without quotes means."""
+    for kind, pattern, first in _WORDS:
+        if text[:1] in first and pattern.match(text):
+            return _MEANINGS[kind](text)
+    return text
+
+
+def _whole(text: str) -> int:
+    """Return a whole number: decimal, 0o for octal, 0x for hexadecimal."""
+    return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+
+
+def _real(text: str) -> float:
+    """Return a number; YAML writes .inf and .nan for what Python knows as inf and nan."""
+    return float(text.replace(".", "", 1) if text[-1] in "fFnN" else text)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Puts into quotes the texts that `_Loader` would read as numbers."""
+    """Puts into quotes the texts that `_word` would read as something else."""
 
 
-_TAG = "tag:yaml.org,2002:"
-_FLOAT = r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
-_WORDS = (  # the first that fits counts
-    ("null", r"^(~|null|Null|NULL|)$", [*"~nN", ""]),
-    ("bool", r"^(true|True|TRUE|false|False|FALSE)$", [*"tTfF"]),
-    ("int", r"^([-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$", [*"-+0123456789"]),
-    ("float", _FLOAT, [*"-+0123456789."]),
+_DIRECTIVE = re.compile(r"^\ufeff?%", re.MULTILINE)
+_FLOAT = r"^[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
+_WORDS = (  # kind, form, and the characters with which it begins; the first that fits counts
+    ("null", re.compile(r"^(~|null|Null|NULL|)$"), [*"~nN", ""]),
+    ("bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), [*"tTfF"]),
+    ("int", re.compile(r"^([-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$"), [*"-+0123456789"]),
+    ("float", re.compile(_FLOAT), [*"-+0123456789."]),
 )
-for _yaml, (_kind, _pattern, _first) in product((_Loader, _Dumper), _WORDS):
-    _yaml.add_implicit_resolver(f"{_TAG}{_kind}", re.compile(_pattern), _first)
-_Loader.add_constructor(f"{_TAG}int", _Loader.construct_whole)
+_MEANINGS: dict[str, Callable[[str], Any]] = {
+    "null": lambda text: None,
+    "bool": lambda text: text.lower() == "true",
+    "int": _whole,
+    "float": _real,
+}
+for _kind, _pattern, _first in _WORDS:
+    _Dumper.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", _pattern, _first)

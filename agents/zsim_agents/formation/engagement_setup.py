@@ -1,7 +1,8 @@
 """The engagement that a scenario's cluster asks for: its space, gains, law and plan, rehearsed before the flight."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, 
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_check import all_near
 from zsim_agents.formation.flight_data import GateInput
-from zsim_agents.formation.flight_plan import plan_of
+from zsim_agents.formation.flight_plan import FlightPlan, plan_of
 from zsim_agents.formation.robot_limits import guard, load
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, closest_pair, robot_rates
 from zsim_agents.formation.spaces.scenario_space import scenario_space
@@ -27,10 +28,27 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
     Raises:
         RunError: the plan can never be flown, with the reason.
     """
-    try:
+    with _refusals_of(cluster):
         space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
         rehearse(space, gains, law)
         return Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
+
+
+def check_plan(scenario: Scenario, cluster: Cluster) -> None:
+    """Refuse a plan that `engagement_of` refuses; nothing is rehearsed, so nothing has to be compiled.
+
+    Raises:
+        RunError: the plan can never be flown, with the reason.
+    """
+    with _refusals_of(cluster):
+        FlightPlan(scenario_space(scenario, cluster), plan_of(cluster))
+
+
+@contextmanager
+def _refusals_of(cluster: Cluster) -> Iterator[None]:
+    """Raise what is wrong with a cluster as a RunError that names it."""
+    try:
+        yield
     except (ValueError, DocumentError) as error:
         raise RunError(f"cluster {cluster.name!r}: {error}") from error
 

@@ -12,11 +12,12 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+from zsim.scenario.scenario import CONSTANTS_MAX
+
 Dual = tuple[float, float]
 
 TEXT_MAX = 1000  # characters
 DEPTH_MAX = 100  # nested operations
-CONSTANTS_MAX = 100  # of a user
 NAME_MAX = 40  # characters of a constant
 CONSTANTS = {"pi": math.pi, "e": math.e}
 

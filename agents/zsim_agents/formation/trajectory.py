@@ -16,10 +16,9 @@ import numpy as np
 
 from zsim.contract.snapshot import State
 from zsim.math.compiled import portable
+from zsim.scenario.scenario import WAYPOINTS_MAX
 from zsim_agents.formation.expression import Expression, ExpressionError, finite_number
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
-
-WAYPOINTS_MAX = 10_000
 
 
 class TrajectoryError(ValueError):

@@ -18,12 +18,12 @@ from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import Scenario
 from zsim.scenario.scenario_file import EXAMPLE
 from zsim.schema import plugin, yaml_file
+from zsim.schema.checker import first_lines
 from zsim_agents.hosting import check_classes
 from zsim_analysis.sweep.axes import SEED, Axis, Draw, FieldPath, Grid, field_path, is_inside, parse, text_of
 
 PLAN = "plan.json"
 RUNS_MAX = 1_000_000
-FAULTS_MAX = 100  # lines; further ones are counted
 _VALUE = re.compile(r" is [^;]*")  # in a fault: what differs from run to run where values are drawn
 _DEFAULT_SEED: int = next(f.default for f in msgspec.structs.fields(Scenario) if f.name == SEED)
 
@@ -199,8 +199,7 @@ def make_plan(
         faults += _faults(lambda _: scenario_file.resolve(copy.deepcopy(document), source), 0)
         faults += [fault for fault in design.faults(progress) if fault not in faults]
     if faults:
-        more = len(faults) - FAULTS_MAX
-        raise ScenarioError([*faults[:FAULTS_MAX], *([f"… and {more} more faults"] if more > 0 else [])])
+        raise ScenarioError(first_lines(faults))
     return plan
 
 

@@ -146,8 +146,11 @@ def _refuse_to_change(
 def validate(scenario: ScenarioPath, set_: Set = None) -> None:
     """Check a scenario and print what it resolves to; every fault is a line."""
     from zsim.scenario import scenario_file
+    from zsim_agents.hosting import check_plans
 
-    print(printable(scenario_file.to_text(load_scenario(scenario, set_))), end="")
+    loaded = load_scenario(scenario, set_)
+    check_plans(loaded, scenario.name)
+    print(printable(scenario_file.to_text(loaded)), end="")
 
 
 def _version(wanted: bool) -> None:

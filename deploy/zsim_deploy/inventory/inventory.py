@@ -7,6 +7,7 @@ import fnmatch
 import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -15,13 +16,15 @@ from msgspec import Meta
 
 from zsim.errors import InventoryError
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
-from zsim.scenario.scenario import Name, Scenario, Spec
+from zsim.scenario.scenario import DRONES_MAX, PROCESSES_MAX, Name, Scenario, Spec
 from zsim.schema import yaml_file
-from zsim.schema.checker import Fault, faults
+from zsim.schema.checker import Fault, faults, first_lines
 
 EXAMPLE = "examples/hosts.yaml"  # named to whoever gives no inventory
 ZENOH_PORT = 7447  # Zenoh's own
 SSH_PORT = 22  # IANA
+HOSTS_MAX = DRONES_MAX  # with more, some have no drone
+ROLES_MAX = PROCESSES_MAX  # each a process at least
 ROUTER_PORT = 7448  # beside a world on the same host
 
 Port = Annotated[int, Meta(ge=1, le=65535)]
@@ -69,10 +72,10 @@ class Security(Spec, frozen=True, kw_only=True):
 
 
 class Inventory(Spec, frozen=True, kw_only=True):
-    hosts: dict[Name, Host]
-    roles: dict[Text, Name | list[Name]]
+    hosts: Annotated[dict[Name, Host], Meta(max_length=HOSTS_MAX)]
+    roles: Annotated[dict[Text, Name | Annotated[list[Name], Meta(max_length=HOSTS_MAX)]], Meta(max_length=ROLES_MAX)]
     """Process name or pattern to a host, or to several over which what it matches is spread in order."""
-    routers: dict[Name, Router] = msgspec.field(default_factory=dict)
+    routers: Annotated[dict[Name, Router], Meta(max_length=HOSTS_MAX)] = msgspec.field(default_factory=dict)
     port: Port = ZENOH_PORT
     """On which the world listens."""
     security: Security = Security()
@@ -98,9 +101,10 @@ def load(path: Path) -> InventoryFile:
         InventoryError: with every fault, a line each.
     """
     document = yaml_file.read(path, EXAMPLE, InventoryError)
-    lines = [*faults(document, Inventory), *_cross_faults(document)]
+    flaws = chain(faults(document, Inventory), _cross_faults(document))
+    lines = first_lines(f"{path.name}: {where} {text}" for where, text in flaws)
     if lines:
-        raise InventoryError([f"{path.name}: {where} {text}" for where, text in lines])
+        raise InventoryError(lines)
     return InventoryFile(msgspec.convert(document, Inventory), path.resolve().parent, path.name)
 
 
@@ -133,8 +137,9 @@ def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
 
 
 def _map(document: dict[str, Any], name: str) -> list[tuple[Any, Any]]:
+    """Return the entries of a map, none where it is no map or has too many: they are compared with each other."""
     value = document.get(name)
-    return list(value.items()) if isinstance(value, dict) else []
+    return list(value.items()) if isinstance(value, dict) and len(value) <= ROLES_MAX else []
 
 
 def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Fault]:

@@ -1,16 +1,17 @@
 """Which agents share a process, by names and patterns."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-from refused import refused
+from refused import has_terms, refused
 
 from zsim.errors import RunError, ScenarioError
 from zsim.runtime.group import AgentGroup
 from zsim.scenario import rights, scenario_file
 from zsim.scenario.role_table import AGENTS, Role
 from zsim.transport.tls import Identity
-from zsim_agents.hosting import agents_of, check_classes, chosen, hosted
+from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, made
 from zsim_deploy.roles import process_identity, roles
 from zsim_world.flight.world import World
 
@@ -109,3 +110,24 @@ def test_every_class_that_a_scenario_names_is_loaded_before_it_flies():
     lines = raised.value.faults
     assert [next(name for name in names.values() if name in line) for line in lines] == list(names.values())
     check_classes(STEP, "step.yaml")
+
+
+UNFLYABLE = {
+    "x_c=9**9**9": ("x_c", "'9**9**9'"),
+    "x_c=__import__('os')": ("x_c", "calls '__import__'"),
+    "bogus=1+t": ("'bogus'", "x_c"),
+}
+
+
+@pytest.mark.parametrize("assignment", UNFLYABLE)
+def test_a_plan_that_a_controller_refuses_is_refused_in_the_same_words(assignment: str):
+    name, _, text = assignment.partition("=")
+    path = f"clusters.main.plan.trajectory.expressions.{name}={text}"
+    scenario = scenario_file.load(Path(__file__).parents[3] / "scenarios" / "trajectory.yaml", [path])
+    info = SimpleNamespace(gate_ns=20_000_000)
+    with pytest.raises(RunError) as refusal:
+        made("controller", info, scenario, ["main"])  # type: ignore[arg-type]
+    with pytest.raises(ScenarioError) as raised:
+        check_plans(scenario, "trajectory.yaml")
+    assert raised.value.faults == [f"trajectory.yaml: {refusal.value}"]
+    assert has_terms(str(refusal.value), *UNFLYABLE[assignment])

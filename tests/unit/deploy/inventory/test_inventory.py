@@ -2,6 +2,7 @@
 
 import errno
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -294,3 +295,27 @@ def test_a_file_that_is_no_inventory_is_one_line(tmp_path: Path, content: str | 
         inventory.load(path)
     (line,) = caught.value.faults
     assert has_terms(line, *terms)
+
+
+HOST = "hosts: {h: {address: a}}\nroles: {world: h}\n"
+LONG = {
+    "hosts": (
+        "hosts: {" + "".join(f"h{i}: {{address: a}}," for i in range(40_000)) + "}\nroles: {world: h0}\n",
+        "hosts",
+    ),
+    "roles": ("hosts: {h: {address: a}}\nroles: {" + "".join(f"r{i}: g," for i in range(80_000)) + "}\n", "roles"),
+    "routers": (
+        HOST + "routers: {" + "".join(f"r{i}: {{host: h, upstream: r{i + 1}}}," for i in range(25_000)) + "}\n",
+        "routers",
+    ),
+    "hosts of a role": ("hosts: {h: {address: a}}\nroles: {world: [" + "h," * 190_000 + "]}\n", "roles.world"),
+}
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_a_megabyte_that_is_no_inventory_is_refused_at_once(tmp_path: Path, name: str) -> None:
+    text, where = LONG[name]
+    start_s = time.process_time()
+    lines = faults(tmp_path, text)
+    assert time.process_time() - start_s < 2.0  # promised; comparing each router with each took minutes
+    assert has_terms(lines[0], where)

@@ -19,7 +19,7 @@ from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import DRONES_MAX, Scenario
-from zsim.scenario.scenario_file import FAULTS_MAX
+from zsim.schema.checker import FAULTS_MAX
 from zsim.schema.quantities import G_M_S2
 from zsim.schema.yaml_file import FILE_SIZE_MAX
 from zsim.sensors.sensor_catalogue import PRESETS
@@ -744,7 +744,7 @@ def test_a_cluster_s_drones_are_not_judged_while_a_drone_s_name_is_unknown():
         ("a: \x07", ("YAML",)),
         (b"\xff\xfe\x00", ("text", "0", "YAML", "UTF-8")),
         (b"a: \xe9", ("text", "3", "YAML", "UTF-8")),
-        ("#" * (FILE_SIZE_MAX + 1), ("larger", "1000000")),
+        ("#" * (FILE_SIZE_MAX + 1), ("larger", str(FILE_SIZE_MAX))),
     ],
     ids=lambda text: repr(text[:12]),
 )
@@ -761,7 +761,7 @@ def test_a_path_that_cannot_be_read_is_one_line(tmp_path: Path):
 
 
 def test_a_file_without_end_is_not_read_to_its_end():
-    assert has_terms(only(faults_in("/dev/zero")), "larger", "1000000")
+    assert has_terms(only(faults_in("/dev/zero")), "larger", str(FILE_SIZE_MAX))
 
 
 def test_a_million_drones_are_refused_at_once():

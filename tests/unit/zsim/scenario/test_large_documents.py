@@ -1,0 +1,100 @@
+"""Documents of a megabyte that are no scenario: refused before they have cost much, whatever they are full of."""
+
+import time
+from pathlib import Path
+
+import pytest
+from refused import has_terms
+
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import CLUSTERS_MAX, DRONES_MAX, OBSTACLES_MAX, PROCESSES_MAX, ROBOTS_MAX
+from zsim.schema.yaml_file import VALUES_MAX
+
+SIZE = 1_000_000  # bytes
+REFUSED_S = 2.0  # CPU time; promised for a file of SIZE. What was slow took from 3 s to hours
+PAIR = """name: pair
+duration_s: 10
+drones:
+- {name: drone1, position_m: [2, 0, 0]}
+- {name: drone2, position_m: [-2, 0, 0]}
+"""
+MANY = "name: many\nduration_s: 10\ndrones:\n" + "".join(
+    f"- {{name: d{i}, position_m: [{3 * (i % 32)}, {3 * (i // 32)}, 0]}}\n" for i in range(DRONES_MAX)
+)
+CLUSTER = PAIR + "clusters:\n- {name: main, drones: [drone1, drone2], %s}"
+
+
+def filled(head: str, unit: str, tail: str = "") -> str:
+    return head + unit * ((SIZE - len(head) - len(tail)) // len(unit)) + tail
+
+
+def numbered(head: str, unit: str, tail: str = "") -> str:
+    return head + "".join(unit.format(i) for i in range((SIZE - len(head) - len(tail)) // (len(unit) + 4))) + tail
+
+
+# name: the text, what the first line must show
+TEXTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "almost a number": (filled(PAIR + "seed: ", "1", "x"), ("seed",)),
+    "almost a fraction": (PAIR + "seed: " + "1" * 400_000 + "." + "1" * 400_000 + "x", ("seed",)),
+    "directives": (numbered("", "%TAG !{}! tag:x\n", "---\na: 1"), ("YAML", "directives")),
+    "short values": (filled("a: [", "1,", "]"), ("line 1", str(VALUES_MAX))),
+    "short pairs": (filled("a: [", "a: 1,", "]"), ("line 1", str(VALUES_MAX))),
+    "unknown keys": (numbered(PAIR, "k{}: 1\n"), ("k0",)),
+    "models": (numbered("name: a\nduration_s: 1\ndrones:\n", "- {{model: m{}.x}}\n"), ("drones", "1", str(DRONES_MAX))),
+    "clusters": (filled(PAIR + "clusters: [", "{},", "]"), ("clusters", "0", str(CLUSTERS_MAX))),
+    "groups": (
+        numbered(CLUSTER.removesuffix("%s}") + "groups: [", "{{name: g{}, size: 2}},", "]}"),
+        ("clusters[0].groups", str(ROBOTS_MAX // 2)),
+    ),
+    "places": (
+        filled(CLUSTER.removesuffix("%s}") + "template_m: [", "[1,2.5,30.25],", "]}"),
+        ("clusters[0].template_m", str(ROBOTS_MAX)),
+    ),
+    "processes": (numbered(MANY + "processes: {expect: [", "estimator.x{},", "]}"), ("processes.expect", str(PROCESSES_MAX))),
+    "policies": (numbered(PAIR + "processes: {on_death: {", "e{}: 1,", "}}"), ("processes.on_death", str(PROCESSES_MAX))),
+    "fields of a fault": (numbered(PAIR + "faults: [{kind: gps_dropout, ", "k{}: 1,", "}]"), ("faults[0].k0",)),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_megabyte_that_is_no_scenario_is_refused_at_once(tmp_path: Path, name: str) -> None:
+    text, terms = TEXTS[name]
+    path = tmp_path / "own.yaml"
+    path.write_text(text)
+    start_s = time.process_time()
+    with pytest.raises(ScenarioError) as caught:
+        scenario_file.load(path)
+    assert time.process_time() - start_s < REFUSED_S
+    assert any(has_terms(line, *terms) for line in caught.value.faults), caught.value.faults[0]
+
+
+def test_a_thousand_obstacles_among_a_thousand_drones_are_checked_at_once(tmp_path: Path) -> None:
+    spheres = "".join(
+        f"{{name: o{i}, shape: sphere, radius_m: 1, position_m: [0, 0, 0]}}," for i in range(OBSTACLES_MAX)
+    )
+    path = tmp_path / "own.yaml"
+    path.write_text(f"{MANY}environment: {{obstacles: [{spheres}]}}")
+    start_s = time.process_time()
+    with pytest.raises(ScenarioError) as caught:
+        scenario_file.load(path)
+    assert time.process_time() - start_s < REFUSED_S
+    assert has_terms(caught.value.faults[0], "drones[0].position_m", "-1.00", "'o0'")
+
+
+@pytest.mark.parametrize("path", ["a" + ".a" * 60_000, "a" + "[a]" * 40_000], ids=["words", "brackets"])
+def test_an_override_of_a_long_path_is_refused_at_once(tmp_path: Path, path: str) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text(PAIR)
+    with pytest.raises(ScenarioError) as caught:
+        scenario_file.load(file, [f"{path}=1"])
+    assert has_terms(caught.value.faults[0], str(len(path)), "1000")
+
+
+def test_a_resolved_scenario_of_a_thousand_drones_is_read_from_its_file(tmp_path: Path) -> None:
+    """`zsim run` hands it to its world that way."""
+    path = tmp_path / "many.yaml"
+    path.write_text(MANY)
+    scenario = scenario_file.load(path)
+    path.write_text(scenario_file.to_text(scenario))
+    assert scenario_file.load(path) == scenario
