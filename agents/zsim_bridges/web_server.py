@@ -7,31 +7,50 @@ import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from ipaddress import ip_address
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from urllib.parse import urlsplit
 
 from aiohttp import web
 
 from zsim.errors import RunError
+from zsim_bridges.http_connections import HttpConnections
 
+BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own
 Resource = TypeVar("Resource")
 _NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, not logged
 
 
-async def start_site(app: web.Application, host: str, port: int, shutdown_s: float) -> web.AppRunner:
-    """Serve an application on a port.
+class Site(NamedTuple):
+    """A web application on a port."""
+
+    runner: web.AppRunner
+    listener: asyncio.Server
+
+    async def cleanup(self) -> None:
+        """Stop listening, and end what is under way."""
+        self.listener.close()
+        await self.runner.cleanup()
+
+
+async def start_site(app: web.Application, host: str, port: int, shutdown_s: float) -> Site:
+    """Serve an application on a port, on a bounded number of connections.
 
     Raises:
         OSError: the port cannot be opened.
     """
+    connections = HttpConnections()
+    app.middlewares.append(connections.observe)
     runner = web.AppRunner(app, access_log=None, logger=_NO_LOG, shutdown_timeout=shutdown_s)
     await runner.setup()
+    server = runner.server
+    assert server is not None
     try:
-        await web.TCPSite(runner, host, port).start()
+        loop = asyncio.get_running_loop()
+        listener = await loop.create_server(lambda: connections.protocol(server()), host, port, backlog=BACKLOG)
     except OSError:
         await runner.cleanup()
         raise
-    return runner
+    return Site(runner, listener)
 
 
 def check_token(process: str, host: str, token: str | None) -> None:

@@ -3,7 +3,9 @@
 import asyncio
 import base64
 import signal
+import socket
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import aiohttp
@@ -12,6 +14,9 @@ import pytest
 from federation import ONE, Federation
 from gateway_process import GatewayProcess, LineConnection
 from refused import has_terms, parts
+from wire import PATIENCE_S
+
+from zsim_bridges.http_connections import STRANGERS_MAX
 
 GATE_NS = 20_000_000
 PILOT = "client.pilot"
@@ -292,12 +297,26 @@ def test_a_command_through_the_zenoh_tree_is_checked(gateway):
         ("GET", "/json/%ff", None, 400),
         ("GET", "/json/", None, 400),
         ("PUT", "/json/my/big", b"1" * 1_100_000, 413),
+        ("GET", "/@/**", None, 403),  # Zenoh's sessions, and the addresses of all who are connected
+        ("POST", "/%40/router/**", b"1", 403),
     ],
 )
 def test_bad_requests_are_told_what_is_wrong(gateway, method, path, body, status):
     answer = gateway.http(method, path, body)
     assert answer.status == status, answer.body
     assert answer.json()["error"]
+
+
+def test_connections_that_send_no_request_lock_nobody_out(gateway):
+    with ExitStack() as stack:
+        halves = []
+        for _ in range(STRANGERS_MAX + 1):
+            half = stack.enter_context(socket.create_connection(("127.0.0.1", gateway.http_port), PATIENCE_S))
+            half.sendall(b"GET /json/clock HTTP/1.1\r\nHost: localhost\r\n")
+            halves.append(half)
+        with suppress(ConnectionResetError):
+            assert halves[0].recv(1) == b""
+        assert gateway.http("GET", "/json/clock").status == 200
 
 
 @pytest.mark.parametrize(

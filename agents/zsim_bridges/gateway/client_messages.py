@@ -99,6 +99,18 @@ def check_not_reserved(key: str) -> None:
         )
 
 
+def check_shown(expression: str) -> None:
+    """Refuse an expression of Zenoh's own keys: its sessions and routers, and who is connected to them.
+
+    Wildcards do not match these; they have to be named.
+
+    Raises:
+        ForbiddenError: with what may be read.
+    """
+    if any(part.startswith("@") for part in expression.split("/")):
+        raise ForbiddenError(f"{expression[:80]}: Zenoh's own keys are not shown; must be keys without @, as zsim/**")
+
+
 def _matches_any(expressions: Sequence[str], key: str) -> bool:
     return any(keys.matches(expression, key) for expression in expressions)
 

@@ -9,8 +9,6 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from typing import Any, NamedTuple
 
-from aiohttp import web
-
 from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED
@@ -27,7 +25,7 @@ from zsim_bridges.gateway.publications import SharedSubscriptions
 from zsim_bridges.gateway.run_access import RunAccess
 from zsim_bridges.gateway.stream_client import Client
 from zsim_bridges.observer_process import ANOTHER_RUN, ObserverProcess
-from zsim_bridges.web_server import cancel_other_tasks, check_token, open_on_thread, start_site, url_host
+from zsim_bridges.web_server import Site, cancel_other_tasks, check_token, open_on_thread, start_site, url_host
 
 CLIENTS_MAX = 500  # streams at once
 UNAUTHENTICATED_MAX = 100  # connections at once that have not shown the token yet
@@ -76,7 +74,6 @@ class Gateway:
         self.loop = asyncio.new_event_loop()
         self.loop.set_exception_handler(self._on_loop_error)
         self._client_limit = ConnectionLimit(CLIENTS_MAX, "clients")
-        self._unauthenticated_limit = ConnectionLimit(UNAUTHENTICATED_MAX, "connections that have shown no token")
         self.subscriptions = SharedSubscriptions(self.loop, self._client_limit)
         self._full_key_subscriptions = SharedSubscriptions(self.loop, self._client_limit)
         self._ports = ports
@@ -89,6 +86,7 @@ class Gateway:
         self._link_lost = False
         self._reported_faults: set[str] = set()
         self._clients: set[Client] = set()
+        self._unauthenticated: dict[Client, None] = {}  # those of them that have shown no token yet, in order
         self._lockstep_threads: set[threading.Thread] = set()
 
     # For clients
@@ -124,7 +122,9 @@ class Gateway:
         if client not in self._clients:
             return
         self._clients.discard(client)
-        (self._client_limit if client.authenticated else self._unauthenticated_limit).leave()
+        if client.authenticated:
+            self._client_limit.leave()
+        self._unauthenticated.pop(client, None)
         others = {other.source for other in self._clients}
         released = [(source, drone) for source, drone in client.commanded if source not in others]
         if self._run is not None and released:
@@ -134,10 +134,12 @@ class Gateway:
         """Count a client that has shown the token among those that have.
 
         Raises:
-            TooManyError: the limit of clients is reached.
+            TooManyError: the limit of clients is reached, or it had to make room for others.
         """
+        if client not in self._unauthenticated:
+            raise TooManyError("the connection has waited too long for its token; connect again")
         self._client_limit.enter()
-        self._unauthenticated_limit.leave()
+        del self._unauthenticated[client]
 
     def _run_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
         reason = "the gateway failed"
@@ -245,7 +247,7 @@ class Gateway:
         with open_on_thread(self.loop, "gateway servers", self._open, lambda servers: self._close(*servers)):
             yield
 
-    async def _open(self) -> tuple[web.AppRunner, asyncio.Server]:
+    async def _open(self) -> tuple[Site, asyncio.Server]:
         host, http_port, lines_port = self._ports
         line_server = LineServer(self._new_client, authenticated=not self._access_check.needs_token)
         rest = RestTree(self.run, self._full_key_subscriptions)
@@ -265,7 +267,7 @@ class Gateway:
         self._say(f"{self.name}: HTTP and WebSocket on {address}, lines on port {lines_port}")
         return site, lines
 
-    async def _close(self, site: web.AppRunner, lines: asyncio.Server) -> None:
+    async def _close(self, site: Site, lines: asyncio.Server) -> None:
         lines.close()
         for client in list(self._clients):
             client.close(connection_lost=False)
@@ -276,15 +278,26 @@ class Gateway:
     def _new_client(self, outbox: Outbox, authenticated: bool) -> Client:
         bucket = TokenBucket(STREAM_RATE_HZ, STREAM_BURST, time.monotonic)
         client = Client(self, outbox, f"client.{secrets.token_hex(3)}", authenticated, bucket)
+        if not authenticated:
+            self._make_room()
         try:
-            (self._client_limit if authenticated else self._unauthenticated_limit).enter()
+            if authenticated:
+                self._client_limit.enter()
         except TooManyError as error:
             client.refuse(str(error))
             return client
         self._clients.add(client)
         if not authenticated:
+            self._unauthenticated[client] = None
             self.loop.call_later(HELLO_TIMEOUT_S, client.expire)
         return client
+
+    def _make_room(self) -> None:
+        """Let go of the client that has waited longest with its token, where there are too many of them."""
+        if len(self._unauthenticated) >= UNAUTHENTICATED_MAX:
+            client = next(iter(self._unauthenticated))
+            client.expire()
+            self.remove(client)
 
 
 def _release_drones(link: Session, commanded: Iterable[tuple[str, str]]) -> None:

@@ -32,6 +32,7 @@ from zsim_bridges.gateway.client_messages import (
     JSON,
     TEXT,
     MethodError,
+    check_shown,
     is_control_key,
     is_reserved,
     json_entry,
@@ -65,6 +66,7 @@ class RestTree:
     async def get(self, request: web.Request) -> web.StreamResponse:
         """Answer a GET or a POST."""
         expression, accepted = _key_of(request, "/"), _first_accepted(request)
+        check_shown(expression)
         if accepted == EVENT_STREAM:
             return await stream_events(request, self._subscriptions, expression, _sample_event)
         samples = await self._query(request, expression)

@@ -6,7 +6,9 @@ from typing import Any
 
 import pytest
 
-from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
+from zsim_bridges.gateway.client_messages import TooManyError
+from zsim_bridges.gateway.client_streams import Outbox
+from zsim_bridges.gateway.gateway_server import UNAUTHENTICATED_MAX, Gateway, GatewayPorts
 
 
 class StateLog:
@@ -31,6 +33,18 @@ def log(gateway: Gateway) -> StateLog:
     log = StateLog()
     gateway._clients.add(log)  # type: ignore[arg-type]
     return log
+
+
+def test_the_oldest_client_without_the_token_makes_room_for_the_next(gateway: Gateway) -> None:
+    outboxes = [Outbox(lambda: None, lambda count: b"") for _ in range(UNAUTHENTICATED_MAX + 1)]
+    clients = [gateway._new_client(outbox, authenticated=False) for outbox in outboxes]
+    lines = [gateway.loop.run_until_complete(outbox.take()) for outbox in (outboxes[0],)]
+    assert b"hello" in lines[0][0]
+    assert clients[0] not in gateway._clients
+    assert set(clients[1:]) <= gateway._clients
+    with pytest.raises(TooManyError):
+        gateway.admit(clients[0])
+    gateway.admit(clients[-1])
 
 
 def test_a_world_that_goes_after_the_end_of_its_run_is_not_lost(gateway: Gateway, log: StateLog) -> None:

@@ -51,8 +51,14 @@ TEXTS: dict[str, tuple[str, tuple[str, ...]]] = {
         filled(CLUSTER.removesuffix("%s}") + "template_m: [", "[1,2.5,30.25],", "]}"),
         ("clusters[0].template_m", str(ROBOTS_MAX)),
     ),
-    "processes": (numbered(MANY + "processes: {expect: [", "estimator.x{},", "]}"), ("processes.expect", str(PROCESSES_MAX))),
-    "policies": (numbered(PAIR + "processes: {on_death: {", "e{}: 1,", "}}"), ("processes.on_death", str(PROCESSES_MAX))),
+    "processes": (
+        numbered(MANY + "processes: {expect: [", "estimator.x{},", "]}"),
+        ("processes.expect", str(PROCESSES_MAX)),
+    ),
+    "policies": (
+        numbered(PAIR + "processes: {on_death: {", "e{}: 1,", "}}"),
+        ("processes.on_death", str(PROCESSES_MAX)),
+    ),
     "fields of a fault": (numbered(PAIR + "faults: [{kind: gps_dropout, ", "k{}: 1,", "}]"), ("faults[0].k0",)),
 }
 

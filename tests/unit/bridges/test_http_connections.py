@@ -1,0 +1,126 @@
+"""Connections that send no request: they make room, or are closed, and others are served all the time."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import Any
+
+from aiohttp import ClientSession, web
+
+from zsim_bridges.http_connections import HttpConnections
+
+HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\n"  # the head never ends
+WHOLE = HALF + b"\r\n"
+LONG_S = 600.0  # wall time that no test takes
+STRANGERS, CONNECTIONS = 5, 8
+
+Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+async def answer(request: web.Request) -> web.Response:
+    """Answer at once, on /wait when the test lets it."""
+    if request.path == "/wait":
+        request.app[STARTED].release()
+        await request.app[RELEASE].wait()
+    return web.Response(status=401 if request.path == "/refused" else 200)
+
+
+RELEASE = web.AppKey("release", asyncio.Event)
+STARTED = web.AppKey("started", asyncio.Semaphore)
+
+
+@asynccontextmanager
+async def server(head_s: float = LONG_S) -> AsyncIterator[tuple[Callable[[], Coroutine[Any, Any, Stream]], str, Any]]:
+    """Yield what connects, the URL, and the application."""
+    connections = HttpConnections(STRANGERS, CONNECTIONS, head_s)
+    app = web.Application(middlewares=[connections.observe])
+    app[RELEASE], app[STARTED] = asyncio.Event(), asyncio.Semaphore(0)
+    app.router.add_get("/{path:.*}", answer)
+    runner = web.AppRunner(app)
+    await runner.setup()
+    http = runner.server
+    assert http is not None
+    async with AsyncExitStack() as stack:
+        stack.push_async_callback(runner.cleanup)
+        listener = await asyncio.get_running_loop().create_server(lambda: connections.protocol(http()), "127.0.0.1", 0)
+        stack.callback(listener.close)
+        port = listener.sockets[0].getsockname()[1]
+
+        async def connect() -> Stream:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            stack.callback(writer.close)
+            return reader, writer
+
+        yield connect, f"http://127.0.0.1:{port}", app
+
+
+async def status(stream: Stream, request: bytes) -> int:
+    """Send a request; return the status of its answer, whose empty body is read too."""
+    reader, writer = stream
+    writer.write(request)
+    head = await reader.readuntil(b"\r\n\r\n")
+    return int(head.split()[1])
+
+
+async def is_cut(stream: Stream) -> bool:
+    try:
+        return await stream[0].read() == b""
+    except ConnectionResetError:
+        return True
+
+
+def test_the_oldest_head_that_does_not_end_makes_room_for_the_next_connection() -> None:
+    async def test() -> None:
+        async with server() as (connect, url, _):
+            halves = []
+            for _ in range(STRANGERS + 1):
+                halves.append(await connect())
+                halves[-1][1].write(HALF)
+            assert await is_cut(halves[0])
+            async with ClientSession() as session, session.get(url) as response:
+                assert response.status == 200
+            assert await is_cut(halves[1])
+            assert await status(halves[-1], b"\r\n") == 200
+
+    asyncio.run(test())
+
+
+def test_a_head_that_does_not_end_in_time_ends_its_connection() -> None:
+    async def test() -> None:
+        async with server(head_s=0.05) as (connect, _, _):
+            half = await connect()
+            half[1].write(HALF)
+            assert await is_cut(half)
+
+    asyncio.run(test())
+
+
+def test_who_has_been_answered_makes_no_room_for_strangers() -> None:
+    async def test() -> None:
+        async with server() as (connect, _, _):
+            known, refused = await connect(), await connect()
+            assert await status(known, WHOLE) == 200
+            assert await status(refused, WHOLE.replace(b"/ ", b"/refused ")) == 401
+            for _ in range(STRANGERS + CONNECTIONS):
+                (await connect())[1].write(HALF)
+            assert await is_cut(refused)
+            assert await status(known, WHOLE) == 200
+
+    asyncio.run(test())
+
+
+def test_a_request_under_way_is_answered_however_many_connections_there_are() -> None:
+    async def test() -> None:
+        async with server() as (connect, _, app):
+            busy = []
+            for _ in range(CONNECTIONS):
+                busy.append(await connect())
+                busy[-1][1].write(WHOLE.replace(b"/ ", b"/wait "))
+                await app[STARTED].acquire()
+            late = await connect()
+            late[1].write(HALF)
+            assert await is_cut(late)
+            app[RELEASE].set()
+            assert [await status(stream, b"") for stream in busy] == [200] * CONNECTIONS
+
+    asyncio.run(test())
