@@ -87,6 +87,9 @@ From = Annotated[
 To = Annotated[float | None, typer.Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
 
 
+Force = Annotated[bool, typer.Option("--force", help="Fly into a folder that holds other files, too.")]
+
+
 def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":
     """Return who this process is on the network."""
     from zsim.transport.tls import Identity

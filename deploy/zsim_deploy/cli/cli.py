@@ -18,6 +18,7 @@ from zsim_deploy.arguments import (
     HOSTS,
     RUN,
     FlightOptions,
+    Force,
     Insecure,
     ScenarioPath,
     Set,
@@ -71,18 +72,13 @@ def run(
     continue_: Annotated[
         bool, typer.Option("--continue", help="SCENARIO is the folder of a run that was interrupted: it goes on.")
     ] = False,
+    force: Force = False,
     order: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
     from zsim.runtime.progress import Screen
-    from zsim_deploy.launch.run import (
-        RunOptions,
-        check_endpoint,
-        make_directory,
-        options_of,
-        run_in_process,
-        run_processes,
-    )
+    from zsim_deploy.launch.run import RunOptions, check_endpoint, options_of, run_in_process, run_processes
+    from zsim_deploy.launch.run_folder import make_directory
     from zsim_deploy.launch.supervisor import Outcome
 
     if in_process:
@@ -97,7 +93,7 @@ def run(
         check_endpoint(listen, insecure)
         loaded = flight.scenario()
         mode, pace = flight.mode_and_rate()
-        folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
+        folder, first = make_directory(out, loaded, force), [name for name in order.split(",") if name]
         options = RunOptions(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
     with Screen(options.scenario.duration_s) as screen:
         try:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from zsim.errors import printable
-from zsim_deploy.arguments import HOSTS, FlightOptions, Insecure, flight_options
+from zsim_deploy.arguments import HOSTS, FlightOptions, Force, Insecure, flight_options
 
 app = typer.Typer()
 
@@ -30,6 +30,7 @@ def up(
     out: Annotated[Path | None, typer.Option(help="Folder of the run (default runs/NAME-TIME).")] = None,
     insecure: Insecure = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
+    force: Force = False,
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
     from zsim_deploy.cli.record_commands import conclude
@@ -42,19 +43,19 @@ def up(
     placed = inventory.insecure(placed) if insecure else placed
     inventory.placement(placed, loaded)
     mode, pace = flight.mode_and_rate()
-    with _folder(out, loaded) as folder:
+    with _folder(out, loaded, force) as folder:
         with StatusTable(loaded.duration_s) as status:
             outcome = HostRun(HostRunOptions(loaded, placed, folder, mode, pace), status).run()
         conclude(outcome, folder, report)
 
 
 @contextlib.contextmanager
-def _folder(out: Path | None, scenario: Any) -> Iterator[Path]:
+def _folder(out: Path | None, scenario: Any, force: bool) -> Iterator[Path]:
     """Yield a folder for a run, which is removed again if the run was refused and nothing is in it."""
-    from zsim_deploy.launch.run import make_directory
+    from zsim_deploy.launch.run_folder import make_directory
 
     was_there = out is not None and out.exists()
-    folder = make_directory(out, scenario)
+    folder = make_directory(out, scenario, force)
     try:
         yield folder
     finally:

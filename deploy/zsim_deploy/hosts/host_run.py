@@ -169,7 +169,7 @@ class HostRun:
     def _make_logs(self) -> None:
         out = self._options.out
         try:
-            self._logs.mkdir(parents=True)
+            self._logs.mkdir(parents=True, exist_ok=True)
             (out / "scenario.yaml").write_text(scenario_file.to_text(self._options.scenario))
         except OSError as error:
             raise RunError(f"{out}: cannot be written ({error.strerror}); give --out another folder") from error

@@ -3,7 +3,6 @@
 import contextlib
 import re
 import socket
-import time
 import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -130,22 +129,6 @@ def free_port(screen: Screen) -> int:
     return port
 
 
-def make_directory(out: Path | None, scenario: Scenario) -> Path:
-    """Return the run's folder, made new.
-
-    Raises:
-        RunError: it holds a record already, or cannot be made.
-    """
-    folder = out or _fresh(Path("runs") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}")
-    if (folder / "run.mcap").exists() or (folder / "logs").exists():
-        raise RunError(f"{folder}: holds a run already; give --out another folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
-    return folder
-
-
 def options_of(folder: Path) -> tuple[RunOptions, bool]:
     """Return how an interrupted run goes on, and whether in one process: then it is flown once more, as all of it.
 
@@ -161,12 +144,6 @@ def options_of(folder: Path) -> tuple[RunOptions, bool]:
     pace = (launch.mode, launch.rate)
     where = (launch.listen, launch.insecure, launch.hosted)
     return RunOptions(scenario, folder, *pace, *where, run_id=launch.run_id, continued=True), launch.in_process
-
-
-def _fresh(folder: Path) -> Path:
-    """Return a folder that is not there yet: two runs may start within one second."""
-    names = [folder, *(folder.with_name(f"{folder.name}-{i}") for i in range(2, 1000))]
-    return next(name for name in names if not name.exists())
 
 
 def run_processes(options: RunOptions, screen: Screen) -> Outcome:
@@ -242,7 +219,7 @@ def _write_scenario(options: RunOptions, in_process: bool) -> None:
     launch = Launch(options.run_id, *pace, in_process, options.hosted, options.insecure, options.listen)
     try:
         if not in_process:
-            (options.out / "logs").mkdir()
+            (options.out / "logs").mkdir(exist_ok=True)
         (options.out / "scenario.yaml").write_text(scenario_file.to_text(options.scenario))
         interrupted_run.keep(options.out, launch)
     except OSError as error:
