@@ -18,6 +18,7 @@ from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
 from zsim.transport import tls, zenoh_settings
+from zsim.transport.open_files import SESSION_FILES, require_files
 from zsim.transport.permissions import Act, Permissions
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode, Settings
@@ -521,8 +522,9 @@ def open_session(
         explain: makes of Zenoh's error the line that the user reads.
 
     Raises:
-        SessionError: it cannot be opened.
+        SessionError: it cannot be opened, or the process may not open as many files as it needs.
     """
+    require_files(SESSION_FILES, "a session")
     config = config_of(settings, identity)
     try:
         raw = zenoh.open(config)

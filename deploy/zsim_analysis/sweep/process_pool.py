@@ -19,6 +19,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from zsim.errors import RunError
+from zsim.transport.open_files import SESSION_FILES, WORKER_FILES, require_files
 
 if TYPE_CHECKING:
     from zsim_analysis.sweep.sweep_run import Row, Task
@@ -127,6 +128,7 @@ class ProcessPool:
         Raises:
             RunError: workers cannot start, or rows cannot be recorded.
         """
+        require_files(SESSION_FILES + WORKER_FILES * self._count, f"{self._count} workers")
         try:
             for _ in range(self._count):
                 self._start()

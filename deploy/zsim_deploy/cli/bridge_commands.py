@@ -50,6 +50,7 @@ def console(
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
     require("console", CONSOLE_NEEDS)
     from zsim.runtime.progress import JsonProgress
+    from zsim.transport.open_files import SERVER_FILES, require_files
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http_proxy import ListenAddress
     from zsim_deploy.roles.process_identity import process_name
@@ -58,6 +59,7 @@ def console(
     lower_priority(only_viewed=True)
     own_name = process_name("console", name, reach.who, "*")
     say = JsonProgress().say if reach.launched else log_printer(None)
+    require_files(SERVER_FILES, "a console and its pages")
     shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
         serve_runs(own_name, shown.serve, reach)
@@ -77,7 +79,9 @@ def gateway(
 ) -> None:
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.transport.connection import find_world
-    from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
+    from zsim.transport.open_files import SERVER_FILES, allow_files, require_files
+    from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
+    from zsim_bridges.http_connections import CONNECTIONS_MAX
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import log_printer, lower_priority, serve_runs
 
@@ -88,6 +92,8 @@ def gateway(
     def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
         return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_client_identity(who, process))
 
+    require_files(SERVER_FILES, "a gateway and its clients")
+    allow_files(SERVER_FILES + CONNECTIONS_MAX + CLIENTS_MAX)
     ports = GatewayPorts(listen, http, lines)
     served = Gateway(ports, own_name, token, connect_as, log_printer(reach.launched), secured=reach.tls is not None)
     with served.open():

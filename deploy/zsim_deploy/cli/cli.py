@@ -77,7 +77,14 @@ def run(
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
     from zsim.runtime.progress import Screen
-    from zsim_deploy.launch.run import RunOptions, check_endpoint, options_of, run_in_process, run_processes
+    from zsim_deploy.launch.run import (
+        RunOptions,
+        check_endpoint,
+        check_open_files,
+        options_of,
+        run_in_process,
+        run_processes,
+    )
     from zsim_deploy.launch.run_folder import make_directory
     from zsim_deploy.launch.supervisor import Outcome
 
@@ -91,10 +98,13 @@ def run(
         options.console = console
     else:
         check_endpoint(listen, insecure)
-        loaded = flight.scenario()
-        mode, pace = flight.mode_and_rate()
-        folder, first = make_directory(out, loaded, force), [name for name in order.split(",") if name]
-        options = RunOptions(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
+        first = [name for name in order.split(",") if name]
+        pace = flight.mode_and_rate()
+        options = RunOptions(flight.scenario(), Path(), *pace, listen, insecure, hosted, first, console)
+    if not in_process:
+        check_open_files(options)
+    if not continue_:
+        options.out = make_directory(out, options.scenario, force)
     with Screen(options.scenario.duration_s) as screen:
         try:
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)

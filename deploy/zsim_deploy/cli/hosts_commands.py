@@ -33,6 +33,7 @@ def up(
     force: Force = False,
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
+    from zsim.transport.open_files import host_launcher_files, require_files
     from zsim_deploy.cli.record_commands import conclude
     from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
     from zsim_deploy.hosts.status_table import StatusTable
@@ -43,6 +44,8 @@ def up(
     placed = inventory.insecure(placed) if insecure else placed
     inventory.placement(placed, loaded)
     mode, pace = flight.mode_and_rate()
+    count, hosts_count = len(inventory.roles(loaded)), len(placed.inventory.hosts)
+    require_files(host_launcher_files(count, hosts_count), f"{count} processes on {hosts_count} hosts")
     with _folder(out, loaded, force) as folder:
         with StatusTable(loaded.duration_s) as status:
             outcome = HostRun(HostRunOptions(loaded, placed, folder, mode, pace), status).run()

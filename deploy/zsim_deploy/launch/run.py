@@ -13,6 +13,7 @@ from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
+from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
 from zsim_deploy.arguments import CONSOLE_PORT, load_scenario, pace_options
@@ -97,6 +98,17 @@ def check_endpoint(endpoint: str | None, insecure: bool) -> None:
     check_listening([endpoint], Identity(insecure=insecure))
     if endpoint.startswith("tcp/") and not re.fullmatch(r"tcp/.+:[0-9]{1,5}", endpoint):
         raise SessionError(f"endpoint is {endpoint!r}; must be tcp/ADDRESS:PORT such as tcp/127.0.0.1:{DEFAULT_PORT}")
+
+
+def check_open_files(options: RunOptions) -> None:
+    """Refuse a run of more processes than this machine allows files for, before anything is started.
+
+    Raises:
+        SessionError: with how many files there must be.
+    """
+    agents = 1 if options.hosted else len(options.scenario.expected())
+    count = 2 + agents + options.console
+    require_files(launcher_files(count), f"{count} processes")
 
 
 def _is_free(port: int) -> bool:

@@ -24,6 +24,7 @@ POLL_S = 0.05  # how often the processes are looked at
 END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
 WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for everybody
 INTERRUPT_S = 2.0  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
+SILENT_S = 10.0  # after which a world that has printed nothing is named; it takes 1 s, and compiles with a notice
 TAKE_OVER_S = 60.0  # how long a process may stay once another was started in its place; a slow one starts in half
 RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
 RESTART_WINDOW_S = 20.0
@@ -80,6 +81,7 @@ class Supervisor:
         self._flies = False
         self._interrupted: str | None = None
         self._until_s: float | None = None
+        self._silent_s: float | None = None  # when a world without a line of its own is to be named (monotonic)
         self._dead: set[str] = set()
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
@@ -124,6 +126,7 @@ class Supervisor:
             return  # not progress: something printed by a library
         if not isinstance(line, dict):
             return  # a number that was printed is JSON too
+        self._silent_s = None
         self._world_watch.received(time.monotonic())
         if "clock" in line:
             self._flies = self._flies or line["clock"].get("state") == "running"
@@ -151,6 +154,7 @@ class Supervisor:
     def _watch(self, look: Callable[[], None]) -> None:
         """Return when the world has ended, or when it has to."""
         world = next(child for child in self.members if child.role == "world")
+        self._silent_s = time.monotonic() + SILENT_S
         while world.code is None or self._restarts_world(world):
             if self._interrupted:
                 self._reason = self._interrupted
@@ -162,6 +166,7 @@ class Supervisor:
                     self._on_exit(child, world)
             self._carry_out_requests()
             self._release_replaced()
+            self._name_silent(world)
             if line := self._world_watch.change(time.monotonic(), world.pid):
                 self._show.say(line)
             look()
@@ -268,6 +273,13 @@ class Supervisor:
                 self._dead.discard(name)
                 child.restarts += 1
                 child.start()
+
+    def _name_silent(self, world: RunProcess) -> None:
+        """Show once whom all others wait for, where the world has not begun."""
+        if self._silent_s is not None and time.monotonic() > self._silent_s:
+            self._silent_s = None
+            last = world.last_log_line() or "its log is empty"
+            self._show.say(f"the world (pid {world.pid}) has not begun after {SILENT_S:g} s: {last}; the others wait")
 
     def _too_often(self, child: RunProcess) -> bool:
         """Count a death; return whether there were too many in a row for another restart."""

@@ -18,6 +18,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport import connection
+from zsim.transport.open_files import hub_files, require_files
 from zsim.transport.session import check_expression
 from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import StopChannel
@@ -57,6 +58,8 @@ def world(
     from zsim_world.server.run_journal import RunJournal, journaled_run
     from zsim_world.server.world_process import run
 
+    clients = {*scenario.expected(), *(expect or ())}
+    require_files(hub_files(len(clients)), f"a world of {len(clients)} processes")
     identity = identity._replace(process=WORLD)
     connection.check_listening(endpoints, identity)  # before anything is compiled
     stop = StopChannel(launched, identity)

@@ -9,7 +9,7 @@ import pytest
 from refused import has_terms
 
 from zsim.errors import RunError
-from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT, Supervisor
+from zsim_deploy.launch.supervisor import RESTARTS_MAX, SILENT_S, SUPERSEDED, USER_FAULT, Supervisor
 
 
 class Show:
@@ -285,3 +285,19 @@ def test_what_is_no_progress_is_passed_over(text):
     team = Team()
     team.watch.handle_line(text)
     assert team.show.lines == []
+
+
+@pytest.mark.parametrize("begins", [False, True])
+def test_a_world_that_does_not_begin_is_named_to_those_who_wait(monkeypatch: pytest.MonkeyPatch, begins: bool):
+    wall_s = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: wall_s[0])
+    team = Team(looks=5)
+
+    def look() -> None:
+        wall_s[0] += SILENT_S
+        if begins:
+            team.watch.handle_line('{"clock": {}}')
+
+    team.go(look)
+    named = [line for line in team.show.lines if has_terms(line, "world", "world: last words")]
+    assert len(named) == (0 if begins else 1)

@@ -1,0 +1,52 @@
+"""Machines that let a process open few files: one line says how many there must be, and so many are enough."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from federation import ONE
+from forked_commands import ROOT, USER_FAULT, ZSIM
+from refused import has_terms
+
+PATIENCE_S = 120.0  # wall time in which a run of a simulated second ends, on a machine with much to do
+TOO_FEW = (10, 16, 24)  # of these one was a traceback, one a panic, and one hung
+BRIEF = ONE.replace("expect: []", "expect: [estimator.drone1]").replace("duration_s: 10", "duration_s: 1")
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "run": ("run", "{one}", "--no-report", "--out", "{out}"),
+    "world": ("world", "{one}", "--listen", "tcp/127.0.0.1:9"),
+    "an agent": ("estimator", "drone1", "--connect", "tcp/127.0.0.1:9"),
+    "an observer": ("keys", "--connect", "tcp/127.0.0.1:9"),
+    "gateway": ("gateway", "--connect", "tcp/127.0.0.1:9"),
+    "console": ("console", "--connect", "tcp/127.0.0.1:9"),
+    "sweep": ("sweep", "{one}", "--vary", "seed", "--runs", "2", "--workers", "2", "--out", "{out}"),
+}
+
+
+def zsim(folder: Path, files: int, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    """Run a command that may open so many files."""
+    one, out = folder / "one.yaml", folder / "out"
+    one.write_text(BRIEF)
+    words = [word.format(one=one, out=out) for word in arguments]
+    command = ["bash", "-c", f'ulimit -n {files}; exec "$@"', "zsim", *ZSIM, *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, cwd=ROOT)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_too_few_files_are_a_line_with_the_number_needed(tmp_path: Path, name: str) -> None:
+    done = zsim(tmp_path, TOO_FEW[len(name) % len(TOO_FEW)], *COMMANDS[name])
+    assert done.returncode == USER_FAULT, done.stderr
+    line = done.stderr.splitlines()[-1]  # a sweep shows its progress before
+    assert "Traceback" not in done.stderr
+    needed = re.search(r"must be (\d+) for", line)
+    assert needed is not None, line
+    assert has_terms(line, str(TOO_FEW[len(name) % len(TOO_FEW)]), needed[1], f"`ulimit -n {needed[1]}`")
+    assert not (tmp_path / "out" / "logs").exists()
+
+
+def test_the_number_that_is_said_is_enough(tmp_path: Path) -> None:
+    refused = zsim(tmp_path, 16, *COMMANDS["run"])
+    needed = re.search(r"must be (\d+)", refused.stderr)
+    assert needed is not None, refused.stderr
+    flown = zsim(tmp_path, int(needed[1]), *COMMANDS["run"])
+    assert flown.returncode == 0, flown.stderr
