@@ -20,6 +20,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
 from zsim_analysis.reading.recorded_run import OUTPUTS, GateInputs, RecordedAgents, decode_or_none
+from zsim_world.flight.coordinator import FLIGHT_REQUESTS
 from zsim_world.flight.world import World
 
 COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # of truth_sha256
@@ -129,8 +130,6 @@ def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Differen
         math.dist(a.angular_velocity_rad_s, b.angular_velocity_rad_s),
     )
 
-
-FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that change a flight
 
 Requests = dict[int, list[tuple[str, ControlRequest]]]
 

@@ -22,10 +22,11 @@ from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.data_flow import DataFlow
 from zsim_world.flight.run_clock import Operation, RunClock, number
-from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox
+from zsim_world.flight.run_outbox import CHANGES_MAX, ChangeBudget, KeyedMessage, Refusal, RunOutbox
 from zsim_world.flight.run_statistics import RunStatistics
 
 RETURNS = ("restart", "wait")  # of on_death: a process that died comes back, or may
+FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # that change a flight
 ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
 
 
@@ -45,6 +46,8 @@ class Coordinator(ABC):
         clock: simulated time.
         barrier: who takes part.
         outbox: what is to be published.
+        changes: that sources may still make.
+        requests: on `world/control`, all of them counted.
         statistics: of the run so far.
         refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
         diverged: what is to be raised once the end is published, None for a run that ended well.
@@ -66,6 +69,8 @@ class Coordinator(ABC):
         self.names = [drone.name for drone in scenario.drones]
         self.clock = RunClock(scenario.time, mode, rate)
         self.outbox = RunOutbox(lambda: self.clock.now_ns)
+        self.changes = ChangeBudget(lambda: self.clock.now_ns, self.clock.gate_ns)
+        self.requests = 0
         self.barrier = Barrier(self.run_id, self.clock.gate_ns, expected)
         self.statistics = RunStatistics()
         self.diverged: RunError | None = None
@@ -141,7 +146,8 @@ class Coordinator(ABC):
 
     def _handle_join(self, name: str, message: run_messages.Join, wall_ns: int) -> None:
         former, replaced = self.barrier.participants.get(name), self.barrier.replaced(name, message)
-        refusal = self.barrier.join(name, message, self.clock.next_ns, wall_ns)
+        may_join = message.period_ns > 0 or self.changes.spend(f"process/{name}")  # time may stand for who gates
+        refusal = self.barrier.join(name, message, self.clock.next_ns, wall_ns) if may_join else _too_many(name)
         if refusal:
             self.outbox.refuse(name, f"process/{name}/join", refusal)
             return
@@ -269,11 +275,21 @@ class Coordinator(ABC):
     # Requests
 
     def control(self, request: ControlRequest) -> ControlAnswer:
-        """Answer a request on `world/control`; every one is an event."""
-        answer = self._answer(request)
+        """Answer a request on `world/control`; it is an event, unless its source has had many of its kind.
+
+        One that changes the flight is an event always, as a rerun repeats it: beyond the budget it is refused.
+        """
+        self.requests += 1
         op, source = request.op[:40], request.source if keys.PROCESS_NAME.fullmatch(request.source) else ""
-        text = f"{source or 'somebody'} asks {op}: {'done' if answer.ok else answer.error}"
-        self.outbox.event("control", op, text, {"args": _shortened(request.args), "ok": answer.ok}, source)
+        may_change = op not in FLIGHT_REQUESTS or self.changes.allows(source)
+        answer = self._answer(request) if may_change else ControlAnswer(False, str(_too_many(source)))
+        if answer.ok:
+            is_event = self.changes.spend(source)
+        else:
+            is_event = self.outbox.refused_requests.add(source, op, answer.error) is not None
+        if is_event:
+            text = f"{source or 'somebody'} asks {op}: {'done' if answer.ok else answer.error}"
+            self.outbox.event("control", op, text, {"args": _shortened(request.args), "ok": answer.ok}, source)
         return answer
 
     def _answer(self, request: ControlRequest) -> ControlAnswer:
@@ -361,6 +377,11 @@ class Coordinator(ABC):
     def take_outbox(self) -> list[KeyedMessage]:
         """Return what is to be published, in order, and forget it."""
         return self.outbox.take()
+
+
+def _too_many(source: str) -> Refusal:
+    """Return the refusal of what a source does too often."""
+    return Refusal(source or "source", f"beyond {CHANGES_MAX} changes at once", "must wait: one is allowed each gate")
 
 
 def _shortened(args: dict[str, Any]) -> dict[str, Any]:

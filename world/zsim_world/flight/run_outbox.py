@@ -11,6 +11,7 @@ from zsim.scenario.rights import WORLD
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
 EVENTS_MAX = 20  # events per source, subject and reason; further refusals are counted only
 REASONS_MAX = 10  # of a source and subject that are kept apart; all further ones count as one
+CHANGES_MAX = 1000  # of a source at once, as many as there may be faults; then 50 a simulated second at gates of 20 ms
 SUBJECTS_MAX = 10_000  # sources and subjects
 
 _FIGURE = re.compile(r"\d[\d.e+-]*")
@@ -71,6 +72,47 @@ class RefusalLog:
         self._counts = {(source, subject): counts for source, subject, counts in state["counts"]}
 
 
+class ChangeBudget:
+    """Bounds what each source may change: CHANGES_MAX at once, and one more with every gate.
+
+    It counts in simulated time, so that a run that is flown again from its record allows the same.
+
+    Args:
+        now_ns: returns the newest gate [ns].
+        gate_ns: between two gates [ns].
+    """
+
+    def __init__(self, now_ns: Callable[[], int], gate_ns: int) -> None:
+        self._now_ns = now_ns
+        self._gate_ns = gate_ns
+        self._spent: dict[str, tuple[float, int]] = {}  # changes that count still, and at which gate they did [ns]
+
+    def snapshot(self) -> State:
+        """Return what each source has spent."""
+        return {"spent": [[source, *spent] for source, spent in self._spent.items()]}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self._spent = {source: (count, at_ns) for source, count, at_ns in state["spent"]}
+
+    def allows(self, source: str) -> bool:
+        """Return whether a source may make one more change."""
+        return self._counted(source) <= CHANGES_MAX - 1
+
+    def spend(self, source: str) -> bool:
+        """Count a change; return False where there was none left."""
+        if not self.allows(source):
+            return False
+        if len(self._spent) > SUBJECTS_MAX:
+            self._spent.clear()
+        self._spent[source] = self._counted(source) + 1, self._now_ns()
+        return True
+
+    def _counted(self, source: str) -> float:
+        spent, at_ns = self._spent.get(source, (0.0, 0))
+        return max(0.0, spent - (self._now_ns() - at_ns) / self._gate_ns)
+
+
 class RunOutbox:
     """Messages of the world that are to be published.
 
@@ -80,6 +122,7 @@ class RunOutbox:
     Attributes:
         pending: keys and messages in order.
         refusals: counted, also those that are no events any more.
+        refused_requests: the same of `world/control`.
     """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
@@ -87,15 +130,21 @@ class RunOutbox:
         self._next_seq: dict[str, int] = {}
         self.pending: list[KeyedMessage] = []
         self.refusals = RefusalLog()
+        self.refused_requests = RefusalLog()
 
     def snapshot(self) -> State:
         """Return the numbers of the keys, and what was refused."""
-        return {"next_seq": self._next_seq, "refusals": self.refusals.snapshot()}
+        return {
+            "next_seq": self._next_seq,
+            "refusals": self.refusals.snapshot(),
+            "refused_requests": self.refused_requests.snapshot(),
+        }
 
     def restore(self, state: State) -> None:
         """Take over what `snapshot` returned; what is pending is forgotten."""
         self._next_seq, self.pending = state["next_seq"], []
         self.refusals.restore(state["refusals"])
+        self.refused_requests.restore(state["refused_requests"])
 
     def put(self, key: str, message: Any) -> None:
         """Add a message."""

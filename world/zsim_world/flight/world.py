@@ -110,6 +110,7 @@ class World(Coordinator):
         return {
             "clock": self.clock,
             "outbox": self.outbox,
+            "changes": self.changes,
             "barrier": self.barrier,
             "statistics": self.statistics,
             "fleet": self.fleet,
@@ -184,6 +185,8 @@ class World(Coordinator):
             "last_ns": self.now_ns,
             **self.statistics.result(self.barrier.participants.values()),
             "refused": self.outbox.refusals.count,
+            "requests": self.requests,
+            "requests_refused": self.outbox.refused_requests.count,
             "truth_sha256": self._hash.hexdigest(),
         }
 
