@@ -36,12 +36,17 @@ OPTION_OF = {"target": "the argument TARGET", "kind": "the argument KIND", "for_
 
 @app.command(rich_help_panel=PANEL)
 @observer_options
-def keys(reach: WorldAccess) -> None:
+def keys(
+    reach: WorldAccess,
+    expression: Annotated[
+        str, typer.Argument(metavar="[KEY]", help="Only these, e.g. 'drone/drone1/**'.", show_default=False)
+    ] = "**",
+) -> None:
     """List the keys in use, with their message and how many came in a second."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
-        for key, kind, count in inspection.list_keys(link):
+        for key, kind, count in inspection.list_keys(link, expression):
             print(printable(f"{key:<36} {kind:<14} {count:>6}"))
 
 

@@ -75,15 +75,23 @@ def down(federation: Federation = "zsim") -> None:
 
 
 def ps(
+    roles: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[ROLE]...", help="Only these, or patterns: 'estimator.*2'.", show_default=False),
+    ] = None,
     federation: Federation = "zsim",
     as_json: Annotated[bool, typer.Option("--json", help="As a JSON line.")] = False,
 ) -> None:
     """Show the processes of the run that is up: role, host, pid, state, lag, messages/s, round trip, restarts."""
     from zsim.runtime.progress import PipedConsole
+    from zsim_agents.hosting import chosen
     from zsim_deploy.hosts import control_socket
     from zsim_deploy.hosts.status_table import table
 
     status = control_socket.ask(federation, "ps")
+    if roles:
+        named = chosen("role", roles, [row["role"] for row in status["rows"]])
+        status["rows"] = [row for row in status["rows"] if row["role"] in named]
     if as_json:
         print(json.dumps(status))
     else:

@@ -23,12 +23,17 @@ PUB, ASK = "zsim.pub", "zsim.ask"
 COMMANDS = "drone/*/cmd/*"
 
 
-def list_keys(link: Session, listen_s: float = LISTEN_S) -> list[tuple[str, str, int]]:
-    """Return (key, message, messages received) of every key with a message or an answer within `listen_s`."""
+def list_keys(link: Session, expression: str, listen_s: float = LISTEN_S) -> list[tuple[str, str, int]]:
+    """Return (key, message, messages received) of every key with a message or an answer within `listen_s`.
+
+    Raises:
+        SessionError: the expression of the keys that are wanted is none.
+    """
+    check_expression(expression)
     counts: Counter[str] = Counter()
-    for expression in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
-        counts.update({sample.key: 0 for sample in link.get(expression)})
-    subscription = link.subscribe("**")
+    for known in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
+        counts.update({sample.key: 0 for sample in link.get(known) if keys.matches(expression, sample.key)})
+    subscription = link.subscribe(expression)
     for sample in _samples(subscription, time.monotonic() + listen_s):
         counts[sample.key] += 1
     return [(key, _kind(key), count) for key, count in sorted(counts.items())]

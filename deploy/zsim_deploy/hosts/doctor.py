@@ -16,6 +16,7 @@ from zsim.runtime.progress import cell
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.host_links import ProgramEndedError, RemoteProgram, open_program
 from zsim_deploy.hosts.host_plan import leftovers, port_in_use
+from zsim_deploy.hosts.name_cell import NameCell
 from zsim_deploy.hosts.ssh_connection import shell_line, shell_word
 from zsim_deploy.inventory import enrolment
 from zsim_deploy.inventory import inventory as inv
@@ -271,11 +272,14 @@ async def _paths(
 
 
 def _hosts_table(reports: dict[str, HostReport]) -> Table:
-    shown = Table("host", "python", "zsim", "round trip", "clock", "load", "cores", "governor", "fingerprint", box=None)
+    shown = Table("host", box=None, pad_edge=False)
+    for column in ("python", "zsim", "round\ntrip", "clock", "load", "cores"):
+        shown.add_column(column, no_wrap=True)
+    shown.add_column("governor")
+    shown.add_column("finger\nprint", no_wrap=True)
     for name, report in reports.items():
         facts = report.facts
         cells = (
-            name,
             facts["python"],
             facts["zsim"],
             f"{1e3 * report.round_trip_s:.1f} ms",
@@ -285,14 +289,15 @@ def _hosts_table(reports: dict[str, HostReport]) -> Table:
             ", ".join(facts["governors"]) or "-",
             facts["fingerprint"][:8],
         )
-        shown.add_row(*map(cell, cells))
+        shown.add_row(NameCell(name), *map(cell, cells))
     return shown
 
 
 def _paths_table(paths: list[NetworkPath]) -> Table:
     shown = Table("from", "to", "port", "round trip", "bandwidth", box=None)
     for path in paths:
-        shown.add_row(*map(cell, (path.source, path.target, str(path.port), *_path_figures(path.figures))))
+        figures = map(cell, (str(path.port), *_path_figures(path.figures)))
+        shown.add_row(NameCell(path.source), NameCell(path.target), *figures)
     return shown
 
 

@@ -11,6 +11,7 @@ from rich.table import Table
 from zsim.runtime.progress import Screen, cell, describe
 from zsim.scenario.rights import WORLD
 from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.name_cell import NameCell
 from zsim_deploy.hosts.remote_process import RemoteProcess
 
 FIRST_S = 1.0  # simulated; from then on it flies
@@ -19,7 +20,8 @@ ROUND_TRIPS = 2.0  # … and so many of its round trips more: over a slow link e
 WAITED_S = 0.5  # a process that is waited for longer is shown so; waiting for less is what lockstep is
 SILENT_PROCESS_S = 1.8  # health comes once a second; so one that is stopped is shown within 2 s
 STALE_S = 3.0  # health comes once a second; older figures are not shown
-COLUMNS = ("role", "host", "pid", "state", "lag", "messages/s", "round trip", "restarts")
+FIGURES = ("lag", "messages\n/s", "round\ntrip", "restarts")  # columns that are never narrower
+COLUMNS = ("role", "host", "pid", "state", *FIGURES)
 
 
 class StatusTable(Screen):
@@ -137,11 +139,13 @@ def _is_silent(link: HostLink) -> bool:
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
     """Return the rows as a table for people."""
-    shown = Table(*COLUMNS, box=None, pad_edge=False)
+    shown = Table(box=None, pad_edge=False)
+    for column in COLUMNS:
+        shown.add_column(column, no_wrap=column in ("pid", *FIGURES))
     for row in rows:
         shown.add_row(
-            cell(row["role"]),
-            cell(row["host"]),
+            NameCell(row["role"]),
+            NameCell(row["host"]),
             str(row["pid"] or "-"),
             cell(row["state"]),  # it may hold output of a process
             _figure(row["lag_ms"], "{:.0f} ms"),

@@ -95,7 +95,7 @@ class World(Coordinator):
     def snapshot(self) -> State:
         """Return all from which the run goes on to the same bits; nothing is pending in the outbox."""
         self._hash.flush()
-        return {name: part.snapshot() for name, part in self._parts().items()}
+        return {"requests": {"count": self.requests}, **{name: part.snapshot() for name, part in self._parts().items()}}
 
     def restore(self, state: State) -> None:
         """Take over what `snapshot` of a world of the same scenario returned, but the hash of its truth.
@@ -103,6 +103,7 @@ class World(Coordinator):
         Raises:
             ValueError: it is of another scenario.
         """
+        self.requests = state["requests"]["count"]
         for name, part in self._parts().items():
             part.restore(state[name])
 

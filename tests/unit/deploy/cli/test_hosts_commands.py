@@ -1,5 +1,6 @@
-"""`zsim logs`: which roles there are, and that following ends with the run."""
+"""`zsim logs`: which roles there are, and that following ends with the run. `zsim ps`: which of them are shown."""
 
+import json
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,10 +10,16 @@ from refused import has_terms, refused
 
 from zsim.errors import RunError
 from zsim_deploy.cli import hosts_commands
-from zsim_deploy.cli.hosts_commands import logs
+from zsim_deploy.cli.hosts_commands import logs, ps
 from zsim_deploy.hosts.control_socket import ControlSocket
 
 ROLES = ["world", "recorder", "estimator.d1"]
+
+
+def row(role: str) -> dict[str, object]:
+    """Return what is known of a process that has not begun."""
+    unknown = dict.fromkeys(("pid", "lag_ms", "messages_per_s", "round_trip_ms"))
+    return {"role": role, "host": "h1", "state": "starting", "restarts": 0, **unknown}
 
 
 class Run:
@@ -23,7 +30,7 @@ class Run:
         self.asked = threading.Event()
         self.is_over = False
         (out / "logs").mkdir(parents=True)
-        self.intercom = ControlSocket("zsim", {"where": self._where})
+        self.intercom = ControlSocket("zsim", {"where": self._where, "ps": lambda: {"rows": [*map(row, ROLES)]}})
 
     def _where(self) -> dict[str, object]:
         self.asked.set()
@@ -79,3 +86,20 @@ def test_following_ends_with_the_run_and_prints_its_last_words(run: Run, capsys:
     follower.join(20.0)
     assert not follower.is_alive()
     assert capsys.readouterr().out == "last words\n"
+
+
+@pytest.mark.usefixtures("run")
+@pytest.mark.parametrize(
+    ("patterns", "shown"), [(None, ROLES), (["estimator.*"], ["estimator.d1"]), (["wor*", "recorder"], ROLES[:2])]
+)
+def test_processes_are_chosen_by_patterns(
+    capsys: pytest.CaptureFixture[str], patterns: list[str] | None, shown: list[str]
+) -> None:
+    ps(patterns, federation="zsim", as_json=True)
+    assert [entry["role"] for entry in json.loads(capsys.readouterr().out)["rows"]] == shown
+
+
+@pytest.mark.usefixtures("run")
+def test_a_pattern_that_fits_no_process_is_refused() -> None:
+    with refused(RunError, "role", "'controller.*'", "world", "recorder", "estimator.d1"):
+        ps(["controller.*"], federation="zsim")

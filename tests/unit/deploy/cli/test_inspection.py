@@ -202,3 +202,26 @@ def test_messages_in_an_answer_are_shown_as_messages():
     link.on_request = lambda key, args: ControlAnswer(ok=True, result=passed)
     (shown,) = inspection.ask(link, keys.CONTROL, "replay", "{}")  # type: ignore[arg-type]
     assert shown == {"key": "process/a.b/bye", "message": {"t_ns": 0, "seq": 0, "reason": "over"}}
+
+
+@pytest.mark.parametrize(
+    ("expression", "found"),
+    [
+        ("**", {keys.CLOCK: 0, "drone/d1/truth": 1, "my/key": 1}),
+        ("drone/**", {"drone/d1/truth": 1}),
+        ("my/key", {"my/key": 1}),
+    ],
+)
+def test_keys_are_chosen_by_an_expression(
+    monkeypatch: pytest.MonkeyPatch, expression: str, found: dict[str, int]
+) -> None:
+    link = FakeLink()
+    link.last[keys.CLOCK] = b""
+    monkeypatch.setattr(inspection, "time", Clock(link, [(0.1, "drone/d1/truth", b"1"), (0.2, "my/key", b"1")]))
+    listed = inspection.list_keys(link, expression)  # type: ignore[arg-type]
+    assert {key: count for key, _, count in listed} == found
+
+
+def test_what_is_no_expression_is_refused() -> None:
+    with pytest.raises(SessionError):
+        inspection.list_keys(FakeLink(), "drone//truth")  # type: ignore[arg-type]
