@@ -493,7 +493,7 @@ def allowed(info: types.Type) -> str:
     if isinstance(info, types.ListType):
         return f"list of: {allowed(info.item_type)}{_length(info)}"
     if isinstance(info, types.DictType):
-        return f"map of: {allowed(info.value_type)}"
+        return f"map of: {allowed(info.value_type)}{_length(info)}"
     if isinstance(info, types.StructType):
         return f"[{info.cls.__name__}](#{info.cls.__name__.lower()})"
     if isinstance(info, types.LiteralType):
@@ -516,7 +516,7 @@ def _number(info: types.FloatType | types.IntType) -> str:
     return f"{'whole number' if whole else 'number'} {', '.join(limits)}".rstrip()
 
 
-def _length(info: types.ListType) -> str:
+def _length(info: types.ListType | types.DictType) -> str:
     least = f", at least {info.min_length}" if info.min_length else ""
     return least + (f", at most {info.max_length}" if info.max_length else "")
 
