@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer
-from zsim.transport.session import RawSample, ReceivedSample
+from zsim.transport.session import FarEnd, RawSample, ReceivedSample
 
 PATIENCE_S = 120.0  # after which a test that waits for ever fails
 UNANSWERED = ControlAnswer(False, "nobody answered")
@@ -53,6 +53,8 @@ class FakeLink:
         requests: (key, arguments) of all requests.
         last: what a get is answered, by key.
         holders: sessions that hold the token of each process, by its name; a query of the admin space finds them.
+        readers: sessions that subscribe to each expression, which is a whole one.
+        ends: who is at the end of each link.
     """
 
     host = "laptop"
@@ -66,6 +68,8 @@ class FakeLink:
         self.requests: list[tuple[str, dict[str, Any]]] = []
         self.last: dict[str, bytes] = {}
         self.holders: dict[str, list[str]] = {}
+        self.readers: dict[str, list[str]] = {}
+        self.ends: dict[str, FarEnd] = {}
         self._subscriptions: list[FakeSubscription] = []
         self._early: list[ReceivedSample] = []
         self._callbacks: list[tuple[str, Callable[[RawSample], None]]] = []
@@ -131,15 +135,20 @@ class FakeLink:
     def unprefixed(self) -> "FakeLink":
         return self
 
+    def far_ends(self) -> dict[str, FarEnd]:
+        return dict(self.ends)
+
     def zid(self) -> str:
         return "hub"
 
     def query(self, expression: str, timeout_s: float = 2.0) -> list[RawSample]:
-        head, _, asked = expression.partition("/router/token/")
+        tokens = {f"token/zsim/{keys.token(name)}": sessions for name, sessions in self.holders.items()}
+        readers = {f"subscriber/{read}": sessions for read, sessions in self.readers.items()}
+        head, _, asked = expression.partition("/router/")
         return [
-            RawSample("PUT", f"{head}/router/token/zsim/{key}", msgspec.json.encode({"clients": sessions}), "", None)
-            for key, sessions in ((keys.token(name), sessions) for name, sessions in self.holders.items())
-            if keys.matches(asked, f"zsim/{key}")
+            RawSample("PUT", f"{head}/router/{key}", msgspec.json.encode({"clients": sessions}), "", None)
+            for key, sessions in (tokens | readers).items()
+            if keys.matches(asked, key)
         ]
 
     def has_subscribers(self, key: str) -> bool:

@@ -1,6 +1,6 @@
 """What Zenoh's routers know of the sessions around them, by their admin space: the hub reads it, see decision 2.
 
-Sessions go by Zenoh's name of them (hexadecimal digits), keys without the federation.
+Sessions go by Zenoh's name of them (hexadecimal digits).
 """
 
 from collections.abc import Iterator
@@ -42,11 +42,12 @@ class AdminSpace:
 
         Of those behind another router that router knows; one that does not answer stands for all of them.
         """
-        return self._sources("token", expression)
+        found = self._sources("token", self._prefix + expression)
+        return {key.removeprefix(self._prefix): sessions for key, sessions in found.items()}
 
-    def subscribers(self, expression: str) -> dict[str, frozenset[str]]:
-        """Return the sessions that subscribe to each expression that lies within `expression`, by it."""
-        return self._sources("subscriber", expression)
+    def subscribers(self) -> dict[str, frozenset[str]]:
+        """Return the sessions that subscribe to each expression, which is a whole one: it may be of all federations."""
+        return self._sources("subscriber", "**")
 
     def _sources(self, kind: str, expression: str) -> dict[str, frozenset[str]]:
         own = dict(self._ask(self._own, kind, expression))
@@ -60,7 +61,7 @@ class AdminSpace:
         return {key: frozenset(sessions) for key, sessions in found.items()}
 
     def _ask(self, router: str, kind: str, expression: str) -> Iterator[tuple[str, _Sources]]:
-        head = f"@/{router}/router/{kind}/{self._prefix}"
+        head = f"@/{router}/router/{kind}/"
         for reply in self._link.query(head + expression, timeout_s=ANSWER_S):
             sources = _decoded(reply.payload)
             if reply.key.startswith(head) and sources is not None:

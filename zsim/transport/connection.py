@@ -33,7 +33,7 @@ def listen(
     Raises:
         SessionError: an endpoint is taken or malformed, or the identity is of no use.
     """
-    with _listening(endpoints, federation, mode, identity or Identity(), zenoh_settings.hub()) as session:
+    with _listening(endpoints, federation, mode, identity or Identity(), zenoh_settings.hub(mode)) as session:
         session.use(mode)
         yield session
 

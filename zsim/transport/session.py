@@ -33,6 +33,13 @@ class ReceivedSample(NamedTuple):
     payload: bytes
 
 
+class FarEnd(NamedTuple):
+    """A session at the other end of a link, by Zenoh's name of it, and whether others may be behind it."""
+
+    session: str
+    is_router: bool
+
+
 class RawSample(NamedTuple):
     """A publication, or a reply to a query, with all that Zenoh knows of it.
 
@@ -506,6 +513,14 @@ class Session:
             callback(event.kind == zenoh.SampleKind.PUT)
 
         self._keep(self._raw.info.declare_transport_events_listener(forward, history=True))
+
+    def far_ends(self) -> dict[str, FarEnd]:
+        """Return who is at the other end of each link, by its address there, e.g. "192.168.1.2:41000"."""
+        routers = {str(each) for each in self._raw.info.routers_zid()}
+        return {
+            str(link.dst).partition("/")[2]: FarEnd(str(link.zid), str(link.zid) in routers)
+            for link in self._raw.info.links()
+        }
 
     def links(self) -> int:
         """Return how many other processes this one has a transport to."""

@@ -20,6 +20,7 @@ CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
 # A stopped participant does not: time stands before its link is full.
 HUB_CLOSE_AFTER_US = 10_000_000
 CONNECT_RETRY_MS = 100
+QUEUE_LOCKSTEP = 16  # batches of 48 kB; Zenoh's limit, 2 its default
 
 _CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_close"
 _TLS = "transport/link/tls"
@@ -76,12 +77,16 @@ def connecting(endpoint: str, identity: Identity, wait_s: float) -> Settings:
     }
 
 
-def hub() -> Settings:
+def hub(timing: Mode) -> Settings:
     """Return what the hub has beside it: nobody is above it, so opening waits for none to be found.
+
+    In lockstep its queues are as long as Zenoh allows, so that a link is closed before it is full (see link_watch); in
+    realtime, where less passes, they would make what passes a slow link stale.
 
     A router keeps Zenoh's half a second, in which it learns from the one above who answers there.
     """
-    return {"scouting/delay": "0"}
+    queue = {"transport/link/tx/queue/size/data": str(QUEUE_LOCKSTEP)} if timing == "lockstep" else {}
+    return {"scouting/delay": "0", **queue}
 
 
 def upstream(endpoint: str, identity: Identity) -> Settings:

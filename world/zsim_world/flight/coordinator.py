@@ -238,6 +238,10 @@ class Coordinator(ABC):
         else:
             self.outbox.event("silent", name, f"{who} shows no sign of life; it is stopped, or its host is gone", data)
 
+    def handle_slow_reader(self, text: str, data: dict[str, Any]) -> None:
+        """Take it that a reader nobody waits for has lost its link, since it took nothing."""
+        self.outbox.event("slow_reader", data["address"], text, data)
+
     def handle_false_join(self, name: str, join: run_messages.Join, fault: str) -> None:
         """Take it that nobody is behind a join in the place of a process, which keeps it."""
         data = {"host": join.host, "pid": join.pid, "incarnation": join.incarnation}

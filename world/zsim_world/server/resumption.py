@@ -9,8 +9,7 @@ from zsim.errors import RunError
 from zsim.transport.session import ReceivedSample
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.world import World
-from zsim_world.server.message_history import MessageHistory
-from zsim_world.server.run_journal import (
+from zsim_world.server.journal_entries import (
     Advanced,
     Controlled,
     Died,
@@ -21,10 +20,12 @@ from zsim_world.server.run_journal import (
     Joined,
     Kept,
     NotShown,
+    ReaderClosed,
     Resumed,
-    RunJournal,
     Taken,
 )
+from zsim_world.server.message_history import MessageHistory
+from zsim_world.server.run_journal import RunJournal
 from zsim_world.server.world_inputs import MessageIntake
 from zsim_world.server.world_outputs import WorldOutputs
 
@@ -92,6 +93,8 @@ class Resumption:
                 self.world.control(messages.decode_as(ControlRequest, request, keys.CONTROL))
             case FellSilent(name, since_wall_ns):
                 self.world.handle_silence(name, since_wall_ns)
+            case ReaderClosed(text, data):
+                self.world.handle_slow_reader(text, data)
             case GivenUp(name):
                 self.world.give_up_outputs(name)
             case Resumed(wall_ns, all_died):

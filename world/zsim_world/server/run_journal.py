@@ -23,6 +23,8 @@ import msgspec
 from zsim.contract.messages import REFUSALS
 from zsim.contract.snapshot import State, pack, unpack
 from zsim.errors import DecodeError, RunError
+from zsim_world.server import journal_entries
+from zsim_world.server.journal_entries import Entry
 
 try:
     import fcntl
@@ -35,95 +37,6 @@ CHECKPOINT_WALL_NS = 1_000_000_000  # wall time between two at least: a checkpoi
 CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the one before it is younger than the history
 HASHED_BYTES = 1 << 20  # of the truth in one go
 _FRAME = struct.Struct("<II")
-
-
-class Entry(msgspec.Struct, array_like=True, tag_field="kind", tag=True):
-    """Something that the world was handed."""
-
-
-class Taken(Entry, tag=0):
-    """A message of somebody else's."""
-
-    wall_ns: int
-    key: str
-    payload: bytes
-
-
-class Advanced(Entry, tag=1):
-    """Permission to go on by a gate, which came too late or not."""
-
-    wall_ns: int
-    late: bool
-
-
-class Died(Entry, tag=2):
-    """The death of a process."""
-
-    wall_ns: int
-    name: str
-
-
-class Controlled(Entry, tag=3):
-    """A request on `world/control`."""
-
-    request: bytes
-
-
-class GivenUp(Entry, tag=4):
-    """Outputs of a participant that are lost."""
-
-    name: str
-
-
-class Kept(Entry, tag=5):
-    """A message of the world's own beside those of gates."""
-
-    key: str
-    payload: bytes
-
-
-class Resumed(Entry, tag=6):
-    """That another incarnation of the world went on here."""
-
-    wall_ns: int
-    all_died: bool
-
-
-class Joined(Entry, tag=7):
-    """A join that was admitted."""
-
-    wall_ns: int
-    name: str
-    join: bytes
-
-
-class FalselyJoined(Entry, tag=8):
-    """A join in the place of another, behind which nobody is."""
-
-    name: str
-    join: bytes
-    reason: str
-
-
-class NotShown(Entry, tag=9):
-    """A participant that never showed that it is there."""
-
-    wall_ns: int
-    name: str
-    reason: str
-
-
-class FellSilent(Entry, tag=10):
-    """That a process publishes its health no longer since a wall time, or does again."""
-
-    name: str
-    since_wall_ns: int | None
-
-
-_OfWorld = Advanced | Kept | Resumed
-_OfOthers = Taken | Died | Controlled | GivenUp | Joined | FalselyJoined | NotShown | FellSilent
-_encode = msgspec.msgpack.Encoder().encode
-_decode = msgspec.msgpack.Decoder(list[_OfWorld | _OfOthers]).decode
 
 
 class _Head(msgspec.Struct, array_like=True):
@@ -189,7 +102,7 @@ class RunJournal:
         """Put what was noted into the file; to be called before anything is published that follows from it."""
         if self._entries:
             entries, self._entries = self._entries, []
-            self._guarded(lambda: _write(self._file, _framed(_encode(entries))))
+            self._guarded(lambda: _write(self._file, _framed(journal_entries.encode(entries))))
 
     def keep_truth(self, data: memoryview) -> None:
         """Append bytes of the truth hash."""
@@ -223,7 +136,7 @@ class RunJournal:
         os.fsync(self._truth)
         file = os.open(place.with_suffix(".new"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
-            _write(file, _framed(_encode(self._head)) + _framed(content))
+            _write(file, _framed(msgspec.msgpack.encode(self._head)) + _framed(content))
             os.fsync(file)
         finally:
             os.close(file)
@@ -240,7 +153,7 @@ class RunJournal:
         assert self._folder is not None
         file = os.open(self._folder / f"{number}.entries", os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         if not os.fstat(file).st_size:
-            _write(file, _framed(_encode(self._head)))
+            _write(file, _framed(msgspec.msgpack.encode(self._head)))
         return file
 
     def _guarded(self, write: Callable[[], None]) -> None:
@@ -332,7 +245,7 @@ class RunJournal:
         assert self._folder is not None
         for number in range(self._first, self._number + 1):
             for frame in self._frames(self._folder / f"{number}.entries"):
-                yield from _decode(frame)
+                yield from journal_entries.decode(frame)
 
     def truth(self, size: int) -> Iterator[bytes]:
         """Yield the first bytes of the truth hash, and forget the others, which the world appends again."""

@@ -18,17 +18,20 @@ from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
 from zsim.transport.admin_space import AdminSpace
+from zsim.transport.link_watch import LinkWatch
 from zsim.transport.session import Query, Session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.world import World
 from zsim_world.server.admission import Admission
+from zsim_world.server.journal_entries import Advanced, Controlled, Died, FellSilent, Resumed
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
 from zsim_world.server.pacing import Pacer, Pipelining
 from zsim_world.server.resumption import Resumption
-from zsim_world.server.run_journal import Advanced, Controlled, Died, FellSilent, Resumed, RunJournal
+from zsim_world.server.run_journal import RunJournal
+from zsim_world.server.slow_readers import SlowReaders
 from zsim_world.server.world_inputs import TICK_S, MessageIntake, ProgressCallback, open_inputs
 from zsim_world.server.world_outputs import WorldOutputs
 
@@ -86,6 +89,7 @@ class WorldProcess:
             self._progress,
             self._journal,
         )
+        self._readers = SlowReaders(LinkWatch(link, world.barrier.is_waited_for), world, link.host, self._journal)
         self._queries: deque[Query] = deque()
         self._over = threading.Event()
         self._clock_wall_ns = 0
@@ -106,9 +110,10 @@ class WorldProcess:
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
         try:
-            while self._world.ended is None:
-                self._turn()
-            self._end()
+            with self._readers.watched():
+                while self._world.ended is None:
+                    self._turn()
+                self._end()
         finally:
             self._over.set()
             ticker.join()
@@ -254,9 +259,7 @@ class WorldProcess:
 
     def _show_stuck(self, since_s: float) -> None:
         """Show that a put does not return; `clock` cannot, since it would have to go the same way."""
-        readers = [p.name for p in list(self._world.barrier.participants.values()) if not p.gating]
-        who = ", ".join([*readers, "a program that only subscribes"])
-        text = f"nothing can be published for {since_s:.1f} s: a reader takes nothing; one of {who}"
+        text = f"nothing can be published for {since_s:.1f} s: {self._readers.stuck()}"
         event = run_messages.Event(self._world.now_ns, 0, "stuck", WORLD, WORLD, text)
         self._progress("event", event, self._intake.phase)
 
@@ -269,6 +272,7 @@ class WorldProcess:
         self._liveliness.check_due()
         if name := self._world.overdue(time.monotonic_ns()):
             self._world.handle_overdue(name)
+        self._readers.report()
         self._admission.check_due(time.monotonic_ns())
         if self.health.due():
             self._liveliness.count_second()
