@@ -20,6 +20,9 @@ CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
 # A stopped participant does not: time stands before its link is full.
 HUB_CLOSE_AFTER_US = 10_000_000
 CONNECT_RETRY_MS = 100
+# Connections that say nothing keep joiners out while so many of them are open and not yet given up: of Zenoh's own 100
+# for 10 s each, a hundred kept them out for 10 s. A handshake takes a few round trips; with TLS over a satellite 2 s.
+ACCEPT_PENDING, ACCEPT_MS = 1000, 3_000
 QUEUE_LOCKSTEP = 16  # batches of 48 kB; Zenoh's limit, 2 its default
 
 _CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_close"
@@ -58,6 +61,8 @@ def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
     return {
         "listen/endpoints": json.dumps(list(endpoints)),
         "listen/exit_on_failure": "true",
+        "transport/unicast/accept_timeout": str(ACCEPT_MS),
+        "transport/unicast/accept_pending": str(ACCEPT_PENDING),
         "adminspace/enabled": "true",  # whose token it is, and who subscribes to what, is known there alone
         _CLOSE_AFTER: str(HUB_CLOSE_AFTER_US),
         **_security(identity, endpoints, "listen on"),

@@ -2,7 +2,7 @@
 
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -80,3 +80,21 @@ def test_an_endpoint_that_cannot_be_tried_is_one_where_nobody_listens(
 ) -> None:
     monkeypatch.setattr(connection, "connect", nobody)
     assert has_terms(said(endpoint), "zsim world")
+
+
+# Connections that say nothing
+
+SILENT_CONNECTIONS = 150  # Zenoh of itself takes 100 at a time, and gives each 10 s
+PATIENCE_S = 5.0
+
+
+def test_connections_that_say_nothing_keep_nobody_out():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with connection.listen([endpoint], "zsim", "lockstep"), ExitStack() as left_open:
+        for _ in range(SILENT_CONNECTIONS):
+            left_open.enter_context(socket.create_connection(("127.0.0.1", port)))
+        with connection.connect(endpoint, "zsim", wait_s=PATIENCE_S) as link:
+            assert link.links() == 1
