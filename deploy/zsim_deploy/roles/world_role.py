@@ -55,7 +55,7 @@ def world(
         SessionError: an endpoint is taken, or the identity is of no use.
     """
     from zsim_world.flight.world import World
-    from zsim_world.server.run_journal import RunJournal, journaled_run
+    from zsim_world.journal.run_journal import RunJournal, journaled_run
     from zsim_world.server.world_process import run
 
     clients = {*scenario.expected(), *(expect or ())}

@@ -10,8 +10,8 @@ from zsim.contract.run_messages import Join
 from zsim.transport.admin_space import AdminSpace
 from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
-from zsim_world.server.journal_entries import Entry, FalselyJoined, Joined, NotShown
-from zsim_world.server.run_journal import RunJournal
+from zsim_world.journal.journal_entries import Entry, FalselyJoined, Joined, NotShown
+from zsim_world.journal.run_journal import RunJournal
 
 TOKEN_NS = 3_000_000_000  # wall time by which a token is there; the hub knows one behind routers within 1 s (measured)
 DONE_NS = 10_000_000_000  # wall time that time may stand for one that never published a done; first steps take 1 s

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 from zsim.transport.link_watch import ClosedLink, LinkWatch
 from zsim_world.flight.coordinator import Coordinator
-from zsim_world.server.journal_entries import ReaderClosed
-from zsim_world.server.run_journal import RunJournal
+from zsim_world.journal.journal_entries import ReaderClosed
+from zsim_world.journal.run_journal import RunJournal
 
 SHOWN = 5  # expressions of one that subscribes to many
 

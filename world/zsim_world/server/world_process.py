@@ -1,6 +1,6 @@
 """The world as a process on Zenoh: one loop that paces and gates simulated time.
 
-Order of this file: `run`, the loop, what other threads bring, queries, publication.
+Order of this file: `run`, a world before this one, the loop, what other threads bring, publication.
 """
 
 import threading
@@ -9,12 +9,9 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from zsim.contract import keys, messages, run_messages
-from zsim.contract.run_messages import ControlAnswer
-from zsim.errors import DecodeError
+from zsim.contract import keys, run_messages
 from zsim.runtime.agent import Output
 from zsim.runtime.health import HealthMeter
-from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
 from zsim.transport.admin_space import AdminSpace
@@ -24,13 +21,14 @@ from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.world import World
+from zsim_world.journal.journal_entries import Advanced, Died, FellSilent, Resumed
+from zsim_world.journal.run_journal import RunJournal
 from zsim_world.server.admission import Admission
-from zsim_world.server.journal_entries import Advanced, Controlled, Died, FellSilent, Resumed
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
 from zsim_world.server.pacing import Pacer, Pipelining
+from zsim_world.server.query_service import QueryService
 from zsim_world.server.resumption import Resumption
-from zsim_world.server.run_journal import RunJournal
 from zsim_world.server.slow_readers import SlowReaders
 from zsim_world.server.world_inputs import TICK_S, MessageIntake, ProgressCallback, open_inputs
 from zsim_world.server.world_outputs import WorldOutputs
@@ -90,6 +88,7 @@ class WorldProcess:
             self._journal,
         )
         self._readers = SlowReaders(LinkWatch(link, world.barrier.is_waited_for), world, link.host, self._journal)
+        self._service = QueryService(link, world, self._history, self._journal)
         self._queries: deque[Query] = deque()
         self._over = threading.Event()
         self._clock_wall_ns = 0
@@ -127,8 +126,7 @@ class WorldProcess:
     def _announce(self) -> None:
         if not self._history.last(keys.INFO):
             self._outputs.publish(Output(keys.INFO, self._world.info()))
-        answered = (*rights.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries)
-        for expression in answered:
+        for expression in self._service.answered_keys():
             self._link.declare_queryable(expression, self._on_query)
         self._link.on_token("process/*", self._on_token)
         self._link.declare_token(keys.token(WORLD))
@@ -268,7 +266,8 @@ class WorldProcess:
         if reason:
             self._clock.stop(reason)
         while self._queries:
-            self._serve(self._queries.popleft())
+            self._service.serve(self._queries.popleft())
+            self._outputs.flush()
         self._liveliness.check_due()
         if name := self._world.overdue(time.monotonic_ns()):
             self._world.handle_overdue(name)
@@ -277,50 +276,6 @@ class WorldProcess:
         if self.health.due():
             self._liveliness.count_second()
             self._publish_health()
-
-    # Queries
-
-    def _serve(self, query: Query) -> None:
-        """Answer a query: with last values, a part of the history, or as a request."""
-        replaying = keys.thing(query.expression) if keys.matches(keys.replay("*"), query.expression) else None
-        if query.expression in self._world.refused_queries:
-            self._refuse(query)
-        elif query.expression == keys.CONTROL or replaying is not None:
-            try:
-                answer = self._answer(query.request(), replaying)
-            except DecodeError as error:
-                answer = ControlAnswer(ok=False, error=str(error))
-            self._journal.commit()
-            query.answer(answer)
-            self._outputs.flush()
-        else:
-            for key, payload in self._history.last(query.expression):
-                query.reply(key, payload)
-            query.end()
-
-    def _refuse(self, query: Query) -> None:
-        """Refuse a request on another process's key, unless that process answers it."""
-        reason = self._world.refusal_at(query.expression)
-        if reason is None:
-            query.end()
-        else:
-            query.answer(ControlAnswer(ok=False, error=reason))
-
-    def _answer(self, request: run_messages.ControlRequest, process: str | None) -> ControlAnswer:
-        """Answer a request on `world/control`, or of a process on its own key, by which access control knows it."""
-        if request.op == "replay":
-            return self._history.replay(request.args, self._readable_by(process))
-        if process is not None:
-            return ControlAnswer(ok=False, error=f"op is {request.op[:40]!r}; must be replay")
-        answer = self._world.control(request)
-        if self._world.ended is None:
-            self._journal.note(Controlled(messages.encode(request)))
-        return answer
-
-    def _readable_by(self, process: str | None) -> tuple[str, ...]:
-        if process is None or not self._link.guarded:
-            return ("**",)
-        return rights.of(process, self._world.scenario).reads
 
     # Publication
 

@@ -23,8 +23,8 @@ import msgspec
 from zsim.contract.messages import REFUSALS
 from zsim.contract.snapshot import State, pack, unpack
 from zsim.errors import DecodeError, RunError
-from zsim_world.server import journal_entries
-from zsim_world.server.journal_entries import Entry
+from zsim_world.journal import journal_entries
+from zsim_world.journal.journal_entries import Entry
 
 try:
     import fcntl
