@@ -3,6 +3,7 @@
 import json
 import signal
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -69,11 +70,11 @@ class Team:
     """A world that lives for so many looks, a recorder, and others; the looks let the others live on too."""
 
     def __init__(
-        self, *others: Member, looks: int = 20, on_death: dict[str, Any] | None = None, world: int = 0
+        self, *others: Member, looks: int = 20, on_death: dict[str, Any] | None = None, world: Sequence[int] = (0,)
     ) -> None:
         self.show = Show()
         self.watch = Supervisor(on_death or {}, self.show)
-        self.world = Member("world", world, lives_for=looks)
+        self.world = Member("world", *world, lives_for=looks)
         self.recorder = Member("recorder", 0, lives_for=looks + 1)
         self.others = others
         self.members: list[Any] = [self.world, self.recorder, *others]
@@ -163,11 +164,30 @@ def test_what_a_death_means(name, code, on_death, fails):
 
 
 def test_a_dead_world_fails_the_run_and_stops_the_rest():
-    team = Team(Member("estimator.d1"), world=-signal.SIGKILL)
+    team = Team(Member("estimator.d1"), world=[-signal.SIGKILL], on_death={"world": "end"})
     outcome = team.go()
     assert outcome.failed
     assert has_terms(outcome.reason, "world", "died", "code -9")
     assert team.others[0].stopped_for == outcome.reason
+
+
+def test_a_dead_world_is_started_again():
+    team = Team(Member("estimator.d1"), world=[-signal.SIGKILL, -signal.SIGKILL, 0])
+    outcome = team.go()
+    assert (outcome.failed, team.world.restarts) == (False, 2)
+
+
+def test_a_world_that_dies_again_and_again_fails_the_run():
+    team = Team(Member("estimator.d1"), world=[-signal.SIGKILL] * 20, looks=1)
+    assert team.go().failed
+    assert team.world.restarts == RESTARTS_MAX
+
+
+@pytest.mark.parametrize("code", [USER_FAULT, 1])
+def test_a_world_that_cannot_begin_is_not_started_again(code: int):
+    team = Team(Member("estimator.d1"), world=[code, 0])
+    assert team.go().failed
+    assert team.world.restarts == 0
 
 
 def test_an_interrupt_ends_everybody():
