@@ -129,7 +129,7 @@ def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:
         rmtree(deployment.out)
         deployment.out.mkdir()
         (deployment.out / "run.mcap.part").symlink_to(lab.folder / "not there" / "run.mcap")
-        second = deployment.up("--duration", "2")
+        second = deployment.up("--duration", "2", "--force")
         second.ends(with_code=1, within_s=START_S)
         remedy = re.search(rf"^warning: h1: .*h1:{path}; .*`(scp .*)`", second.text(), re.MULTILINE)
         assert remedy

@@ -70,7 +70,7 @@ def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
 
 def _show_record(complete: bool, state: str) -> str:
     """Print whether a record is complete; return what it lacks, empty if nothing."""
-    print(f"record: {state}")
+    print(printable(f"record: {state}"))
     return "" if complete else f"the record is {state}"
 
 

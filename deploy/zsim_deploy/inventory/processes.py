@@ -49,6 +49,11 @@ class PlannedProcess(NamedTuple):
     on_death: OnDeath
 
     @property
+    def is_restarted(self) -> bool:
+        """Tell whether its service is to start it again: not a world, which has no journal there."""
+        return self.on_death == "restart" and self.name != WORLD
+
+    @property
     def role(self) -> str:
         return self.name.partition(".")[0]
 

@@ -97,7 +97,7 @@ def _service(scenario: Scenario, process: PlannedProcess) -> dict[str, Any]:
         "cap_drop": ["ALL"],
         "security_opt": ["no-new-privileges:true"],
         "volumes": _volumes(process),
-        "restart": f"on-failure:{RESTARTS_MAX}" if process.on_death == "restart" else "no",
+        "restart": f"on-failure:{RESTARTS_MAX}" if process.is_restarted else "no",
         "stop_signal": "SIGTERM",
         "stop_grace_period": f"{STOP_S}s",
         "logging": {"driver": "local"},  # the one that rotates

@@ -206,7 +206,7 @@ def _job(space: str, process: PlannedProcess, image: str) -> dict[str, Any]:
     """Return a Job: a fault of the call, and a name that another has taken, are not healed by a new Pod."""
     codes = {"operator": "In", "values": [USER_FAULT, SUPERSEDED]}
     spec = {
-        "backoffLimit": RESTARTS_MAX if process.on_death == "restart" else 0,
+        "backoffLimit": RESTARTS_MAX if process.is_restarted else 0,
         "podFailurePolicy": {"rules": [{"action": "FailJob", "onExitCodes": codes}]},
         "podReplacementPolicy": "Failed",
         "template": _pod_template(process, image, "Never"),

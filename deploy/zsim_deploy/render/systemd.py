@@ -185,7 +185,7 @@ def _word(text: str) -> str:
 
 def _life(process: PlannedProcess) -> list[str]:
     """Return when a process is started again, and how it is ended."""
-    restart = "on-failure" if process.on_death == "restart" else "no"
+    restart = "on-failure" if process.is_restarted else "no"
     return [
         f"Restart={restart}",
         f"RestartPreventExitStatus={USER_FAULT} {SUPERSEDED}",
