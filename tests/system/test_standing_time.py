@@ -81,8 +81,8 @@ def test_who_takes_a_place_and_does_nothing_gives_it_back(federation: Federation
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("superseded", CONTROLLER))
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("death", CONTROLLER))
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("restart", CONTROLLER))
-    token.undeclare()
     watched.flies_on()
+    token.undeclare()
 
 
 # Who is stopped
