@@ -1,12 +1,7 @@
 """Time is stopped by nobody who does not take part, and who stops it is named."""
 
 import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 
-import pytest
 from federation import PAIR, Federation
 from wire import Client, Subscription
 
@@ -43,16 +38,6 @@ class Watched:
         self.clock.until(lambda m: m["t_ns"] > t_ns + 2e9)
         assert self.client.request("world/control", "stop")["ok"]
         self.run.ends(with_code=0)
-
-
-def test_a_join_in_another_s_name_takes_no_place(federation: Federation) -> None:
-    watched = Watched(federation)
-    pid = federation.pid(CONTROLLER)
-    watched.join_as(CONTROLLER)
-    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("no_show", CONTROLLER))
-    assert federation.pid(CONTROLLER) == pid
-    watched.flies_on()
-    assert federation.record().events("superseded", "death") == []
 
 
 def test_a_join_of_another_s_process_is_answered_by_a_newer_one(federation: Federation) -> None:
@@ -117,48 +102,3 @@ def test_a_stopped_world_is_named(federation: Federation) -> None:
     federation.kill("world", signal.SIGCONT)
     watched.run.line("world .* is back")
     watched.flies_on()
-
-
-# Who reads nothing
-
-READER = """
-import json, sys, time, zenoh
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
-session = zenoh.open(config)
-subscriber = session.declare_subscriber("**", lambda sample: time.sleep(1000))
-print("reads", flush=True)
-time.sleep(1000)
-"""
-
-
-@contextmanager
-def stopped_reader(endpoint: str) -> Iterator[int]:
-    """Let a program subscribe to everything and stop it; yield its process id."""
-    reader = subprocess.Popen([sys.executable, "-c", READER, endpoint], stdout=subprocess.PIPE)
-    try:
-        assert reader.stdout is not None
-        reader.stdout.readline()
-        reader.send_signal(signal.SIGSTOP)
-        yield reader.pid
-    finally:
-        reader.kill()
-        reader.communicate()
-
-
-@pytest.mark.parametrize("pace", [("--rate", "10"), ("--realtime",)])
-def test_who_subscribes_to_everything_and_reads_nothing_costs_nobody_anything(
-    federation: Federation, pace: tuple[str, ...]
-) -> None:
-    watched = Watched(federation, *pace)
-    with stopped_reader(federation.endpoint) as pid:
-        closed = watched.events.until(lambda m: m["kind"] == "slow_reader").message["data"]
-        assert closed["process"].startswith(f"pid {pid} ")
-        assert closed["reads"] == ["**"]
-        t_ns = watched.clock.now()[-1].message["t_ns"]
-        watched.clock.until(lambda m: m["t_ns"] > t_ns + 5e9)
-    watched.flies_on()
-    record = federation.record()
-    assert record.events("death", "silent", "outputs_missing") == []
-    assert [event for event in record.events("refused") if "age" in event["text"]] == []

@@ -87,7 +87,7 @@ class Admission:
         if passed_ns < LOOK_NS or not (self._withheld or self._standing_ns):
             return
         self._look_wall_ns = wall_ns
-        holders = self._token_holders()
+        holders = {} if self._trusts else self._token_holders()
         self._check_withheld(holders, wall_ns)
         self._check_admitted(holders, wall_ns)
         self._count_standing(min(passed_ns, 2 * LOOK_NS), wall_ns)

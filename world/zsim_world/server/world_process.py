@@ -36,6 +36,9 @@ from zsim_world.server.world_outputs import WorldOutputs
 STUCK_NS = 2_000_000_000  # wall time in one turn from which on it is an event; a turn takes milliseconds
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
+# Zenoh 1.x can stop answering for good when its admin space is asked while others declare (4 of 11 000 tests): so joins
+# are trusted, and links are not watched, until that is asked for in another way.
+ASKS_NOBODY = True
 HEALTH = keys.process(WORLD, "health")
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
 
@@ -75,7 +78,7 @@ class WorldProcess:
         self._liveliness = LivelinessMonitor(
             link, world.barrier, self._handle_death, self._take_in, self._handle_silence
         )
-        self._admission = Admission(AdminSpace(link), world, link.guarded, self._journal)
+        self._admission = Admission(AdminSpace(link), world, ASKS_NOBODY, self._journal)
         self._intake = MessageIntake(
             link,
             world,
@@ -109,10 +112,9 @@ class WorldProcess:
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
         try:
-            with self._readers.watched():
-                while self._world.ended is None:
-                    self._turn()
-                self._end()
+            while self._world.ended is None:
+                self._turn()
+            self._end()
         finally:
             self._over.set()
             ticker.join()
