@@ -108,12 +108,12 @@ class Recorder:
         self._left_out = 0
         self._leavers: set[str] = set()
         self._joined: set[str] = set()
-        self.health = HealthMeter(NAME, host=link.host)
+        self.health = HealthMeter(NAME, host=link.host, reads=link.reads)
 
     def run(self) -> str:
         self._traffic = Traffic(self._link, run_key_table(self._info), self._refuse)
         self._views = self._link.subscribe("view/**")
-        self._link.declare_token(keys.token(self._name))
+        self._link.declare_process(self._name)
         self._link.on_link(self._on_link)
         if self._writer.messages:
             self._resume()

@@ -34,7 +34,7 @@ class ObserverProcess:
         self._join_seq = -1
         self.name = name
         self.now_ns = 0
-        self.health = HealthMeter(name.split(".", 1)[0], host=link.host)
+        self.health = HealthMeter(name.split(".", 1)[0], host=link.host, reads=link.reads)
         self.end_reason = ""
         self._process = link.host, os.getpid()
         self._incarnation = secrets.randbits(62)
@@ -45,7 +45,7 @@ class ObserverProcess:
         """Join the run."""
         self._link.declare_subscriber(keys.EVENT, self._on_event)
         self._link.on_link(self._on_link)
-        self._link.declare_token(keys.token(self.name))
+        self._link.declare_process(self.name)
         self._join()
 
     def _on_link(self, up: bool) -> None:

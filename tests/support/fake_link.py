@@ -4,7 +4,6 @@ import queue
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import msgspec
 from msgspec import Struct
 
 from zsim.contract import keys, messages
@@ -52,8 +51,7 @@ class FakeLink:
         on_request: answers a request by its key and arguments.
         requests: (key, arguments) of all requests.
         last: what a get is answered, by key.
-        holders: sessions that hold the token of each process, by its name; a query of the admin space finds them.
-        readers: sessions that subscribe to each expression, which is a whole one.
+        reads: the expressions that are subscribed to.
         ends: who is at the end of each link.
     """
 
@@ -67,13 +65,13 @@ class FakeLink:
         self.on_request: Callable[[str, dict[str, Any]], ControlAnswer] = lambda key, args: UNANSWERED
         self.requests: list[tuple[str, dict[str, Any]]] = []
         self.last: dict[str, bytes] = {}
-        self.holders: dict[str, list[str]] = {}
-        self.readers: dict[str, list[str]] = {}
+        self.reads: list[str] = []
         self.ends: dict[str, FarEnd] = {}
         self._subscriptions: list[FakeSubscription] = []
         self._early: list[ReceivedSample] = []
         self._callbacks: list[tuple[str, Callable[[RawSample], None]]] = []
         self._on_link: Callable[[bool], None] = lambda up: None
+        self._on_tokens: list[tuple[str, Callable[[str, bool], None]]] = []
 
     # What a test does
 
@@ -91,6 +89,12 @@ class FakeLink:
     def cut(self, up: bool) -> None:
         """Let the link come (True) or go."""
         self._on_link(up)
+
+    def show(self, key: str, alive: bool = True) -> None:
+        """Let a token appear, or go."""
+        for expression, callback in self._on_tokens:
+            if keys.matches(expression, key):
+                callback(key, alive)
 
     def published_on(self, expression: str) -> list[Any]:
         """Return the messages published on an expression."""
@@ -132,24 +136,8 @@ class FakeLink:
     def get(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample]:
         return [ReceivedSample(key, payload) for key, payload in self.last.items() if keys.matches(expression, key)]
 
-    def unprefixed(self) -> "FakeLink":
-        return self
-
     def far_ends(self) -> dict[str, FarEnd]:
         return dict(self.ends)
-
-    def zid(self) -> str:
-        return "hub"
-
-    def query(self, expression: str, timeout_s: float = 2.0) -> list[RawSample]:
-        tokens = {f"token/zsim/{keys.token(name)}": sessions for name, sessions in self.holders.items()}
-        readers = {f"subscriber/{read}": sessions for read, sessions in self.readers.items()}
-        head, _, asked = expression.partition("/router/")
-        return [
-            RawSample("PUT", f"{head}/router/{key}", msgspec.json.encode({"clients": sessions}), "", None)
-            for key, sessions in (tokens | readers).items()
-            if keys.matches(asked, key)
-        ]
 
     def has_subscribers(self, key: str) -> bool:
         return True
@@ -161,10 +149,10 @@ class FakeLink:
         self._on_link = callback
 
     def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:
-        return
+        self._on_tokens.append((expression, callback))
 
     def declare_queryable(self, expression: str, callback: Callable[[Any], None]) -> None:
         return
 
-    def declare_token(self, key: str) -> None:
+    def declare_process(self, name: str) -> None:
         return

@@ -241,7 +241,7 @@ class Lab:
 
     def _start_sshd(self, name: str) -> None:
         folder = self.folder / name
-        variables = {"ZSIM_LAB_HOST": name, "HOME": str(folder), **self._variables.get(name, {})}
+        variables = {**_arithmetic(), "ZSIM_LAB_HOST": name, "HOME": str(folder), **self._variables.get(name, {})}
         command = sshd.command(self.address(name), folder, self.folder / "keys/client.pub", variables)
         self._sshd[name] = self._service(name, command, sshd.READY, folder / "sshd.log")
 
@@ -252,6 +252,11 @@ class Lab:
         """End a service; what it started, such as the sessions of an sshd, lives on."""
         service.kill()
         self._past.append(service)
+
+
+def _arithmetic() -> dict[str, str]:
+    """Return the variables by which BLAS computes in this process; hosts of the same machine are to compute as it does."""
+    return {name: value for name, value in os.environ.items() if name.startswith("OPENBLAS_")}
 
 
 def lacking() -> str | None:

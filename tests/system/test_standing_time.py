@@ -1,7 +1,12 @@
 """Time is stopped by nobody who does not take part, and who stops it is named."""
 
 import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 
+import pytest
 from federation import PAIR, Federation
 from wire import Client, Subscription
 
@@ -40,6 +45,19 @@ class Watched:
         self.run.ends(with_code=0)
 
 
+@pytest.mark.parametrize("has_token", [False, True])
+def test_a_join_in_another_s_name_takes_no_place(federation: Federation, has_token: bool) -> None:
+    watched = Watched(federation)
+    if has_token:  # of the name alone, as a program has that knows no more than the contract
+        watched.client.token(CONTROLLER)
+    pid = federation.pid(CONTROLLER)
+    watched.join_as(CONTROLLER)
+    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("no_show", CONTROLLER))
+    assert federation.pid(CONTROLLER) == pid
+    watched.flies_on()
+    assert federation.record().events("superseded", "death") == []
+
+
 def test_a_join_of_another_s_process_is_answered_by_a_newer_one(federation: Federation) -> None:
     watched = Watched(federation)
     health = watched.client.subscribe(f"process/{CONTROLLER}/health").until(lambda m: m).message
@@ -61,13 +79,15 @@ def test_a_join_without_a_token_holds_time_up_for_a_moment_only(federation: Fede
 
 def test_who_takes_a_place_and_does_nothing_gives_it_back(federation: Federation) -> None:
     watched = Watched(federation)
-    token = watched.client.token(CONTROLLER)
+    client = watched.client
+    tokens = [client.token(CONTROLLER), client.token(f"{CONTROLLER}/session/{client.session.info.zid()}")]
     watched.join_as(CONTROLLER)
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("superseded", CONTROLLER))
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("death", CONTROLLER))
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("restart", CONTROLLER))
     watched.flies_on()
-    token.undeclare()
+    for token in tokens:
+        token.undeclare()
 
 
 # Who is stopped
@@ -77,8 +97,8 @@ def test_a_stopped_estimator_is_named_and_not_the_controller_that_waits_for_it(f
     watched = Watched(federation)
     watched.stop(ESTIMATOR)
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent", ESTIMATOR))
-    standing = watched.clock.until(lambda m: len(m["waiting_for"]) == 2).message["waiting_for"]
-    assert {w["name"]: w["held_by"] for w in standing} == {ESTIMATOR: [], CONTROLLER: [ESTIMATOR]}
+    wanted = {ESTIMATOR: [], CONTROLLER: [ESTIMATOR]}
+    watched.clock.until(lambda m: {w["name"]: w["held_by"] for w in m["waiting_for"]} == wanted)
     watched.run.line(f"waiting for {ESTIMATOR} on [^,]*$")
     federation.kill(ESTIMATOR, signal.SIGCONT)
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent_end", ESTIMATOR))
@@ -102,3 +122,50 @@ def test_a_stopped_world_is_named(federation: Federation) -> None:
     federation.kill("world", signal.SIGCONT)
     watched.run.line("world .* is back")
     watched.flies_on()
+
+
+# Who reads nothing
+
+READER = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+session = zenoh.open(config)
+subscriber = session.declare_subscriber("**", lambda sample: time.sleep(1000))
+print("reads", flush=True)
+time.sleep(1000)
+"""
+
+
+@contextmanager
+def reader(endpoint: str, stopped: bool) -> Iterator[int]:
+    """Let a program subscribe to everything and take nothing of it; yield its process id."""
+    program = subprocess.Popen([sys.executable, "-c", READER, endpoint], stdout=subprocess.PIPE)
+    try:
+        assert program.stdout is not None
+        program.stdout.readline()
+        if stopped:
+            program.send_signal(signal.SIGSTOP)
+        yield program.pid
+    finally:
+        program.kill()
+        program.communicate()
+
+
+@pytest.mark.parametrize("pace", [("--rate", "10"), ("--realtime",)])
+def test_who_subscribes_to_everything_and_takes_nothing_costs_nobody_anything(
+    federation: Federation, pace: tuple[str, ...]
+) -> None:
+    watched = Watched(federation, *pace)
+    with ExitStack() as readers:
+        pids = {readers.enter_context(reader(federation.endpoint, stopped=n == 0)) for n in range(5)}
+        while pids:
+            closed = watched.events.until(lambda m: m["kind"] == "slow_reader").message["data"]
+            pids.discard(int(closed["process"].split()[1]))
+        t_ns = watched.clock.now()[-1].message["t_ns"]
+        watched.clock.until(lambda m: m["t_ns"] > t_ns + 5e9)
+    watched.flies_on()
+    record = federation.record()
+    assert record.events("death", "silent", "outputs_missing") == []
+    assert [event for event in record.events("refused") if "age" in event["text"]] == []

@@ -1,7 +1,7 @@
 """Same bits: the fingerprint of what a process computes with, its `join`, and the hash of a flight's truth.
 
-A fingerprint covers what the last bit of a number depends on: CPU feature level, libm, versions of the numeric
-packages; BLAS comes with numpy and scipy, so their versions stand for it.
+A fingerprint covers what the last bit of a number depends on: CPU feature level, libm, versions of the numeric packages,
+and for which processor BLAS computes: by itself it goes by the CPU, but OPENBLAS_CORETYPE or MKL_CBWR choose another.
 """
 
 import hashlib
@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from functools import cache
 
 import numpy as np
+import threadpoolctl
 from numpy.typing import ArrayLike, NDArray
 
 from zsim import __version__
@@ -31,6 +32,7 @@ def parts() -> dict[str, str]:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "cpu": _cpu_features(),
+        "blas": _blas(),
         "libc": "-".join(filter(None, platform.libc_ver())) or platform.system(),
         **{package: version for package, version in versions.items() if version},
     }
@@ -95,6 +97,12 @@ def _cpu_features() -> str:
     except OSError:
         flags = platform.processor()
     return hashlib.sha256(" ".join(sorted(flags.split())).encode()).hexdigest()[:8]
+
+
+def _blas() -> str:
+    """Return the kinds of BLAS that are loaded, and for which processor each computes."""
+    loaded = (each for each in threadpoolctl.threadpool_info() if each["user_api"] == "blas")
+    return " ".join(sorted({f"{each['internal_api']}-{each.get('architecture', '')}" for each in loaded})) or "none"
 
 
 class TruthHash:

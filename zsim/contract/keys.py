@@ -91,6 +91,17 @@ def token(process: str) -> str:
     return f"process/{process}"
 
 
+def session_token(process: str, session: str) -> str:
+    """Return the token by which a process says which session of Zenoh's is its own."""
+    return f"process/{process}/session/{session}"
+
+
+def session_of(token_key: str) -> str:
+    """Return the session that a token is about, empty if it is about none."""
+    head, _, session = token_key.rpartition("/session/")
+    return session if head else ""
+
+
 def process(process_name: str, what: str) -> str:
     """Return the key of `join`, `done`, `snapshot`, `bye` or `health` of a process."""
     return f"process/{process_name}/{what}"

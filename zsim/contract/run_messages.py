@@ -108,6 +108,7 @@ class Health(Message, frozen=True):
     refused: Count
     rss_bytes: Count
     received: Count = 0
+    reads: tuple[str, ...] = ()
 
 
 class Fault(Struct, frozen=True):

@@ -5,13 +5,14 @@ import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from zsim.contract.run_messages import Health
 
 PERIOD_S = 1.0  # contract: 1 Hz wall
 STEPS_KEPT = 1000
+READS_MAX = 8  # expressions that are listed of one that reads many
 
 
 class HealthMeter:
@@ -21,6 +22,7 @@ class HealthMeter:
         role: of the process.
         wall_s: monotonic wall time.
         host: the name of its host; None: as the system has it.
+        reads: the expressions that it subscribes to, as its session keeps them.
 
     Attributes:
         received, refused, dropped: messages taken in, not decodable, and gates given up.
@@ -28,9 +30,16 @@ class HealthMeter:
         link_lost: whether the world cannot be reached now.
     """
 
-    def __init__(self, role: str, wall_s: Callable[[], float] = time.monotonic, host: str | None = None) -> None:
+    def __init__(
+        self,
+        role: str,
+        wall_s: Callable[[], float] = time.monotonic,
+        host: str | None = None,
+        reads: Sequence[str] = (),
+    ) -> None:
         self._role = role
         self._host = host or socket.gethostname()
+        self._reads = reads
         self._wall_s = wall_s
         self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
         self._last_s = wall_s()
@@ -67,6 +76,7 @@ class HealthMeter:
             refused=self.refused,
             rss_bytes=resident_bytes(),
             received=self.received,
+            reads=tuple(self._reads[:READS_MAX]),
         )
 
 

@@ -56,7 +56,7 @@ class Runner:
         self._stopped = stopped
         self._say = say
         self._deserted = deserted
-        self.health = HealthMeter(agent.role, host=link.host)
+        self.health = HealthMeter(agent.role, host=link.host, reads=link.reads)
         self._inputs = RunnerInputs(link, info, agent, self.health, say)
         self._inbox = self._inputs.inbox
         self._member = Membership(link, info, agent, self._inputs.take_in, say)

@@ -65,7 +65,7 @@ class RunnerInputs:
         for key in self._agent.control_keys():
             self._link.declare_queryable(key, self._on_query)
         self._link.declare_queryable(keys.process(self._agent.name, "outputs"), self._on_query)
-        self._link.declare_token(keys.token(self._agent.name))
+        self._link.declare_process(self._agent.name)
 
     def wait(self) -> None:
         """Wait for what completes the next gate, or until woken.

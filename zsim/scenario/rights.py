@@ -84,7 +84,7 @@ def _own(process: str) -> Rights:
         writes=tuple(keys.process(process, what) for what in ("join", "done", "snapshot", "bye", "health")),
         asks=(keys.INFO, keys.CLOCK, keys.FAULTS, keys.process(process, "snapshot"), keys.replay(process)),
         answers=(keys.process(process, "outputs"),),
-        tokens=(keys.token(process),),
+        tokens=(keys.token(process), keys.session_token(process, "*")),
     )
 
 

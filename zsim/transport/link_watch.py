@@ -8,15 +8,14 @@ before its link is full, or at once if it comes back and does so again.
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from zsim.contract import keys
-from zsim.transport.admin_space import AdminSpace
 from zsim.transport.link_sockets import LinkSockets
-from zsim.transport.peer_process import local_socket, owner
+from zsim.transport.peer_process import command, local_socket, owner
 from zsim.transport.session import FarEnd, Session
+from zsim.transport.session_tokens import SessionTokens
 
 LOOK_S = 0.05  # wall time between two looks
 # Zenoh's thread that closes links is also the one that passes on what participants publish. Once that is blocked by a
@@ -25,9 +24,21 @@ STALL_BYTES = 1 << 16  # unacknowledged, from which on a link is looked at; the 
 STALL_S = 0.1  # wall time in which a far end that lives acknowledges something, beside …
 ROUND_TRIPS = 3.0  # … so many of its round trips
 HELD_BYTES, HELD_S = 1 << 20, 1.0  # one that takes something all the time, but never catches up
-REFRESH_S, FRESH_S = 1.0, 0.2  # between two looks at who is at which far end; where somebody is to be judged
+FRESH_S = 0.2  # between two looks at who is at which far end
 SPARED, SPARED_S = 3, 60.0  # times within so long that the link of a session is closed before it is kept out …
 KEPT_OUT_S = 30.0  # … for so long
+
+
+class Awaited(NamedTuple):
+    """A process that is waited for.
+
+    Attributes:
+        names: its own, and those whose work it does.
+        pid: as it joined.
+    """
+
+    names: tuple[str, ...]
+    pid: int
 
 
 class ClosedLink(NamedTuple):
@@ -36,8 +47,7 @@ class ClosedLink(NamedTuple):
     Attributes:
         address: of its far end.
         process: at that end, by pid and command, if it is on this machine.
-        names: of the processes whose tokens its session held.
-        reads: expressions that it subscribed to.
+        names: of the processes that its session stands for.
         held_bytes: what it held back in the kernel.
         times: that a link of its session was closed so far.
     """
@@ -45,7 +55,6 @@ class ClosedLink(NamedTuple):
     address: str
     process: str
     names: tuple[str, ...]
-    reads: tuple[str, ...]
     held_bytes: int
     times: int
 
@@ -64,7 +73,8 @@ class LinkWatch:
 
     Args:
         link: the listening session.
-        is_waited_for: tells whether a process takes part in a way that it must not lose anything.
+        tokens: of all processes.
+        awaited: returns who takes part in a way that they must not lose anything.
         sockets: of this process.
         wall_s: monotonic.
 
@@ -75,20 +85,19 @@ class LinkWatch:
     def __init__(
         self,
         link: Session,
-        is_waited_for: Callable[[str], bool],
+        tokens: SessionTokens,
+        awaited: Callable[[], list[Awaited]],
         sockets: LinkSockets | None = None,
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._link = link
-        self._space = AdminSpace(link)
-        self._is_waited_for = is_waited_for
+        self._tokens = tokens
+        self._awaited = awaited
         self._sockets = sockets or LinkSockets()
         self._wall_s = wall_s
         self._backlogs: dict[str, _Backlog] = {}
         self._far_ends: dict[str, FarEnd] = {}
-        self._names: dict[str, tuple[str, ...]] = {}  # by session
-        self._reads: dict[str, tuple[str, ...]] = {}
-        self._refreshed_s = -REFRESH_S
+        self._refreshed_s = -FRESH_S
         self._times: dict[str, list[float]] = {}  # at which links of a session were closed
         self._kept_out_s: dict[str, float] = {}
         self._over = threading.Event()
@@ -110,8 +119,6 @@ class LinkWatch:
     def look(self) -> None:
         """Look at all links once, and close those that have to be."""
         now_s, queued = self._wall_s(), self._sockets.queued()
-        if now_s - self._refreshed_s >= REFRESH_S:
-            self._refresh(now_s)
         self._backlogs = {address: self._backlogs[address] for address in queued if address in self._backlogs}
         for address, held_bytes in queued.items():
             if self._holds_up(address, held_bytes, now_s) or self._is_kept_out(address, now_s):
@@ -137,48 +144,41 @@ class LinkWatch:
         return now_s - backlog.moved_s >= stall_s or now_s - backlog.low_s >= HELD_S
 
     def _is_kept_out(self, address: str, now_s: float) -> bool:
-        far = self._far_ends.get(address)
+        if now_s >= max(self._kept_out_s.values(), default=now_s):
+            return False
+        far = self._far_end(address, now_s)
         return far is not None and now_s < self._kept_out_s.get(far.session, now_s)
 
     def _judge(self, address: str, held_bytes: int, now_s: float) -> None:
         """Close a link, unless somebody is, or may be, behind it who must lose nothing."""
-        if now_s - self._refreshed_s >= FRESH_S:
-            self._refresh(now_s)
-        far = self._far_ends.get(address)
-        if far is None or far.is_router or any(map(self._is_waited_for, self._who(address))):
+        far, inode = self._far_end(address, now_s), local_socket(address)
+        if far is None or far.is_router or self._may_be_awaited(far, inode):
             return
-        socket_there = local_socket(address)
+        pid = owner(inode)
         self._sockets.close(address)
         self._backlogs.pop(address, None)
-        del self._far_ends[address]
         times = self._times.setdefault(far.session, [])
         times.append(now_s)
         if len(times) >= SPARED and now_s - times[-SPARED] < SPARED_S:
             self._kept_out_s[far.session] = now_s + KEPT_OUT_S
-        reads = self._reads.get(far.session, ())
-        process, names = owner(socket_there), self._names.get(far.session, ())
-        self.closed.append(ClosedLink(address, process, names, reads, held_bytes, len(times)))
+        names = self._tokens.processes(far.session)
+        self.closed.append(ClosedLink(address, command(pid), names, held_bytes, len(times)))
+
+    def _may_be_awaited(self, far: FarEnd, inode: str) -> bool:
+        """Tell whether a far end is waited for: by its tokens, or else by its pid, if that can be known."""
+        awaited = self._awaited()
+        if names := self._tokens.processes(far.session):
+            return any(name in each.names for each in awaited for name in names)
+        unknown = [each.pid for each in awaited if not any(map(self._tokens.sessions, each.names))]
+        pid = owner(inode) if unknown else ""
+        return int(pid) in unknown if pid else bool(unknown)
 
     def _who(self, address: str) -> tuple[str, ...]:
         far = self._far_ends.get(address)
-        return self._names.get(far.session, ()) if far else ()
+        return self._tokens.processes(far.session) if far else ()
 
-    def _refresh(self, now_s: float) -> None:
-        """Find out who is where; without an answer that is known to be whole nobody is judged."""
-        self._refreshed_s = now_s
-        holders = self._space.token_holders(keys.token("*"))
-        if not any(self._link.zid() in sessions for sessions in holders.values()):  # at least the hub's own is there
-            self._far_ends = {}
-            return
-        self._names = _by_session(holders, keys.thing)
-        self._reads = _by_session(self._space.subscribers(), str)
-        self._far_ends = self._link.far_ends()
-
-
-def _by_session(found: Mapping[str, Iterable[str]], name: Callable[[str], str]) -> dict[str, tuple[str, ...]]:
-    """Return what is found of each session."""
-    inverted: dict[str, list[str]] = {}
-    for key, sessions in found.items():
-        for session in sessions:
-            inverted.setdefault(session, []).append(name(key))
-    return {session: tuple(names) for session, names in inverted.items()}
+    def _far_end(self, address: str, now_s: float) -> FarEnd | None:
+        if now_s - self._refreshed_s >= FRESH_S:
+            self._refreshed_s = now_s
+            self._far_ends = self._link.far_ends()
+        return self._far_ends.get(address)

@@ -16,13 +16,25 @@ def local_socket(address: str) -> str:
     return _inode(f"{_table_form(host.strip('[]'))}:{int(port):04X}")
 
 
-def owner(inode: str) -> str:
-    """Return pid and command of the process that has a socket open; empty if we may not know."""
-    pid = _owner(inode) if inode else ""
+def command(pid: str) -> str:
+    """Return pid and command of a process; empty without a pid."""
+    if not pid:
+        return ""
     with suppress(OSError):
-        command = (Path("/proc") / pid / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-        return f"pid {pid} ({' '.join(command.split())[:COMMAND_MAX]})" if pid else ""
+        line = (Path("/proc") / pid / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        return f"pid {pid} ({' '.join(line.split())[:COMMAND_MAX]})"
     return f"pid {pid}"
+
+
+def owner(inode: str) -> str:
+    """Return the pid of the process that has a socket open; empty if there is none, or we may not know."""
+    for pid in filter(str.isdigit, os.listdir("/proc")) if inode else ():
+        with suppress(OSError), os.scandir(f"/proc/{pid}/fd") as files:
+            for file in files:
+                with suppress(OSError):  # closed meanwhile
+                    if os.readlink(file.path) == f"socket:[{inode}]":
+                        return pid
+    return ""
 
 
 def _table_form(host: str) -> str:
@@ -39,13 +51,4 @@ def _inode(end: str) -> str:
                 fields = line.split()
                 if fields[1] == end and fields[9] != "0":
                     return fields[9]
-    return ""
-
-
-def _owner(inode: str) -> str:
-    for pid in filter(str.isdigit, os.listdir("/proc")):
-        with suppress(OSError):
-            for file in os.scandir(f"/proc/{pid}/fd"):
-                if os.readlink(file.path) == f"socket:[{inode}]":
-                    return pid
     return ""

@@ -219,6 +219,7 @@ class Session:
         process: the name in its certificate; empty without one.
         guarded: whether access control decides here who may do what.
         permissions: what access control at the other end lets this process do; None where it has none, or is not asked.
+        reads: the expressions that it has subscribed to so far.
     """
 
     def __init__(self, raw: zenoh.Session, federation: str, identity: Identity) -> None:
@@ -228,6 +229,7 @@ class Session:
         self.process = tls.own_name(identity) if identity.tls is not None else ""
         self.guarded = identity.access is not None
         self.permissions: Permissions | None = None
+        self.reads: list[str] = []
         self._prefix = f"{federation}/" if federation else ""
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._cached_publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
@@ -395,6 +397,7 @@ class Session:
             SessionError: it is no key expression, or our certificate does not let us read it.
         """
         self._check("read", expression)
+        self.reads.append(expression)
         with key_errors(expression):
             return self._keep(Subscription(self._raw, self._prefix, expression))
 
@@ -403,6 +406,7 @@ class Session:
 
         Nothing wakes who waits for it.
         """
+        self.reads.append("**")
         return self._keep(Subscription(self._raw, self._prefix, "**", without))
 
     def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> Callable[[], None]:
@@ -412,6 +416,7 @@ class Session:
             SessionError: it is no key expression, or our certificate does not let us read it.
         """
         self._check("read", expression)
+        self.reads.append(expression)
         with key_errors(expression):
             subscriber = self._raw.declare_subscriber(
                 self._prefix + expression, lambda sample: callback(raw_sample(sample, self._prefix))
@@ -420,6 +425,7 @@ class Session:
 
         def undeclare() -> None:
             if self._declared.pop(id(subscriber), None) is not None:
+                self.reads.remove(expression)
                 subscriber.undeclare()
 
         return undeclare
@@ -488,8 +494,13 @@ class Session:
 
     # Liveliness and links
 
+    def declare_process(self, name: str) -> None:
+        """Show that a process lives, and that this session is its own."""
+        self.declare_token(keys.session_token(name, self.zid()))
+        self.declare_token(keys.token(name))
+
     def declare_token(self, key: str) -> None:
-        """Show that this process lives; the token goes with it."""
+        """Show that what a key is about lives; the token goes with this session."""
         self._keep(self._raw.liveliness().declare_token(self._prefix + key))
 
     def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:

@@ -63,7 +63,6 @@ def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
         "listen/exit_on_failure": "true",
         "transport/unicast/accept_timeout": str(ACCEPT_MS),
         "transport/unicast/accept_pending": str(ACCEPT_PENDING),
-        "adminspace/enabled": "true",  # whose token it is, and who subscribes to what, is known there alone
         _CLOSE_AFTER: str(HUB_CLOSE_AFTER_US),
         **_security(identity, endpoints, "listen on"),
     }

@@ -275,9 +275,9 @@ class Barrier:
         participant = self.participants.get(name)
         return participant is not None and participant.gating
 
-    def is_waited_for(self, name: str) -> bool:
-        """Tell whether a process, or one that does its work, takes part in a way that it must not lose anything."""
-        return any(p.is_waited_for and name in p.served_names for p in list(self.participants.values()))
+    def awaited(self) -> list[Participant]:
+        """Return who takes part in a way that it must not lose anything; callable from any thread."""
+        return [p for p in list(self.participants.values()) if p.is_waited_for]
 
     def mark_dead(self, name: str, wall_ns: int) -> Participant | None:
         """Mark a participant as dead; it stays in the barrier until it is removed or rejoins."""

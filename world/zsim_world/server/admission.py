@@ -1,85 +1,87 @@
-"""Whose join counts: who takes another's place has a token of its own; who joins has one, and publishes a done.
+"""Whose join counts: who takes the place of one that lives shows that it is there; who joins has a token and a done.
 
-A join is only a message, which anybody can publish in any name. A token goes with a session: Zenoh knows whose it is.
+A join is only a message, which anybody can publish in any name. What shows that a process is there is a token of its own
+session, or, of a program that has none of these, the done that follows the join.
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import Join
-from zsim.transport.admin_space import AdminSpace
+from zsim.transport.session_tokens import Sessions, SessionTokens
 from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.journal.journal_entries import Entry, FalselyJoined, Joined, NotShown
 from zsim_world.journal.run_journal import RunJournal
 
 TOKEN_NS = 3_000_000_000  # wall time by which a token is there; the hub knows one behind routers within 1 s (measured)
+SHOWN_NS = 10_000_000_000  # wall time by which one whose token is not its own publishes a done; first steps take 1 s
+HELD_NS = 1_000_000_000  # wall time that time stands for one that lives from which on another may take its place
 DONE_NS = 10_000_000_000  # wall time that time may stand for one that never published a done; first steps take 1 s
 LOOK_NS = 200_000_000  # wall time between two looks at those who still have to show that they are there
-NO_TOKEN = "has no liveliness token of its own"
+NO_TOKEN = "has no liveliness token"
 NO_DONE = "has never published a done"
 
-Holders = frozenset[str]  # sessions, by Zenoh's names
 
-
-class _Withheld(NamedTuple):
-    """A join in another's place, and the wall time until which its token may come."""
+@dataclass
+class _Withheld:
+    """A join in another's place, since when there is one, and whether a done has followed it."""
 
     join: Join
-    until_ns: int
+    since_ns: int
+    has_done: bool = False
 
 
 class Admission:
     """Hands the joins to a world, and tells it of those behind which nobody is.
 
     Args:
-        space: knows who holds which token.
+        tokens: of all processes.
         world: that is joined.
         trusts: whether access control lets nobody join in another's name.
         journal: of what the world is handed.
     """
 
-    def __init__(self, space: AdminSpace, world: Coordinator, trusts: bool, journal: RunJournal | None = None) -> None:
+    def __init__(
+        self, tokens: SessionTokens, world: Coordinator, trusts: bool, journal: RunJournal | None = None
+    ) -> None:
         self._journal = journal or RunJournal(None)
-        self._space = space
+        self._tokens = tokens
         self._world = world
         self._barrier = world.barrier
         self._trusts = trusts
-        self._holders: dict[str, Holders] = {}  # of the tokens by which somebody takes part, or did
+        self._sessions: dict[str, Sessions] = {}  # by whose tokens somebody takes part, or did
         self._withheld: dict[str, _Withheld] = {}
         self._standing_ns: dict[str, int] = {}  # of those without a token or a done so far: how long time stood for it
         self._look_wall_ns = 0
 
     def take(self, name: str, join: Join, wall_ns: int) -> None:
-        """Take a join, or withhold it until its token is there."""
-        if self._trusts or not self._barrier.takes_place(name, join):
+        """Take a join, or withhold it until it is clear that somebody is behind it."""
+        if not self._barrier.takes_place(name, join):
             self._admit(name, join, wall_ns)
-        elif not self._admit_holder(name, join, self._token_holders(), wall_ns):
-            former = self._withheld.get(name)
-            self._withheld[name] = _Withheld(join, former.until_ns if former else wall_ns + TOKEN_NS)
+            return
+        former = self._withheld.get(name)
+        self._withheld[name] = _Withheld(join, former.since_ns if former else wall_ns)
+        self._check_withheld(wall_ns)
 
-    def _admit_holder(self, name: str, join: Join, holders: dict[str, Holders], wall_ns: int) -> bool:
-        """Take a join in the place of another if a session has a token for it; each session can do so once."""
-        present, former = holders.get(name, Holders()), self._holders.get(name, Holders())
-        if not present - former:
-            return False
-        self._admit(name, join, wall_ns)
-        self._holders[name] = (present & former) | {min(present - former)}
-        return True
+    def done_received(self, name: str, incarnation: int, wall_ns: int) -> None:
+        """Take the news that a process has published a done, before the world has it."""
+        withheld = self._withheld.get(name)
+        if withheld is not None and withheld.join.incarnation == incarnation:
+            withheld.has_done = True
+            self._check_withheld(wall_ns)
 
     def _admit(self, name: str, join: Join, wall_ns: int) -> None:
         self._withheld.pop(name, None)
+        former, present = self._sessions.get(name, Sessions()), self._tokens.sessions(name)
         if name not in self._barrier.participants:
-            self._holders.pop(name, None)
+            former = Sessions()
         self._world.handle(keys.process(name, "join"), join, wall_ns)
         self._note(Joined(wall_ns, name, messages.encode(join)))
         participant = self._barrier.participants.get(name)
         if participant is not None and participant.join is join:
+            self._sessions[name] = (present & former) | frozenset(sorted(present - former)[:1])  # one for each join
             self._standing_ns[name] = 0
-
-    def _token_holders(self) -> dict[str, Holders]:
-        found = self._space.token_holders(keys.token("*"))
-        return {keys.thing(key): sessions for key, sessions in found.items() if sessions}
 
     def check_due(self, wall_ns: int) -> None:
         """Look at those who still have to show that they are there."""
@@ -87,29 +89,41 @@ class Admission:
         if passed_ns < LOOK_NS or not (self._withheld or self._standing_ns):
             return
         self._look_wall_ns = wall_ns
-        holders = {} if self._trusts else self._token_holders()
-        self._check_withheld(holders, wall_ns)
-        self._check_admitted(holders, wall_ns)
+        self._check_withheld(wall_ns)
+        self._check_admitted(wall_ns)
         self._count_standing(min(passed_ns, 2 * LOOK_NS), wall_ns)
 
-    def _check_withheld(self, holders: dict[str, Holders], wall_ns: int) -> None:
-        for name, (join, until_ns) in list(self._withheld.items()):
-            if not self._barrier.takes_place(name, join):
+    def _check_withheld(self, wall_ns: int) -> None:
+        for name, withheld in list(self._withheld.items()):
+            join = withheld.join
+            if not self._barrier.takes_place(name, join) or self._may_take_place(name, withheld, wall_ns):
                 self._admit(name, join, wall_ns)
-            elif not self._admit_holder(name, join, holders, wall_ns) and wall_ns >= until_ns:
+                continue
+            reason = NO_DONE if self._tokens.is_alive(name) else NO_TOKEN
+            if wall_ns - withheld.since_ns >= (SHOWN_NS if reason == NO_DONE else TOKEN_NS):
                 del self._withheld[name]
-                self._world.handle_false_join(name, join, NO_TOKEN)
-                self._note(FalselyJoined(name, messages.encode(join), NO_TOKEN))
+                self._world.handle_false_join(name, join, reason)
+                self._note(FalselyJoined(name, messages.encode(join), reason))
 
-    def _check_admitted(self, holders: dict[str, Holders], wall_ns: int) -> None:
+    def _may_take_place(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
+        """Tell whether somebody is behind a join in the place of another, or the other is not there any more."""
+        if self._trusts or withheld.has_done or self._tokens.sessions(name) - self._sessions.get(name, Sessions()):
+            return True
+        former = self._barrier.participants.get(name)
+        if former is None or not former.alive:
+            return self._tokens.is_alive(name)
+        held_up = former in self._world.standing_for() and wall_ns - former.since_wall_ns >= HELD_NS
+        return held_up or former.silent_wall_ns is not None
+
+    def _check_admitted(self, wall_ns: int) -> None:
         """Note who has a token, and tell the world of those who have had the time and have none."""
         for name in list(self._standing_ns):
             participant = self._barrier.participants.get(name)
             if participant is None or not participant.alive:
                 del self._standing_ns[name]
                 continue
-            self._holders[name] = self._holders.get(name) or holders.get(name, Holders())
-            has_token = bool(self._trusts or self._holders[name])
+            self._sessions[name] = self._sessions.get(name) or self._tokens.sessions(name)
+            has_token = self._trusts or self._tokens.is_alive(name)
             if has_token and not _owes_done(participant):
                 del self._standing_ns[name]
             elif not has_token and wall_ns - participant.joined_wall_ns >= TOKEN_NS:

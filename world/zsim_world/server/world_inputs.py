@@ -239,6 +239,8 @@ class MessageIntake:
         """Hand the world a message that it acts on."""
         message = messages.decode(key, payload)
         self.history.add(key, payload, message.t_ns)
+        if type(message) is run_messages.Done:
+            self.admission.done_received(keys.thing(key), message.incarnation, wall_ns)
         if type(message) is not run_messages.Join:  # that is for `take` to admit, or for the journal to repeat
             self.world.handle(key, message, wall_ns)
         if type(message) is run_messages.Health and not self.replaying:

@@ -14,9 +14,8 @@ from zsim.runtime.agent import Output
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
-from zsim.transport.admin_space import AdminSpace
-from zsim.transport.link_watch import LinkWatch
 from zsim.transport.session import Query, Session
+from zsim.transport.session_tokens import SessionTokens
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator
@@ -36,9 +35,6 @@ from zsim_world.server.world_outputs import WorldOutputs
 STUCK_NS = 2_000_000_000  # wall time in one turn from which on it is an event; a turn takes milliseconds
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
-# Zenoh 1.x can stop answering for good when its admin space is asked while others declare (4 of 11 000 tests): so joins
-# are trusted, and links are not watched, until that is asked for in another way.
-ASKS_NOBODY = True
 HEALTH = keys.process(WORLD, "health")
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
 
@@ -78,7 +74,8 @@ class WorldProcess:
         self._liveliness = LivelinessMonitor(
             link, world.barrier, self._handle_death, self._take_in, self._handle_silence
         )
-        self._admission = Admission(AdminSpace(link), world, ASKS_NOBODY, self._journal)
+        self._tokens = SessionTokens(link)
+        self._admission = Admission(self._tokens, world, link.guarded, self._journal)
         self._intake = MessageIntake(
             link,
             world,
@@ -90,7 +87,7 @@ class WorldProcess:
             self._progress,
             self._journal,
         )
-        self._readers = SlowReaders(LinkWatch(link, world.barrier.is_waited_for), world, link.host, self._journal)
+        self._readers = SlowReaders(link, self._tokens, world, self._history, self._journal)
         self._service = QueryService(link, world, self._history, self._journal)
         self._queries: deque[Query] = deque()
         self._over = threading.Event()
@@ -112,9 +109,10 @@ class WorldProcess:
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
         try:
-            while self._world.ended is None:
-                self._turn()
-            self._end()
+            with self._readers.watch:
+                while self._world.ended is None:
+                    self._turn()
+                self._end()
         finally:
             self._over.set()
             ticker.join()
@@ -130,8 +128,9 @@ class WorldProcess:
             self._outputs.publish(Output(keys.INFO, self._world.info()))
         for expression in self._service.answered_keys():
             self._link.declare_queryable(expression, self._on_query)
-        self._link.on_token("process/*", self._on_token)
-        self._link.declare_token(keys.token(WORLD))
+        self._tokens.watch()
+        self._link.on_token(keys.token("*"), self._on_token)
+        self._link.declare_process(WORLD)
 
     # A world before this one
 

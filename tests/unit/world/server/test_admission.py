@@ -6,9 +6,9 @@ from fake_link import FakeLink
 from zsim.contract import keys
 from zsim.contract.run_messages import Done, Join
 from zsim.scenario import scenario_file
-from zsim.transport.admin_space import AdminSpace
+from zsim.transport.session_tokens import SessionTokens
 from zsim_world.flight.world import World
-from zsim_world.server.admission import DONE_NS, LOOK_NS, TOKEN_NS, Admission
+from zsim_world.server.admission import DONE_NS, HELD_NS, LOOK_NS, SHOWN_NS, TOKEN_NS, Admission
 
 GATE_NS = 20_000_000
 ME = "estimator.d1"
@@ -28,7 +28,9 @@ class Case:
     def __init__(self, trusts: bool = False) -> None:
         self.link = FakeLink()
         self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
-        self.admission = Admission(AdminSpace(self.link), self.world, trusts)  # type: ignore[arg-type]
+        tokens = SessionTokens(self.link)  # type: ignore[arg-type]
+        tokens.watch()
+        self.admission = Admission(tokens, self.world, trusts)
         self.wall_ns = TOKEN_NS
         self._dones = 0
 
@@ -37,7 +39,14 @@ class Case:
         join = Join(0, 0, "run1", incarnation, role, host, pid, period_ns)
         self.admission.take(name, join, self.wall_ns)
 
+    def show(self, name: str, session: str = "", alive: bool = True) -> None:
+        """Let a token of a process appear, or go, and that of its session unless it is a program of somebody's own."""
+        self.link.show(keys.token(name), alive)
+        if session:
+            self.link.show(keys.session_token(name, session), alive)
+
     def done(self, name: str, t_ns: int, incarnation: int) -> None:
+        self.admission.done_received(name, incarnation, self.wall_ns)
         done = Done(t_ns, self._dones, "run1", incarnation, t_ns, 0)
         self._dones += 1
         self.world.handle(keys.process(name, "done"), done, self.wall_ns)
@@ -47,6 +56,14 @@ class Case:
         for _ in range(wall_ns // LOOK_NS + 1):
             self.wall_ns += LOOK_NS
             self.admission.check_due(self.wall_ns)
+
+    def flies_for(self, wall_ns: int, incarnation: int = 1) -> None:
+        """Let wall time pass while ME keeps up with the world."""
+        for _ in range(wall_ns // LOOK_NS + 1):
+            self.done(ME, self.world.now_ns, incarnation)
+            self.advance()
+            self.done(ME, self.world.now_ns, incarnation)
+            self.passes(0)
 
     def advance(self) -> None:
         while self.world.may_advance():
@@ -71,7 +88,7 @@ class Case:
 def case() -> Case:
     """A run in which ME takes part, with a token, and has published a done."""
     made = Case()
-    made.link.holders[ME] = ["a"]
+    made.show(ME, "a")
     made.join(ME, pid=7, incarnation=1)
     made.advance()
     made.done(ME, 0, incarnation=1)
@@ -80,36 +97,57 @@ def case() -> Case:
 
 
 @pytest.mark.parametrize("forged", [{"pid": 8}, {"pid": 7, "host": "elsewhere"}, {"pid": 7, "period_ns": 0}])
-def test_a_join_without_a_token_takes_nobody_s_place(case: Case, forged: dict[str, int]) -> None:
+def test_a_join_that_nobody_is_behind_takes_nobody_s_place(case: Case, forged: dict[str, int]) -> None:
     case.join(ME, incarnation=2, **forged)  # type: ignore[arg-type]
-    case.passes(TOKEN_NS)
+    case.flies_for(SHOWN_NS)
     assert case.kinds() == ["join", "no_show"]
     assert (case.incarnation(), case.world.barrier.participants[ME].gating) == (1, True)
 
 
 def test_one_that_is_repeated_is_named_as_soon(case: Case) -> None:
-    for incarnation in range(2, 2 + TOKEN_NS // LOOK_NS):
+    for incarnation in range(2, 2 + SHOWN_NS // LOOK_NS):
         case.join(ME, pid=8, incarnation=incarnation)
-        case.passes(0)
-    case.passes(LOOK_NS)
+        case.flies_for(0)
+    case.flies_for(LOOK_NS)
     assert case.kinds() == ["join", "no_show"]
 
 
-def test_one_with_a_token_of_its_own_takes_over_at_once(case: Case) -> None:
-    case.link.holders[ME] = ["a", "b"]
+def test_one_with_a_token_of_its_own_session_takes_over_at_once(case: Case) -> None:
+    case.show(ME, "b")
     case.join(ME, pid=8, incarnation=2)
     assert case.kinds() == ["join", "superseded"]
     case.join(ME, pid=9, incarnation=3)  # of nobody, while both tokens are there
-    case.link.holders[ME] = ["b"]
-    case.passes(TOKEN_NS)
+    case.show(ME, "a", alive=False)
+    case.show(ME)
+    case.flies_for(TOKEN_NS, incarnation=2)
     assert case.incarnation() == 2
 
 
 def test_one_whose_token_comes_late_over_a_router_takes_over_then(case: Case) -> None:
     case.join(ME, pid=8, incarnation=2)
-    case.passes(TOKEN_NS // 2)
-    case.link.holders[ME] = ["a", "b"]
+    case.flies_for(TOKEN_NS // 2)
+    case.show(ME, "b")
     case.passes(LOOK_NS)
+    assert case.kinds() == ["join", "superseded"]
+
+
+def test_a_program_without_such_a_token_takes_over_with_its_first_done(case: Case) -> None:
+    case.join(ME, pid=8, incarnation=2)
+    case.flies_for(TOKEN_NS)
+    case.done(ME, case.world.now_ns, incarnation=2)
+    assert (case.kinds(), case.incarnation()) == (["join", "superseded"], 2)
+    assert case.world.barrier.participants[ME].done_ns == case.world.now_ns
+
+
+@pytest.mark.parametrize("how", ["held_up", "silent"])
+def test_or_as_soon_as_the_one_that_lives_is_not_there(case: Case, how: str) -> None:
+    case.join(ME, pid=8, incarnation=2)
+    if how == "silent":
+        case.world.handle_silence(ME, case.wall_ns)
+        case.passes(LOOK_NS)
+    else:
+        case.advance()
+        case.passes(HELD_NS)
     assert case.kinds() == ["join", "superseded"]
 
 
@@ -118,13 +156,14 @@ def test_the_same_process_rejoins_without_another_token(case: Case) -> None:
     assert case.kinds() == ["join", "superseded"]
 
 
-def test_nobody_restarts_the_dead_without_a_token(case: Case) -> None:
+@pytest.mark.parametrize("session", ["b", ""])
+def test_nobody_restarts_the_dead_without_a_token(case: Case, session: str) -> None:
     case.world.handle_death(ME, case.wall_ns)
-    case.link.holders[ME] = []
+    case.show(ME, "a", alive=False)
     case.join(ME, pid=8, incarnation=2)
     case.passes(TOKEN_NS)
     assert case.kinds() == ["join", "death", "no_show"]
-    case.link.holders[ME] = ["b"]
+    case.show(ME, session)
     case.join(ME, pid=9, incarnation=3)
     assert case.kinds()[-1] == "restart"
 
@@ -147,7 +186,7 @@ def test_who_joins_without_a_token_is_dropped(case: Case) -> None:
 
 
 def test_who_never_publishes_a_done_is_dropped(case: Case) -> None:
-    case.link.holders[VISITOR] = ["v"]
+    case.show(VISITOR, "v")
     case.join(VISITOR, pid=9, incarnation=1)
     case.fly()
     case.passes(DONE_NS // 2)
@@ -157,7 +196,7 @@ def test_who_never_publishes_a_done_is_dropped(case: Case) -> None:
 
 
 def test_but_not_while_time_stands_for_another_too(case: Case) -> None:
-    case.link.holders[VISITOR] = ["v"]
+    case.show(VISITOR, "v")
     case.join(VISITOR, pid=9, incarnation=1)
     case.advance()  # until ME is waited for as well: it may be for ME that the visitor has published nothing
     case.passes(2 * DONE_NS)
@@ -166,7 +205,7 @@ def test_but_not_while_time_stands_for_another_too(case: Case) -> None:
 
 def test_nor_one_of_the_scenario_however_long_its_first_step_takes() -> None:
     case = Case()
-    case.link.holders[ME] = ["a"]
+    case.show(ME, "a")
     case.join(ME, pid=7, incarnation=1)
     case.advance()
     case.passes(2 * DONE_NS)
@@ -174,7 +213,7 @@ def test_nor_one_of_the_scenario_however_long_its_first_step_takes() -> None:
 
 
 def test_a_successor_that_publishes_nothing_is_dead(case: Case) -> None:
-    case.link.holders[ME] = ["a", "b"]
+    case.show(ME, "b")
     case.join(ME, pid=8, incarnation=2)
     case.advance()
     case.passes(DONE_NS + LOOK_NS)

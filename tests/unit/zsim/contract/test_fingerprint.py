@@ -1,5 +1,7 @@
 """The numeric fingerprint: the same in every process of a machine, another when anything of it changes."""
 
+import os
+import platform
 import re
 import subprocess
 import sys
@@ -30,7 +32,7 @@ def test_another_process_has_the_same():
 
 def test_it_is_made_of_what_the_last_bit_depends_on():
     found = parts()
-    assert {"zsim", "python", "machine", "cpu", "libc", "numpy"} <= set(found)
+    assert {"zsim", "python", "machine", "cpu", "blas", "libc", "numpy"} <= set(found)
     assert all(found.values())
 
 
@@ -50,6 +52,15 @@ def test_another_processor_is_another_fingerprint(monkeypatch: pytest.MonkeyPatc
     parts.cache_clear()
     fingerprint.cache_clear()
     assert fingerprint() != here
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="names of cores of x86")
+@pytest.mark.parametrize("core", ["Haswell", "Sandybridge"])
+def test_blas_for_another_processor_is_another_fingerprint(core: str):
+    command = [sys.executable, "-c", "from zsim.contract.fingerprint import parts; print(parts()['blas'])"]
+    chosen = {**os.environ, "OPENBLAS_CORETYPE": core}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=chosen)
+    assert done.stdout.strip() == f"openblas-{core}"
 
 
 def test_where_the_c_library_is_unknown_the_system_stands_for_it(monkeypatch: pytest.MonkeyPatch):

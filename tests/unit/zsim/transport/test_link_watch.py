@@ -1,10 +1,15 @@
 """Who loses its link: a reader that takes nothing and that nobody waits for; never anybody else."""
 
+import os
+import socket
+
 from fake_link import FakeLink
 
+from zsim.contract import keys
 from zsim.transport.link_sockets import Progress
-from zsim.transport.link_watch import HELD_BYTES, KEPT_OUT_S, LOOK_S, SPARED, STALL_BYTES, STALL_S, LinkWatch
+from zsim.transport.link_watch import HELD_BYTES, KEPT_OUT_S, LOOK_S, SPARED, STALL_BYTES, STALL_S, Awaited, LinkWatch
 from zsim.transport.session import FarEnd
+from zsim.transport.session_tokens import SessionTokens
 
 READER, RECORDER, ROUTER = "10.0.0.1:1", "10.0.0.2:2", "10.0.0.3:3"
 FAR_ENDS = {READER: FarEnd("r", False), RECORDER: FarEnd("rec", False), ROUTER: FarEnd("x", True)}
@@ -36,9 +41,11 @@ class Case:
     def __init__(self) -> None:
         self.link, self.sockets, self.wall_s = FakeLink(), Sockets(), 100.0
         self.link.ends = dict(FAR_ENDS)
-        self.link.holders = {"world": ["hub"], "recorder": ["rec"]}
-        self.link.readers = {"zsim/drone/**": ["r"]}
-        self.watch = LinkWatch(self.link, {"recorder"}.__contains__, self.sockets, lambda: self.wall_s)  # type: ignore[arg-type]
+        self.awaited = [Awaited(("recorder",), 7)]
+        tokens = SessionTokens(self.link)  # type: ignore[arg-type]
+        tokens.watch()
+        self.link.show(keys.session_token("recorder", "rec"))
+        self.watch = LinkWatch(self.link, tokens, lambda: self.awaited, self.sockets, lambda: self.wall_s)  # type: ignore[arg-type]
 
     def passes(self, wall_s: float, taken: int = 0) -> None:
         """Let time pass look by look; each far end takes so many bytes in each."""
@@ -54,7 +61,7 @@ def test_who_takes_nothing_is_closed_and_named_and_who_is_waited_for_is_not():
     case.passes(STALL_S + 2 * LOOK_S)
     assert case.sockets.closed == [READER]
     (closed,) = case.watch.closed
-    assert (closed.reads, closed.names, closed.held_bytes, closed.times) == (("zsim/drone/**",), (), STALL_BYTES, 1)
+    assert (closed.names, closed.held_bytes, closed.times) == ((), STALL_BYTES, 1)
     assert case.watch.stuck()[0].startswith("recorder")
 
 
@@ -82,12 +89,29 @@ def test_a_long_way_is_given_its_time():
     assert case.sockets.closed == [READER]
 
 
-def test_nobody_is_closed_of_whom_it_is_not_known_who_they_are():
+def test_nobody_is_closed_while_one_that_is_waited_for_may_be_behind_any_link():
     case = Case()
-    case.link.holders = {}
+    case.awaited.append(Awaited(("estimator.d1",), 8))  # by its own program: it does not show which session it has
     case.sockets.held = {READER: HELD_BYTES}
     case.passes(2.0)
     assert case.sockets.closed == []
+    case.link.show(keys.session_token("estimator.d1", "e"))
+    case.passes(2.0)
+    assert case.sockets.closed == [READER]
+
+
+def test_one_that_others_wait_for_is_told_from_a_reader_by_its_pid_on_this_machine():
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as reader:
+        case, here = Case(), "{}:{}".format(*reader.getsockname())
+        case.awaited.append(Awaited(("estimator.d1",), os.getpid()))
+        case.link.ends[here] = FarEnd("r", False)
+        case.sockets.held = {here: HELD_BYTES}
+        case.passes(2.0)
+        assert case.sockets.closed == []
+        case.awaited[-1] = Awaited(("estimator.d1",), os.getpid() + 1)
+        case.passes(2.0)
+        assert case.sockets.closed == [here]
+        assert case.watch.closed[0].process.startswith(f"pid {os.getpid()} ")
 
 
 def test_who_comes_back_to_do_it_again_is_kept_out_for_a_while():
