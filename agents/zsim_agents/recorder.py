@@ -159,7 +159,7 @@ class Recorder:
                 self._print(f"{self._name}: lost the link to the world; waiting for it to come back")
             self._must_look = up and self._link_lost
             self._link_lost = not up
-        info = read_info(self._link) if self._must_look else None
+        info = self._info_of_world() if self._must_look else None
         if info is None:
             return False
         self._must_look = False
@@ -175,11 +175,11 @@ class Recorder:
     def _loop(self) -> str:
         while True:
             arrived = list(self._traffic.receive())
+            time.sleep(PAUSE_S)
+            arrived += self._traffic.drain()
             if self._is_another_run():  # before what has arrived: it may have passed after what was missed
                 return ANOTHER_RUN
             self._write_arrived(arrived)
-            time.sleep(PAUSE_S)
-            self._write_arrived(self._traffic.drain())
             self._fetch_when_quiet()
             for sample in self._views.drain():
                 self._write(sample.key, sample.payload)
@@ -242,25 +242,32 @@ class Recorder:
             self._fetch_missed()
 
     def _write_arrived(self, arrived: Iterable[Passed]) -> None:
-        """Write what has arrived; where gates are missing before it, what the world still has of them comes first.
+        """Write what has arrived; where clocks are missing before it, what the world still has since comes first.
 
-        What stands before a clock is held until that is looked at: it may have passed after gates that are missing.
+        What stands before a clock is held until that is looked at: it may have passed after what is missing.
         """
         held: list[Passed] = []
         for passed in arrived:
             held.append(passed)
             if isinstance(passed, ReceivedSample) and passed.key == keys.CLOCK:
                 clock = self._clock_in(passed.payload)
-                if clock is not None and self._gates.gap_before(clock) and self._reaches_run():
+                if clock is not None and self._gates.misses(clock) and self._reaches_run():
                     self._fetch_missed(clock)
                 self._write_all(held)
                 held.clear()
         self._write_all(held)
 
     def _reaches_run(self) -> bool:
-        """Tell whether the world of this run still answers."""
-        info = read_info(self._link)
+        """Tell whether the world of this run answers."""
+        info = self._info_of_world()
         return info is not None and info.run_id == self._info.run_id
+
+    def _info_of_world(self) -> messages.Info | None:
+        """Return what the world says of its run, which may take a while where it was just started again."""
+        until_s = time.monotonic() + REPLAY_S
+        while (info := read_info(self._link)) is None and time.monotonic() < until_s and not self._stopped():
+            self._over.wait(TICK_S)
+        return info
 
     def _write_all(self, held: Iterable[Passed]) -> None:
         for passed in held:

@@ -225,10 +225,10 @@ class Federation:
 
     def nobody_left(self, within_s: float = PATIENCE_S) -> None:
         """Fail if any process of this federation is still there after a while."""
-        pids = [pid for pid, _ in self._processes()]
         until_s = time.monotonic() + within_s
-        for pid in pids:
-            wait_gone(pid, until_s - time.monotonic())
+        while (pids := [pid for pid, _ in self._processes()]) and time.monotonic() < until_s:  # one may start another
+            for pid in pids:
+                wait_gone(pid, until_s - time.monotonic())
         assert self.left() == []
 
     def _processes(self) -> Iterator[tuple[int, list[str]]]:

@@ -59,6 +59,10 @@ class GateCount:
         self._step, self._seq = clock.step, clock.seq
         return gap
 
+    def misses(self, clock: run_messages.Clock) -> bool:
+        """Tell whether a clock is missing before this one, of a gate or of time that stood still."""
+        return clock.seq > self._seq + 1
+
     def gap_before(self, clock: run_messages.Clock) -> GateGap | None:
         """Return the gates that are missing between the clock that was added last and this one.
 

@@ -38,8 +38,9 @@ def pair(key: str, message: Struct) -> Pair:
     return key, messages.encode(message)
 
 
-def clock(gate: int, state: str = "running") -> Pair:
-    return pair(keys.CLOCK, Clock(gate * GATE_NS, gate, "r", gate, state, 1.0))  # type: ignore[arg-type]
+def clock(gate: int, state: str = "running", seq: int | None = None) -> Pair:
+    number = gate if seq is None else seq
+    return pair(keys.CLOCK, Clock(gate * GATE_NS, number, "r", gate, state, 1.0))  # type: ignore[arg-type]
 
 
 def imu(gate: int) -> Pair:
@@ -64,7 +65,7 @@ def recorded(
 ) -> list[Pair]:
     """Record a run that answers replays, has last values, and sends batches; return what is in the record."""
     link, left = FakeLink(), iter(answers)
-    link.last = last or {}
+    link.last = dict([pair(keys.INFO, INFO)]) | (last or {})
     link.on_request = lambda key, args: next(left, page([]))  # the world has no more of the gates before the last one
     for passed in (*batches, [clock(99, "stopped")]):
         link.deliver(keys.BATCH, encode_batch(passed))
@@ -156,7 +157,8 @@ def test_what_is_not_answered_is_asked_for_again(tmp_path: Path, first: ControlA
 @pytest.mark.parametrize("key", [keys.CLOCK, keys.EVENT, IMU, "process/x.y/join", "of/somebody"])
 @pytest.mark.parametrize("payload", [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000], ids=["utf8", "nested", "no", "deep"])
 def test_garbage_is_recorded_as_it_came(tmp_path: Path, key: str, payload: bytes):
-    found = recorded(tmp_path / "run.mcap", [page([(key, payload)])], [(key, payload), clock(2), (key, payload)])
+    passed = [(key, payload), clock(0), (key, payload), clock(1)]
+    found = recorded(tmp_path / "run.mcap", [page([(key, payload)])], passed)
     assert [each for each in found if each[1] == payload] == [(key, payload)] * 2
 
 
@@ -276,6 +278,16 @@ def test_gates_that_did_not_come_are_asked_for_and_stand_before_what_came_after_
     with RecordReader(path) as reader:
         written = [message.key for message in reader.messages([keys.CLOCK, strange[0]], by_time=False)]
     assert written == [*[keys.CLOCK] * 4, strange[0], *[keys.CLOCK] * 4]
+
+
+def test_a_clock_of_time_that_stood_still_is_missed_by_its_number(tmp_path: Path):
+    """The world died just after it had published that clock: the next one knows of it."""
+    path, stood = tmp_path / "run.mcap", clock(1, seq=2)
+    after = [clock(1, seq=3), clock(2, seq=4)]
+    recorded(path, [page(gates(0)), page([*gates(0, 1), stood, *after])], gates(1), after, last=dict([pair(keys.INFO, INFO)]))
+    with RecordReader(path) as reader:
+        clocks = [messages.decode(each.key, each.payload) for each in reader.messages([keys.CLOCK], by_time=False)]
+    assert [(each.step, each.seq) for each in clocks[:-1]] == [(0, 0), (1, 1), (1, 2), (1, 3), (2, 4)]
 
 
 def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path):
