@@ -1,7 +1,7 @@
 """Same bits: the fingerprint of what a process computes with, its `join`, and the hash of a flight's truth.
 
-A fingerprint covers what the last bit of a number depends on: CPU feature level, libm, versions of the numeric packages,
-and for which processor BLAS computes: by itself it goes by the CPU, but OPENBLAS_CORETYPE or MKL_CBWR choose another.
+A fingerprint covers what the last bit of a number depends on: CPU feature level, libm, versions of the numeric
+packages, and for which processor BLAS computes: its own, unless OPENBLAS_CORETYPE or the like chooses another.
 """
 
 import hashlib

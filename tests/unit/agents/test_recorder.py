@@ -284,7 +284,9 @@ def test_a_clock_of_time_that_stood_still_is_missed_by_its_number(tmp_path: Path
     """The world died just after it had published that clock: the next one knows of it."""
     path, stood = tmp_path / "run.mcap", clock(1, seq=2)
     after = [clock(1, seq=3), clock(2, seq=4)]
-    recorded(path, [page(gates(0)), page([*gates(0, 1), stood, *after])], gates(1), after, last=dict([pair(keys.INFO, INFO)]))
+    recorded(
+        path, [page(gates(0)), page([*gates(0, 1), stood, *after])], gates(1), after, last=dict([pair(keys.INFO, INFO)])
+    )
     with RecordReader(path) as reader:
         clocks = [messages.decode(each.key, each.payload) for each in reader.messages([keys.CLOCK], by_time=False)]
     assert [(each.step, each.seq) for each in clocks[:-1]] == [(0, 0), (1, 1), (1, 2), (1, 3), (2, 4)]

@@ -1,7 +1,7 @@
 """Whose join counts: who takes the place of one that lives shows that it is there; who joins has a token and a done.
 
-A join is only a message, which anybody can publish in any name. What shows that a process is there is a token of its own
-session, or, of a program that has none of these, the done that follows the join.
+A join is only a message, which anybody can publish in any name. What shows that a process is there is a token of its
+own session, or, of a program that has none of these, the done that follows the join.
 """
 
 from dataclasses import dataclass
