@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 
 import msgspec
@@ -112,7 +113,7 @@ class Recorder:
 
     def run(self) -> str:
         self._traffic = Traffic(self._link, run_key_table(self._info), self._refuse)
-        self._views = self._link.subscribe("view/**")
+        self._beside = [self._link.subscribe(expression) for expression in ("view/**", keys.camera("*", "*"))]
         self._link.declare_process(self._name)
         self._link.on_link(self._on_link)
         if self._writer.messages:
@@ -181,7 +182,7 @@ class Recorder:
                 return ANOTHER_RUN
             self._write_arrived(arrived)
             self._fetch_when_quiet()
-            for sample in self._views.drain():
+            for sample in chain.from_iterable(subscription.drain() for subscription in self._beside):
                 self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
             if self._now_ns - self._on_disk_ns >= FLUSH_NS:

@@ -39,7 +39,7 @@ def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]
 
     Args:
         drones: their names.
-        own: names of the users' sensors of the run; their keys follow those of KINDS.
+        own: names of the users' sensors of the run, and that of the sightings; their keys follow those of KINDS.
     """
     kinds = (*KINDS, *own)
     return tuple(keys.truth(d) if kind == "truth" else keys.sensor(d, kind) for d in drones for kind in kinds)
@@ -47,7 +47,8 @@ def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]
 
 def run_key_table(info: messages.Info) -> tuple[str, ...]:
     """Return the keys of the world's messages about the drones of a run."""
-    return key_table([drone.name for drone in info.drones], [sensor.name for sensor in info.own_sensors])
+    beside = [sensor.name for sensor in info.own_sensors] + [keys.SIGHTINGS] * (info.sightings is True)
+    return key_table([drone.name for drone in info.drones], beside)
 
 
 @lru_cache(maxsize=8)

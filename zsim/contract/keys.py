@@ -13,6 +13,7 @@ from zsim.sensors.sensor_catalogue import STOCK
 NAME = re.compile(r"[a-z0-9_.-]{1,32}")
 PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a thing of up to 32
 SENSORS = tuple(STOCK)
+SIGHTINGS = "sightings"  # a sensor of drones with cameras, computed by the world; its messages have any length
 
 INFO = "world/info"
 CLOCK = "clock"
@@ -46,6 +47,26 @@ def sensors(drone: str) -> str:
 
 def status(drone: str) -> str:
     return f"drone/{drone}/sensor/status"
+
+
+def camera(drone: str, name: str) -> str:
+    return f"drone/{drone}/camera/{name}"
+
+
+def camera_info(drone: str, name: str) -> str:
+    return f"drone/{drone}/camera/{name}/info"
+
+
+@lru_cache(maxsize=4096)
+def is_picture(key: str) -> bool:
+    """Tell whether a key has pictures: large, and never needed by the lockstep."""
+    kind, _, what = parts(key)
+    return kind == "drone" and what.startswith("camera/") and what.count("/") == 1
+
+
+def detections(drone: str) -> str:
+    """Return the key on which a detector publishes what it found in pictures of a drone's cameras."""
+    return f"drone/{drone}/sightings"
 
 
 def gate(drone: str) -> str:

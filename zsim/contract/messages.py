@@ -12,11 +12,12 @@ from typing import Any, Literal, NoReturn
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from zsim.contract import flight_messages, keys, run_messages, views
+from zsim.contract import camera_messages, flight_messages, keys, run_messages, views
 from zsim.errors import DecodeError
 from zsim.schema.checker import first_fault
 from zsim.schema.message import Count, Message, Number
 from zsim.sensors.baro import Baro as Baro
+from zsim.sensors.camera import CAMERAS
 from zsim.sensors.flow import Flow as Flow
 from zsim.sensors.gps import Gps as Gps
 from zsim.sensors.imu import Imu as Imu
@@ -83,7 +84,8 @@ class Info(Message, frozen=True):
 
     `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
     run_id of the run that is played back; empty for a flight. `user_sensors` is left out where all sensors are the
-    contract's. Wherever an Info is made or decoded, the messages of its sensors can be encoded and decoded.
+    contract's, `sightings` where the world computes none. Wherever an Info is made or decoded, the messages of its
+    sensors can be encoded and decoded.
     """
 
     contract: Count
@@ -104,6 +106,7 @@ class Info(Message, frozen=True):
     fingerprint: str
     replay_of: str = ""
     user_sensors: tuple[SensorInfo, ...] | UnsetType = UNSET
+    sightings: bool | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         register_sensors(self.own_sensors)
@@ -123,6 +126,7 @@ _FIXED: dict[str, type[Struct]] = {
 }
 _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     **{("drone", f"sensor/{name}"): kind.message for name, kind in STOCK.items()},
+    ("drone", f"sensor/{keys.SIGHTINGS}"): camera_messages.Sightings,
     ("drone", "sensor/status"): flight_messages.Status,
     ("drone", "truth"): flight_messages.Truth,
     ("drone", "cmd/velocity"): flight_messages.Velocity,
@@ -131,6 +135,9 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("drone", "cmd/rotors"): flight_messages.RotorSpeeds,
     ("drone", "cmd/mode"): flight_messages.Mode,
     ("drone", "estimate"): flight_messages.Estimate,
+    ("drone", "sightings"): camera_messages.Sightings,
+    **{("drone", f"camera/{name}"): camera_messages.CameraImage for name in CAMERAS},
+    **{("drone", f"camera/{name}/info"): camera_messages.CameraInfo for name in CAMERAS},
     ("cluster", "state"): flight_messages.ClusterState,
     ("cluster", "request"): run_messages.ClusterRequest,
     ("process", "join"): run_messages.Join,

@@ -10,6 +10,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType, field
 from zsim.scenario.role_table import OnDeath, agent_names
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
+from zsim.sensors.camera import Hats
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Arm, Limits, Mass, RotorLag, TakeoffHeight
@@ -95,6 +96,10 @@ class Environment(Spec, frozen=True, kw_only=True):
     air_density_kg_m3: Positive = SEA_LEVEL_KG_M3
     wind: Wind = Wind()
     obstacles: Annotated[list[Obstacle], Meta(max_length=OBSTACLES_MAX)] = []
+    hats: Hats | UnsetType = UNSET
+    """Unset: the defaults, and left out of the resolved text."""
+    light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET
+    """Of a clear day, for the cameras; unset: 1."""
 
 
 class Silence(Spec, frozen=True, kw_only=True):
@@ -202,6 +207,8 @@ class Estimation(Spec, frozen=True, kw_only=True):
     gate_probability: Annotated[float, Meta(gt=0.5, lt=1)] = 0.9999
     magnetometer: bool = True
     flow: bool = True
+    use_sightings: bool | UnsetType = UNSET
+    """Whether drones of a cluster are located by what they see of each other; unset: not."""
 
     def chosen(self) -> str:
         """Return the algorithm that flies."""

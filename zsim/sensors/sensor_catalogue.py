@@ -13,6 +13,7 @@ from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, field_path, show
 from zsim.sensors import baro, flow, gps, imu, mag, sonar
 from zsim.sensors.baro import BaroConfig
+from zsim.sensors.camera import CAMERAS, BottomCamera, Camera, FrontCamera, SightingModel
 from zsim.sensors.flow import FlowConfig
 from zsim.sensors.gps import GpsConfig
 from zsim.sensors.imu import ImuConfig
@@ -42,9 +43,18 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     baro: BaroConfig
     sonar: SonarConfig
     flow: FlowConfig
+    front_camera: FrontCamera | UnsetType = UNSET
+    bottom_camera: BottomCamera | UnsetType = UNSET
+    sightings: SightingModel | UnsetType = UNSET
+    """What a detector makes of the cameras' pictures, without pictures: computed by the world."""
     own: dict[str, dict[str, Any]] | UnsetType = UNSET
     """A user's sensors, by name: settings with every field, `module` and `declared`. A file has them beside the
     others, see `flattened`."""
+
+    def cameras(self) -> dict[str, Camera]:
+        """Return the cameras that the drone has, by name."""
+        found = {name: getattr(self, f"{name}_camera") for name in CAMERAS}
+        return {name: camera for name, camera in found.items() if camera is not UNSET}
 
     def sections(self) -> Iterator[tuple[str, SensorType, Sensor]]:
         """Yield name, type and settings of every sensor; a user's module is imported.

@@ -114,7 +114,7 @@ class Subscription:
         raw: the session.
         prefix: of its keys.
         expression: what to take.
-        without: beginnings of keys to leave out; then what this session itself publishes is left out too.
+        without: beginnings of keys to leave out; then pictures and what this session itself publishes are left out too.
     """
 
     def __init__(self, raw: zenoh.Session, prefix: str, expression: str, without: tuple[str, ...] = ()) -> None:
@@ -160,7 +160,7 @@ class Subscription:
 
     def _take(self, raw: zenoh.Sample) -> ReceivedSample | None:
         key = self._key or str(raw.key_expr)[self._cut :]
-        if self._without and key.startswith(self._without):
+        if self._without and (key.startswith(self._without) or keys.is_picture(key)):
             return None
         payload = raw.payload.to_bytes()
         return ReceivedSample(key, payload) if payload else None  # empty: a wake, or a deletion; no message is
@@ -300,7 +300,7 @@ class Session:
 
     def _declare(self, key: str) -> zenoh.Publisher:
         self._check("publish", key)
-        view = key.startswith("view/")
+        view = key.startswith("view/") or keys.is_picture(key)
         drop = view or (self._realtime and keys.may_drop(key))
         # A queue of its own: in one with others, a view that the hub passes on would wait behind a put that blocks.
         priority = zenoh.Priority.DATA_LOW if view else zenoh.Priority.DATA
@@ -402,7 +402,7 @@ class Session:
             return self._keep(Subscription(self._raw, self._prefix, expression))
 
     def subscribe_remote(self, without: tuple[str, ...]) -> Subscription:
-        """Return a subscription to everything that other sessions publish, but on keys that begin so.
+        """Return a subscription to everything that other sessions publish, but pictures and keys that begin so.
 
         Nothing wakes who waits for it.
         """

@@ -1,0 +1,96 @@
+"""The lens of a camera: points of its frame to pixels and back, by a pinhole and the distortion of Brown and Conrady.
+
+Frame K of the camera: x to the right of the picture, y down, z ahead. Pixels (u, v) from the picture's upper left
+corner, whole numbers in the middle of a pixel, as OpenCV has them (calib3d, "Detailed description").
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.math.compiled import portable
+from zsim.math.frames import quaternion_from_matrix
+from zsim.math.rotation import matrix_from_rpy
+from zsim.sensors.camera import Camera
+
+Array = NDArray[np.float64]
+R_SK = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # K's axes in the mount's: x right is -y, …
+UNDISTORT_STEPS = 8  # of a fixed point; enough for 1e-6 px within the field of view of any lens allowed here
+
+
+class Lens(NamedTuple):
+    """Intrinsics: focal lengths and centre [px], distortion, and the picture's size [px]."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float
+    k2: float
+    p1: float
+    p2: float
+    k3: float
+    width: int
+    height: int
+
+
+class CameraPose(NamedTuple):
+    """Where a camera is in the body: its place [m; B], and the rotation from K to B, (3, 3)."""
+
+    p_BK: Array
+    R_BK: Array
+
+    @property
+    def q_BK(self) -> tuple[float, ...]:
+        """The rotation as a quaternion, w first."""
+        return tuple(quaternion_from_matrix(self.R_BK).tolist())
+
+
+def lens_of(camera: Camera) -> Lens:
+    """Return the lens of a camera: square pixels, the diagonal field of view, the axis in the picture's middle."""
+    half_px = math.hypot(camera.width_px, camera.height_px) / 2
+    focal_px = half_px / math.tan(math.radians(camera.diagonal_deg) / 2)
+    centre = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
+    return Lens(focal_px, focal_px, *centre, *camera.distortion, camera.width_px, camera.height_px)
+
+
+def camera_pose(camera: Camera) -> CameraPose:
+    """Return where a camera is in the body."""
+    R_BS = np.array(matrix_from_rpy(*map(math.radians, camera.mount.rpy_deg)))
+    return CameraPose(np.array(camera.mount.position_m), R_BS @ R_SK)
+
+
+def camera_matrix(lens: Lens) -> Array:
+    """Return K of OpenCV, (3, 3)."""
+    return np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+
+
+@portable
+def distorted(lens: Lens, x: float, y: float) -> tuple[float, float]:
+    """Return where a ray (x, y, 1) of K falls on the picture plane after the lens, in focal lengths."""
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+    return (
+        x * radial + 2.0 * lens.p1 * x * y + lens.p2 * (r2 + 2.0 * x * x),
+        y * radial + lens.p1 * (r2 + 2.0 * y * y) + 2.0 * lens.p2 * x * y,
+    )
+
+
+@portable
+def undistorted(lens: Lens, u: float, v: float) -> tuple[float, float]:
+    """Return the ray (x, y, 1) of K that falls on a pixel, by a fixed point."""
+    a, b = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
+    x, y = a, b
+    for _ in range(UNDISTORT_STEPS):
+        at_x, at_y = distorted(lens, x, y)
+        x, y = x + a - at_x, y + b - at_y
+    return x, y
+
+
+@portable
+def pixel(lens: Lens, x: float, y: float, z: float) -> tuple[float, float]:
+    """Return the pixel of a point of K in front of the camera (z > 0) [px]; it may lie outside of the picture."""
+    at_x, at_y = distorted(lens, x / z, y / z)
+    return lens.fx * at_x + lens.cx, lens.fy * at_y + lens.cy
