@@ -46,8 +46,8 @@ class CameraInfo(Message, frozen=True, kw_only=True):
 class Seen(Struct, frozen=True, gc=False):
     """A hat that was seen, nobody knows whose.
 
-    `direction_B` is the unit vector from the camera to the hat's centre in B; the sigmas are standard deviations, that of
-    the direction in each of the two axes across it.
+    `direction_B` is the unit vector from the camera to the hat's centre in B. The sigmas are standard deviations,
+    that of the direction in each of the two axes across it.
     """
 
     direction_B: Vector3
