@@ -15,6 +15,7 @@ from zsim.scenario.fault_kinds import kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, space_name
+from zsim.scenario.sighting_check import sighting_faults
 from zsim.schema.checker import Fault, show
 from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.sensors.sensor_catalogue import DECLARED, MODULE, declarations, own_sections
@@ -43,6 +44,7 @@ def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fau
     for index, drone in drones:
         yield from ((f"drones[{index}].{path}", text) for path, text in _drone_faults(drone, scenario, vehicles))
     yield from _own_sensor_faults(drones)
+    yield from sighting_faults(scenario, drones, clusters)
     yield from _membership_faults(drones, clusters)
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState
@@ -25,8 +26,9 @@ from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.initial_state import arrays
 from zsim_world.physics.air import WIND
 from zsim_world.sensors.noise import NoiseTable
-from zsim_world.sensors.sampler import Sampled, Sampler, SensorSample
+from zsim_world.sensors.sampler import VALUE_COLUMNS, WHOSE, Sampled, Sampler, SensorSample
 from zsim_world.sensors.sensor_set import fleet_sensors
+from zsim_world.sensors.sighting_sampler import Sighting, SightingSampler
 from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, state_arrays
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY, SETPOINT
@@ -73,7 +75,8 @@ class Fleet:
         gps_sigma_m: of each drone's fixes.
         impairment: what faults do to it.
         bodies, boards: the arrays that the kernel works on; to be read only.
-        sampled: what fell due for publication in the last gate.
+        sampled: what fell due for publication in the last gate; a sighting is of the sensor behind all of `sensors`.
+        sightings: among these, by the row of `sampled`.
         touching: whether a drone's hull touched another's in the last gate, (N,).
     """
 
@@ -99,6 +102,8 @@ class Fleet:
         self._noise = NoiseTable(scenario, NOISE_GATES)
         self._w = arrays(scenario, vehicles, self.sensors, self._noise)
         self._sampler = Sampler(scenario, self.sensors, self._w.senses)
+        self._sightings = _sighting_sampler(scenario, self._w.bodies.vehicle[:, VEHICLE.hull_radius])
+        self.sightings: dict[int, Sighting] = {}
         self._held = kernel.hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
         self.impairment = Impairment(self._w, self.names, vehicles, self.sensors)
@@ -110,6 +115,11 @@ class Fleet:
     def _rehearse(self) -> None:
         """Load or compile what the first command needs: in realtime no gate may wait for it."""
         kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
+
+    @property
+    def has_sightings(self) -> bool:
+        """Whether any drone has them."""
+        return self._sightings is not None
 
     @property
     def t_ns(self) -> int:
@@ -151,6 +161,7 @@ class Fleet:
             "arrays": list(state_arrays(self._w)),
             "streams": self._noise.streams,
             "sampler": self._sampler.snapshot(),
+            **({"sightings": self._sightings.snapshot()} if self._sightings else {}),
         }
 
     def restore(self, state: State) -> None:
@@ -166,10 +177,13 @@ class Fleet:
         self.bodies.near.origin.fill(math.inf)  # the near pairs are found anew
         self._noise.streams[:] = state["streams"]
         self._sampler.restore(state["sampler"])
+        if self._sightings:
+            self._sightings.restore(state["sightings"])
 
     def samples(self) -> list[SensorSample]:
-        """Return what fell due for publication in the last gate, in the order of (t_ns, drone, sensor)."""
-        return self.sampled.each(self.sensors)
+        """Return what fell due for publication in the last gate but sightings, by (t_ns, drone, sensor)."""
+        numbers = self.sampled.whose[:, WHOSE.sensor] < len(self.sensors.names)
+        return Sampled(self.sampled.whose[numbers], self.sampled.values[numbers]).each(self.sensors)
 
     def truth(self) -> TrueState:
         """Return the true state now."""
@@ -290,6 +304,19 @@ class Fleet:
         self._least = least
         self._meet(least)
         self.sampled = self._sampler.due(logged, self.t_ns)
+        if self._sightings:
+            self._add_sightings(self._sightings.due(self.bodies.state, self.t_ns))
+
+    def _add_sightings(self, sightings: list[Sighting]) -> None:
+        """Put sightings among the samples of the gate, behind those of the same drone and time."""
+        number = len(self.sensors.names)
+        rows = [(number, each.drone, each.t_ns, each.t_sample_ns) for each in sightings]
+        whose = np.concatenate((self.sampled.whose, np.array(rows, dtype=np.int64).reshape(-1, WHOSE.size)))
+        values = np.concatenate((self.sampled.values, np.zeros((len(rows), VALUE_COLUMNS))))
+        order = np.lexsort((whose[:, WHOSE.sensor], whose[:, WHOSE.drone], whose[:, WHOSE.t]))
+        self.sampled = Sampled(whose[order], values[order])
+        first = len(whose) - len(rows)
+        self.sightings = {place: sightings[m - first] for place, m in enumerate(order.tolist()) if m >= first}
 
     def _meet(self, least: float) -> None:
         self._began: list[tuple[int, int]] = []
@@ -299,6 +326,12 @@ class Fleet:
         if least < 2.0 * self._hull_m:
             self._began = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
             self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
+
+
+def _sighting_sampler(scenario: Scenario, hulls: NDArray[np.float64]) -> SightingSampler | None:
+    """Return what makes the sightings of a scenario, None where no drone has any."""
+    has_some = any(drone.sensors.sightings is not UNSET for drone in scenario.drones)
+    return SightingSampler(scenario, hulls.copy()) if has_some else None
 
 
 def _gps_sigma(gps: GpsConfig) -> float:

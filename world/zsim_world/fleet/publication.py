@@ -10,7 +10,8 @@ import numpy as np
 from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
-from zsim.contract import encoding, flight_messages, messages
+from zsim.contract import encoding, flight_messages, keys, messages
+from zsim.contract.camera_messages import Sightings
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.snapshot import State
@@ -24,6 +25,7 @@ from zsim_world.fleet.kernel import hold
 from zsim_world.physics.rotors import charge_percent
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
+from zsim_world.sensors.sighting_sampler import Sighting
 from zsim_world.state.fleet_arrays import STATE
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY
@@ -105,8 +107,9 @@ class GatePublication:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._encoder = UserMessages(fleet) if len(fleet.sensors.names) > STOCK_SENSORS else None
-        self.table = key_table(fleet.names, fleet.sensors.names[STOCK_SENSORS:])
+        own = [*fleet.sensors.names[STOCK_SENSORS:], *([keys.SIGHTINGS] if fleet.has_sightings else [])]
+        self._encoder = UserMessages(fleet) if own else None
+        self.table = key_table(fleet.names, own)
         bodies = fleet.bodies
         self._seen = PublishedArrays(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
         self._commanders: list[str | None] = []  # of the last gate
@@ -172,7 +175,7 @@ class GatePublication:
 
 
 class UserMessages:
-    """Encodes what users' sensors have sampled."""
+    """Encodes what users' sensors have sampled, and sightings."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -193,7 +196,10 @@ class UserMessages:
             s, i, t_ns, t_sample_ns = whose[m].tolist()
             number = seq.setdefault((i, s), int(counts[i, s + 2]))
             seq[i, s] += 1
-            payloads.append(messages.encode(self._message(s, i, (t_ns, number, t_sample_ns), values[m])))
+            stamps = (t_ns, number, t_sample_ns)
+            sighting = self._fleet.sightings.get(m)
+            message = self._message(s, i, stamps, values[m]) if sighting is None else _sightings(stamps, sighting)
+            payloads.append(messages.encode(message))
             sizes[m] = len(payloads[-1])
         return UserPayloads(np.frombuffer(bytearray(b"".join(payloads)), dtype=np.uint8), np.cumsum(sizes))
 
@@ -216,6 +222,11 @@ class UserMessages:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise RunError(f"{what}: its reading makes no {kind.message.__name__} ({reason})") from error
         return self._messages[s - STOCK_SENSORS](*stamps, *fields)
+
+
+def _sightings(stamps: tuple[int, int, int], sighting: Sighting) -> Sightings:
+    t_ns, seq, t_sample_ns = stamps
+    return Sightings(t_ns=t_ns, seq=seq, t_sample_ns=t_sample_ns, camera=sighting.camera, seen=sighting.seen)
 
 
 @inlined

@@ -88,6 +88,7 @@ class World(Coordinator):
             version=__version__,
             fingerprint=fingerprint(),
             user_sensors=_own_sensors(s) or UNSET,
+            sightings=self.fleet.has_sightings or UNSET,
         )
 
     # To go on elsewhere

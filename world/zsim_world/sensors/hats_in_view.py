@@ -1,0 +1,171 @@
+"""Which hats a camera has in view, and where: of true poses, without pictures. Compiled, without time or chance.
+
+A hat is a ball. It is in view where its centre falls on the picture and nothing stands before it: no obstacle, and no
+hull, a flat body of revolution about its drone's z axis.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.math.columns import Field, columns
+from zsim.math.compiled import inlined, kernel
+from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
+from zsim.scenario import obstacle
+from zsim.sensors.camera_model import Lens, pixel
+
+POSE = columns(  # of a drone at an instant
+    "PoseColumns", (Field("p_WB", "m", 3), Field("v_WB", "m/s", 3), Field("q_WB", "1", 4), Field("w_WB_B", "rad/s", 3))
+)
+VIEW = columns(  # of a hat in a camera
+    "ViewColumns",
+    (
+        Field("seen", "1"),  # 0 or 1
+        Field("direction_K", "1", 3),  # unit vector to its centre
+        Field("range", "m"),
+        Field("angle", "rad"),  # its apparent diameter
+        Field("scale", "px/rad"),  # of the picture where it is
+        Field("rate", "rad/s"),  # at which it moves over the picture
+    ),
+)
+AHEAD_MIN = 0.05  # cosine to the axis; flatter rays never fall on a picture of 150 deg
+HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
+SURFACE_M = 0.01  # m, nearer than which a ray has met an obstacle
+STEPS_MAX = 64  # along a ray; each goes as far as the nearest surface
+
+nearest: Any = inlined(obstacle.nearest)
+
+
+class MountedCamera(NamedTuple):
+    """A camera: lens, and pose in its drone's body."""
+
+    lens: Lens
+    p_BK: Vector  # m
+    q_BK: Quaternion
+
+
+@inlined
+def _three(row: NDArray, at: int) -> Vector:
+    return (row[at], row[at + 1], row[at + 2])
+
+
+@inlined
+def _four(row: NDArray, at: int) -> Quaternion:
+    return (row[at], row[at + 1], row[at + 2], row[at + 3])
+
+
+@inlined
+def _hull_hides(eye: Vector, ray: Vector, far: float, p_WB: Vector, q_WB: Quaternion, radius: float) -> bool:
+    """Tell whether a hull stands on a ray (unit vector, W) nearer than `far` [m]: an ellipsoid, made a ball."""
+    o, d = rotate_back(q_WB, subtract(eye, p_WB)), rotate_back(q_WB, ray)
+    stretch = 1.0 / HULL_FLATNESS
+    o, d = (o[0], o[1], stretch * o[2]), (d[0], d[1], stretch * d[2])
+    a, b, c = dot(d, d), dot(o, d), dot(o, o) - radius * radius
+    root = b * b - a * c
+    if c <= 0.0 or root <= 0.0:
+        return False  # the eye is inside of it, as that of its own camera, or the ray passes
+    at = (-b - math.sqrt(root)) / a
+    return 0.0 < at < far
+
+
+@inlined
+def _obstacle_hides(eye: Vector, ray: Vector, far: float, row: NDArray) -> bool:
+    """Tell whether an obstacle stands on a ray nearer than `far` [m]: a walk along it by the distance that is free."""
+    at = 0.0
+    for _ in range(STEPS_MAX):
+        p = axpy(eye, at, ray)
+        free = nearest(row, p[0], p[1], p[2])[0]
+        if free < SURFACE_M:
+            return True
+        at += free
+        if at >= far:
+            return False
+    return False
+
+
+@inlined
+def _in_picture(lens: Lens, to_K: Vector) -> bool:
+    if to_K[2] < AHEAD_MIN * norm(to_K):
+        return False
+    u, v = pixel(lens, to_K[0], to_K[1], to_K[2])
+    return -0.5 <= u < lens.width - 0.5 and -0.5 <= v < lens.height - 0.5
+
+
+@inlined
+def _scale(lens: Lens, cosine: float) -> float:
+    """Return pixels per radian off the axis: the mean of along and across the radius, f / cos^2 and f / cos."""
+    return lens.fx / (cosine * math.sqrt(cosine))
+
+
+@kernel()
+def hats_in_view(
+    camera: MountedCamera,
+    own: int,
+    poses: NDArray,
+    hulls: NDArray,
+    hat_B: Vector,
+    diameter: float,
+    balls: NDArray,
+    bare: NDArray,
+    obstacles: NDArray,
+    view: NDArray,
+) -> None:
+    """Write what a camera has in view.
+
+    Args:
+        camera: of the drone `own`.
+        own: number of its drone.
+        poses: of N drones at the instant of the picture, (N, POSE.size).
+        hulls: radius of each hull [m], (N,).
+        hat_B: centre of a hat in the body of its drone [m].
+        diameter: of a hat [m].
+        balls: centres of what only looks like a hat [m; W], (M, 3).
+        bare: of each drone, whether its hat can be seen at all, (N,).
+        obstacles: rows of zsim.scenario.obstacle, (O, 9).
+        view: the result, (N + M, VIEW.size): drones, then balls.
+    """
+    row = poses[own]
+    q_WB, w_B = _four(row, POSE.q_WB), _three(row, POSE.w_WB_B)
+    eye = add(_three(row, POSE.p_WB), rotate(q_WB, camera.p_BK))
+    v_eye = add(_three(row, POSE.v_WB), rotate(q_WB, cross(w_B, camera.p_BK)))
+    w_W = rotate(q_WB, w_B)
+    drones = poses.shape[0]
+    view[:, VIEW.seen] = 0.0
+    for m in range(view.shape[0]):
+        if m == own or (m < drones and not bare[m]):
+            continue
+        centre, velocity = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        if m < drones:
+            other = _four(poses[m], POSE.q_WB)
+            centre = add(_three(poses[m], POSE.p_WB), rotate(other, hat_B))
+            velocity = _three(poses[m], POSE.v_WB)
+        else:
+            centre = _three(balls[m - drones], 0)
+        to_W = subtract(centre, eye)
+        away = norm(to_W)
+        to_K = rotate_back(camera.q_BK, rotate_back(q_WB, to_W))
+        if away <= diameter or not _in_picture(camera.lens, to_K):
+            continue
+        ray, hidden = scaled(to_W, 1.0 / away), False
+        for i in range(drones):
+            if i != own and i != m:
+                p, q = _three(poses[i], POSE.p_WB), _four(poses[i], POSE.q_WB)
+                hidden = hidden or _hull_hides(eye, ray, away, p, q, hulls[i])
+            elif i == m:
+                q = _four(poses[i], POSE.q_WB)
+                hidden = hidden or _hull_hides(eye, ray, away, _three(poses[i], POSE.p_WB), q, hulls[i])
+        for k in range(obstacles.shape[0]):
+            hidden = hidden or _obstacle_hides(eye, ray, away, obstacles[k])
+        if hidden:
+            continue
+        across = axpy(subtract(velocity, v_eye), -dot(subtract(velocity, v_eye), ray), ray)
+        moves = subtract(scaled(across, 1.0 / away), cross(w_W, ray))
+        view[m, VIEW.seen] = 1.0
+        for k in range(3):
+            view[m, VIEW.direction_K + k] = to_K[k] / away
+        view[m, VIEW.range] = away
+        view[m, VIEW.angle] = 2.0 * math.asin(0.5 * diameter / away)
+        view[m, VIEW.scale] = _scale(camera.lens, to_K[2] / away)
+        view[m, VIEW.rate] = norm(moves)
