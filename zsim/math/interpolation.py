@@ -9,9 +9,7 @@ COSINE_MAX = 0.9995  # of half the angle between two attitudes; nearer ones are 
 
 
 @portable
-def position_between(
-    s: float, dt: float, p0: Vector, v0: Vector, p1: Vector, v1: Vector
-) -> tuple[float, float, float]:
+def position_between(s: float, dt: float, p0: Vector, v0: Vector, p1: Vector, v1: Vector) -> tuple[float, float, float]:
     """Return the position at share s of an interval of dt seconds: the cubic with these ends and slopes (Hermite)."""
     a, b = s * s * (3.0 - 2.0 * s), dt * s * (1.0 - s) * (1.0 - s)
     c = dt * s * s * (s - 1.0)
@@ -31,9 +29,7 @@ def attitude_between(s: float, q0: Quaternion, q1: Quaternion) -> Quaternion:
     if cosine < COSINE_MAX:
         angle = math.acos(cosine)
         a, b = math.sin((1.0 - s) * angle) / math.sin(angle), sign * math.sin(s * angle) / math.sin(angle)
-    return normalised(
-        (a * q0[0] + b * q1[0], a * q0[1] + b * q1[1], a * q0[2] + b * q1[2], a * q0[3] + b * q1[3])
-    )
+    return normalised((a * q0[0] + b * q1[0], a * q0[1] + b * q1[1], a * q0[2] + b * q1[2], a * q0[3] + b * q1[3]))
 
 
 @portable

@@ -98,10 +98,19 @@ def _about_drone(thing: str, scenario: Scenario, role: str) -> Rights:
         return Rights()
     estimate = (keys.estimate(thing),)
     return Rights(
-        reads=(keys.sensors(thing), keys.gate(thing), *estimate),
+        reads=(keys.sensors(thing), keys.gate(thing), *estimate, *_of_mates(thing, scenario)),
         writes=(*estimate, keys.estimates_view(f"{role}.{thing}")),
         asks=(keys.status(thing), *estimate),
     )
+
+
+def _of_mates(thing: str, scenario: Scenario) -> tuple[str, ...]:
+    """Return what an estimator reads that uses sightings: all that the drones of its cluster sense."""
+    if scenario.estimation.use_sightings is not True:
+        return ()
+    mates = next((cluster.drones for cluster in scenario.clusters if thing in cluster.drones), [thing])
+    expressions = (keys.sensors, keys.gate, keys.detections)
+    return (keys.GATE, *(expression(mate) for mate in mates for expression in expressions))
 
 
 def _about_cluster(thing: str, scenario: Scenario, role: str) -> Rights:

@@ -7,7 +7,9 @@ from msgspec import UNSET
 
 from zsim.schema.checker import Fault, show
 
-SIGHTED_MAX = 12  # drones of a cluster: each of its estimators has the states of all, at a cost that grows by the square
+SIGHTED_MAX = (
+    12  # drones of a cluster: each of its estimators has the states of all, at a cost that grows by the square
+)
 
 
 def sighting_faults(scenario: Any, drones: list[tuple[int, Any]], clusters: list[tuple[int, Any]]) -> Iterator[Fault]:
@@ -31,7 +33,10 @@ def _camera_faults(sensors: Any) -> Iterator[Fault]:
     cameras = {"front": sensors.front_camera, "bottom": sensors.bottom_camera}
     for place, name in enumerate(model.cameras or ()):
         if name in cameras and not cameras[name]:
-            yield f"sightings.cameras[{place}]", f"is {name!r}, which the drone does not have; give it {name}_camera: {{}}"
+            yield (
+                f"sightings.cameras[{place}]",
+                f"is {name!r}, which the drone does not have; give it {name}_camera: {{}}",
+            )
 
 
 def _estimation_faults(

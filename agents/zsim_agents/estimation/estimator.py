@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, cast
 
-from msgspec import Struct
+from msgspec import UNSET, Struct
 
 from zsim.contract import flight_messages, keys, messages
 from zsim.contract.framing import GateMessages, key_table
@@ -16,6 +16,7 @@ from zsim.runtime.routing import Input
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import EstimatorSet, estimator_class
 from zsim_agents.estimation.estimator_bank import EstimatorBank
+from zsim_agents.estimation.joint.cluster_banks import ClusterBanks
 
 
 class Estimator(Agent):
@@ -40,24 +41,27 @@ class Estimator(Agent):
         self.name, *others = (f"estimator.{drone}" for drone in names)
         self.serves = tuple(others)
         self.period_ns = info.gate_ns
-        self.gate_keys = tuple(keys.status(drone) for drone in names)
-        self.counted = names
         self.writes = tuple(keys.estimate(drone) for drone in names)
         specs = [scenario.drone(drone) for drone in names]
         settings = (specs, scenario.environment, scenario.estimation, info.gate_ns / 1e9)
         make = estimator_class(scenario.estimation.chosen(), "world/info: estimation.algorithm")
-        self._estimators = EstimatorSet(make, *settings) if make else EstimatorBank(*settings)
-        self._settings = None if make else settings
-        self.reads = (
-            tuple(keys.sensors(drone) for drone in names)
-            if make
-            else _reads(names, [sensor.name for sensor in info.own_sensors])
-        )
+        sighted = scenario.estimation.use_sightings is True and not make
+        banks = ClusterBanks(scenario, names, info.gate_ns / 1e9) if sighted else None
+        self._estimators = banks or (EstimatorSet(make, *settings) if make else EstimatorBank(*settings))
+        self._settings = None if make or sighted else settings
+        read = tuple(banks.drones) if banks else names
+        self.gate_keys = tuple(keys.status(drone) for drone in read)
+        self.counted = read
+        beside = [*(sensor.name for sensor in info.own_sensors), *([keys.SIGHTINGS] * (info.sightings is True))]
+        self.reads = tuple(keys.sensors(drone) for drone in read) if make else _reads(read, beside)
+        if banks:
+            self.reads += tuple(keys.detections(drone) for drone in read if not has_own_sightings(scenario, drone))
         self._last: list[flight_messages.Estimate] = []
         self._view_key = keys.estimates_view(self.name)
         self.takes_gates = COMPILES and not make
         self._since_ns = 0
-        self._index = {drone: i for i, drone in enumerate(names)}
+        self._index = {drone: i for i, drone in enumerate(read)}
+        self._names = names
 
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
         self._since_ns = t_ns - self.period_ns
@@ -68,6 +72,8 @@ class Estimator(Agent):
             # what a slow link brings has not arrived before the last gate, whatever stamp it bears
             t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
             _, drone, what = keys.parts(key)
+            if drone not in self._index:
+                return
             self._estimators.receive(self._index[drone], what.removeprefix("sensor/"), message, t_arrival_s)
 
     def receive_gate(self, gate: GateMessages) -> None:
@@ -83,13 +89,13 @@ class Estimator(Agent):
         return list(map(Output, self.writes, self._last))
 
     def views(self, t_ns: int) -> list[Output]:
-        shown = tuple(map(estimate_view, self.counted, self._last))
+        shown = tuple(map(estimate_view, self._names, self._last))
         return [Output(self._view_key, ViewEstimates(t_ns, self.next_seq(self._view_key), shown))]
 
     def rehearse(self) -> None:
         if self._settings is None:
             return
-        bank, drone, t_ns, still = EstimatorBank(*self._settings), self.counted[0], 1_000_000, (0.0, 0.0, 0.0)
+        bank, drone, t_ns, still = EstimatorBank(*self._settings), self._names[0], 1_000_000, (0.0, 0.0, 0.0)
         readings: dict[str, Struct] = {
             "imu": messages.Imu(t_ns, 0, t_ns, (0.0, 0.0, 9.8), still),
             "gps": messages.Gps(t_ns, 0, t_ns, 0.0, 0.0, 0.0, still, still, 1.0, 3, 9),
@@ -111,6 +117,11 @@ class Estimator(Agent):
 
     def warm_start(self, key: str, message: flight_messages.Estimate) -> None:
         self._estimators.warm_start(self.writes.index(key), message)
+
+
+def has_own_sightings(scenario: Scenario, drone: str) -> bool:
+    """Tell whether the world computes a drone's sightings; else a detector's are used."""
+    return scenario.drone(drone).sensors.sightings is not UNSET
 
 
 def _reads(drones: Sequence[str], own: Sequence[str]) -> tuple[str, ...]:

@@ -107,7 +107,7 @@ class EstimatorBank:
         """Use what has come since the last gate and return the estimates for `t_s`."""
         count, self._count = self._count, 0
         self.use(t_s, self._readings[:count])
-        counts = self.rows.counts[:, COUNT.used :].tolist()
+        counts = self.rows.counts[:, COUNT.used : COUNT.sightings_used].tolist()
         return [_estimate(row, count) for row, count in zip(self._estimates.tolist(), counts, strict=True)]
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -184,8 +184,24 @@ def step(rows: Rows, t_s: float, readings: np.ndarray, estimates: np.ndarray) ->
         estimates: (N, ESTIMATE.size), written.
     """
     count = rows.nominal.shape[0]
-    first, last = np.full(count, -1), np.full(count, -1)
-    after = np.full(readings.shape[0], -1)  # the next aiding reading of the same drone
+    first = np.full(count, -1)
+    after = np.full(readings.shape[0], -1)
+    sort_readings(rows, readings, first, after)
+    for i in range(count):
+        _step_one(rows, i, t_s, readings, first[i], after, estimates[i])
+
+
+@portable
+def sort_readings(rows: Rows, readings: np.ndarray, first: np.ndarray, after: np.ndarray) -> None:
+    """Move every drone by its IMU, and chain the aiding readings that are to be used.
+
+    Args:
+        rows: of N drones; changed.
+        readings: (M, READING.size).
+        first: the first of each drone, (N,); -1 for none, as it comes in.
+        after: of each reading, the next one of the same drone, (M,); -1 after the last.
+    """
+    last = np.full(rows.nominal.shape[0], -1)
     for m in range(readings.shape[0]):
         reading, i = readings[m], int(readings[m, READING.drone])
         if int(reading[READING.sensor]) == IMU:
@@ -197,8 +213,6 @@ def step(rows: Rows, t_s: float, readings: np.ndarray, estimates: np.ndarray) ->
             else:
                 after[last[i]] = m
             last[i] = m
-    for i in range(count):
-        _step_one(rows, i, t_s, readings, first[i], after, estimates[i])
 
 
 @portable
@@ -215,11 +229,11 @@ def _step_one(
         measurement_update.start_heading(rows, i, P, t_s, readings, first, after)
     P = measurement_update.fuse(rows, i, P, readings, first, after)
     rows.covariance[i, :n, :n] = P
-    _write_estimate(row, P, t_s, estimate)
+    write_estimate(row, P, t_s, estimate)
 
 
 @portable
-def _write_estimate(row: np.ndarray, P: np.ndarray, t_s: float, estimate: np.ndarray) -> None:
+def write_estimate(row: np.ndarray, P: np.ndarray, t_s: float, estimate: np.ndarray) -> None:
     """Write the estimate for an instant that the IMU may not have reached yet, (ESTIMATE.size,)."""
     p, v, q, a_W, w, _ = reckoning(row)
     ahead = t_s - row[NOMINAL.t]

@@ -198,6 +198,7 @@ def initial_rows(
         layout=layout,
         walk=walk,
         limits=innovation_limits(estimation.gate_probability),
+        joint=np.zeros((0, 0)),
     )
     return rows, np.zeros((count, ESTIMATE.size))
 

@@ -103,6 +103,8 @@ COUNT = columns(
         Field("newest", "1"),  # of them
         Field("used", "1", len(SENSORS)),  # readings
         Field("refused", "1", len(SENSORS)),
+        Field("sightings_used", "1"),
+        Field("sightings_refused", "1"),
     ),
 )
 
@@ -147,9 +149,17 @@ class Rows(NamedTuple):
     layout: NDArray[np.int64]  # (N, LAYOUT.size)
     walk: NDArray[np.float64]  # (N, n), unit^2/s
     limits: NDArray[np.float64]  # (7,), of the innovation gates by number of rows
+    joint: NDArray[np.float64]  # (N n, N n), covariance of all of them together; (0, 0) where each stands for itself
 
 
-STATES = ("nominal", "counts", "covariance", "bias", "history")  # the rows that change; the others are settings
+STATES = (
+    "nominal",
+    "counts",
+    "covariance",
+    "bias",
+    "history",
+    "joint",
+)  # the rows that change; the others are settings
 
 
 @portable

@@ -36,6 +36,7 @@ from zsim_agents.estimation.filter_state import (
     quaternion,
     vector,
 )
+from zsim_agents.estimation.joint_covariance import block, put_block, use_own
 from zsim_agents.estimation.kalman_update import (
     ROWS_MAX,
     stacked_update,
@@ -189,6 +190,35 @@ def count_outcome(row: np.ndarray, counts: np.ndarray, kind: int, passed: bool) 
 
 
 @portable
+def _correct_jointly(
+    rows: Rows,
+    i: int,
+    P: np.ndarray,
+    H: np.ndarray,
+    y: np.ndarray,
+    variance: np.ndarray,
+    blocks: np.ndarray,
+    kinds: np.ndarray,
+) -> np.ndarray:
+    """Do as `correct` does, with the covariance of all drones, whose states it corrects."""
+    row, counts, distances = rows.nominal[i], rows.counts[i], np.zeros(ROWS_MAX)
+    put_block(rows.joint, i, P)  # it may have been inflated
+    used = use_own(rows, i, H, variance, y, blocks, distances)
+    kept, m = np.zeros(y.shape[0], dtype=np.int64), 0
+    for b in range(blocks.shape[0]):
+        first, size = blocks[b, 0], blocks[b, 1]
+        good = used or distances[b] <= rows.limits[size]
+        count_outcome(row, counts, kinds[b], good)
+        for k in range(size if good else 0):
+            kept[m] = first + k
+            m += 1
+    if not used and m:
+        kept = kept[:m]
+        use_own(rows, i, H[kept], variance[kept], y[kept], blocks[:0], distances)
+    return block(rows.joint, i, P.shape[0])
+
+
+@portable
 def correct(
     rows: Rows,
     i: int,
@@ -206,6 +236,8 @@ def correct(
     """
     row, counts = rows.nominal[i], rows.counts[i]
     y, distances = z - expected, np.zeros(ROWS_MAX)
+    if rows.joint.shape[0]:
+        return _correct_jointly(rows, i, P, H, y, variance, blocks, kinds)
     used, x, P, _ = stacked_update(P, H, variance, y, blocks, rows.limits, distances)
     kept, m = np.zeros(y.shape[0], dtype=np.int64), 0
     for b in range(blocks.shape[0]):

@@ -137,27 +137,34 @@ def coast(row: np.ndarray, setting: np.ndarray, t_s: float) -> None:
 @portable
 def grow(rows: Rows, i: int, P: np.ndarray) -> np.ndarray:
     """Return the covariance grown over the interval of dead reckoning that ends now, and begin the next one."""
-    row, setting, layout, n = rows.nominal[i], rows.setting[i], rows.layout[i], P.shape[0]
-    dt, dt_squared = row[NOMINAL.t] - row[NOMINAL.t_start], row[NOMINAL.dt_squared]
-    if dt > 0.0:
-        turned = setting[SETTING.gyro_variance] * dt_squared + row[NOMINAL.lost_turn]
-        velocity = setting[SETTING.accel_variance] * dt_squared + row[NOMINAL.lost_velocity]
+    row, n = rows.nominal[i], P.shape[0]
+    if row[NOMINAL.t] > row[NOMINAL.t_start]:
         F, Q = np.eye(n), np.zeros((n, n))
-        write_prediction(
-            F,
-            Q,
-            rows.walk[i, :n],
-            reckoning(row),
-            vector(row, NOMINAL.v_start),
-            setting[SETTING.gravity],
-            setting[SETTING.levelling],
-            layout[LAYOUT.accel_bias] != 0,
-            (velocity, turned + setting[SETTING.tilt_density] * dt, turned),
-            dt,
-        )
+        write_growth(rows, i, F, Q)
         P = predicted_covariance(P, F, Q)
     begin_interval(row, row[NOMINAL.t])
     return P
+
+
+@portable
+def write_growth(rows: Rows, i: int, F: np.ndarray, Q: np.ndarray) -> None:
+    """Write the transition of the errors over the interval that ends now into F, the identity, and their noise into Q."""
+    row, setting = rows.nominal[i], rows.setting[i]
+    dt, dt_squared = row[NOMINAL.t] - row[NOMINAL.t_start], row[NOMINAL.dt_squared]
+    turned = setting[SETTING.gyro_variance] * dt_squared + row[NOMINAL.lost_turn]
+    velocity = setting[SETTING.accel_variance] * dt_squared + row[NOMINAL.lost_velocity]
+    write_prediction(
+        F,
+        Q,
+        rows.walk[i, : F.shape[0]],
+        reckoning(row),
+        vector(row, NOMINAL.v_start),
+        setting[SETTING.gravity],
+        setting[SETTING.levelling],
+        rows.layout[i, LAYOUT.accel_bias] != 0,
+        (velocity, turned + setting[SETTING.tilt_density] * dt, turned),
+        dt,
+    )
 
 
 @portable

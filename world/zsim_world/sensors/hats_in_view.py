@@ -7,7 +7,6 @@ hull, a flat body of revolution about its drone's z axis.
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.columns import Field, columns

@@ -117,7 +117,15 @@ class _Watcher:
     """One camera of one drone, and the detector behind it."""
 
     def __init__(
-        self, seed: int, drone: int, spec: Drone, name: str, camera: Camera, model: SightingModel, hats: Hats, light: float
+        self,
+        seed: int,
+        drone: int,
+        spec: Drone,
+        name: str,
+        camera: Camera,
+        model: SightingModel,
+        hats: Hats,
+        light: float,
     ) -> None:
         pose = camera_pose(camera)
         self.drone, self._name, self._model = drone, name, model
@@ -165,7 +173,9 @@ class _Watcher:
 
     def _sigmas_px(self, row: list[float]) -> tuple[float, float]:
         blur = self._model.blur_share * row[VIEW.rate] * self._exposure_s * row[VIEW.scale]
-        return self._dark * math.hypot(self._model.centre_px, blur), self._dark * math.hypot(self._model.diameter_px, blur)
+        return self._dark * math.hypot(self._model.centre_px, blur), self._dark * math.hypot(
+            self._model.diameter_px, blur
+        )
 
     def _seen(self, row: list[float], noise: list[float]) -> Seen:
         centre_px, diameter_px = self._sigmas_px(row)

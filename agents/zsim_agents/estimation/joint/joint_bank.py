@@ -1,0 +1,140 @@
+"""The estimators of the drones of a cluster with one covariance, which use what the drones see of each other."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.contract import keys, messages
+from zsim.contract.flight_messages import Estimate
+from zsim.contract.framing import GateMessages
+from zsim.errors import DecodeError
+from zsim.math.compiled import portable
+from zsim.math.rotation import Vector
+from zsim.scenario.scenario import Drone, Environment, Estimation
+from zsim.sensors.camera import Hats
+from zsim.sensors.camera_model import camera_pose
+from zsim_agents.estimation import measurement_update, strapdown
+from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.estimator_bank import EstimatorBank, sort_readings, write_estimate
+from zsim_agents.estimation.filter_state import COUNT, NOMINAL, Rows
+from zsim_agents.estimation.joint.sighting_update import SIGHTING, use_sightings
+from zsim_agents.estimation.joint_covariance import block, predict_jointly, put_block
+
+SIGHTED_A_GATE = 1000  # more of one gate are a flood, and left out
+
+
+class JointBank(EstimatorBank):
+    """Fuse the sensors and the sightings of the drones of a cluster.
+
+    Args:
+        drones, environment, estimation, gate_s: as of EstimatorBank.
+    """
+
+    def __init__(
+        self, drones: Sequence[Drone], environment: Environment, estimation: Estimation, gate_s: float
+    ) -> None:
+        super().__init__(drones, environment, estimation, gate_s)
+        count, n = self.rows.covariance.shape[:2]
+        joint = np.zeros((count * n, count * n))
+        for i in range(count):
+            put_block(joint, i, self.rows.covariance[i])
+        self.rows = self.rows._replace(joint=joint)
+        hats = environment.hats if isinstance(environment.hats, Hats) else Hats()
+        x, y, z = hats.position_m
+        self._hat_B: Vector = float(x), float(y), float(z)
+        self._cameras = [{name: camera_pose(c).p_BK for name, c in d.sensors.cameras().items()} for d in drones]
+        self._drones = {keys.sensor(drone.name, keys.SIGHTINGS): i for i, drone in enumerate(drones)}
+        self._table: Sequence[str] = ()
+        self._places: dict[int, int] = {}
+        self._sighted: list[list[float]] = []
+
+    def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
+        if sensor != keys.SIGHTINGS:
+            super().receive(i, sensor, message, t_arrival_s)
+            return
+        p_BK = self._cameras[i].get(message.camera)
+        room = SIGHTED_A_GATE - len(self._sighted)
+        for seen in message.seen[:room] if p_BK is not None else ():
+            self._sighted.append(
+                [i, t_arrival_s, message.t_sample_ns * 1e-9, *p_BK.tolist(), *seen.direction_B, seen.range_m]
+                + [seen.sigma_direction_rad, seen.sigma_range_m]
+            )
+
+    def receive_gate(self, gate: GateMessages) -> bool:
+        if gate.table is not self._table:
+            self._table = gate.table
+            self._places = {place: self._drones[key] for place, key in enumerate(gate.table) if key in self._drones}
+        if not super().receive_gate(gate):
+            return False
+        for m, which in enumerate(gate.which.tolist()) if self._places else ():
+            if which in self._places:
+                with suppress(DecodeError):
+                    message = messages.decode(gate.table[which], gate.payload(m))
+                    self.receive(self._places[which], keys.SIGHTINGS, message, message.t_ns * 1e-9)
+        return True
+
+    def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
+        super().warm_start(i, last)
+        put_block(self.rows.joint, i, self.rows.covariance[i])
+
+    def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        sighted, self._sighted = self._sighted, []
+        sightings = np.array(sorted(sighted), dtype=float).reshape(-1, SIGHTING.size)
+        step_jointly(self.rows, t_s, readings, sightings, self._hat_B, self._estimates)
+        return self._estimates
+
+    def estimate(self, t_s: float) -> list[StateEstimate]:
+        estimates = super().estimate(t_s)
+        counts = self.rows.counts[:, COUNT.sightings_used :].tolist()
+        return [
+            each._replace(sensors={**each.sensors, keys.SIGHTINGS: (used, refused)})
+            for each, (used, refused) in zip(estimates, counts, strict=True)
+        ]
+
+
+@portable
+def step_jointly(
+    rows: Rows, t_s: float, readings: np.ndarray, sightings: np.ndarray, hat_B: Vector, estimates: np.ndarray
+) -> None:
+    """Use the readings and sightings of a gate of all drones and write their estimates for `t_s`.
+
+    Args:
+        rows: of N drones; changed.
+        t_s: instant of the gate [s].
+        readings: (M, READING.size), each drone's in the order of their arrival.
+        sightings: (M, SIGHTING.size).
+        hat_B: centre of a hat in the body of its drone [m].
+        estimates: (N, ESTIMATE.size), written.
+    """
+    count, n = rows.covariance.shape[:2]
+    first, after = np.full(count, -1), np.full(readings.shape[0], -1)
+    sort_readings(rows, readings, first, after)
+    for i in range(count):
+        _grow(rows, i, t_s)
+    for i in range(count):
+        P = block(rows.joint, i, n)
+        if not rows.counts[i, COUNT.heading_known]:
+            measurement_update.start_heading(rows, i, P, t_s, readings, first[i], after)
+            put_block(rows.joint, i, P)
+        measurement_update.fuse(rows, i, P, readings, first[i], after)
+    use_sightings(rows, sightings, hat_B)
+    for i in range(count):
+        rows.covariance[i] = block(rows.joint, i, n)
+        write_estimate(rows.nominal[i], rows.covariance[i], t_s, estimates[i])
+
+
+@portable
+def _grow(rows: Rows, i: int, t_s: float) -> None:
+    """Let the errors of a drone follow its dead reckoning since the last gate."""
+    row, n = rows.nominal[i], rows.covariance.shape[1]
+    if not rows.counts[i, COUNT.running]:
+        strapdown.begin(row, rows.counts[i], t_s)
+    strapdown.coast(row, rows.setting[i], t_s)
+    if row[NOMINAL.t] > row[NOMINAL.t_start]:
+        F, Q = np.eye(n), np.zeros((n, n))
+        strapdown.write_growth(rows, i, F, Q)
+        predict_jointly(rows.joint, i, F, Q)
+    strapdown.begin_interval(row, row[NOMINAL.t])

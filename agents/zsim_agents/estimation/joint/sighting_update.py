@@ -1,0 +1,174 @@
+"""Sightings used by a joint filter: whose hat was seen is found out, then drones that see and are seen are corrected.
+
+Compiled. A sighting is compared with the states of both drones at the instant of its picture. Errors: R_true =
+(I + [theta]x) R_WB, as in dead_reckoning.
+"""
+
+import math
+
+import numpy as np
+
+from zsim.math.columns import Field, columns
+from zsim.math.compiled import portable
+from zsim.math.rotation import Vector, add, cross, dot, matrix, norm, product, scaled, subtract, transposed
+from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
+from zsim_agents.estimation.filter_state import COUNT, LAYOUT, NOMINAL, SETTING, Moment, Rows, moment, vector
+from zsim_agents.estimation.joint_covariance import correct_all
+from zsim_agents.estimation.kalman_update import innovation_covariance, within_gates
+from zsim_agents.estimation.strapdown import recall
+
+SIGHTING = columns(  # one hat that was seen
+    "SightingColumns",
+    (
+        Field("drone", "1"),  # who saw it
+        Field("t_arrival", "s"),
+        Field("t_sample", "s"),
+        Field("p_BK", "m", 3),  # of the camera
+        Field("direction_B", "1", 3),
+        Field("range", "m"),
+        Field("sigma_direction", "rad"),
+        Field("sigma_range", "m"),
+    ),
+)
+# by which y^T S^-1 y of the second best must be more than that of the best: chosen, a likelihood ratio of 150
+AMBIGUITY = 10.0
+RANGE_MAX_M = 1e4  # no hat is seen farther away
+SIGMA_MIN_RAD, SIGMA_MIN_M = 1e-4, 1e-3  # what interpolation of past states loses
+NOBODY = -1
+
+
+@portable
+def expected(a: Moment, b: Moment, hat_B: Vector, p_BK: Vector) -> Vector:
+    """Return where drone a's camera should see the hat of drone b [m; axes of a's body]."""
+    away = subtract(add(b[1], product(matrix(b[3]), hat_B)), a[1])
+    return subtract(product(transposed(matrix(a[3])), away), p_BK)
+
+
+@portable
+def write_rows(
+    H: np.ndarray,
+    i: int,
+    j: int,
+    n: int,
+    a: Moment,
+    b: Moment,
+    hat_B: Vector,
+    axes: tuple[Vector, Vector, Vector],
+    lags: tuple[float, float],
+) -> None:
+    """Write the Jacobian of a sighting along three axes of the observer's body, (3, D), which comes in as zero."""
+    R_a, hat_W = matrix(a[3]), product(matrix(b[3]), hat_B)
+    away = subtract(add(b[1], hat_W), a[1])
+    for r in range(3):
+        w = product(R_a, axes[r])
+        by_own, by_other = cross(w, away), cross(hat_W, w)
+        for k in range(3):
+            H[r, j * n + POSITION + k] = w[k]
+            H[r, i * n + POSITION + k] = -w[k]
+            H[r, j * n + VELOCITY + k] = -lags[1] * w[k]
+            H[r, i * n + VELOCITY + k] = lags[0] * w[k]
+            H[r, i * n + ATTITUDE + k] = by_own[k]
+            H[r, j * n + ATTITUDE + k] = by_other[k]
+
+
+@portable
+def across(d: Vector) -> tuple[Vector, Vector, Vector]:
+    """Return a unit vector and two across it."""
+    side = (0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)
+    e = cross(d, side)
+    e = scaled(e, 1.0 / norm(e))
+    return d, e, cross(d, e)
+
+
+@portable
+def judge(
+    rows: Rows,
+    sighting: np.ndarray,
+    j: int,
+    hat_B: Vector,
+    H: np.ndarray,
+    y: np.ndarray,
+    PHt: np.ndarray,
+    S_out: np.ndarray,
+) -> float:
+    """Return y^T S^-1 y of a sighting taken as one of drone j; inf where it cannot be one. Writes H, y, P H^T and S."""
+    i, n, J = int(sighting[SIGHTING.drone]), rows.covariance.shape[1], rows.joint
+    t_s = sighting[SIGHTING.t_sample]
+    a = recall(rows.counts[i], rows.history[i], rows.layout[i, LAYOUT.history], t_s, moment(rows.nominal[i]))
+    b = recall(rows.counts[j], rows.history[j], rows.layout[j, LAYOUT.history], t_s, moment(rows.nominal[j]))
+    p_BK = vector(sighting, SIGHTING.p_BK)
+    r = expected(a, b, hat_B, p_BK)
+    away = norm(r)
+    if away < 0.1:
+        return math.inf
+    axes = across(scaled(r, 1.0 / away))
+    seen = scaled(vector(sighting, SIGHTING.direction_B), sighting[SIGHTING.range])
+    miss = subtract(seen, r)
+    H[:] = 0.0
+    lags = (rows.nominal[i, NOMINAL.t] - a[0], rows.nominal[j, NOMINAL.t] - b[0])
+    write_rows(H, i, j, n, a, b, hat_B, axes, lags)
+    sideways = away * max(sighting[SIGHTING.sigma_direction], SIGMA_MIN_RAD)
+    along = max(sighting[SIGHTING.sigma_range], SIGMA_MIN_M)
+    variance = np.array([along * along, sideways * sideways, sideways * sideways])
+    for k in range(3):
+        y[k] = dot(axes[k], miss)
+    S_out[:] = innovation_covariance(J, H, variance, PHt)
+    blocks, distances = np.array([[0, 3]]), np.zeros(1)
+    within_gates(S_out, y, blocks, rows.limits, distances)
+    return distances[0]
+
+
+@portable
+def owner(rows: Rows, sighting: np.ndarray, hat_B: Vector, taken: np.ndarray) -> int:
+    """Return whose hat was seen, NOBODY where none fits or two do; `taken` are those seen in the same picture."""
+    size = rows.joint.shape[0]
+    H, y, PHt, S = np.zeros((3, size)), np.zeros(3), np.zeros((size, 3)), np.zeros((3, 3))
+    best, second, found = math.inf, math.inf, NOBODY
+    for j in range(rows.nominal.shape[0]):
+        if j == int(sighting[SIGHTING.drone]) or not rows.counts[j, COUNT.heading_known]:
+            continue
+        distance = judge(rows, sighting, j, hat_B, H, y, PHt, S)
+        if distance < best:
+            best, second, found = distance, best, j
+        elif distance < second:
+            second = distance
+    if best > rows.limits[3] or second - best < AMBIGUITY or taken[found]:
+        return NOBODY
+    return found
+
+
+@portable
+def is_possible(rows: Rows, sighting: np.ndarray) -> bool:
+    """Tell whether a sighting can be used at all: its time, and what it says."""
+    i = int(sighting[SIGHTING.drone])
+    age_s = sighting[SIGHTING.t_arrival] - sighting[SIGHTING.t_sample]
+    good = 0.0 <= age_s <= rows.setting[i, SETTING.age_max] and rows.counts[i, COUNT.heading_known] != 0
+    good = good and 0.0 < sighting[SIGHTING.range] < RANGE_MAX_M
+    length = norm(vector(sighting, SIGHTING.direction_B))
+    return good and 0.99 < length < 1.01 and sighting[SIGHTING.sigma_range] > 0.0
+
+
+@portable
+def use_sightings(rows: Rows, sightings: np.ndarray, hat_B: Vector) -> None:
+    """Use the sightings of a gate, one after the other; those that nobody's hat explains are counted as refused.
+
+    Args:
+        rows: of all drones; changed.
+        sightings: (M, SIGHTING.size), those of one picture one behind the other.
+        hat_B: centre of a hat in the body of its drone [m].
+    """
+    size = rows.joint.shape[0]
+    taken = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
+    H, y, PHt, S = np.zeros((3, size)), np.zeros(3), np.zeros((size, 3)), np.zeros((3, 3))
+    for m in range(sightings.shape[0]):
+        sighting, i = sightings[m], int(sightings[m, SIGHTING.drone])
+        if m == 0 or sighting[0] != sightings[m - 1, 0] or sighting[2] != sightings[m - 1, 2]:
+            taken[:] = False
+        j = owner(rows, sighting, hat_B, taken) if is_possible(rows, sighting) else NOBODY
+        if j == NOBODY:
+            rows.counts[i, COUNT.sightings_refused] += 1
+            continue
+        taken[j] = True
+        rows.counts[i, COUNT.sightings_used] += 1
+        judge(rows, sighting, j, hat_B, H, y, PHt, S)
+        correct_all(rows, rows.joint, PHt, S, y)
