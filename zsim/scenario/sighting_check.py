@@ -7,9 +7,7 @@ from msgspec import UNSET
 
 from zsim.schema.checker import Fault, show
 
-SIGHTED_MAX = (
-    12  # drones of a cluster: each of its estimators has the states of all, at a cost that grows by the square
-)
+SIGHTED_MAX = 12  # drones of a cluster: each of its estimators has the states of all; the cost grows by the square
 
 
 def sighting_faults(scenario: Any, drones: list[tuple[int, Any]], clusters: list[tuple[int, Any]]) -> Iterator[Fault]:

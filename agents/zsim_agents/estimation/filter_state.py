@@ -159,7 +159,7 @@ STATES = (
     "bias",
     "history",
     "joint",
-)  # the rows that change; the others are settings
+)  # rows that change; others are settings
 
 
 @portable

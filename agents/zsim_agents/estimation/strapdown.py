@@ -148,7 +148,7 @@ def grow(rows: Rows, i: int, P: np.ndarray) -> np.ndarray:
 
 @portable
 def write_growth(rows: Rows, i: int, F: np.ndarray, Q: np.ndarray) -> None:
-    """Write the transition of the errors over the interval that ends now into F, the identity, and their noise into Q."""
+    """Write how the errors grow over the interval that ends now: transition into F, the identity, and noise into Q."""
     row, setting = rows.nominal[i], rows.setting[i]
     dt, dt_squared = row[NOMINAL.t] - row[NOMINAL.t_start], row[NOMINAL.dt_squared]
     turned = setting[SETTING.gyro_variance] * dt_squared + row[NOMINAL.lost_turn]

@@ -69,7 +69,8 @@ class SightingSampler:
         self._bare = np.array([drone.name not in hats.covered for drone in scenario.drones])
         self._balls = np.array(hats.false_m, dtype=float).reshape(-1, 3)
         self._obstacles = np.array([row_of(each) for each in env.obstacles], dtype=float).reshape(-1, COLUMNS)
-        self._hat_B, self._diameter_m = tuple(map(float, hats.position_m)), hats.diameter_m
+        x, y, z = hats.position_m
+        self._hat_B, self._diameter_m = (float(x), float(y), float(z)), hats.diameter_m
         self._later: list[Sighting] = []
         self._former: NDArray[np.float64] | None = None
         self._former_ns = 0

@@ -56,12 +56,11 @@ class JointBank(EstimatorBank):
             super().receive(i, sensor, message, t_arrival_s)
             return
         p_BK = self._cameras[i].get(message.camera)
-        room = SIGHTED_A_GATE - len(self._sighted)
-        for seen in message.seen[:room] if p_BK is not None else ():
-            self._sighted.append(
-                [i, t_arrival_s, message.t_sample_ns * 1e-9, *p_BK.tolist(), *seen.direction_B, seen.range_m]
-                + [seen.sigma_direction_rad, seen.sigma_range_m]
-            )
+        if p_BK is None:
+            return
+        for seen in message.seen[: SIGHTED_A_GATE - len(self._sighted)]:
+            row = (i, t_arrival_s, message.t_sample_ns * 1e-9, *p_BK.tolist(), *seen.direction_B, seen.range_m)
+            self._sighted.append([*row, seen.sigma_direction_rad, seen.sigma_range_m])
 
     def receive_gate(self, gate: GateMessages) -> bool:
         if gate.table is not self._table:
