@@ -36,6 +36,7 @@ ANOTHER_RUN = "the world has begun another run"
 PAUSE_S = 0.01  # between two looks into the queue: nobody waits for the recorder, and waking up is what costs
 TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
 REPLAY_S = 5.0  # a hub answers within milliseconds
+JOIN_S = 1.0  # wall time after which a join is repeated of which there was no event: it may have met no world
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
 STOP_DRAIN_S = 0.5  # after a stop is requested, how long the end of the run is waited for: both may be stopped at once
 QUIET_S = 1.5  # a world whose time stands publishes its clock once a second
@@ -105,6 +106,7 @@ class Recorder:
         self._on_disk_ns = 0  # when everything taken was put there last
         self._incarnation = secrets.randbits(62)
         self._incarnations = {self._incarnation}
+        self._joined_s: float | None = None  # when it joined last, until the world has taken it in
         self._seq = {"join": 0, "done": 0, "bye": 0, "health": 0}
         self._left_out = 0
         self._leavers: set[str] = set()
@@ -188,6 +190,8 @@ class Recorder:
             if self._now_ns - self._on_disk_ns >= FLUSH_NS:
                 self._put_on_disk()
             self._count_left_out()
+            if self._joined_s is not None and time.monotonic() - self._joined_s > JOIN_S:
+                self._join()
             if self._successor:
                 return "superseded"
             if self._may_stop():
@@ -376,7 +380,11 @@ class Recorder:
         except DecodeError:
             return  # garbage by somebody else; recorded as it came
         data = event.data
-        if event.subject != self._name or event.kind != "superseded":
+        if event.subject != self._name:
+            return
+        if data.get("incarnation") == self._incarnation:
+            self._joined_s = None
+        if event.kind != "superseded":
             return
         if (data.get("host"), data.get("pid")) == (self._link.host, os.getpid()):
             if data.get("incarnation") not in self._incarnations:
@@ -397,6 +405,7 @@ class Recorder:
         name, host, run_id, seq = self._name, self._link.host, self._info.run_id, self._next("join")
         join = join_of(name, host, run_id, self._incarnation, seq, self._now_ns, calculates=False, slack_ns=SLACK_NS)
         self._publish("join", join)
+        self._joined_s = time.monotonic()
         self._put_on_disk()
 
     def _join_again(self) -> None:

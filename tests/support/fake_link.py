@@ -7,7 +7,7 @@ from typing import Any
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.run_messages import ControlAnswer
+from zsim.contract.run_messages import ControlAnswer, Event, Join
 from zsim.transport.session import FarEnd, RawSample, ReceivedSample
 
 PATIENCE_S = 120.0  # after which a test that waits for ever fails
@@ -52,6 +52,7 @@ class FakeLink:
         requests: (key, arguments) of all requests.
         last: what a get is answered, by key.
         reads: the expressions that are subscribed to.
+        admits: whether there is an event of each join.
         ends: who is at the end of each link.
     """
 
@@ -66,6 +67,7 @@ class FakeLink:
         self.requests: list[tuple[str, dict[str, Any]]] = []
         self.last: dict[str, bytes] = {}
         self.reads: list[str] = []
+        self.admits = True
         self.ends: dict[str, FarEnd] = {}
         self._subscriptions: list[FakeSubscription] = []
         self._early: list[ReceivedSample] = []
@@ -96,6 +98,13 @@ class FakeLink:
             if keys.matches(expression, key):
                 callback(key, alive)
 
+    def _admit(self, name: str, join: Join) -> None:
+        data = {"incarnation": join.incarnation, "host": join.host, "pid": join.pid, "from_ns": 0, "done_ns": -1}
+        event = messages.encode(Event(0, 0, "join", "world", name, "", data))
+        for expression, callback in self._callbacks:
+            if keys.matches(expression, keys.EVENT):
+                callback(RawSample("PUT", keys.EVENT, event, "", None))
+
     def published_on(self, expression: str) -> list[Any]:
         """Return the messages published on an expression."""
         return [messages.decode(key, payload) for key, payload in self.published if keys.matches(expression, key)]
@@ -122,6 +131,8 @@ class FakeLink:
     def put_raw(self, key: str, payload: bytes) -> None:
         self.published.append((key, payload))
         self.on_publish(key, payload)
+        if self.admits and key.endswith("/join"):
+            self._admit(keys.thing(key), messages.decode(key, payload))
 
     def put_all(self, encoded: Sequence[tuple[str, bytes]]) -> None:
         for key, payload in encoded:

@@ -72,13 +72,17 @@ class Deployment:
         return {row["role"]: row for row in json.loads(role.text().splitlines()[-1])["rows"]}
 
     def kill(self, role: str, number: int = signal.SIGKILL) -> None:
-        """Send a role a signal."""
-        for host in self.lab.names:
-            for pid, line in self.lab.processes(host).items():
-                if re.match(rf"\S*python\S* .*/{re.escape(role)}( |$)", line):  # its certificate's folder
-                    os.kill(pid, number)
-                    return
-        pytest.fail(f"{role} runs on no host")
+        """Send a role a signal, once it runs: the newest of its processes where it is being moved."""
+        until_s = time.monotonic() + START_S
+        while not (pids := self._pids(role)):
+            assert time.monotonic() < until_s, f"{role} runs on no host"
+            threading.Event().wait(0.05)  # nothing tells of the start of another's process
+        os.kill(max(pids), number)
+
+    def _pids(self, role: str) -> list[int]:
+        lines = [line for host in self.lab.names for line in self.lab.processes(host).items()]
+        own = re.compile(rf"\S*python\S* .*/{re.escape(role)}( |$)")  # its certificate's folder
+        return [pid for pid, line in lines if own.match(line)]
 
     def record(self) -> Record:
         """Return what was recorded; a record that was cut is mended first."""

@@ -106,11 +106,11 @@ def test_on_three_hosts(lab: Lab, tmp_path: Path, seed: int) -> None:
         deployment.zsim("down").ends(with_code=0)
         run.ends(with_code=130, within_s=START_S)
         record = deployment.record()
-    wanted = sha256_in_process(scenario_file.load(STEP), record, tmp_path)
-    drones = ["drone1", "drone2", "drone3"]
-    assert (record.sha256(), record.recomputed_sha256(drones)) == (wanted, wanted)
-    check_whole(record)
-    assert deaths.count == 14 * ROUNDS
+        wanted = sha256_in_process(scenario_file.load(STEP), record, tmp_path)
+        drones = ["drone1", "drone2", "drone3"]
+        assert (record.sha256(), record.recomputed_sha256(drones)) == (wanted, wanted)
+        check_whole(record)
+        assert deaths.count == 14 * ROUNDS
 
 
 def move(deployment: Deployment, role: str, host: str) -> None:

@@ -244,20 +244,6 @@ def test_gates_that_nobody_has_any_more_are_missed_aloud(federation: Federation,
 
 
 @pytest.mark.soak
-def test_a_stopped_reader(federation: Federation) -> None:
-    """Whoever only listens and takes nothing loses its link; the terminal says meanwhile why nothing moves."""
-    run = federation.run(PAIR, "--duration", "100000")
-    clock = federation.client().subscribe("clock")
-    reader = federation.role("echo", "**")
-    reader.line("clock")
-    reader.signal(signal.SIGSTOP)
-    stuck = run.line("stuck: nothing can be published for .*; one of recorder, ")
-    clock.until(lambda _: clock.received[-1].wall_s > stuck.wall_s + 1.0)
-    run.signal(signal.SIGINT)
-    run.ends(with_code=130)
-
-
-@pytest.mark.soak
 def test_a_stopped_recorder(federation: Federation) -> None:
     """Time stands still for it, before the world has forgotten what it lacks."""
     flight = Flight(federation, "--rate", "1000")

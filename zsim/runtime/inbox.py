@@ -179,7 +179,7 @@ class Inbox:
             if meter.partial or meter.counts or meter.came:
                 meter.forget(t_ns)
         self._taken_ns = t_ns
-        return ready
+        return _once(ready) if len(ready) > 1 else ready
 
     def _with_belated(self, ready: list[tuple[str, Any]]) -> list[tuple[str, Any]]:
         """Put what came late in front, and note what is handed out."""
@@ -200,6 +200,15 @@ class Inbox:
     def start_after(self, t_ns: int) -> None:
         """Ignore everything up to and including t_ns; the next gate is counted in full."""
         self.take(t_ns)
+
+
+def _once(ready: list[tuple[str, Any]]) -> list[tuple[str, Any]]:
+    """Leave out the sensor messages that are there a second time, in a GateMessages: a replay brings them singly."""
+    gates = [message for _, message in ready if type(message) is GateMessages]
+    if not gates or not any(keys.is_sensor(key) for key, _ in ready):
+        return ready
+    covered = {gate.table[place] for gate in gates for place in set(gate.which.tolist()) if place < len(gate.table)}
+    return [(key, message) for key, message in ready if key not in covered]
 
 
 class _Meter:

@@ -38,11 +38,12 @@ class Membership:
         take_in: takes what a replay brings.
         say: called with lines for the user.
         wall_s: monotonic wall time.
+        stopped: tells whether the process is to end.
 
     Attributes:
         done_ns: newest gate that it is through with, -1 before the first.
         published_ns: gate up to which a former incarnation has published all outputs, which are not published again.
-        awaited: whether the world has still to say what that gate is, after a snapshot was taken over.
+        awaited: whether the world has still to say that this process takes part, and from which gate on.
         failure: why it can take part no longer, None while it can.
     """
 
@@ -54,7 +55,10 @@ class Membership:
         take_in: Callable[[ReceivedSample], None],
         say: Callable[[str], None],
         wall_s: Callable[[], float] = time.monotonic,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
+        self._stopped = stopped
+        self._resumed = False
         self._link = link
         self._info = info
         self._agent = agent
@@ -86,7 +90,7 @@ class Membership:
 
         The world's history must reach back to it: what came since is fetched and stepped through again.
         """
-        for sample in self._link.get(keys.process(self._agent.name, "snapshot")):
+        for sample in self._last_values(keys.process(self._agent.name, "snapshot")):
             fresh = self._agent.checkpoint()
             try:
                 snapshot: run_messages.Snapshot = messages.decode(sample.key, sample.payload)
@@ -97,7 +101,7 @@ class Membership:
                     self._agent.resume(self._info, fresh)  # not half of the former state
                 continue
             self._say(f"{self._agent.name}: goes on from its snapshot of t = {snapshot.t_ns / 1e9:.2f} s")
-            self.done_ns, self.awaited = snapshot.t_ns, True
+            self.done_ns, self._resumed = snapshot.t_ns, True
             return self.done_ns
         return None
 
@@ -110,13 +114,22 @@ class Membership:
 
     def _world_ns(self) -> int:
         """Return the world's newest gate."""
-        clocks = [messages.decode(sample.key, sample.payload) for sample in self._link.get(keys.CLOCK)]
+        clocks = [messages.decode(sample.key, sample.payload) for sample in self._last_values(keys.CLOCK)]
         return clocks[0].t_ns if clocks else 0
+
+    def _last_values(self, key: str) -> list[ReceivedSample]:
+        """Return what the world has as the last value of a key, once there is a world that answers: one that has died
+        is started again, and a process that would begin without its former state lost what that has come to know."""
+        while not (found := self._link.get(key)) and not self._stopped():
+            if self._link.get(keys.INFO):
+                return self._link.get(key)
+            time.sleep(RETRY_S)
+        return found
 
     def warm_start(self) -> int | None:
         """Hand the agent what a former incarnation published last; return the time of it, None if there was none."""
         for key in self._agent.warm_start_keys():
-            for sample in self._link.get(key):
+            for sample in self._last_values(key):
                 self._hand_over(key, sample.payload)
         if self.done_ns < 0:
             return None
@@ -134,13 +147,22 @@ class Membership:
         self.done_ns = max(self.done_ns, message.t_ns)
 
     def enter(self) -> None:
-        """Join; after a warm start, go on where the former incarnation was."""
+        """Join; what follows waits for the event of it, and until that comes the join is repeated."""
+        self.awaited = True
         self._join()
-        if self.awaited:
-            self._retry_s = self._wall_s() + RETRY_S
+        self._retry_s = self._wall_s() + RETRY_S
+
+    def _begin(self, entry: ProcessEntry) -> None:
+        """Fetch what came since the state that was taken over, or in the time of a former incarnation."""
+        self.awaited = False
+        if self._resumed:
+            self.published_ns = entry.done_ns
         elif self.done_ns >= 0:
             self._link.put(self._done_key, self._done(self.done_ns, 0))
+        if self.done_ns >= 0:
             self._catch_up(self.done_ns)
+        elif entry.former_pid is not None:
+            self._catch_up(max(entry.from_ns - 1, entry.done_ns))
 
     def publish(self, t_ns: int, outputs: Sequence[Output]) -> None:
         """Encode the outputs of a gate and the done that counts them, for `send`."""
@@ -217,10 +239,7 @@ class Membership:
         if entry.incarnation == self._incarnation:
             self._unproved = 0
             if self.awaited:
-                self.awaited, self.published_ns = False, entry.done_ns
-                self._catch_up(self.done_ns)
-            elif self.done_ns < 0:
-                self._catch_up(max(entry.from_ns - 1, entry.done_ns))
+                self._begin(entry)
         elif entry.former_pid == os.getpid() and entry.pid != os.getpid():
             self.failure = SupersededError(
                 f"{self._agent.name}: another process of this name joined from {entry.host} "

@@ -59,7 +59,7 @@ class Runner:
         self.health = HealthMeter(agent.role, host=link.host, reads=link.reads)
         self._inputs = RunnerInputs(link, info, agent, self.health, say)
         self._inbox = self._inputs.inbox
-        self._member = Membership(link, info, agent, self._inputs.take_in, say)
+        self._member = Membership(link, info, agent, self._inputs.take_in, say, stopped=stopped)
         self._snapshot_ns = snapshot_ns
         self._snapshot_due_ns = 0
         self._resumed_ns: int | None = None
@@ -131,7 +131,7 @@ class Runner:
         """Return the gate to step now, None if it must be waited for."""
         t_ns = self._inbox.next_gate_ns()
         self._lacks = False
-        if t_ns is None or not self._reaches_back(t_ns):
+        if t_ns is None or self._member.awaited or not self._reaches_back(t_ns):
             return None
         if self._inbox.missing(t_ns) is None:
             return t_ns
@@ -262,10 +262,10 @@ class Runner:
             self._end_wall_s = time.monotonic()
         elif read.kind in ("drop", "leave"):
             self._inputs.ignore_estimates(read.subject)
-        elif isinstance(read.data, ProcessEntry) and read.kind == "join":
-            self._inputs.expect_estimates(read.subject, read.data.from_ns)
         elif isinstance(read.data, ProcessEntry) and read.subject == self._agent.name:
             self._member.taken_in(read.data)
+        elif isinstance(read.data, ProcessEntry) and read.kind == "join":
+            self._inputs.expect_estimates(read.subject, read.data.from_ns)
 
     def _serve_link(self, up: bool) -> None:
         if up and self.health.link_lost:

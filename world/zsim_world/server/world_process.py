@@ -126,7 +126,8 @@ class WorldProcess:
     def _announce(self) -> None:
         if not self._history.last(keys.INFO):
             self._outputs.publish(Output(keys.INFO, self._world.info()))
-        for expression in self._service.answered_keys():
+        answered = self._service.answered_keys()
+        for expression in sorted(answered, key=keys.INFO.__eq__):  # who is answered there is answered everywhere
             self._link.declare_queryable(expression, self._on_query)
         self._tokens.watch()
         self._link.on_token(keys.token("*"), self._on_token)

@@ -6,8 +6,9 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim.contract import keys
+from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate, Status
+from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import Baro, Imu
 from zsim.runtime.inbox import GAP_MAX, Inbox
 
@@ -306,3 +307,13 @@ def test_in_lockstep_a_late_message_is_refused():
     inbox.take(GATE_NS)
     assert not inbox.put(STATUS, status(GATE_NS, 1, 1))
     assert inbox.take(2 * GATE_NS) == []
+
+
+def test_what_a_replay_brings_of_a_gate_that_came_whole_is_left_out():
+    singly = gate_of("d1", 1)
+    whole = GateMessages.of(GATE_NS, 1, key_table(["d1"]), [(key, messages.encode(each)) for key, each in singly])
+    inbox = Inbox((STATUS, keys.estimate("d1")), ("d1",))
+    for key, message in [(keys.gate("d1"), whole), *singly, (keys.estimate("d1"), estimate(GATE_NS, 0))]:
+        inbox.put(key, message)
+    assert inbox.missing(GATE_NS) is None
+    assert sorted(key for key, _ in inbox.take(GATE_NS)) == sorted([keys.gate("d1"), keys.estimate("d1")])

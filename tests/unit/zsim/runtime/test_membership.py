@@ -10,9 +10,11 @@ from refused import refused
 from zsim.contract import keys, messages
 from zsim.contract.framing import decode_batch, pairs_of
 from zsim.contract.messages import Info, Origin
-from zsim.contract.run_messages import ControlAnswer
+from zsim.contract.run_messages import Clock, ControlAnswer, Snapshot
+from zsim.contract.snapshot import VERSION, pack
 from zsim.contract.world_events import ProcessEntry
 from zsim.errors import DecodeError, NoWorldError
+from zsim.runtime import membership
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.membership import RETRY_S, Membership, replay
 from zsim.transport.session import ReceivedSample
@@ -76,6 +78,52 @@ def test_who_did_not_join_as_the_news_of_its_own_process_say_joins_again():
         member.taken_in(ProcessEntry(own.incarnation, link.host, os.getpid(), 0, former_pid=os.getpid()))
     assert len(link.published_on("process/*/join")) == 2
     assert member.failure is None
+
+
+# What is not there yet, as while a world is being started again
+
+
+def test_a_join_is_repeated_until_the_world_has_taken_it_in():
+    link, wall = FakeLink(), Wall()
+    link.admits, link.last = False, {keys.INFO: messages.encode(INFO)}
+    member = Membership(link, INFO, Quiet(), lambda sample: None, lambda text: None, wall)  # type: ignore[arg-type]
+    member.enter()
+    for _ in range(3):
+        wall.now_s += RETRY_S
+        member.settle()
+    joins = link.published_on("process/*/join")
+    assert len(joins) == 4
+    assert len({join.incarnation for join in joins}) == 1
+    assert member.awaited
+    member.taken_in(ProcessEntry(joins[0].incarnation, link.host, os.getpid(), 0))
+    wall.now_s += RETRY_S
+    member.settle()
+    assert (member.awaited, len(link.published_on("process/*/join"))) == (False, 4)
+
+
+def test_a_snapshot_is_asked_for_until_a_world_answers(monkeypatch: pytest.MonkeyPatch):
+    link, states = FakeLink(), []
+    agent = Quiet()
+    monkeypatch.setattr(agent, "snapshot", lambda: {"count": 3})
+    monkeypatch.setattr(agent, "restore", states.append)
+    state = agent.checkpoint()
+    assert state is not None
+    key = keys.process(agent.name, "snapshot")
+    kept = {
+        key: messages.encode(Snapshot(GATE_NS, 0, agent.name, VERSION, pack(state))),
+        keys.CLOCK: messages.encode(Clock(2 * GATE_NS, 0, "r", 2, "running", 1.0)),
+        keys.INFO: messages.encode(INFO),
+    }
+    monkeypatch.setattr(membership.time, "sleep", lambda wall_s: link.last.update(kept))  # it is there when asked again
+    member = Membership(link, INFO, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    assert (member.resume(), states) == (GATE_NS, [{"count": 3}])
+
+
+def test_whoever_is_to_end_waits_for_no_world():
+    link = FakeLink()
+    settings = (lambda sample: None, lambda text: None, Wall(), lambda: True)
+    member = Membership(link, INFO, Quiet(), *settings)  # type: ignore[arg-type]
+    assert member.resume() is None
 
 
 # The pages of a replay

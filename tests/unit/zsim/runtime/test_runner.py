@@ -291,7 +291,7 @@ def test_after_a_lost_link_it_rejoins_as_soon_as_the_world_answers(hears: bool):
     asked = iter(range(3))
 
     def cut(world: World) -> None:
-        world.last = {}
+        world.last, world.admits = {}, False
         world.cut(False)
         world.cut(True)
 
@@ -455,6 +455,7 @@ class Restarting(World):
     def __init__(self, snapshot: Snapshot, first_kept: int = 0) -> None:
         self._joined = False
         super().__init__(estimates(range(END + 1)))
+        self.admits = False
         self.last[keys.process(ME, "snapshot")] = messages.encode(snapshot)
         self.last[keys.CLOCK] = messages.encode(Clock(self.DIED * GATE_NS, 0, "run1", self.DIED, "running", 1.0))
         self.last[keys.estimate("d2")] = messages.encode(estimate(self.DIED, ME))
