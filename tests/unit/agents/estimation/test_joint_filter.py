@@ -1,0 +1,172 @@
+"""The joint filter of a cluster: without sightings as every drone by itself, with them whose hat was seen is found out."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from zsim.contract.camera_messages import Seen, Sightings
+from zsim.contract.messages import Baro, Flow, Gps, Imu, Mag
+from zsim.math.rotation import matrix, normalised
+from zsim.scenario import scenario_file
+from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.estimator_bank import EstimatorBank
+from zsim_agents.estimation.filter_state import Moment
+from zsim_agents.estimation.joint.cluster_banks import ClusterBanks
+from zsim_agents.estimation.joint.joint_bank import JointBank
+from zsim_agents.estimation.joint.sighting_update import across, expected, write_rows
+
+EYES = scenario_file.load(Path(__file__).parents[4] / "scenarios" / "eyes.yaml")
+GATE_S, GATE_NS = 0.02, 20_000_000
+PLACES = np.array(
+    [(0.0, 4.0, 5.0), (-1.5, 0.0, 5.0), (1.5, 0.0, 5.0)]
+)  # drones 2 and 3 have drone 1 ahead, north of them
+NORTH = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+CAMERA_B, HAT_B = np.array([0.162, 0.0, 0.012]), np.array([-0.03, 0.0, 0.11])
+FIELD_B = np.array([17.8, 2.8, 14.0])  # of the scenario, seen by who looks north
+
+
+def still(bank: EstimatorBank | ClusterBanks, gate: int, rng: np.random.Generator) -> None:
+    """Hand over what drones sense that stand still in the air, looking north."""
+    t_ns = gate * GATE_NS
+    for i, place in enumerate(PLACES):
+        for k in (3, 2, 1, 0) if gate else ():
+            at = t_ns - k * 5_000_000
+            bank.receive(i, "imu", Imu(at, 0, at, (0.0, 0.0, 9.80665), (0.0, 0.0, 0.0)), at * 1e-9)
+        if gate % 10 == 0:
+            x, y, z = (place + rng.normal(0, 2.0, 3)).tolist()
+            bank.receive(i, "gps", Gps(t_ns, 0, t_ns, 0, 0, 0, (x, y, z), (0.0, 0.0, 0.0), 2.0, 3, 9), t_ns * 1e-9)
+        if gate % 2 == 0:
+            bank.receive(i, "mag", Mag(t_ns, 0, t_ns, tuple(FIELD_B.tolist())), t_ns * 1e-9)
+            bank.receive(i, "baro", Baro(t_ns, 0, t_ns, 101_000.0, float(place[2] + rng.normal(0, 0.1))), t_ns * 1e-9)
+        if gate % 3 == 0:
+            bank.receive(i, "flow", Flow(t_ns, 0, t_ns, tuple(rng.normal(0, 0.1, 3).tolist()), 1.0), t_ns * 1e-9)
+
+
+def sighted(observer: int, target: NDArray[np.float64], t_ns: int) -> Sightings:
+    """Return what an observer sees of a hat at a place, without error."""
+    R = np.array(matrix(NORTH))
+    to_B = R.T @ (target + R @ HAT_B - PLACES[observer]) - CAMERA_B
+    away = float(np.linalg.norm(to_B))
+    seen = Seen(tuple((to_B / away).tolist()), away, 1e-3, 0.05)
+    return Sightings(t_ns=t_ns, seq=0, t_sample_ns=t_ns, camera="front", seen=(seen,))
+
+
+def settings() -> tuple[object, ...]:
+    return EYES.drones, EYES.environment, EYES.estimation, GATE_S
+
+
+def flown(bank: EstimatorBank, gates: int, seen: dict[int, NDArray[np.float64]] | None = None) -> list[StateEstimate]:
+    """Return the estimates after so many gates; each observer sees a hat there in every third."""
+    rng = np.random.default_rng(3)
+    estimates: list[StateEstimate] = []
+    for gate in range(gates):
+        still(bank, gate, rng)
+        for observer, target in (seen or {}).items() if gate % 3 == 0 else ():
+            bank.receive(observer, "sightings", sighted(observer, target, gate * GATE_NS), gate * GATE_S)
+        estimates = bank.estimate(gate * GATE_S)
+    return estimates
+
+
+def test_without_sightings_every_drone_is_as_by_itself():
+    alone, together = flown(EstimatorBank(*settings()), 300), flown(JointBank(*settings()), 300)  # type: ignore[arg-type]
+    for one, other in zip(alone, together, strict=True):
+        assert np.array(other.position_m) == pytest.approx(np.array(one.position_m), abs=1e-9)
+        assert np.array(other.covariance) == pytest.approx(np.array(one.covariance), abs=1e-9)
+
+
+def test_with_sightings_the_drones_are_where_they_are_to_each_other():
+    alone = flown(JointBank(*settings()), 1500)  # type: ignore[arg-type]
+    together = flown(JointBank(*settings()), 1500, {1: PLACES[0], 2: PLACES[0]})  # type: ignore[arg-type]
+
+    def miss(estimates: list[StateEstimate], i: int) -> float:
+        apart = np.subtract(estimates[0].position_m, estimates[i].position_m)
+        return float(np.linalg.norm(apart - (PLACES[0] - PLACES[i])))
+
+    assert max(miss(together, 1), miss(together, 2)) < 0.05 < max(miss(alone, 1), miss(alone, 2))
+    assert together[1].sensors["sightings"][0] > 300
+    assert together[0].sensors["sightings"] == (0, 0)
+
+
+def test_a_hat_where_nobody_is_moves_nobody():
+    lying = flown(JointBank(*settings()), 900, {1: np.array([3.0, 9.0, 0.0])})  # type: ignore[arg-type]
+    alone = flown(JointBank(*settings()), 900)  # type: ignore[arg-type]
+    for one, other in zip(alone, lying, strict=True):
+        assert np.array(other.position_m) == pytest.approx(np.array(one.position_m), abs=1e-12)
+    used, refused = lying[1].sensors["sightings"]
+    assert (used, refused) == (0, 300)
+
+
+def test_who_might_be_two_is_nobody():
+    """Before GPS has told them apart, within a metre or two, a sighting is not used."""
+    estimates = flown(JointBank(*settings()), 4, {1: PLACES[0]})  # type: ignore[arg-type]
+    assert estimates[1].sensors["sightings"] == (0, 2)
+
+
+def test_the_jacobian_is_that_of_what_is_expected():
+    a: Moment = (
+        0.0,
+        (1.0, 2.0, 3.0),
+        (0.0,) * 3,
+        normalised((0.9, 0.1, -0.2, 0.3)),
+        (0.0,) * 3,
+        (0.0,) * 3,
+        (0.0,) * 3,
+    )
+    b: Moment = (
+        0.0,
+        (4.0, -1.0, 3.5),
+        (0.0,) * 3,
+        normalised((0.8, -0.1, 0.2, 0.5)),
+        (0.0,) * 3,
+        (0.0,) * 3,
+        (0.0,) * 3,
+    )
+    hat, eye, n, step = (0.1, -0.2, 0.3), (0.2, 0.1, 0.05), 9, 1e-6
+    axes = across((0.6, 0.0, 0.8))
+    H = np.zeros((3, 2 * n))
+    write_rows(H, 0, 1, n, a, b, hat, axes, (0.0, 0.0))
+
+    def turned(q: tuple[float, ...], k: int) -> tuple[float, float, float, float]:
+        half = [0.0, 0.0, 0.0]
+        half[k] = step / 2
+        w, x, y, z = q
+        i, j, l = half
+        return normalised(
+            (w - i * x - j * y - l * z, x + i * w + j * z - l * y, y - i * z + j * w + l * x, z + i * y - j * x + l * w)
+        )
+
+    def moved(m: Moment, state: int) -> Moment:
+        p = list(m[1])
+        if state < 3:
+            p[state] += step
+            return (m[0], (p[0], p[1], p[2]), *m[2:])
+        return (*m[:3], turned(m[3], state - 6), *m[4:])
+
+    at = np.array(expected(a, b, hat, eye))
+    for drone in (0, 1):
+        for state in (0, 1, 2, 6, 7, 8):
+            pair = (moved(a, state), b) if drone == 0 else (a, moved(b, state))
+            slope = (np.array(expected(*pair, hat, eye)) - at) / step
+            assert H[:, drone * n + state] == pytest.approx(np.array(axes) @ slope, abs=1e-5)
+
+
+def test_it_goes_on_from_a_snapshot_to_the_same_bits():
+    def banks() -> ClusterBanks:
+        return ClusterBanks(EYES, ["drone2"], GATE_S)
+
+    first, second, rng = banks(), banks(), np.random.default_rng(1)
+    assert first.drones == ["drone1", "drone2", "drone3"]
+    for gate in range(200):
+        still(first, gate, rng)
+        first.estimate(gate * GATE_S)
+    second.restore(first.snapshot())
+    for gate in range(200, 220):
+        rngs = np.random.default_rng(gate), np.random.default_rng(gate)
+        for bank, own in zip((first, second), rngs, strict=True):
+            still(bank, gate, own)
+            bank.receive(1, "sightings", sighted(1, PLACES[0], gate * GATE_NS), gate * GATE_S)
+        (one,), (other,) = first.estimate(gate * GATE_S), second.estimate(gate * GATE_S)
+        assert one == other

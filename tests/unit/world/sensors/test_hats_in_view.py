@@ -1,0 +1,112 @@
+"""Which hats a camera has in view: by geometry that can be worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from zsim.math.frames import quaternion_from_rpy
+from zsim.scenario.obstacle import COLUMNS, row_of
+from zsim.scenario.scenario import Obstacle
+from zsim.sensors.camera import FrontCamera
+from zsim.sensors.camera_model import camera_pose, lens_of
+from zsim_world.sensors.hats_in_view import POSE, VIEW, MountedCamera, hats_in_view
+
+HAT_B, DIAMETER_M, HULL_M = (-0.03, 0.0, 0.11), 0.14, 0.26
+LENS_B = (0.162, 0.0, 0.012)  # of the front camera
+
+
+def pose(x: float, y: float, z: float, rpy_deg: tuple[float, float, float] = (0, 0, 0)) -> NDArray[np.float64]:
+    row = np.zeros(POSE.size)
+    row[:3], row[POSE.q_WB : POSE.q_WB + 4] = (x, y, z), quaternion_from_rpy(np.radians(rpy_deg))
+    return row
+
+
+def look(
+    poses: list[NDArray[np.float64]],
+    balls: list[tuple[float, float, float]] | None = None,
+    bare: list[bool] | None = None,
+    obstacles: list[Obstacle] | None = None,
+) -> NDArray[np.float64]:
+    """Return what the front camera of the first drone has in view."""
+    at, camera = camera_pose(FrontCamera()), FrontCamera()
+    x, y, z = at.p_BK.tolist()
+    w, i, j, k = at.q_BK
+    mounted = MountedCamera(lens_of(camera), (x, y, z), (w, i, j, k))
+    view = np.zeros((len(poses) + len(balls or []), VIEW.size))
+    rows = np.array([row_of(each) for each in obstacles or []]).reshape(-1, COLUMNS)
+    spheres, seen = np.array(balls or []).reshape(-1, 3), np.array(bare or [True] * len(poses))
+    hulls = np.full(len(poses), HULL_M)
+    hats_in_view(mounted, 0, np.array(poses), hulls, HAT_B, DIAMETER_M, spheres, seen, rows, view)
+    return view
+
+
+def test_a_hat_ahead_is_seen_where_it_is():
+    view = look([pose(0, 0, 5), pose(4, 1, 5.5)])
+    to_B = np.array([4 + HAT_B[0] - LENS_B[0], 1.0, 0.5 + HAT_B[2] - LENS_B[2]])
+    away = float(np.linalg.norm(to_B))
+    assert view[:, VIEW.seen].tolist() == [0.0, 1.0]
+    to_K = view[1, VIEW.direction_K : VIEW.direction_K + 3]
+    assert to_K == pytest.approx(np.array([-to_B[1], -to_B[2], to_B[0]]) / away)
+    assert view[1, VIEW.range] == pytest.approx(away)
+    assert view[1, VIEW.angle] == pytest.approx(2 * math.asin(DIAMETER_M / 2 / away))
+
+
+@pytest.mark.parametrize(("yaw_deg", "seen"), [(0, 1), (41, 1), (44, 0), (-41, 1), (-44, 0), (180, 0)])
+def test_a_hat_is_seen_within_the_picture_s_width(yaw_deg: float, seen: int):
+    # 92 deg across the diagonal of 640 x 360 are 84.2 deg across the width; the camera is level with the hat
+    view = look(
+        [
+            pose(
+                -LENS_B[0] * math.cos(math.radians(yaw_deg)),
+                -LENS_B[0] * math.sin(math.radians(yaw_deg)),
+                0,
+                (0, 0, yaw_deg),
+            ),
+            pose(4 - HAT_B[0], 0, LENS_B[2] - HAT_B[2]),
+        ]
+    )
+    assert view[1, VIEW.seen] == seen
+
+
+def test_a_covered_hat_is_not_seen_and_a_false_one_is():
+    view = look([pose(0, 0, 5), pose(4, 0, 5)], balls=[(3.0, 1.0, 5.0)], bare=[True, False])
+    assert view[:, VIEW.seen].tolist() == [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(("height_m", "seen"), [(0.0, 0), (0.1, 0), (0.5, 1), (-0.5, 1)])
+def test_a_hull_in_between_hides_it(height_m: float, seen: int):
+    """The middle one stands in the line of sight, which rises by 0.1 m over 4 m, or over or under it."""
+    view = look([pose(0, 0, 5), pose(4, 0, 5), pose(2, 0, 5 + height_m)], bare=[True, True, False])
+    assert view[1, VIEW.seen] == seen
+
+
+def test_its_own_hull_hides_a_hat_from_below():
+    view = look([pose(0, 0, 5, (0, -30, 0)), pose(0.8, 0, 6.5)])
+    assert view[1, VIEW.seen] == 0.0
+
+
+OBSTACLES = [
+    Obstacle(name="box", shape="box", position_m=(2, 0, 0), size_m=(0.2, 2, 10)),
+    Obstacle(name="pole", shape="cylinder", position_m=(2, 0, 0), radius_m=0.1, height_m=10),
+    Obstacle(name="ball", shape="sphere", position_m=(2, 0, 5.05), radius_m=0.3),
+]
+
+
+@pytest.mark.parametrize("obstacle", OBSTACLES, ids=lambda obstacle: obstacle.name)
+@pytest.mark.parametrize(("y", "seen"), [(0.0, 0), (6.0, 1)])
+def test_an_obstacle_in_between_hides_it(obstacle: Obstacle, y: float, seen: int):
+    """The second pair stands beside the obstacle."""
+    view = look([pose(0, y, 5), pose(4, y, 5)], obstacles=[obstacle])
+    assert view[1, VIEW.seen] == seen
+
+
+def test_it_moves_over_the_picture_as_the_drones_move_and_turn():
+    watcher, other = pose(0, 0, 5), pose(4, 0, 5)
+    away = 4 + HAT_B[0] - LENS_B[0]
+    other[POSE.v_WB + 1] = 2.0
+    assert look([watcher, other])[1, VIEW.rate] == pytest.approx(2.0 / away, rel=0.01)
+    watcher[POSE.w_WB_B + 2] = 0.5
+    watcher[POSE.v_WB : POSE.v_WB + 3] = other[POSE.v_WB : POSE.v_WB + 3]
+    assert look([watcher, other])[1, VIEW.rate] == pytest.approx(0.5 * (1 + LENS_B[0] / away), rel=0.01)
