@@ -109,20 +109,20 @@ def test_the_jacobian_is_that_of_what_is_expected():
     a: Moment = (
         0.0,
         (1.0, 2.0, 3.0),
-        (0.0,) * 3,
+        (0.0, 0.0, 0.0),
         normalised((0.9, 0.1, -0.2, 0.3)),
-        (0.0,) * 3,
-        (0.0,) * 3,
-        (0.0,) * 3,
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
     )
     b: Moment = (
         0.0,
         (4.0, -1.0, 3.5),
-        (0.0,) * 3,
+        (0.0, 0.0, 0.0),
         normalised((0.8, -0.1, 0.2, 0.5)),
-        (0.0,) * 3,
-        (0.0,) * 3,
-        (0.0,) * 3,
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
     )
     hat, eye, n, step = (0.1, -0.2, 0.3), (0.2, 0.1, 0.05), 9, 1e-6
     axes = across((0.6, 0.0, 0.8))
@@ -133,9 +133,9 @@ def test_the_jacobian_is_that_of_what_is_expected():
         half = [0.0, 0.0, 0.0]
         half[k] = step / 2
         w, x, y, z = q
-        i, j, l = half
+        i, j, k_ = half
         return normalised(
-            (w - i * x - j * y - l * z, x + i * w + j * z - l * y, y - i * z + j * w + l * x, z + i * y - j * x + l * w)
+            (w - i * x - j * y - k_ * z, x + i * w + j * z - k_ * y, y - i * z + j * w + k_ * x, z + i * y - j * x + k_ * w)
         )
 
     def moved(m: Moment, state: int) -> Moment:
