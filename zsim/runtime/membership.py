@@ -120,7 +120,7 @@ class Membership:
     def _last_values(self, key: str) -> list[ReceivedSample]:
         """Return what the world has as the last value of a key, once there is a world that answers.
 
-        One that has died is started again; who then began without its former state would lose what that had come to know.
+        One that has died is started again; who began without its former state would lose what that had come to know.
         """
         while not self._stopped():
             found = self._link.get_surely(key)

@@ -456,7 +456,7 @@ class Session:
         return [ReceivedSample(reply.key, reply.payload) for reply in replies if reply.kind != "ERROR"]
 
     def get_surely(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample] | None:
-        """Return the last values that are replied on an expression; None if somebody who is asked did not reply in time.
+        """Return the last values that are replied on an expression; None if somebody did not reply in time.
 
         Raises:
             SessionError: it is no key expression.
