@@ -118,13 +118,20 @@ class Membership:
         return clocks[0].t_ns if clocks else 0
 
     def _last_values(self, key: str) -> list[ReceivedSample]:
-        """Return what the world has as the last value of a key, once there is a world that answers: one that has died
-        is started again, and a process that would begin without its former state lost what that has come to know."""
-        while not (found := self._link.get(key)) and not self._stopped():
-            if self._link.get(keys.INFO):
-                return self._link.get(key)
+        """Return what the world has as the last value of a key, once there is a world that answers.
+
+        One that has died is started again; who began without its former state would lose what that had come to know.
+        """
+        while not self._stopped():
+            found = self._link.get_surely(key)
+            if not found and self._link.get_surely(keys.INFO):  # there is a world, which may have come just now
+                found = self._link.get_surely(key)
+                if found is not None:
+                    return found
+            if found:
+                return found
             time.sleep(RETRY_S)
-        return found
+        return []
 
     def warm_start(self) -> int | None:
         """Hand the agent what a former incarnation published last; return the time of it, None if there was none."""

@@ -455,6 +455,17 @@ class Session:
         replies = self.query(expression, timeout_s=timeout_s)
         return [ReceivedSample(reply.key, reply.payload) for reply in replies if reply.kind != "ERROR"]
 
+    def get_surely(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample] | None:
+        """Return the last values that are replied on an expression; None if somebody did not reply in time.
+
+        Raises:
+            SessionError: it is no key expression.
+        """
+        replies = self.query(expression, timeout_s=timeout_s)
+        if any(reply.kind == "ERROR" for reply in replies):  # Zenoh's own "Timeout" among them
+            return None
+        return [ReceivedSample(reply.key, reply.payload) for reply in replies]
+
     def request(
         self, key: str, op: str, source: str, args: dict[str, Any] | None = None, timeout_s: float = 5.0
     ) -> ControlAnswer:
