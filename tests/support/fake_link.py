@@ -114,8 +114,9 @@ class FakeLink:
     def subscribe_remote(self, without: tuple[str, ...]) -> FakeSubscription:
         return self.subscribe("**", without)
 
-    def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> None:
+    def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> Callable[[], None]:
         self._callbacks.append((expression, callback))
+        return lambda: self._callbacks.remove((expression, callback))
 
     def put(self, key: str, message: Struct) -> None:
         self.put_raw(key, messages.encode(message))

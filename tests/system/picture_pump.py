@@ -28,6 +28,21 @@ def image(number: int, data: bytes, size: tuple[int, int] = SIZE) -> dict[str, o
     return {**stamp, "source": "camera.tester", "width": size[0], "height": size[1], "format": "jpeg", "data": data}
 
 
+def calibration() -> dict[str, object]:
+    """Return the fields of a front camera's info; its camera is turned and not in the body's middle."""
+    return {
+        "t_ns": 0,
+        "source": "camera.tester",
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "K": [50.0, 0.0, 31.5, 0.0, 51.0, 17.5, 0.0, 0.0, 1.0],
+        "D": [-0.1, 0.02, 0.001, -0.002, 0.003],
+        "position_m": [0.162, 0.0, 0.012],
+        "orientation_wxyz": [0.5, -0.5, 0.5, -0.5],
+        "rate_hz": 30.0,
+    }
+
+
 @contextmanager
 def pumping(client: Client, key: str, size: tuple[int, int] = SIZE, filler: int = 0) -> Iterator[None]:
     """Publish a picture every PERIOD_S meanwhile; `filler` bytes behind each make them as large as real ones."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from chromium import needs_browser
-from federation import ONE, Federation
+from federation import PAIR, Federation
 from gateway_process import GatewayProcess
 from picture_pump import SIZE, image, pumping, shaded
 from refused import has_terms
@@ -59,7 +59,7 @@ class Pictures:
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[tuple[Federation, GatewayProcess]]:
     with Federation(tmp_path_factory.mktemp("cameras")) as federation:
-        federation.world(ONE.replace("duration_s: 10", "duration_s: 3600"), "--realtime")
+        federation.world(PAIR.replace("duration_s: 12", "duration_s: 3600"), "--realtime", "--expect", "nobody.yet")
         yield federation, GatewayProcess(federation).in_run()
 
 
@@ -127,7 +127,7 @@ def test_who_does_not_read_loses_pictures_and_the_others_none(gateway: GatewayPr
         ("/camera/drone1/side", ("camera", "'side'", "front", "bottom")),
         ("/camera/ghost/front", ("drone", "'ghost'", "drone1")),
         ("/camera/ghost/front.jpg", ("drone", "'ghost'", "drone1")),
-        ("/camera/drone1/bottom.jpg", ("drone/drone1/camera/bottom", "picture")),
+        ("/camera/drone2/bottom.jpg", ("drone/drone2/camera/bottom", "picture")),
         ("/camera/drone1%2Fx/front", ("drone", "drone1")),
     ],
 )
@@ -152,7 +152,9 @@ JUNK = (
 def test_junk_on_a_camera_s_key_is_counted_and_touches_nothing(gateway: GatewayProcess, camera: Client) -> None:
     healths = camera.subscribe("process/gateway.main/health")
     with Pictures(gateway, "/camera/drone1/front") as stream:
-        for junk in JUNK:
+        with pumping(camera, FRONT):
+            stream.next()
+        for junk in JUNK:  # now that the gateway's subscription has reached whoever publishes
             camera.put_raw(FRONT, junk)
         with pumping(camera, FRONT):
             number, data = stream.next()
@@ -160,15 +162,16 @@ def test_junk_on_a_camera_s_key_is_counted_and_touches_nothing(gateway: GatewayP
     assert healths.until(lambda health: health["refused"]).message["refused"] == len(JUNK)
 
 
-def test_a_client_of_the_gateway_may_be_a_camera(gateway: GatewayProcess, camera: Client) -> None:
-    pictures = camera.subscribe(FRONT)
+def test_a_client_of_the_gateway_may_be_a_camera(gateway: GatewayProcess) -> None:
     text = base64.b64encode(shaded(3)).decode()
-    value: dict[str, Any] = {"t_sample_ns": 0, "width": SIZE[0], "height": SIZE[1], "data": text}
-    assert gateway.http("PUT", f"/json/{FRONT}", value).status == 200
-    got = pictures.until(lambda image: image["source"] == "gateway.main")
-    assert got.message["data"] == shaded(3)
-    assert gateway.http("PUT", f"/json/{FRONT}", {**value, "data": "no base64!"}).status == 400
-    assert gateway.http("PUT", f"/json/{FRONT}", {**value, "data": "R0lG"}).status == 400
+    value: dict[str, Any] = {"t_sample_ns": 10**12, "width": SIZE[0], "height": SIZE[1], "data": text}
+    with Pictures(gateway, "/camera/drone1/bottom") as stream:
+        assert gateway.http("PUT", "/json/drone/drone1/camera/bottom", value).status == 200
+        assert stream.next() == (10**6, shaded(3))
+    for data in ("no base64!", "R0lG"):
+        answer = gateway.http("PUT", "/json/drone/drone1/camera/bottom", {**value, "data": data})
+        assert answer.status == 400
+        assert has_terms(answer.json()["error"], "drone/drone1/camera/bottom", "data", "JPEG")
 
 
 @needs_browser

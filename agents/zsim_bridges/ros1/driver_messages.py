@@ -7,6 +7,7 @@ Order of this file: the state that the driver reports, its messages.
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -39,6 +40,7 @@ NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags that its 
 }
 UNKNOWN_3X3, UNKNOWN_6X6 = np.zeros(9), np.zeros(36)  # zeros mean in ROS that the covariance is not known
 
+Part = tuple[str, Vector, Quaternion]  # frame of a part, and its pose in the body
 Vector3 = ros.geometry_msgs__msg__Vector3
 TFMessage = message_class("tf2_msgs/TFMessage")
 Navdata = message_class("ardrone_autonomy/Navdata")
@@ -278,13 +280,14 @@ def _odometry(head: Any, child: str, position: Vector, attitude: Quaternion, vel
     )
 
 
-def transforms(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
-    """Return `/tf` of a drone: odom to base as integrated, and world to odom as far as the estimator knows it."""
+def transforms(seq: int, state: OnboardState, frames: DriverFrames, parts: Sequence[Part] = ()) -> Any:
+    """Return `/tf` of a drone: odom to base as integrated, world to odom as far as it is estimated, and its parts."""
     assert state.status is not None
     t_ns = state.status.t_ns
     poses = [_transform(seq, t_ns, frames.odom, frames.base, state.position_m, state.attitude)]
     if state.origin_m is not None:
         poses.append(_transform(seq, t_ns, WORLD, frames.odom, state.origin_m, LEVEL))
+    poses += [_transform(seq, t_ns, frames.base, *part) for part in parts]
     return TFMessage(transforms=poses)
 
 
