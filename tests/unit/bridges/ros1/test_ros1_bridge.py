@@ -141,7 +141,9 @@ class Link:
 
 def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(ros1_bridge, "BACKLOG", 3)
-    info: Any = type("Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "own_sensors": (), "sightings": False})()
+    info: Any = type(
+        "Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "own_sensors": (), "sightings": False}
+    )()
     table = key_table(["drone1"])
 
     def payload(gate: int) -> bytes:
