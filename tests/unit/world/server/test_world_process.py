@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import pytest
 from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
 from refused import has_terms, parts, refused
@@ -124,7 +125,7 @@ def test_how_a_camera_sees_is_kept_and_handed_on_and_its_pictures_are_not():
     assert process.health.refused == 0
     assert process._history.last(FRONT_INFO) == [(FRONT_INFO, messages.encode(info()))]
     assert process._history.last(FRONT) == []
-    passed = [key for _, payload in link.published if _ == keys.BATCH for key, _ in decode_batch(payload)]
+    passed = [key for at, payload in link.published if at == keys.BATCH for key, _ in decode_batch(payload)]
     assert [key for key in passed if key in (FRONT_INFO, FRONT, DETECTIONS)] == [FRONT_INFO, DETECTIONS]
 
 
@@ -148,6 +149,18 @@ def test_sightings_of_the_world_itself_are_nobodys_to_publish():
     made, link = world(), FakeLink()
     link.deliver(keys.sensor("d1", keys.SIGHTINGS), sightings(0))
     assert run(made, link).health.refused == 1
+
+
+def test_pictures_of_a_replay_are_on_their_key_alone():
+    """A recorder reads pictures on their keys: in the batches too they would be on record twice."""
+    made, link = world(), FakeLink()
+    made.outbox.put(FRONT, msgspec.Raw(messages.encode(image(0))))
+    made.outbox.put(FRONT_INFO, msgspec.Raw(messages.encode(info())))
+    process = run(made, link)
+    assert link.published_on(FRONT) == [image(0)]
+    passed = [key for at, payload in link.published if at == keys.BATCH for key, _ in decode_batch(payload)]
+    assert (FRONT in passed, FRONT_INFO in passed) == (False, True)
+    assert process._history.last(FRONT) == []
 
 
 # Outputs that got lost
