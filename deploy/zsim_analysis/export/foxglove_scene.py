@@ -75,20 +75,20 @@ class Instant:
 
     def add(self, key: str, message: Any) -> None:
         """Add a message of a type that is drawn."""
-        if isinstance(message, Event):
-            self.events.append(message)
-            return
-        if isinstance(message, CameraImage | CameraInfo):
-            (self.pictures if isinstance(message, CameraImage) else self.cameras).append((key, message))
-            return
-        by_type: dict[type, dict[str, Any]] = {
-            Truth: self.truth,
-            Estimate: self.estimates,
-            Status: self.status,
-            Gps: self.gps,
-            ClusterState: self.states,
-        }
-        by_type[type(message)][subject(key)] = message
+        match message:
+            case Event():
+                self.events.append(message)
+            case CameraImage():
+                self.pictures.append((key, message))
+            case CameraInfo():
+                self.cameras.append((key, message))
+            case _:
+                self._newest(type(message))[subject(key)] = message
+
+    def _newest(self, kind: type) -> dict[str, Any]:
+        newest: dict[type, dict[str, Any]] = {Truth: self.truth, Estimate: self.estimates, Status: self.status}
+        newest |= {Gps: self.gps, ClusterState: self.states}
+        return newest[kind]
 
 
 def is_drawn(key: str) -> bool:
