@@ -437,6 +437,6 @@ def test_the_cameras_of_the_scenario_are_among_the_frames_that_never_move() -> N
     poses = {pose.child: pose for pose in conversions.static_frames("d", drone.sensors)}
     ahead, down = poses["d/front_camera_optical_frame"], poses["d/bottom_camera_optical_frame"]
     assert ahead.parent == down.parent == "d/base_link"
-    assert ahead.position_m == drone.sensors.front_camera.mount.position_m
+    assert ahead.position_m == drone.sensors.cameras()["front"].mount.position_m
     assert rotate(ahead.orientation_wxyz, (0.0, 0.0, 1.0)) == pytest.approx((1.0, 0.0, 0.0), abs=1e-12)
     assert rotate(down.orientation_wxyz, (0.0, 0.0, 1.0)) == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)
