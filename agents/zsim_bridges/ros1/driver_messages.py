@@ -1,8 +1,6 @@
 """Messages of the contract as those of ROS 1, with the units, signs and frames of ardrone_autonomy. Pure.
 
 Sources: ardrone_autonomy 1.4.1, src/ardrone_driver.cpp (PublishNavdata, PublishOdometry); REP 103 and 105.
-
-Order of this file: the state that the driver reports, its messages.
 """
 
 import math
@@ -30,8 +28,7 @@ POSITIONS_KEPT = 32  # gates for which the integrated position is remembered; an
 WORLD = "world"
 MAG_LSB_PER_UT = 1 / 0.3  # AK8975 datasheet, 0.3 uT per LSB: the AR.Drone 2.0's
 NO_FIX, FIX, GPS_SERVICE = -1, 0, 1  # sensor_msgs/NavSatStatus
-DIAGONAL_KNOWN = 2  # sensor_msgs/NavSatFix
-FIX_3D = 3  # as in NMEA: with a height
+DIAGONAL_KNOWN, FIX_3D = 2, 3  # sensor_msgs/NavSatFix; a fix with a height, as in NMEA
 NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags that its camera recognises
     **dict.fromkeys(("temp", "wind_speed", "wind_angle", "wind_comp_angle", "tags_count"), 0),
     **dict.fromkeys(("motor1", "motor2", "motor3", "motor4"), 0),
