@@ -174,6 +174,17 @@ def test_a_client_of_the_gateway_may_be_a_camera(gateway: GatewayProcess) -> Non
         assert has_terms(answer.json()["error"], "drone/drone1/camera/bottom", "data", "JPEG")
 
 
+def test_pictures_are_for_those_who_show_the_token(federation: Federation) -> None:
+    federation.world(PAIR, "--realtime", "--expect", "nobody.yet")
+    guarded = GatewayProcess(federation, "--token", "sesame").in_run()
+    for path in ("/camera/drone1/front", "/camera/drone1/front.jpg", "/camera/drone1/front?token=wrong"):
+        assert guarded.http("GET", path).status == 401
+    with pumping(federation.client(), FRONT):
+        ok, _ = cv2.VideoCapture(f"{guarded.url}/camera/drone1/front?token=sesame").read()
+        assert ok
+        assert guarded.http("GET", "/camera/drone1/front.jpg", headers={"Authorization": "Bearer sesame"}).status == 200
+
+
 @needs_browser
 def test_a_browser_shows_them(gateway: GatewayProcess, camera: Client, browser: Any) -> None:
     page = browser.new_context().new_page()
