@@ -304,9 +304,9 @@ class Recorder:
                 held.clear()
 
     def _write_lasting(self) -> None:
-        """Write of what run this is, and the newest faults: published long ago, the replay has them no longer."""
+        """Write of what run this is, the newest faults, and how cameras see: the replay has them no longer."""
         lasting = {keys.INFO: messages.encode(self._info)}
-        for key in (keys.INFO, keys.FAULTS):
+        for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
             lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
         for key, payload in lasting.items():
             self._write(key, payload)

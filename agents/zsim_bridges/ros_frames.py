@@ -1,4 +1,4 @@
-"""What the bridges to ROS 1 and ROS 2 share: rotations as ROS writes them, and the states of ardrone_autonomy. Pure.
+"""What the bridges to ROS 1 and ROS 2 share: rotations and cameras as ROS writes them, ardrone_autonomy's states. Pure.
 
 ROS has the same W (east, north, up) and B (forward, left, up) as zsim (REP 103, REP 105); its quaternions end with w.
 """
@@ -6,11 +6,20 @@ ROS has the same W (east, north, up) and B (forward, left, up) as zsim (REP 103,
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from zsim.math.frames import quaternion_conjugate, quaternion_multiply
 from zsim.math.rotation import Quaternion, Vector
 
 NAVDATA_STATES = {"landed": 2, "taking_off": 6, "hovering": 4, "flying": 3, "landing": 8, "emergency": 0}
 """States in ardrone_autonomy's Navdata (ctrl_state >> 16 of the aircraft), which shows an emergency as unknown."""
+
+DISTORTION_MODEL = "plumb_bob"  # k1, k2, p1, p2, k3: sensor_msgs/distortion_models.h
+
+
+def projection(K: Sequence[float]) -> np.ndarray:
+    """Return P of sensor_msgs/CameraInfo, (12,), of a camera that is no part of a stereo pair: K, and a column of 0."""
+    return np.column_stack([np.reshape(K, (3, 3)), np.zeros(3)]).ravel()
 
 
 def xyzw(q_WB: Quaternion) -> Quaternion:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.camera_messages import Sightings
 from zsim.contract.framing import GateMessages
 from zsim.contract.run_messages import ControlRequest
 from zsim.errors import RunError
@@ -221,6 +222,8 @@ class RerunBus(Bus):
             self._feed_event(message)
         elif isinstance(message, OUTPUTS):
             self._feed_output(key, message)
+        elif isinstance(message, Sightings):  # no detector is run again: it would need the pictures
+            self._hand_over(key, message, message.source)
         elif isinstance(message, flight_messages.Command):
             if message.source in self._rerun:
                 self.outputs.add(key, message)
@@ -236,7 +239,11 @@ class RerunBus(Bus):
         source = (message.controller if is_request else message.source) or f"{role}.{keys.thing(key)}"
         if source in self._rerun:
             self.outputs.add(key, message)
-            return
+        else:
+            self._hand_over(key, message, source)
+
+    def _hand_over(self, key: str, message: Any, source: str) -> None:
+        """Pass what another process published to the agents that read it."""
         for inbox in self._route(key).inboxes:
             inbox.put(key, message)
         self._world.count_output(source)

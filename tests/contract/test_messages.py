@@ -19,6 +19,7 @@ from msgspec import inspect as types
 from refused import has_terms, refused
 
 from zsim.contract import messages, run_messages
+from zsim.contract.camera_messages import JPEG_BEGINS
 from zsim.errors import DecodeError
 
 # Fields besides t_ns and seq, in the contract's order.
@@ -36,6 +37,7 @@ CONTRACT = {
     "drone/*/sensor/baro": SENSOR + "pressure_pa altitude_m",
     "drone/*/sensor/sonar": SENSOR + "range_m valid",
     "drone/*/sensor/flow": SENSOR + "velocity_m_s quality",
+    "drone/*/sensor/sightings": SENSOR + "source camera seen",
     "drone/*/sensor/status": "state battery_percent collision commander count",
     "drone/*/truth": "position_m velocity_m_s orientation_wxyz angular_velocity_rad_s accel_m_s2 rotor_rad_s",
     "drone/*/cmd/velocity": "source velocity_m_s yaw_rate_rad_s frame",
@@ -45,6 +47,12 @@ CONTRACT = {
     "drone/*/cmd/mode": "source mode",
     "drone/*/estimate": "position_m velocity_m_s orientation_wxyz yaw_rad covariance yaw_sigma_rad gyro_bias_rad_s "
     "sensors",
+    "drone/*/sightings": SENSOR + "source camera seen",
+    **{f"drone/*/camera/{camera}": SENSOR + "source width height format data" for camera in ("front", "bottom")},
+    **{
+        f"drone/*/camera/{camera}/info": "source width height K D position_m orientation_wxyz rate_hz"
+        for camera in ("front", "bottom")
+    },
     "cluster/*/state": "phase drones names value desired desired_rate trajectory_t_s margin reason",
     "cluster/*/request": "op args source ok",
     "process/*/join": "run_id incarnation role host pid period_ns version fingerprint",
@@ -66,6 +74,7 @@ NAMES = {
 }
 LENGTHS = {"covariance": 36, "accel_m_s2": 3, "gyro_rad_s": 3, "orientation_wxyz": 4, "rotor_rad_s": 4}
 SHAPES = sorted(CONTRACT)
+INT64 = -(2**63), 2**63 - 1
 FREE = {"data", "args", "parameters"}  # fields of free content
 
 every_message = pytest.mark.parametrize("shape", SHAPES)
@@ -116,12 +125,13 @@ def values(info: Any) -> st.SearchStrategy[Any]:
     if isinstance(info, types.LiteralType):
         return st.sampled_from(info.values)
     if isinstance(info, types.IntType):
-        return st.integers(info.ge if info.ge is not None else -(2**63), 2**63 - 1)
+        low, high = INT64
+        return st.integers(low if info.ge is None else info.ge, high if info.le is None else info.le)
     return {
         types.FloatType: finite,
         types.StrType: text,
         types.BoolType: st.booleans(),
-        types.BytesType: st.binary(max_size=12),
+        types.BytesType: st.binary(max_size=12).map(lambda some: JPEG_BEGINS + some),
         types.NoneType: st.none(),
         types.AnyType: free,
     }[type(info)]
@@ -171,7 +181,7 @@ def _filled(info: Any) -> Any:
     if isinstance(info, types.LiteralType):
         return info.values[0]
     scalars = {types.IntType: 7, types.FloatType: 2.0, types.StrType: "abc", types.BoolType: True}
-    return {**scalars, types.BytesType: b"state"}.get(type(info), 1)
+    return {**scalars, types.BytesType: JPEG_BEGINS + b"state"}.get(type(info), 1)
 
 
 Path = tuple[Any, ...]

@@ -26,7 +26,8 @@ class FakeSubscription:
         self._arrived: queue.SimpleQueue[ReceivedSample | None] = queue.SimpleQueue()
 
     def put(self, sample: ReceivedSample | None) -> None:
-        if sample is None or not (self._without and sample.key.startswith(self._without)):
+        is_left_out = sample and self._without and (sample.key.startswith(self._without) or keys.is_picture(sample.key))
+        if not is_left_out:
             self._arrived.put(sample)
 
     def receive(self) -> ReceivedSample | None:
@@ -122,8 +123,9 @@ class FakeLink:
     def subscribe_remote(self, without: tuple[str, ...]) -> FakeSubscription:
         return self.subscribe("**", without)
 
-    def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> None:
+    def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> Callable[[], None]:
         self._callbacks.append((expression, callback))
+        return lambda: self._callbacks.remove((expression, callback))
 
     def put(self, key: str, message: Struct) -> None:
         self.put_raw(key, messages.encode(message))

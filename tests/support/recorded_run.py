@@ -5,6 +5,7 @@ from typing import Any
 
 import msgspec
 from msgspec import inspect
+from synthetic_pictures import jpeg
 
 from zsim.contract import messages
 from zsim.record import RecordReader, RecordWriter
@@ -68,4 +69,4 @@ def _some(info: inspect.Type) -> Any:
     if isinstance(info, inspect.UnionType):
         return _some(info.types[0])
     simple = {inspect.BoolType: True, inspect.StrType: "text", inspect.IntType: 7, inspect.FloatType: 1.5}
-    return {**simple, inspect.BytesType: b"state"}.get(type(info), 7)
+    return {**simple, inspect.BytesType: jpeg()}.get(type(info), 7)

@@ -43,6 +43,8 @@ drone/drone1/cmd/attitude         -       p       r       rp
 drone/drone1/cmd/rotors           -       p       r       rp
 drone/drone1/cmd/mode             -       p       r       rp
 drone/drone1/estimate             rpg     rg      rg      rg
+drone/drone1/camera/front         -       -       r       r
+drone/drone1/camera/front/info    -       -       rg      rg
 drone/drone2/sensor/imu           -       -       r       r
 drone/drone2/sensor/gps           -       -       r       r
 drone/drone2/sensor/status        -       rg      rg      rg

@@ -41,6 +41,7 @@ from msgspec import inspect as types
 from zsim.contract import messages
 from zsim.scenario import scenario, scenario_file
 from zsim.schema import quantities
+from zsim.sensors.camera import CAMERAS
 from zsim.sensors.sensor import ErrorModel, Mount, Sensor
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors
 from zsim.vehicles import vehicle
@@ -558,6 +559,7 @@ def test_the_protocol_names_every_message_and_field(shape: str) -> None:
     kind = messages.types_by_shape()[shape]
     things = {"drone/*": "drone/{d}", "cluster/*": "cluster/{c}", "process/*": "process/{p}"}
     key = shape.replace("estimates/*", "estimates/{p}")
+    things |= {f"camera/{camera}": "camera/{name}" for camera in CAMERAS}
     for stars, names in things.items():
         key = key.replace(stars, names)
     text = (ROOT / "docs/protocol.md").read_text()

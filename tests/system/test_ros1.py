@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import ros1_graph
 from federation import ONE, Federation, Role
+from picture_pump import calibration, pumping
 from ros1_graph import RosGraph, numbers
 
 pytestmark = pytest.mark.xdist_group("ros1")
@@ -52,7 +53,10 @@ float32[] tags_orientation
 float32[] tags_distance
 float32 tm
 """  # what the driver's package would build for its users: ardrone_autonomy/msg/Navdata.msg
+IMAGE, CAMERA_INFO = "sensor_msgs/CompressedImage", "sensor_msgs/CameraInfo"
 OFFERED = {
+    **{f"/drone1/ardrone/{camera}image_raw/compressed": IMAGE for camera in ("", "front/", "bottom/")},
+    **{f"/drone1/ardrone/{camera}camera_info": CAMERA_INFO for camera in ("", "front/", "bottom/")},
     "/clock": "rosgraph_msgs/Clock",
     "/tf": "tf2_msgs/TFMessage",
     "/drone1/ardrone/imu": "sensor_msgs/Imu",
@@ -80,6 +84,7 @@ class Flight:
 
     def __init__(self, federation: Federation, graph: RosGraph) -> None:
         self.graph = graph
+        self.federation = federation
         self.world = federation.world(ONE, *PACE)
         self.estimator = federation.role("estimator", "drone1")
         self.bridge = bridge(federation, graph)
@@ -107,6 +112,26 @@ def flight(installed: None, tmp_path_factory: pytest.TempPathFactory, compiled: 
 @pytest.fixture
 def graph(flight: Flight) -> RosGraph:
     return flight.graph
+
+
+def test_pictures_are_as_a_camera_publishes_them(flight: Flight, graph: RosGraph):
+    """A camera of somebody's own: rospy's tools have its pictures, and what their pixels mean."""
+    camera = flight.federation.client()
+    camera.put("drone/drone1/camera/front/info", **calibration())
+    with pumping(camera, "drone/drone1/camera/front"):
+        for base in ("/drone1/ardrone/front", "/drone1/ardrone"):
+            echoed = graph.run("rostopic", "echo", "-n", "1", f"{base}/image_raw/compressed")
+            assert 'frame_id: "drone1/ardrone_base_frontcam"' in echoed
+            assert 'format: "jpeg"' in echoed
+            assert "data: [255, 216, 255," in echoed
+            seen = graph.run("rostopic", "echo", "-n", "1", f"{base}/camera_info")
+            assert 'distortion_model: "plumb_bob"' in seen
+            assert "K: [50.0, 0.0, 31.5, 0.0, 51.0, 17.5, 0.0, 0.0, 1.0]" in seen
+        graph.run("rosservice", "call", "/drone1/ardrone/togglecam")
+        other = graph.start("rostopic", "echo", "/drone1/ardrone/image_raw/compressed/header/frame_id")
+        with pumping(camera, "drone/drone1/camera/bottom"):
+            assert "bottomcam" in other.until(lambda line: "cam" in line)
+        graph.run("rosservice", "call", "/drone1/ardrone/togglecam")
 
 
 def test_the_tools_list_what_the_driver_offers(graph: RosGraph):

@@ -15,6 +15,7 @@ from federation import ONE, PAIR, Federation, Role, free_port
 
 pytest.importorskip("zenoh_ros2_sdk", reason="PyPI zenoh-ros2-sdk is not installed; `pip install -e .[dev]` brings it")
 
+from picture_pump import calibration, pumping, shaded
 from ros2_lab import TRIGGER, Peer, Router, write_definitions
 from secured import Certificates, tls_endpoint
 
@@ -24,6 +25,7 @@ from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_deploy.inventory.enrolment import access_control
 
 TWIST, EMPTY = "geometry_msgs/msg/Twist", "std_msgs/msg/Empty"
+IMAGE, CAMERAS = "sensor_msgs/msg/CompressedImage", ("", "front/", "bottom/")
 TAKEN = ("cmd_vel", "takeoff", "land", "reset")
 NEVER = """
 name: never
@@ -84,6 +86,8 @@ def expected() -> dict[str, list[str]]:
         "ground_truth": "nav_msgs/msg/Odometry",
         "battery": "sensor_msgs/msg/BatteryState",
         "state": "std_msgs/msg/String",
+        **{f"{camera}image_raw/compressed": IMAGE for camera in CAMERAS},
+        **{f"{camera}camera_info": "sensor_msgs/msg/CameraInfo" for camera in CAMERAS},
         "navdata": "zsim_msgs/msg/Navdata",
         "cmd_vel": TWIST,
         "takeoff": EMPTY,
@@ -114,7 +118,8 @@ def test_two_participants_find_and_receive_every_topic_and_request(federation: F
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= 0)
     peer, _ = ros
     topics = expected()
-    kinds = {topic: kind for topic, (kind,) in topics.items() if topic.rsplit("/", 1)[1] not in TAKEN}
+    without = (*TAKEN, "compressed", "camera_info")  # commands, and what there is no camera for here
+    kinds = {topic: kind for topic, (kind,) in topics.items() if topic.rsplit("/", 1)[1] not in without}
     before = peer(port_of(federation.endpoint))
     for topic, kind in kinds.items():
         before.request("subscribe", topic=topic, kind=kind, kept=topic == "/tf_static")
@@ -128,7 +133,7 @@ def test_two_participants_find_and_receive_every_topic_and_request(federation: F
     assert after.until("topics", lambda found: found == topics) == topics
     services = after.request("services")
     assert services == {f"/cluster/main/{op}": [TRIGGER["kind"]] for op in ("takeoff", "engage", "hold", "land")} | {
-        f"/drone{n}/release": [TRIGGER["kind"]] for n in (1, 2)
+        f"/drone{n}/{service}": [TRIGGER["kind"]] for n in (1, 2) for service in ("release", "togglecam")
     }
     after.request("subscribe", topic="/cluster/main/state", kind=kinds["/cluster/main/state"])
     engaged = after.receive("/cluster/main/state", lambda m: m["phase"] == "engaged")
@@ -141,6 +146,31 @@ def test_two_participants_find_and_receive_every_topic_and_request(federation: F
     refused = after.request("call", service="/cluster/main/takeoff", **TRIGGER)
     assert not refused["success"]
     assert "held" in refused["message"]
+
+
+def test_pictures_are_as_a_camera_publishes_them(federation: Federation, ros: ROS) -> None:
+    """A camera of somebody's own that has said how it sees before ROS asks: its pictures, and what they mean."""
+    federation.world(ONE.replace("duration_s: 10", "duration_s: 3600"), "--realtime")
+    camera = federation.client()
+    camera.subscribe("clock").until(lambda m: m["t_ns"] > 0)
+    camera.put("drone/drone1/camera/front/info", **calibration())
+    bridge(federation)
+    peer = ros[0](port_of(federation.endpoint))
+    for leaf, kind in (("image_raw/compressed", IMAGE), ("camera_info", "sensor_msgs/msg/CameraInfo")):
+        for base in ("/drone1/front", "/drone1"):
+            peer.request("subscribe", topic=f"{base}/{leaf}", kind=kind)
+    with pumping(camera, "drone/drone1/camera/front"), pumping(camera, "drone/drone1/camera/bottom"):
+        for base in ("/drone1/front", "/drone1"):
+            image = peer.receive(f"{base}/image_raw/compressed")
+            assert image["header"]["frame_id"] == "drone1/front_camera_optical_frame"
+            number = round(seconds(image["header"]) * 1e3)
+            assert (image["format"], bytes(image["data"])) == ("jpeg", shaded(number))
+            info = peer.receive(f"{base}/camera_info")
+            assert (info["k"], info["d"]) == (calibration()["K"], calibration()["D"])
+        answer = peer.request("call", service="/drone1/togglecam", **TRIGGER)
+        assert answer["success"], answer
+        frame = "drone1/bottom_camera_optical_frame"
+        peer.receive("/drone1/image_raw/compressed", lambda m: m["header"]["frame_id"] == frame)
 
 
 def check_sensors(received: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ from zsim.schema.message import Count, Message, Number, Vector3, Whole
 
 PICTURE_MAX = 4_000_000  # bytes; a JPEG of 1920 x 1080 at full quality is below it
 SEEN_MAX = 1000  # of one picture
+JPEG_BEGINS = b"\xff\xd8\xff"  # SOI, then the next marker: ISO/IEC 10918-1, B.1
 
 SidePx = Annotated[int, Meta(ge=1, le=16_384)]
 Quaternion = tuple[Number, Number, Number, Number]
@@ -22,6 +23,12 @@ class CameraImage(Message, frozen=True, kw_only=True):
     height: SidePx
     format: Literal["jpeg"] = "jpeg"
     data: Annotated[bytes, Meta(max_length=PICTURE_MAX)]
+
+    def fault(self) -> str | None:
+        """Return what the types do not say."""
+        if self.data.startswith(JPEG_BEGINS):
+            return None
+        return f"data begins with {self.data[:8].hex(' ') or 'nothing'}; must be a JPEG, which begins with ff d8 ff"
 
 
 class CameraInfo(Message, frozen=True, kw_only=True):

@@ -19,6 +19,7 @@ LAST_VALUES = (
     "drone/*/sensor/status",
     "drone/*/truth",
     "drone/*/estimate",
+    keys.camera_info("*", "*"),
     "cluster/*/state",
     "process/*/snapshot",
 )

@@ -337,9 +337,17 @@ class Session:
         Raises:
             SessionError: it is no key.
         """
-        block = zenoh.CongestionControl.BLOCK
+        picture = keys.is_picture(key)
+        control = zenoh.CongestionControl.DROP if picture else zenoh.CongestionControl.BLOCK
+        priority = zenoh.Priority.DATA_LOW if picture else zenoh.Priority.DATA
         with key_errors(key):
-            self._raw.put(self._prefix + key, payload, encoding=zenoh.Encoding(encoding), congestion_control=block)
+            self._raw.put(
+                self._prefix + key,
+                payload,
+                encoding=zenoh.Encoding(encoding),
+                congestion_control=control,
+                priority=priority,
+            )
 
     def declare_publisher(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
         """Return what publishes (payload, attachment) on one key, again and again; a full link loses it.

@@ -17,7 +17,9 @@ from zsim.errors import DecodeError, ZsimError
 from zsim.transport.session import RawSample
 
 COUNTED_KEYS = (keys.command("*", "*"), keys.estimate("*"), keys.cluster_state("*"))  # contract: `sent` of a done
-CLIENT_KEYS = (*COUNTED_KEYS, keys.cluster_view("*"), keys.estimates_view("*"))
+CAMERA_KEYS = (keys.camera("*", "*"), keys.camera_info("*", "*"), keys.detections("*"))
+"""Of cameras, renderers and detectors of clients' own."""
+CLIENT_KEYS = (*COUNTED_KEYS, keys.cluster_view("*"), keys.estimates_view("*"), *CAMERA_KEYS)
 """Keys of the contract on which clients publish."""
 CONTROL_KEYS = (keys.CONTROL, keys.cluster_control("*"))  # requests go there
 RESERVED_KEYS = (
@@ -203,10 +205,22 @@ def json_to_payload(key: str, value: Any) -> bytes:
     """
     if messages.type_of(key) is None:
         return _pack(key, value)
+    if keys.is_picture(key):
+        value = _with_picture(value, key)
     try:
         return messages.encode(messages.decode(key, _pack(key, value)))
     except DecodeError:
         return messages.encode(messages.decode(key, _pack(key, _with_integers(value, key))))
+
+
+def _with_picture(value: Any, key: str) -> Any:
+    """Return an image whose data is base64, as JSON has it, with the bytes themselves."""
+    if not isinstance(value, dict) or not isinstance(value.get("data"), str):
+        return value
+    try:
+        return {**value, "data": base64.b64decode(value["data"], validate=True)}
+    except ValueError as error:
+        raise DecodeError(f"{key[:80]}: data is no base64 ({error}); must be a JPEG as base64") from error
 
 
 def _pack(key: str, value: Any) -> bytes:

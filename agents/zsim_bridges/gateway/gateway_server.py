@@ -19,12 +19,13 @@ from zsim_bridges.gateway.access_check import AccessCheck, ConnectionLimit, Toke
 from zsim_bridges.gateway.client_messages import TooManyError
 from zsim_bridges.gateway.client_streams import LINE_MAX, LineServer, Outbox
 from zsim_bridges.gateway.http_routes import application
-from zsim_bridges.gateway.http_trees import JsonTree, RestTree
+from zsim_bridges.gateway.http_trees import CameraTree, JsonTree, RestTree
 from zsim_bridges.gateway.lockstep_session import LockstepSession
 from zsim_bridges.gateway.publications import SharedSubscriptions
 from zsim_bridges.gateway.run_access import RunAccess
 from zsim_bridges.gateway.stream_client import Client
 from zsim_bridges.observer_process import ANOTHER_RUN, ObserverProcess
+from zsim_bridges.picture_streams import PictureFeeds
 from zsim_bridges.web_server import Site, cancel_other_tasks, check_token, open_on_thread, start_site, url_host
 
 CLIENTS_MAX = 500  # streams at once
@@ -32,6 +33,7 @@ UNAUTHENTICATED_MAX = 100  # connections at once that have not shown the token y
 HELLO_TIMEOUT_S = 5.0  # how long a client may take to show it
 DRAIN_S = 2.0  # after the end of a run, how long agents may still answer their last gates
 FAULTS_REPORTED_MAX = 100
+PICTURES_WAITING_MAX = 4  # of a camera that wait for the loop; each may have megabytes
 RELEASE_TIMEOUT_S = 1.0  # the world answers within milliseconds
 STREAM_RATE_HZ = 5_000.0  # requests per wall second of one stream; a loop at the speed of the fastest run has 2 500
 STREAM_BURST = 10_000.0
@@ -76,6 +78,8 @@ class Gateway:
         self._client_limit = ConnectionLimit(CLIENTS_MAX, "clients")
         self.subscriptions = SharedSubscriptions(self.loop, self._client_limit)
         self._full_key_subscriptions = SharedSubscriptions(self.loop, self._client_limit)
+        self._picture_subscriptions = SharedSubscriptions(self.loop, self._client_limit, PICTURES_WAITING_MAX)
+        self._pictures = PictureFeeds(self._picture_subscriptions.subscribe, self._refuse_picture)
         self._ports = ports
         self.name = name
         self._access_check = AccessCheck(token, self.report)
@@ -186,6 +190,8 @@ class Gateway:
         self._run, self._link_lost = run, False
         self.subscriptions.attach(run.link)
         self._full_key_subscriptions.attach(run.bare_link)
+        self._picture_subscriptions.attach(run.link)
+        self._pictures.forget()
         self._notify_clients("begun", run)
 
     def _end(self, run: RunAccess, another: bool = False) -> None:
@@ -195,6 +201,7 @@ class Gateway:
         self._run = None
         self.subscriptions.detach()
         self._full_key_subscriptions.detach()
+        self._picture_subscriptions.detach()
         self._notify_clients("ended", run)
         self.loop.call_later(DRAIN_S, self._end_lockstep_sessions, run)
 
@@ -204,10 +211,18 @@ class Gateway:
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Print what reaches no client, each text once: a flood of connections makes a flood of these."""
-        text = f"{context.get('message')}: {context.get('exception')!r}"
+        self._report_once(f"{context.get('message')}: {context.get('exception')!r}")
+
+    def _report_once(self, text: str) -> None:
         if text not in self._reported_faults and len(self._reported_faults) < FAULTS_REPORTED_MAX:
             self._reported_faults.add(text)
             self.report(text)
+
+    def _refuse_picture(self, reason: str) -> None:
+        """Count what is no picture, and print each text once."""
+        if self._run is not None:
+            self._run.count_refused()
+        self._report_once(reason)
 
     def _notify_clients(self, state: str, run: RunAccess) -> None:
         for client in self._clients:
@@ -252,7 +267,8 @@ class Gateway:
         line_server = LineServer(self._new_client, authenticated=not self._access_check.needs_token)
         rest = RestTree(self.run, self._full_key_subscriptions)
         tree = JsonTree(self.run, self.subscriptions, self.name)
-        app = application(self._access_check, rest, tree, self._new_client)
+        cameras = CameraTree(self.run, self._pictures, self._client_limit)
+        app = application(self._access_check, rest, tree, cameras, self._new_client)
         try:
             site = await start_site(app, host, http_port, shutdown_s=1.0)
             try:

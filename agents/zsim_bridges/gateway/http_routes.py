@@ -10,10 +10,11 @@ from aiohttp import web
 from zsim import __version__
 from zsim.contract import messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
+from zsim.sensors.camera import CAMERAS
 from zsim_bridges.gateway.access_check import AccessCheck
 from zsim_bridges.gateway.client_messages import is_client_key
 from zsim_bridges.gateway.client_streams import LINE_MAX, ClientFactory, serve_websocket
-from zsim_bridges.gateway.http_trees import JSON_PREFIX, JsonTree, RestTree
+from zsim_bridges.gateway.http_trees import JSON_PREFIX, ONE_PICTURE, CameraTree, JsonTree, RestTree
 
 DEFAULTED = ("t_ns", "seq", "source")  # fields that a client may leave out
 CONTROL_PATHS = ("world/control", "cluster/{cluster}/control")
@@ -43,7 +44,13 @@ def description() -> dict[str, Any]:
     return {
         "openapi": "3.1.0",
         "info": {"title": "zsim gateway", "version": __version__, "description": "See docs/gateway.md."},
-        "paths": {**paths, **dict(map(_control_path, CONTROL_PATHS)), **_own_key_path(), **_zenoh_path()},
+        "paths": {
+            **paths,
+            **dict(map(_control_path, CONTROL_PATHS)),
+            **_own_key_path(),
+            **_camera_paths(),
+            **_zenoh_path(),
+        },
         "components": {
             "schemas": {**schemas, **_sent_schemas(shapes, schemas), "Refusal": refusal},
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
@@ -128,6 +135,27 @@ def _own_key_path() -> dict[str, Any]:
     }
 
 
+def _camera_paths() -> dict[str, Any]:
+    """Return the paths of the pictures of cameras."""
+    camera = {"name": "camera", "in": "path", "required": True, "schema": {"type": "string", "enum": list(CAMERAS)}}
+    texts = {"": "The pictures of a camera from now on", ONE_PICTURE: "The newest picture of a camera"}
+    kinds = {"": "multipart/x-mixed-replace", ONE_PICTURE: "image/jpeg"}
+    picture = {"schema": {"type": "string", "format": "binary"}}
+    return {
+        f"/camera/{{drone}}/{{camera}}{end}": {
+            "parameters": [_parameter("drone"), camera],
+            "get": {
+                "summary": text,
+                "responses": {
+                    "200": {"description": "JPEG", "content": {kinds[end]: picture}},
+                    **_error_responses(),
+                },
+            },
+        }
+        for end, text in texts.items()
+    }
+
+
 def _zenoh_path() -> dict[str, Any]:
     """Return the path of full keys, as Zenoh's REST plugin has it."""
     examples = {"federation": "zsim", "key": "world/info"}
@@ -191,12 +219,12 @@ def _error_responses() -> dict[str, Any]:
     return {str(status): _response(schema, text) for status, text in _ERRORS.items()}
 
 
-STREAM, DESCRIPTION = "/stream", "/openapi.json"
+STREAM, DESCRIPTION, CAMERA = "/stream", "/openapi.json", "/camera/{drone}/{camera}"
 TREE = {"GET": "get", "POST": "get", "PUT": "put", "PATCH": "put", "DELETE": "delete"}
 
 
 def application(
-    access_check: AccessCheck, rest: RestTree, tree: JsonTree, new_client: ClientFactory
+    access_check: AccessCheck, rest: RestTree, tree: JsonTree, cameras: CameraTree, new_client: ClientFactory
 ) -> web.Application:
     """Return the web application of a gateway.
 
@@ -204,6 +232,7 @@ def application(
         access_check: of requests.
         rest: of full keys.
         tree: of JSON.
+        cameras: of pictures.
         new_client: makes the client of a WebSocket.
     """
     app = web.Application(middlewares=[access_check.check], client_max_size=LINE_MAX)
@@ -213,7 +242,8 @@ def application(
     for method in ("get", "put", "post"):
         app.router.add_route(method.upper(), f"{JSON_PREFIX}{{key:.*}}", getattr(tree, method))
     app.router.add_route("*", f"{JSON_PREFIX}{{key:.*}}", _method_not_allowed("GET", "POST", "PUT"))
-    for path in (STREAM, DESCRIPTION):
+    app.router.add_get(CAMERA, cameras.get, allow_head=False)
+    for path in (STREAM, DESCRIPTION, CAMERA):
         app.router.add_route("*", path, _method_not_allowed("GET"))
     for method, handler in TREE.items():
         app.router.add_route(method, "/{key:.*}", getattr(rest, handler))
@@ -221,7 +251,8 @@ def application(
 
 
 async def _index(request: web.Request) -> web.Response:
-    paths = {"description": DESCRIPTION, "json": JSON_PREFIX, "stream": STREAM, "zenoh": "/FEDERATION/KEY"}
+    cameras = {"camera": "/camera/DRONE/CAMERA", "picture": f"/camera/DRONE/CAMERA{ONE_PICTURE}"}
+    paths = {"description": DESCRIPTION, "json": JSON_PREFIX, "stream": STREAM, **cameras, "zenoh": "/FEDERATION/KEY"}
     return web.json_response({"zsim": "gateway", **paths})
 
 

@@ -1,4 +1,4 @@
-"""The keys as two trees of HTTP: that of the Zenoh REST plugin, and one of JSON by the schema of each message.
+"""The keys as trees of HTTP: that of the Zenoh REST plugin, one of JSON by the schema of each message, and pictures.
 
 RestTree: full keys, payloads as they are. GET and POST query, PUT and PATCH publish, DELETE deletes; `Accept:
 text/event-stream` subscribes; `?_raw` returns the first payload alone. Source: zenoh, plugins/zenoh-plugin-rest.
@@ -8,6 +8,8 @@ GET    /json/drone/drone1/sensor/imu      the last value; of an expression, a li
 GET    … with Accept: text/event-stream   every value from now on
 PUT    /json/drone/drone1/cmd/velocity    {"velocity_m_s": [1, 0, 0]}; t_ns, seq and source are filled in
 POST   /json/world/control                {"op": "pause", "args": {}}
+
+CameraTree: /camera/DRONE/CAMERA, a stream of pictures; /camera/DRONE/CAMERA.jpg, the newest one.
 """
 
 import base64
@@ -26,7 +28,7 @@ from zsim.contract.messages import REFUSALS
 from zsim.contract.run_messages import ControlRequest
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample, check_expression
-from zsim_bridges.gateway.access_check import error_response
+from zsim_bridges.gateway.access_check import ConnectionLimit, error_response
 from zsim_bridges.gateway.client_messages import (
     CACHED_VALUES,
     JSON,
@@ -41,11 +43,15 @@ from zsim_bridges.gateway.client_messages import (
 from zsim_bridges.gateway.client_streams import event_bytes, stream_events
 from zsim_bridges.gateway.publications import SharedSubscriptions
 from zsim_bridges.gateway.run_access import RunAccess
+from zsim_bridges.picture_streams import PictureFeeds, as_file, stream_pictures
 
 EVENT_STREAM = "text/event-stream"
 RAW, TOKEN = "_raw", "token"
 BYTES = "zenoh/bytes"  # encoding that the plugin gives a body without Content-Type
 JSON_PREFIX = "/json/"
+ONE_PICTURE = ".jpg"  # end of the path of a single picture
+PICTURE_S = 2.0  # wall time that the first picture is waited for; twice the period of a slow camera
+NO_PICTURE = "no picture yet; does a camera process publish there, and does time run?"
 NO_VALUE = "no value yet; is the key right, and does somebody publish it?"
 _encode = msgspec.json.Encoder().encode
 _control_request = msgspec.json.Decoder(ControlRequest).decode
@@ -138,6 +144,35 @@ class JsonTree:
             raise DecodeError(f"{key[:80]}: {error}; must be a JSON object with op and args") from error
         answer = await self._run().request(key, control.op, control.args, control.source or self._source)
         return _as_json({"ok": answer.ok, "error": answer.error, "result": json_value(answer.result)})
+
+
+class CameraTree:
+    """Handlers of the pictures of cameras.
+
+    Args:
+        run: returns the current run.
+        feeds: of the cameras.
+        limit: of clients, in which streams count.
+    """
+
+    def __init__(self, run: Callable[[], RunAccess], feeds: PictureFeeds, limit: ConnectionLimit) -> None:
+        self._run = run
+        self._feeds = feeds
+        self._limit = limit
+
+    async def get(self, request: web.Request) -> web.StreamResponse:
+        """Answer with all pictures from now on, or with the newest one alone where the path ends with `.jpg`."""
+        camera = request.match_info["camera"]
+        key = self._run().camera_key(request.match_info["drone"], camera.removesuffix(ONE_PICTURE))
+        self._limit.enter()
+        try:
+            with self._feeds.watched(key) as feed:
+                if not camera.endswith(ONE_PICTURE):
+                    return await stream_pictures(request, feed)
+                picture = feed.newest or await feed.after(-1, PICTURE_S)
+        finally:
+            self._limit.leave()
+        return as_file(picture.image) if picture else error_response(404, f"{key}: {NO_PICTURE}")
 
 
 def methods_of(key: str) -> tuple[str, ...]:

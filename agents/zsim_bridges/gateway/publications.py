@@ -17,7 +17,7 @@ ECHOES_MAX = 256  # of a key; a paused world returns none, and clients may go on
 DELETED = None
 OWN_BYTES_MAX = 64_000_000  # of the values on clients' own keys
 KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
-WAITING_MAX = 50_000  # messages of an expression that wait for the loop; then the oldest go
+WAITING_MAX = 50_000  # messages of an expression that wait for the loop, unless said otherwise
 DELIVER_MAX = 500  # messages delivered before the other tasks of the loop run
 EXPRESSIONS_MAX = 2_000  # of all clients together; each is a subscription that the world's session checks
 
@@ -158,11 +158,13 @@ class SharedSubscriptions:
     Args:
         loop: on which everything but Zenoh's callbacks is called.
         limit: of connections, in which streams count that are nothing but one subscription.
+        waiting_max: messages of an expression that wait for the loop; then the oldest go.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, limit: ConnectionLimit) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, limit: ConnectionLimit, waiting_max: int = WAITING_MAX) -> None:
         self._loop = loop
         self._limit = limit
+        self._waiting_max = waiting_max
         self._link: Session | None = None
         self._by_expression: dict[str, _SharedSubscription] = {}
 
@@ -191,7 +193,7 @@ class SharedSubscriptions:
             check_expression(expression)
             if len(self._by_expression) >= EXPRESSIONS_MAX:
                 raise TooManyError(f"subscribe: there are {EXPRESSIONS_MAX} expressions already; take one of them")
-            shared = self._by_expression[expression] = _SharedSubscription(self._loop)
+            shared = self._by_expression[expression] = _SharedSubscription(self._loop, self._waiting_max)
             if self._link is not None:
                 shared.undeclare = self._link.declare_subscriber(expression, shared.on_publication)
         shared.subscribers[subscriber] = None
@@ -230,9 +232,9 @@ class SharedSubscriptions:
 class _SharedSubscription:
     """One subscription: publications that arrive close together are delivered together."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, waiting_max: int) -> None:
         self._loop = loop
-        self._waiting: deque[RawSample] = deque(maxlen=WAITING_MAX)
+        self._waiting: deque[RawSample] = deque(maxlen=waiting_max)
         self._scheduled = False
         self.subscribers: dict[Subscriber, None] = {}
         self.undeclare: Callable[[], None] = _do_nothing

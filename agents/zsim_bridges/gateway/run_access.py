@@ -12,6 +12,7 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
+from zsim.sensors.camera import CAMERAS
 from zsim.transport.session import RawSample, Session, check_expression
 from zsim.transport.traffic import Passed, Traffic
 from zsim_bridges.gateway.client_messages import (
@@ -71,7 +72,7 @@ class RunAccess:
 
     def open(self) -> None:
         """Subscribe to what passes the world, and read the last values of before."""
-        self._traffic = Traffic(self.link, run_key_table(self.info), self._count_refused)
+        self._traffic = Traffic(self.link, run_key_table(self.info), self.count_refused)
         # Views do not pass the world.
         self.link.declare_subscriber("view/**", lambda sample: self.values.add(sample.key, sample.payload))
         for expression in rights.LAST_VALUES:
@@ -104,9 +105,6 @@ class RunAccess:
             if entry.key == keys.CLOCK:
                 self._observer.update_clock(entry.payload)
 
-    def _count_refused(self) -> None:
-        self._observer.health.refused += 1
-
     def close(self) -> None:
         """Give up requests that wait."""
         self._threads.shutdown(wait=False, cancel_futures=True)
@@ -131,7 +129,8 @@ class RunAccess:
         """Publish payloads that have been checked."""
         for key, payload in checked:
             self.link.put_sample(key, payload, messages.encoding(key))
-            self.values.add_own(key, payload)
+            if not keys.is_picture(key):  # nobody's last value: they are large, and the world keeps none either
+                self.values.add_own(key, payload)
 
     def encode(self, key: str, value: Any) -> bytes:
         """Return plain data as the payload of a key on which clients may publish.
@@ -174,6 +173,22 @@ class RunAccess:
             raise UnknownError(f"{key[:80]}: {kind} is {thing[:40]!r}; must be one of {', '.join(names) or 'none'}")
         if kind == "estimates" and not keys.PROCESS_NAME.fullmatch(thing):
             raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 of a-z 0-9 _ . -")
+
+    def camera_key(self, drone: str, camera: str) -> str:
+        """Return the key of a camera's pictures.
+
+        Raises:
+            UnknownError: with the drones that the run has, or the cameras of a drone.
+        """
+        if camera not in CAMERAS:
+            raise UnknownError(f"camera is {camera[:40]!r}; must be {' or '.join(CAMERAS)}")
+        if drone not in self._known_names["drone"]:
+            raise UnknownError(f"drone is {drone[:40]!r}; must be one of {', '.join(self._known_names['drone'])}")
+        return keys.camera(drone, camera)
+
+    def count_refused(self) -> None:
+        """Count a message that is not what its key promises."""
+        self._observer.health.refused += 1
 
     async def request(
         self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0
@@ -218,8 +233,11 @@ class RunAccess:
         own = self._federation_key(key)
         if own is not None and messages.type_of(own) is not None:
             messages.decode(own, payload)
-        self.bare_link.put_sample(key, payload, encoding)
-        if own is not None:
+        if own is None:
+            self.bare_link.put_sample(key, payload, encoding)
+            return
+        self.link.put_sample(own, payload, encoding)
+        if not keys.is_picture(own):
             self.values.add_own(own, payload, encoding)
 
     def delete_full_key(self, key: str) -> None:

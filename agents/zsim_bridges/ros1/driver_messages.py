@@ -1,12 +1,11 @@
 """Messages of the contract as those of ROS 1, with the units, signs and frames of ardrone_autonomy. Pure.
 
 Sources: ardrone_autonomy 1.4.1, src/ardrone_driver.cpp (PublishNavdata, PublishOdometry); REP 103 and 105.
-
-Order of this file: the state that the driver reports, its messages.
 """
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -29,8 +28,7 @@ POSITIONS_KEPT = 32  # gates for which the integrated position is remembered; an
 WORLD = "world"
 MAG_LSB_PER_UT = 1 / 0.3  # AK8975 datasheet, 0.3 uT per LSB: the AR.Drone 2.0's
 NO_FIX, FIX, GPS_SERVICE = -1, 0, 1  # sensor_msgs/NavSatStatus
-DIAGONAL_KNOWN = 2  # sensor_msgs/NavSatFix
-FIX_3D = 3  # as in NMEA: with a height
+DIAGONAL_KNOWN, FIX_3D = 2, 3  # sensor_msgs/NavSatFix; a fix with a height, as in NMEA
 NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags that its camera recognises
     **dict.fromkeys(("temp", "wind_speed", "wind_angle", "wind_comp_angle", "tags_count"), 0),
     **dict.fromkeys(("motor1", "motor2", "motor3", "motor4"), 0),
@@ -39,6 +37,7 @@ NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags that its 
 }
 UNKNOWN_3X3, UNKNOWN_6X6 = np.zeros(9), np.zeros(36)  # zeros mean in ROS that the covariance is not known
 
+Part = tuple[str, Vector, Quaternion]  # frame of a part, and its pose in the body
 Vector3 = ros.geometry_msgs__msg__Vector3
 TFMessage = message_class("tf2_msgs/TFMessage")
 Navdata = message_class("ardrone_autonomy/Navdata")
@@ -278,13 +277,14 @@ def _odometry(head: Any, child: str, position: Vector, attitude: Quaternion, vel
     )
 
 
-def transforms(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
-    """Return `/tf` of a drone: odom to base as integrated, and world to odom as far as the estimator knows it."""
+def transforms(seq: int, state: OnboardState, frames: DriverFrames, parts: Sequence[Part] = ()) -> Any:
+    """Return `/tf` of a drone: odom to base as integrated, world to odom as far as it is estimated, and its parts."""
     assert state.status is not None
     t_ns = state.status.t_ns
     poses = [_transform(seq, t_ns, frames.odom, frames.base, state.position_m, state.attitude)]
     if state.origin_m is not None:
         poses.append(_transform(seq, t_ns, WORLD, frames.odom, state.origin_m, LEVEL))
+    poses += [_transform(seq, t_ns, frames.base, *part) for part in parts]
     return TFMessage(transforms=poses)
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from zsim.contract import flight_messages, keys, messages
 from zsim.scenario.scenario import Drone
 from zsim_bridges.ros1 import driver_messages
+from zsim_bridges.ros1.camera_topics import CameraTopics
 from zsim_bridges.ros1.connections import PublishedTopic
 from zsim_bridges.ros1.driver_messages import DriverFrames, OnboardState
 from zsim_bridges.ros1.node import Ros1Node
@@ -132,6 +133,9 @@ class DroneTopics:
         source: process name under which commands are sent.
         put: publishes a message on a key.
         tf: the topic that all drones share.
+
+    Attributes:
+        cameras: of the drone.
     """
 
     def __init__(
@@ -141,6 +145,7 @@ class DroneTopics:
         name = ros1_name(drone.name)
         self._state, self._frames = OnboardState(drone.sensors.imu.mount, drone.sensors.mag.mount), DriverFrames(name)
         self._commands = DriverCommands(drone.name, source, put)
+        self.cameras = CameraTopics(node, name)
         self._advertise(node, f"/{name}")
         self._subscribe(node, f"/{name}")
 
@@ -181,4 +186,4 @@ class DroneTopics:
         self._commands.on_status(status)
         self._navdata.publish(partial(driver_messages.navdata, state=state, frames=frames))
         self._odometry.publish(partial(driver_messages.odometry, state=state, frames=frames))
-        self._tf.publish(partial(driver_messages.transforms, state=state, frames=frames))
+        self._tf.publish(partial(driver_messages.transforms, state=state, frames=frames, parts=self.cameras.poses()))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from zsim.contract import keys, messages
+from zsim.contract.camera_messages import CameraImage, CameraInfo
 from zsim.contract.framing import run_key_table
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError, RunError, SessionError
@@ -19,6 +20,7 @@ from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics, ros1_name
 from zsim_bridges.ros1.node import Ros1Node
+from zsim_bridges.ros1.picture_intake import PictureIntake
 
 BACKLOG = 250  # times that something arrived, some seconds of realtime
 POLL_S = 0.1  # how often a stop is looked for
@@ -133,6 +135,9 @@ class Ros1Bridge:
 
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Forward messages both ways until the run is over or a stop is requested."""
+        for sample in self._link.get(keys.camera_info("*", "*")):
+            self.forward(sample.key, sample.payload)
+        pictures = PictureIntake(self._link, asyncio.get_running_loop(), self.forward)
         intake = Intake(self._link, self._info, self._observer.health, asyncio.get_running_loop())
         try:
             async with self._node.running():
@@ -140,9 +145,16 @@ class Ros1Bridge:
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(intake.news.wait(), POLL_S)
                     await self._forward_all(intake)
+                    pictures.follow(self._wanted_pictures())
                     self._observer.tick()
         finally:
+            pictures.follow(())
             intake.close()
+
+    def _wanted_pictures(self) -> Iterator[str]:
+        """Yield the keys of the cameras that some node subscribes to."""
+        for name, drone in self._drones.items():
+            yield from (keys.camera(name, camera) for camera in drone.cameras.wanted())
 
     async def _forward_all(self, intake: Intake) -> None:
         for arrived in intake.arrivals():
@@ -157,8 +169,19 @@ class Ros1Bridge:
             self._on_clock(payload)
         elif key == keys.EVENT:
             self._on_event(payload)
+        elif kind == "drone" and thing in self._drones and leaf.startswith("camera/"):
+            self._forward_camera(thing, key, payload)
         elif kind == "drone" and thing in self._drones and not leaf.startswith("cmd/"):
             self._publish(thing, key, payload)
+
+    def _forward_camera(self, drone: str, key: str, payload: bytes) -> None:
+        """Publish a picture, or keep how a camera sees."""
+        message = self._decoded(key, payload)
+        cameras = self._drones[drone].cameras
+        if isinstance(message, CameraImage):
+            cameras.publish(keys.leaf(key), message)
+        elif isinstance(message, CameraInfo):
+            cameras.learn(keys.parts(key)[2].split("/")[1], message)
 
     def _publish(self, drone: str, key: str, payload: bytes) -> None:
         message = self._decoded(key, payload)

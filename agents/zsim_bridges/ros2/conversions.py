@@ -16,9 +16,17 @@ from rosbags.typesys.stores import ros2_jazzy as ros
 
 from zsim.contract import flight_messages, messages, run_messages
 from zsim.contract.flight_messages import Quaternion
-from zsim.math.frames import quaternion_conjugate, quaternion_from_rpy, quaternion_multiply, rotate, rotation_matrix
+from zsim.math.frames import (
+    quaternion_conjugate,
+    quaternion_from_matrix,
+    quaternion_from_rpy,
+    quaternion_multiply,
+    rotate,
+    rotation_matrix,
+)
 from zsim.math.rotation import LEVEL
 from zsim.schema.message import Vector3
+from zsim.sensors.camera_model import camera_pose
 from zsim.sensors.sensor import ErrorModel, Mount
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.sensors.sonar import SonarConfig
@@ -50,6 +58,11 @@ def sensor(drone: str, kind: str) -> str:
     return f"{drone}/{kind}_link"
 
 
+def camera_frame(drone: str, camera: str) -> str:
+    """Return the frame of a camera: x to the right of the picture, y down, z ahead (REP 103)."""
+    return f"{drone}/{camera}_camera_optical_frame"
+
+
 def cluster(name: str) -> str:
     return f"cluster/{name}"
 
@@ -62,6 +75,10 @@ def static_frames(drone: str, sensors: Sensors) -> Iterator[FramePose]:
         yield FramePose(base(drone), sensor(drone, kind), mount.position_m, _mount_rotation(mount))
     beam = quaternion_multiply(_mount_rotation(sensors.sonar.mount), _ALONG_BEAM)
     yield FramePose(base(drone), sensor(drone, "sonar"), sensors.sonar.mount.position_m, _quaternion(beam))
+    for name, camera in sensors.cameras().items():
+        p_BK, R_BK = camera_pose(camera)
+        x, y, z = p_BK.tolist()
+        yield FramePose(base(drone), camera_frame(drone, name), (x, y, z), _quaternion(quaternion_from_matrix(R_BK)))
 
 
 def _mount_rotation(mount: Mount) -> Quaternion:

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from functools import partial
+from itertools import chain
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from zsim.transport.session import RawSample, Session
 from zsim.transport.tls import Identity
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
+from zsim_bridges.ros2.camera_topics import DroneCameras
 from zsim_bridges.ros2.rmw_zenoh import Ros2Node, RosContext, ros_names
 from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.source_keys import SAMPLES_MAX, BridgedTopic, CallbackQueue, SourceSubscriptions
@@ -186,9 +188,9 @@ class Ros2Bridge:
 
     def advertise_run(self, ros: RosContext) -> None:
         """Advertise the run's topics and services."""
-        self._domain = ros.domain
-        types = ros.types
-        commands = RosCommands(self._link, self._observer, types.message_class("std_srvs/srv/Trigger_Response"))
+        self._domain, types = ros.domain, ros.types
+        response = types.message_class("std_srvs/srv/Trigger_Response")
+        commands = RosCommands(self._link, self._observer, response)
         sensors = {drone.name: drone.sensors for drone in self._scenario.drones}
         root = ros.node("/", NODE)
         self._advertise(root, topics.run_topics(self.names))
@@ -196,6 +198,9 @@ class Ros2Bridge:
         for drone, name in self.names.drones.items():
             node = ros.node(f"/{name}", NODE)
             self._advertise(node, topics.drone_topics(drone, name, sensors[drone], types))
+            cameras = DroneCameras(drone, name)
+            self._advertise(node, cameras.topics())
+            node.service(f"/{name}/togglecam", TRIGGER, partial(cameras.toggle, response))
             self._accept_commands(node, drone, name, commands)
         for cluster, name in self.names.clusters.items():
             node = ros.node(f"/cluster/{name}", NODE)
@@ -208,8 +213,7 @@ class Ros2Bridge:
 
     def _advertise(self, node: Ros2Node, run_topics: Iterator[Topic]) -> None:
         for topic in run_topics:
-            publisher = node.publisher(topic.name, topic.kind, topic.qos)
-            self._publications[topic.name] = BridgedTopic(topic, publisher)
+            self._publications[topic.name] = BridgedTopic(topic, node.publisher(topic.name, topic.kind, topic.qos))
 
     def _accept_commands(self, node: Ros2Node, drone: str, name: str, commands: RosCommands) -> None:
         """Subscribe to a drone's commands."""
@@ -227,12 +231,8 @@ class Ros2Bridge:
     def _publish_static_frames(self, node: Ros2Node) -> None:
         """Publish the frames that never move, once for all, later subscribers too."""
         publisher = node.publisher("/tf_static", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF_STATIC)
-        poses = [
-            pose
-            for d in self._scenario.drones
-            for pose in conversions.static_frames(self.names.drones[d.name], d.sensors)
-        ]
-        publisher.publish(conversions.transforms(0, poses))
+        frames = (conversions.static_frames(self.names.drones[d.name], d.sensors) for d in self._scenario.drones)
+        publisher.publish(conversions.transforms(0, list(chain.from_iterable(frames))))
 
     def _report_names(self) -> None:
         for name, ros in {**self.names.drones, **self.names.clusters}.items():

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
+from zsim.contract.camera_messages import CameraInfo
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription
 from zsim_bridges.ros2.rmw_zenoh import Publisher
@@ -62,6 +63,7 @@ class CallbackQueue:
         return work
 
 
+LAST_S = 1.0  # how long a last value is waited for; the world answers within milliseconds
 SAMPLES_MAX = 2000  # of a key that wait to be converted: about a tenth of a second of work
 
 
@@ -116,6 +118,9 @@ class SourceSubscriptions:
         if self._prompt and keys.leaf(key) in ("estimate", "state"):
             return SourceSubscription([], self._link.declare_subscriber(key, self._on_sample))
         subscription = self._link.subscribe(key)
+        if messages.type_of(key) is CameraInfo:  # said once, before anybody here read it
+            for sample in self._link.get(key, timeout_s=LAST_S):
+                self._queue.add_sample(sample.key, sample.payload)
         return SourceSubscription([], subscription.undeclare, subscription)
 
     def _on_sample(self, sample: RawSample) -> None:

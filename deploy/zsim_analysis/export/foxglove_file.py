@@ -8,19 +8,22 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 from foxglove import layouts
 
-from zsim.contract import keys
+from zsim.contract import keys, messages
+from zsim.contract.camera_messages import CameraInfo
 from zsim.contract.messages import Info
 from zsim.record import Recorded, RecordReader
 from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import cross_layout
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_analysis.export.foxglove_scene import RotorDisc, instants, is_drawn
+from zsim_analysis.export.foxglove_scene import Instant, RotorDisc, instants, is_drawn
 from zsim_analysis.export.foxglove_topics import DRONES, ESTIMATES, FORMATIONS, GROUND, LOG, TRAILS, FoxgloveFile
 from zsim_analysis.export.selection import DecodedMessages, MessageSelection, subject
 from zsim_analysis.reading.recorded_run import decode_or_none, scenario_of
@@ -56,13 +59,25 @@ def convert(
     file = FoxgloveFile(path, _rotors(info, scenario, dict.fromkeys(drones)), _spaces(scenario))
     with deferred_signals() as check:
         try:
-            for instant in instants(decoded):
+            for instant in chain(_cameras_before(reader, selection, wanted), instants(decoded)):
                 file.write(instant)
                 check()
         finally:
             file.close()
     layout_path.write_text(layout(file.counts, file.variables()) + "\n", encoding="utf-8")
     return dict(sorted(file.counts.items())), decoded.refused
+
+
+def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: Iterable[str]) -> Iterator[Instant]:
+    """Yield how cameras see by what they said before the first time that is selected: they may say it once only."""
+    from_ns = round((selection.from_s or 0.0) * 1e9)
+    of_cameras = [key for key in wanted if messages.type_of(key) is CameraInfo]
+    known: dict[str, CameraInfo] = {}
+    for recorded in reader.messages(of_cameras) if from_ns and of_cameras else ():
+        if recorded.t_ns < from_ns and (info := _decode(recorded)) is not None:
+            known[recorded.key] = msgspec.structs.replace(info, t_ns=from_ns)
+    if known:
+        yield Instant(from_ns, cameras=list(known.items()))
 
 
 @contextmanager
@@ -135,6 +150,8 @@ DRONE_PLOTS = (
     ("battery (%)", "battery_percent"),
 )
 DRONES_MAX = 12  # drones that are plotted
+PICTURES, CALIBRATION = "_camera/image", "_camera/calibration"  # ends of topics
+PICTURES_MAX = 6  # cameras that are shown: those of the paper's three drones
 
 
 def layout(topics: Iterable[str], variables: Mapping[str, Sequence[str]]) -> str:
@@ -150,6 +167,8 @@ def layout(topics: Iterable[str], variables: Mapping[str, Sequence[str]]) -> str
     )
     tabs = [tab for cluster, fields in variables.items() for tab in _cluster_tabs(cluster, fields, len(variables) > 1)]
     tabs += [layouts.TabItem(title="drones", content=_drone_plots(drones[:DRONES_MAX]))] if drones else []
+    pictures = sorted(topic for topic in present if topic.endswith(PICTURES))
+    tabs += [layouts.TabItem(title="cameras", content=_pictures(pictures[:PICTURES_MAX]))] if pictures else []
     left = _column((3, _scene(present)), (1, layouts.LogPanel(config=layouts.LogConfig(topic_to_render=LOG))))
     parts = [(2, layouts.TabContainer(tabs=tabs))] if tabs else []
     right = _column(*parts, (1, _states(variables, drones[:DRONES_MAX])))
@@ -204,6 +223,22 @@ def _drone_plots(drones: Sequence[str]) -> layouts.SplitContainer:
         for title, field in DRONE_PLOTS
     ]
     return _column(*((1, panel) for panel in panels))
+
+
+def _pictures(topics: Sequence[str]) -> layouts.SplitContainer:
+    """Return a panel for each camera, with what its pixels mean."""
+    modes = {
+        topic: layouts.ImageModeConfig(
+            image_topic=topic, calibration_topic=f"{topic.removesuffix(PICTURES)}{CALIBRATION}"
+        )
+        for topic in topics
+    }
+    return _column(
+        *(
+            (1, layouts.ImagePanel(config=layouts.ImageConfig(image_mode=mode), title=topic.split("/", 2)[2]))
+            for topic, mode in modes.items()
+        )
+    )
 
 
 def _plot(title: str, series: list[layouts.PlotSeries]) -> layouts.PlotPanel:

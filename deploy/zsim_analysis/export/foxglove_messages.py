@@ -12,6 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 from foxglove.messages import (
+    CameraCalibration,
+    CompressedImage,
     FrameTransform,
     FrameTransforms,
     LocationFix,
@@ -23,6 +25,7 @@ from foxglove.messages import (
     PointCloud,
 )
 
+from zsim.contract.camera_messages import CameraImage, CameraInfo
 from zsim.contract.flight_messages import Estimate, Status, Truth
 from zsim.contract.messages import Gps
 from zsim.contract.run_messages import Event
@@ -41,6 +44,7 @@ from zsim_analysis.export.foxglove_scene import (
 from zsim_analysis.export.message_columns import Values
 
 PACKAGE: Final = "zsim"
+DISTORTION_MODEL = "plumb_bob"  # k1, k2, p1, p2, k3, as OpenCV has them
 _BYTES, _EIGHT = 2, 1  # wire types: bytes after their length, eight bytes
 _DOUBLE, _STRING = 1, 9  # FieldDescriptorProto.Type
 _OPTIONAL = 1  # FieldDescriptorProto.Label
@@ -133,13 +137,13 @@ def _varint(value: int) -> bytes:
     return bytes(out)
 
 
-def transforms(t_ns: int, frames: Iterable[FramePose]) -> FrameTransforms:
-    """Return where frames are in W."""
+def transforms(t_ns: int, frames: Iterable[FramePose], parent: str = WORLD) -> FrameTransforms:
+    """Return where frames are in another, W unless it is given."""
     at = timestamp(t_ns)
     frame_transforms = [
         FrameTransform(
             timestamp=at,
-            parent_frame_id=WORLD,
+            parent_frame_id=parent,
             child_frame_id=child,
             translation=vector(position),
             rotation=quaternion(orientation),
@@ -192,6 +196,27 @@ def location_fix(gps: Gps, drone: str, index: int) -> LocationFix:
         position_covariance=[variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance],
         position_covariance_type=LocationFixPositionCovarianceType.DiagonalKnown,
         color=colour(drone_colour(index)),
+    )
+
+
+def compressed_image(image: CameraImage, frame_id: str) -> CompressedImage:
+    """Return a picture, at the time of its exposure."""
+    at = timestamp(max(0, image.t_sample_ns))
+    return CompressedImage(timestamp=at, frame_id=frame_id, data=image.data, format=image.format)
+
+
+def camera_calibration(info: CameraInfo, frame_id: str) -> CameraCalibration:
+    """Return what a camera's pixels mean; it is no part of a stereo pair."""
+    return CameraCalibration(
+        timestamp=timestamp(info.t_ns),
+        frame_id=frame_id,
+        width=info.width,
+        height=info.height,
+        distortion_model=DISTORTION_MODEL,
+        D=list(info.D),
+        K=list(info.K),
+        R=np.eye(3).ravel().tolist(),
+        P=np.column_stack([np.reshape(info.K, (3, 3)), np.zeros(3)]).ravel().tolist(),
     )
 
 

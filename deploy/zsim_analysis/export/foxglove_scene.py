@@ -29,6 +29,7 @@ from foxglove.messages import (
 )
 
 from zsim.contract import keys, messages
+from zsim.contract.camera_messages import CameraImage, CameraInfo
 from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth
 from zsim.contract.messages import Gps, Info
 from zsim.contract.run_messages import Event
@@ -41,7 +42,7 @@ LEVEL = Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 # Okabe and Ito's colours, distinct with every kind of colour vision.
 DRONES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 MAGENTA, DARK, GREY = "#d4008f", "#30363d", "#8c959f"
-DRAWN = (Truth, Estimate, Status, Gps, ClusterState, Event)
+DRAWN = (Truth, Estimate, Status, Gps, ClusterState, Event, CameraImage, CameraInfo)
 WORLD = "world"
 TRAIL_S = 20.0  # s of simulated time that a trail is long
 TRAIL_STEP_NS = 500_000_000  # between two points of a trail, and two messages of trails
@@ -60,7 +61,7 @@ class RotorDisc(NamedTuple):
 
 @dataclass
 class Instant:
-    """Messages stamped with one time; of several on a key, the last."""
+    """Messages stamped with one time; of several on a key the last, but all events, and all of cameras."""
 
     t_ns: int
     truth: dict[str, Truth] = field(default_factory=dict)
@@ -69,20 +70,25 @@ class Instant:
     gps: dict[str, Gps] = field(default_factory=dict)
     states: dict[str, ClusterState] = field(default_factory=dict)
     events: list[Event] = field(default_factory=list)
+    pictures: list[tuple[str, CameraImage]] = field(default_factory=list)
+    cameras: list[tuple[str, CameraInfo]] = field(default_factory=list)
 
     def add(self, key: str, message: Any) -> None:
         """Add a message of a type that is drawn."""
-        if isinstance(message, Event):
-            self.events.append(message)
-            return
-        by_type: dict[type, dict[str, Any]] = {
-            Truth: self.truth,
-            Estimate: self.estimates,
-            Status: self.status,
-            Gps: self.gps,
-            ClusterState: self.states,
-        }
-        by_type[type(message)][subject(key)] = message
+        match message:
+            case Event():
+                self.events.append(message)
+            case CameraImage():
+                self.pictures.append((key, message))
+            case CameraInfo():
+                self.cameras.append((key, message))
+            case _:
+                self._newest(type(message))[subject(key)] = message
+
+    def _newest(self, kind: type) -> dict[str, Any]:
+        newest: dict[type, dict[str, Any]] = {Truth: self.truth, Estimate: self.estimates, Status: self.status}
+        newest |= {Gps: self.gps, ClusterState: self.states}
+        return newest[kind]
 
 
 def is_drawn(key: str) -> bool:
@@ -142,6 +148,11 @@ def drone_colour(index: int) -> str:
 def frame(drone: str) -> str:
     """Return the name of a drone's frame B."""
     return f"drone/{drone}"
+
+
+def camera_frame(drone: str, camera: str) -> str:
+    """Return the name of a camera's frame: x to the right of the picture, y down, z ahead."""
+    return f"{frame(drone)}/{camera}_camera"
 
 
 def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> SceneUpdate:

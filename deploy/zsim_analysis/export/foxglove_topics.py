@@ -10,6 +10,8 @@ from typing import Any
 import foxglove
 import numpy as np
 from foxglove.channels import (
+    CameraCalibrationChannel,
+    CompressedImageChannel,
     FrameTransformsChannel,
     LocationFixChannel,
     LogChannel,
@@ -19,6 +21,7 @@ from foxglove.channels import (
 )
 from foxglove.messages import PoseInFrame
 
+from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Status
 from zsim.math.frames import heading
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
@@ -95,6 +98,13 @@ class CheckedFile:
                 self._failure = error
 
 
+def _camera_of(key: str) -> tuple[str, str, str]:
+    """Return drone, camera and frame of a camera's key."""
+    _, drone, what = keys.parts(key)
+    camera = what.split("/")[1]
+    return drone, camera, foxglove_scene.camera_frame(drone, camera)
+
+
 class FoxgloveFile:
     """An MCAP file that is being written.
 
@@ -160,7 +170,21 @@ class FoxgloveFile:
             self._write_cluster(instant, name, state)
         for event in instant.events:
             self._log(LOG, LogChannel, foxglove_messages.log_line(event), event.t_ns)
+        self._write_cameras(instant)
         self._write_scene(instant)
+
+    def _write_cameras(self, instant: Instant) -> None:
+        for key, info in instant.cameras:
+            drone, camera, frame_id = _camera_of(key)
+            calibration = foxglove_messages.camera_calibration(info, frame_id)
+            self._log(f"/drone/{drone}/{camera}_camera/calibration", CameraCalibrationChannel, calibration, info.t_ns)
+            placed = [(frame_id, info.position_m, info.orientation_wxyz)]
+            fixed = foxglove_messages.transforms(info.t_ns, placed, foxglove_scene.frame(drone))
+            self._log(TF, FrameTransformsChannel, fixed, info.t_ns)
+        for key, image in instant.pictures:
+            drone, camera, frame_id = _camera_of(key)
+            picture = foxglove_messages.compressed_image(image, frame_id)
+            self._log(f"/drone/{drone}/{camera}_camera/image", CompressedImageChannel, picture, image.t_ns)
 
     def _write_frames(self, instant: Instant) -> None:
         frames = [(foxglove_scene.frame(d), t.position_m, t.orientation_wxyz) for d, t in instant.truth.items()]

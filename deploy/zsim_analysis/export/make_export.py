@@ -19,7 +19,7 @@ from zsim.errors import ReportError
 from zsim.record import RecordReader
 from zsim.record.record_reader import record_at, record_notes
 from zsim_analysis.export import Format
-from zsim_analysis.export.selection import DecodedMessages, MessageSelection, TableSurvey, batches
+from zsim_analysis.export.selection import DecodedMessages, MessageSelection, TableSurvey, batches, hat_by_hat
 
 DEFAULTS = {  # names beside the record
     Format.CSV: "csv",
@@ -93,12 +93,12 @@ def _tables(
     with placed(target) as (new,):
         sink = _sink(form, new, survey)
         with sink:
-            for batch in batches(decoded, sink.columns):
+            for batch in batches(hat_by_hat(decoded), sink.columns):
                 sink.write(batch)
             written = sink.finish()
         if not written:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
-        notes = [*record_notes(reader), *_refused(decoded.refused)]
+        notes = [*record_notes(reader), *_refused(decoded.refused), *_left_out(survey.pictures)]
         if form is not Format.MAT:
             (new / MANIFEST).write_bytes(_manifest(reader, selection, written, notes))
     return ExportResult((target,), {table.file: table.rows for table in written}, notes)
@@ -132,6 +132,10 @@ def _foxglove(
 
 def _refused(count: int) -> list[str]:
     return [f"{count} messages on record are not what their key promises and were left out"] if count else []
+
+
+def _left_out(pictures: int) -> list[str]:
+    return [f"{pictures} pictures are left out: a table holds none; --format foxglove has them"] if pictures else []
 
 
 def _nothing(reader: RecordReader, selection: MessageSelection) -> str:

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import Struct, inspect
+from msgspec import UNSET, Struct, inspect
 from numpy.typing import NDArray
 
 from zsim.contract.messages import REFUSALS
@@ -44,7 +44,8 @@ class FieldColumns:
 
     def values(self, messages: Sequence[Any]) -> Values:
         """Return a value per message, or a table (messages, columns); None or NaN where there is none."""
-        return [getattr(message, self.name) for message in messages]
+        found = [getattr(message, self.name) for message in messages]
+        return [None if value is UNSET else value for value in found]
 
 
 class VectorColumns(FieldColumns):

@@ -1,5 +1,6 @@
 """Which messages of a record are exported, the tables that they become, and the rows of these in batches."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -8,6 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from zsim.contract import keys, messages
+from zsim.contract.camera_messages import CameraImage, Sightings
 from zsim.contract.messages import REFUSALS
 from zsim.record import Recorded, RecordReader
 from zsim_analysis.export.message_columns import FieldColumns, fields, json_text, open_fields
@@ -70,11 +72,46 @@ def _content(payload: bytes) -> str:
         return json_text({"hexadecimal": payload.hex()})
 
 
+class Sighting(Struct, frozen=True):
+    """A row of a hat that was seen in a picture, or of a picture in which none was: numbers are NaN then.
+
+    `hats` tells how many were seen in the picture, `hat` which of them this is, from 0.
+    """
+
+    t_ns: int
+    seq: int
+    t_sample_ns: int
+    source: str
+    camera: str
+    hats: int
+    hat: int | None = None
+    direction_B: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    range_m: float = math.nan
+    sigma_direction_rad: float = math.nan
+    sigma_range_m: float = math.nan
+
+
+def hat_by_hat(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[tuple[Recorded, Any]]:
+    """Yield messages, and for each of Sightings its rows."""
+    for recorded, message in decoded:
+        if not isinstance(message, Sightings):
+            yield recorded, message
+            continue
+        source = message.source or ("world" if keys.is_sensor(recorded.key) else "")
+        head = (message.t_ns, message.seq, message.t_sample_ns, source, message.camera, len(message.seen))
+        for hat, seen in enumerate(message.seen):
+            numbers = (seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
+            yield recorded, Sighting(*head, hat, *numbers)
+        if not message.seen:
+            yield recorded, Sighting(*head)
+
+
 class TableSurvey:
     """The tables that a selection becomes, by a first look through the record.
 
     Attributes:
         wanted: the keys.
+        pictures: messages that are selected and go into no table.
         kinds: the message type of each key of the contract.
         rows: messages by type, with those outside the times or unreadable; None: of foreign keys.
     """
@@ -82,11 +119,13 @@ class TableSurvey:
     def __init__(self, reader: RecordReader, selection: MessageSelection) -> None:
         self._reader = reader
         self._selection = selection
-        self.wanted = selection.keys(reader)
+        counts = reader.topics()
+        chosen = selection.keys(reader)
+        self.pictures = sum(counts[key] for key in chosen if messages.type_of(key) is CameraImage)
+        self.wanted = [key for key in chosen if messages.type_of(key) is not CameraImage]
         if (info := reader.last(keys.INFO)) is not None:
             decode_or_none(info)  # from here on the messages of users' sensors are known
         self.kinds = {key: kind for key in self.wanted if (kind := messages.type_of(key))}
-        counts = reader.topics()
         self.rows: Counter[type[Struct] | None] = Counter()
         for key in self.wanted:
             self.rows[self.kinds.get(key)] += counts[key]

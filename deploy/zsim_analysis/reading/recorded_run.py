@@ -229,4 +229,6 @@ def _is_input(key: str) -> bool:
     kind, _, what = keys.parts(key)
     if kind == "process":
         return what in PROCESS_MESSAGES
+    if kind == "drone" and what == keys.SIGHTINGS:  # of a detector
+        return True
     return key == keys.EVENT or (kind == "drone" and what.startswith("cmd/")) or messages.type_of(key) in OUTPUTS

@@ -12,6 +12,7 @@ from mcap.opcode import Opcode
 from msgspec import Struct
 from msgspec.structs import replace
 from refused import has_terms, refused
+from synthetic_pictures import NO_JPEG, image, info
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
@@ -398,3 +399,46 @@ def test_a_batch_of_a_stranger_ends_nothing(tmp_path: Path, garbage: bytes):
     made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False)  # type: ignore[arg-type]
     assert made.run() == RUN_ENDED
     assert made.health.refused == 1
+
+
+# Cameras
+
+FRONT, FRONT_INFO = keys.camera("d1", "front"), keys.camera_info("d1", "front")
+
+
+def filmed(path: Path, pictures: list[Struct | bytes], last: dict[str, bytes]) -> list[Pair]:
+    """Record a run in which pictures are published beside what passes the world; return what is on record."""
+    link = FakeLink()
+    link.last = dict([pair(keys.INFO, INFO)]) | last
+    link.on_request = lambda key, args: page([])
+    for picture in pictures:
+        link.deliver(FRONT, picture)
+    for passed in (gates(0), [clock(99, "stopped")]):
+        link.deliver(keys.BATCH, encode_batch(passed))
+    record(link, INFO, path)  # type: ignore[arg-type]
+    with RecordReader(path) as reader:
+        return [(message.key, message.payload) for message in reader.messages()]
+
+
+def test_pictures_are_on_record_as_published_and_how_the_camera_sees_too(tmp_path: Path):
+    pictures: list[Struct | bytes] = [image(number * GATE_NS, number) for number in range(3)]
+    found = filmed(tmp_path / "run.mcap", pictures, dict([pair(FRONT_INFO, info())]))
+    assert [payload for key, payload in found if key == FRONT] == [
+        messages.encode(image(number * GATE_NS, number)) for number in range(3)
+    ]
+    assert [payload for key, payload in found if key == FRONT_INFO] == [messages.encode(info())]
+
+
+def test_junk_on_a_camera_s_key_is_on_record_and_disturbs_nothing(tmp_path: Path):
+    found = filmed(tmp_path / "run.mcap", [b"\xc1", image(0, 0, NO_JPEG), image(GATE_NS, 1)], {})
+    assert [key for key, _ in found].count(FRONT) == 3
+    assert stamps(found, IMU) == [0]
+
+
+def test_a_record_of_pictures_is_hardly_larger_than_they_are(tmp_path: Path):
+    """JPEG is compressed; what the container and the messages' other fields add is below 2 %."""
+    rng = np.random.default_rng(1)
+    jpegs = [b"\xff\xd8\xff" + rng.bytes(18_000) for _ in range(200)]
+    filmed(tmp_path / "run.mcap", [image(n * GATE_NS, n, data) for n, data in enumerate(jpegs)], {})
+    size = (tmp_path / "run.mcap").stat().st_size
+    assert size < 1.02 * sum(map(len, jpegs)) + 10_000

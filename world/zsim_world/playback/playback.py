@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.camera_messages import CameraInfo
 from zsim.contract.framing import KINDS, GateMessages, run_key_table
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
@@ -89,6 +90,7 @@ class Playback(Coordinator):
         self._recounts = any(keys.is_sensor(key) and key not in wanted for key in topics)
         self._reader = reader
         self._plays_faults = keys.FAULTS in wanted
+        self._camera_infos = frozenset(key for key in wanted if messages.type_of(key) is CameraInfo)
         gate_keys = wanted | ({keys.VIEW_DRONES} & topics.keys())
         self._recorded_gates = RecordedGates(reader, self.clock.gate_ns, self.clock.delay_ns, gate_keys)
         self._wind(played.from_ns)
@@ -136,10 +138,10 @@ class Playback(Coordinator):
         gating = [p.name for p in self.barrier.participants.values() if p.gating]
         if gating:
             return Refusal(", ".join(gating), "in the lockstep", "seek needs nobody who is waited for")
-        former = self._gates, self._coming, self._pending_faults
+        former = self._gates, self._coming, self._pending_faults, self._pending_infos
         self._wind(round(t_s * 1e9))
         if self._coming is None:
-            self._gates, self._coming, self._pending_faults = former
+            self._gates, self._coming, self._pending_faults, self._pending_infos = former
             return refused_argument(request, "t_s", "a time on record [s]")
         self._forget(self._coming.t_ns)
         self.clock.jumps += 1
@@ -157,6 +159,7 @@ class Playback(Coordinator):
         self._gates = self._recorded_gates.gates(from_ns)
         self._read_next()
         self._pending_faults = self._faults_before(from_ns) if self._plays_faults and from_ns > 0 else None
+        self._pending_infos = self._camera_infos_before(from_ns) if self._camera_infos and from_ns > 0 else []
 
     def _read_next(self) -> None:
         self._coming: Gate | None = next(self._gates, None)
@@ -167,6 +170,11 @@ class Playback(Coordinator):
         """Return the last list of faults before a time: the world publishes it only when it changes."""
         lists = self._reader.messages([keys.FAULTS], by_time=False)
         return max((m for m in lists if m.t_ns < t_ns), key=lambda m: m.t_ns, default=None)
+
+    def _camera_infos_before(self, t_ns: int) -> list[Recorded]:
+        """Return the last info of each camera before a time: a camera may say once only how it sees."""
+        before = (m for m in self._reader.messages(self._camera_infos, by_time=False) if m.t_ns < t_ns)
+        return list({m.key: m for m in sorted(before, key=lambda m: m.t_ns)}.values())
 
     # What is played
 
@@ -186,7 +194,8 @@ class Playback(Coordinator):
             self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
         self.statistics.gate(gate.t_ns, wall_ns)
         self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
-        for recorded in (m for m in gate.messages if m.key not in self._place and m.key != keys.FAULTS):
+        infos, self._pending_infos = self._pending_infos, []
+        for recorded in (m for m in (*infos, *gate.messages) if m.key not in self._place and m.key != keys.FAULTS):
             if not (live and author(recorded) in live):
                 self._publish(recorded)
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
 from zsim.contract.messages import REFUSALS
 from zsim.contract.views import (
     DroneView,
@@ -23,6 +24,7 @@ from zsim.runtime.agent import Output
 from zsim.scenario import rights
 from zsim.scenario.fault_kinds import PROCESS_KILL
 
+SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # say who published them
 VIEWS = (ViewDrones, ViewCluster, ViewEstimates)  # made anew, as often as they are shown
 
 
@@ -126,7 +128,7 @@ def author(recorded: Recorded) -> str:
         return f"estimator.{keys.thing(recorded.key)}"
     if kind in (flight_messages.ClusterState, run_messages.ClusterRequest):
         return f"controller.{keys.thing(recorded.key)}"
-    if kind is None or not issubclass(kind, flight_messages.Command):
+    if kind is None or not issubclass(kind, SOURCED):
         return ""
     try:
         return _decode_sourced(recorded.payload).source

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract import camera_messages, flight_messages, keys, messages, run_messages
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
@@ -30,6 +30,7 @@ RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within 
 REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take until a process can be asked
 PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
 RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
+OF_CAMERAS = (camera_messages.CameraInfo, camera_messages.Sightings)  # relayed too, from whoever has a camera
 PROCESSES, VIEWS = "process/", "view/"  # the last are nothing to the world
 OWN = keys.process(WORLD, "")
 
@@ -222,6 +223,9 @@ class MessageIntake:
             if kind in RELAYED:
                 self.outputs.passed(sample)
                 self._relay(key, sample.payload)
+            elif kind in OF_CAMERAS and not keys.is_sensor(key):
+                self.outputs.passed(sample)
+                self._relay_of_camera(key, sample.payload)
             elif key.startswith(PROCESSES) or (key.startswith("drone/") and "/cmd/" in key):
                 self.outputs.passed(sample)
                 self._hand_over(key, sample.payload, wall_ns)
@@ -269,6 +273,14 @@ class MessageIntake:
         role = "estimator" if kind is flight_messages.Estimate else "controller"
         source = head.controller if kind is run_messages.ClusterRequest else head.source
         self.world.count_output(source or f"{role}.{keys.thing(key)}")
+
+    def _relay_of_camera(self, key: str, payload: bytes) -> None:
+        """Keep what a camera or a detector says; who asks later how a camera sees gets nothing that is no answer."""
+        message = messages.decode(key, payload)
+        if message.t_ns > self.world.now_ns:
+            raise DecodeError(f"{key}: t_ns is {message.t_ns}; must be <= {self.world.now_ns}, the newest gate")
+        self.history.add(key, payload, message.t_ns)
+        self.world.count_output(message.source)
 
     def _read_phase(self, key: str, payload: bytes) -> None:
         if self._states[key] % PHASE_EVERY == 0:

@@ -18,11 +18,12 @@ import recorded_run
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from refused import has_terms
+from synthetic_pictures import AHEAD, FRONT_P_BK, NO_JPEG, image, info, jpeg
 
 from zsim.contract import keys, messages
-from zsim.contract.flight_messages import ClusterState
+from zsim.contract.flight_messages import ClusterState, Truth
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
-from zsim.record import RecordReader
+from zsim.record import RecordReader, RecordWriter
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export import Format
@@ -34,6 +35,7 @@ from zsim_analysis.export.selection import MessageSelection
 
 DRONES = ("drone1", "a-b.c", "end")
 GATES = 301  # of six seconds
+GATE_NS = 20_000_000
 RERUN = shutil.which("rerun", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
 WITHOUT_NETWORK = ("unshare", "--map-root-user", "--net")  # Linux: a network of its own in which there is nobody
 
@@ -108,7 +110,8 @@ def test_frames_are_where_truth_estimate_and_cluster_are(run: Path) -> None:
     frames: dict[str, dict[int, Any]] = defaultdict(dict)
     for t_ns, message in shown(run / "foxglove.mcap")["/tf"]:
         for transform in message.transforms:
-            assert transform.parent_frame_id == "world"
+            is_camera = transform.child_frame_id.endswith("_camera")
+            assert transform.parent_frame_id == ("drone/drone1" if is_camera else "world")
             frames[transform.child_frame_id][t_ns] = transform
     for drone in DRONES:
         for name, key in ((f"drone/{drone}", keys.truth(drone)), (f"drone/{drone}/estimate", keys.estimate(drone))):
@@ -258,6 +261,69 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
     assert done.tables == {topic: len(found) for topic, found in topics.items()}
 
 
+# Cameras
+
+FILMED = 10  # gates, with a picture each
+FRONT = keys.camera("drone1", "front")
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drone that climbs, and what its front camera published: how it sees once, a picture a gate, and one no JPEG."""
+    folder = tmp_path_factory.mktemp("filmed")
+    with RecordWriter(folder / "run.mcap") as writer:
+        writer.add_message(keys.camera_info("drone1", "front"), info(), 0)
+        for gate in range(FILMED):
+            t_ns = gate * GATE_NS
+            p_W, level, still = (0.0, 0.0, 0.1 * gate), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+            truth = Truth(t_ns, gate, p_W, still, level, still, still, (0.0,) * 4)
+            writer.add_message(keys.truth("drone1"), truth, gate)
+            writer.add_message(FRONT, image(t_ns, gate, jpeg(20 * gate)), gate)
+        writer.add_message(FRONT, image(FILMED * GATE_NS, FILMED, NO_JPEG), FILMED)
+    export(folder, Format.FOXGLOVE)
+    return folder
+
+
+def test_pictures_are_those_on_record_at_the_time_of_their_exposure(filmed: Path, tmp_path: Path) -> None:
+    pictures = shown(filmed / "foxglove.mcap")["/drone/drone1/front_camera/image"]
+    assert [t_ns for t_ns, _ in pictures] == [gate * GATE_NS for gate in range(FILMED)]
+    for gate, (t_ns, picture) in enumerate(pictures):
+        assert (picture.data, picture.format) == (jpeg(20 * gate), "jpeg")
+        assert picture.frame_id == "drone/drone1/front_camera"
+        assert picture.timestamp.nanos == max(0, t_ns - 4_000_000)
+    again = export(filmed, Format.FOXGLOVE, tmp_path / "again.mcap")
+    assert len([note for note in again.notes if has_terms(note, "1", "key")]) == 1
+
+
+def test_the_calibration_and_the_camera_s_place_are_as_published(filmed: Path) -> None:
+    topics = shown(filmed / "foxglove.mcap")
+    ((_, calibration),) = topics["/drone/drone1/front_camera/calibration"]
+    assert (tuple(calibration.K), tuple(calibration.D)) == (info().K, info().D)
+    assert (calibration.width, calibration.height) == (info().width, info().height)
+    assert (calibration.distortion_model, calibration.frame_id) == ("plumb_bob", "drone/drone1/front_camera")
+    np.testing.assert_array_equal(np.reshape(calibration.P, (3, 4))[:, :3], np.reshape(info().K, (3, 3)))
+    (placed,) = [
+        t for _, message in topics["/tf"] for t in message.transforms if t.child_frame_id.endswith("front_camera")
+    ]
+    assert placed.parent_frame_id == "drone/drone1"
+    assert (xyz(placed.translation), wxyz(placed.rotation)) == (FRONT_P_BK, AHEAD)
+
+
+def test_a_part_of_a_flight_has_the_calibration_that_was_said_before(filmed: Path, tmp_path: Path) -> None:
+    export(filmed, Format.FOXGLOVE, tmp_path / "late.mcap", MessageSelection(from_s=0.1))
+    topics = shown(tmp_path / "late.mcap")
+    assert len(topics["/drone/drone1/front_camera/image"]) == FILMED - 5
+    ((t_ns, calibration),) = topics["/drone/drone1/front_camera/calibration"]
+    assert (t_ns, tuple(calibration.K)) == (100_000_000, info().K)
+
+
+def test_the_layout_shows_the_cameras(filmed: Path) -> None:
+    layout = json.loads((filmed / "foxglove-layout.json").read_text())
+    topics = shown(filmed / "foxglove.mcap")
+    assert list(values_of(layout, "imageTopic")) == ["/drone/drone1/front_camera/image"]
+    assert set(values_of(layout, "calibrationTopic")) <= set(topics)
+
+
 # Rerun
 
 
@@ -312,7 +378,7 @@ def test_rerun_has_what_is_drawn_and_plotted_at_every_instant(run: Path, convert
             rows[entity.replace("\\", ""), column] += int(count)
     topics = shown(run / "foxglove.mcap")
     transforms = sum(len(message.transforms) for _, message in topics["/tf"])
-    assert rows["/tf", "Transform3D:translation"] == transforms == GATES * 8
+    assert rows["/tf", "Transform3D:translation"] == transforms == GATES * 8 + 2  # and two cameras
     for drone in DRONES:
         assert rows[f"/drone/{drone}/pose", "InstancePoses3D:translations"] == GATES
         assert rows[f"/drone/{drone}/numbers", "zsim.Drone:message"] == GATES
@@ -326,3 +392,19 @@ def test_rerun_has_the_values_and_times_on_record(run: Path, converted: Path) ->
     printed = rerun(run / "home", "rrd", "print", "-vvv", str(converted), "--entity", "/drone/end/pose")
     times = re.findall(r"1970-01-01T00:00:0(\d\.\d+|\d)", printed)
     assert {float(each) for each in times} >= {truth.t_ns / 1e9 for truth in messages_on(run, keys.truth("end"))}
+
+
+def test_rerun_plays_pictures_with_their_camera_in_the_drone_s_tree(filmed: Path) -> None:
+    path = filmed / "foxglove.rrd"
+    rerun(filmed / "home", "mcap", "convert", str(filmed / "foxglove.mcap"), "-o", str(path))
+    assert has_terms(rerun(filmed / "home", "rrd", "verify", str(path)), "verified", "without error")
+    printed = rerun(filmed / "home", "rrd", "print", "-v", str(path))
+    rows: Counter[tuple[str, str]] = Counter()
+    for count, entity, columns in re.findall(
+        r"^Chunk\(\w+\) with (\d+) rows .* - (/\S*) - data columns: \[(.*)\]", printed, re.M
+    ):
+        for column in {column.split("@", 1)[1] for column in columns.split()}:
+            rows[entity.replace("\\", ""), column] += int(count)
+    assert rows["/drone/drone1/front_camera/image", "EncodedImage:blob"] == FILMED
+    assert rows["/drone/drone1/front_camera/calibration", "Pinhole:image_from_camera"] == 1
+    assert rows["/tf", "Transform3D:translation"] == FILMED + 1

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from refused import has_terms
+from synthetic_pictures import image, info, sightings
 
 from zsim import __version__
 from zsim.contract import keys, messages
@@ -174,3 +175,19 @@ def test_inputs_count_before_the_clock_that_follows_them(write: Any):
 
 def test_a_gate_without_its_clock_is_no_passage(write: Any):
     assert list(gates(write(truth(0, "d1"), truth(0, "d2")), ["d1", "d2"])) == []
+
+
+def test_pictures_are_no_inputs_and_what_detectors_saw_is(write: Any) -> None:
+    """A picture more or less on record changes nothing that is flown again."""
+    pictures: list[RecordedEntry] = [(keys.camera_info("d1", "front"), info())]
+    pictures += [(keys.camera("d1", "front"), image(gate * GATE_NS, gate)) for gate in range(3)]
+    detected: RecordedEntry = (keys.detections("d1"), sightings(GATE_NS))
+    flown = [entry for gate in range(3) for entry in (truth(gate, "d1"), truth(gate, "d2"), clock(gate))]
+    with_pictures = write((keys.INFO, INFO), *pictures[:2], *flown[:3], *pictures[2:], detected, *flown[3:])
+    bare = write((keys.INFO, INFO), *flown[:3], detected, *flown[3:])
+    found, same = (
+        [(g.t_ns, [(m.key, m.payload) for m in g.inputs], g.truth) for g in gates(reader, ["d1", "d2"])]
+        for reader in (with_pictures, bare)
+    )
+    assert found == same
+    assert [[key for key, _ in inputs] for _, inputs, _ in found] == [[], [keys.detections("d1")], []]

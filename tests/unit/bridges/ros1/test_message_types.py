@@ -12,6 +12,8 @@ MD5 = {  # as `rosmsg md5` of Noetic prints them; of Navdata as ardrone_autonomy
     "geometry_msgs/Twist": "9f195f881246fdfa2798d1d3eebca84a",
     "geometry_msgs/Vector3Stamped": "7b324c7325e683bf02a9b14b01090ec7",
     "sensor_msgs/Imu": "6a62c6daae103f4ff57a132d6f95cec2",
+    "sensor_msgs/CameraInfo": "c9a58c1b0b154e0e6da7578cb991d214",
+    "sensor_msgs/CompressedImage": "8f7a12909da2c9d3332d540a0977563f",
     "sensor_msgs/NavSatFix": "2d3a8cd499b9b4a0249fb98fd05cfa48",
     "nav_msgs/Odometry": "cd5e73d190d741a2f92e81eda573aca7",
     "rosgraph_msgs/Clock": "a9c97c1d230cfc112e270351a944ee47",

@@ -4,72 +4,22 @@ import asyncio
 import threading
 from typing import Any, cast
 
-import msgspec
 import pytest
 from fake_link import FakeLink
+from ros1_drone import GATE_NS, Drone, Subscriber, scenario, status
 
 from zsim.contract import flight_messages, keys, messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.errors import RunError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
-from zsim.scenario.scenario import Scenario
 from zsim.transport.session import ReceivedSample
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import ros1_bridge, tcpros
-from zsim_bridges.ros1.drone_topics import DroneTopics
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.ros1_bridge import Intake, Ros1Bridge, check_names
 
-GATE_NS = 20_000_000
-SCENARIO = """
-name: one
-duration_s: 10
-sensors: {preset: paper}
-drones: [{name: quad-1, position_m: [0, 0, 0]}]
-"""
 LEVEL, ZERO, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
-
-
-def scenario() -> Scenario:
-    return scenario_file.resolve(msgspec.yaml.decode(SCENARIO.encode()))
-
-
-class Subscriber:
-    """A subscriber that keeps what is published, as messages."""
-
-    def __init__(self, node: Ros1Node, topic: str) -> None:
-        published = node._published[topic]
-        self._kind = published.topic_type.type
-        self.ros_messages: list[Any] = []
-        published.links.append(cast(Any, self))
-
-    def put(self, framed: bytes) -> None:
-        self.ros_messages.append(tcpros.deserialize(self._kind, framed[4:]))
-
-
-class Drone:
-    """The topics of a drone, without a graph."""
-
-    def __init__(self) -> None:
-        self.node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", print)
-        self.sent: list[tuple[str, Any]] = []
-        (drone,) = scenario().drones
-        tf = self.node.publish("/tf", "tf2_msgs/TFMessage", 10)
-        self.topics = DroneTopics(
-            self.node, drone, "ros1.main", lambda key, command: self.sent.append((key, command)), tf
-        )
-
-    def subscriber(self, topic: str) -> Subscriber:
-        return Subscriber(self.node, topic)
-
-    def deliver(self, *command: Any) -> None:
-        for message in command:
-            self.topics.publish(message)
-
-
-def status(t_ns: int) -> flight_messages.Status:
-    return flight_messages.Status(t_ns, 0, "hovering", 90.0, False, None, 1)
 
 
 def truth(t_ns: int) -> flight_messages.Truth:
@@ -83,7 +33,7 @@ def test_the_namespace_is_the_drone_s_name_as_ros_can_write_it():
     assert set(Drone().node._subscribed) == {
         f"/quad_1/{topic}" for topic in ("cmd_vel", "ardrone/takeoff", "ardrone/land", "ardrone/reset")
     }
-    assert set(Drone().node._services) == {"/quad_1/ardrone/flattrim"}
+    assert set(Drone().node._services) == {"/quad_1/ardrone/flattrim", "/quad_1/ardrone/togglecam"}
 
 
 def test_a_gate_is_navdata_odometry_and_transforms():
@@ -191,7 +141,9 @@ class Link:
 
 def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(ros1_bridge, "BACKLOG", 3)
-    info: Any = type("Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "own_sensors": ()})()
+    info: Any = type(
+        "Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "own_sensors": (), "sightings": False}
+    )()
     table = key_table(["drone1"])
 
     def payload(gate: int) -> bytes:

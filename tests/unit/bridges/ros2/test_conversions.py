@@ -16,6 +16,7 @@ from zsim.schema.message import Vector3
 from zsim.sensors.sensor import ErrorModel, Mount
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
+from zsim_bridges.ros2.camera_topics import DroneCameras
 from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.topics import NavdataSummary
 
@@ -51,7 +52,8 @@ def all_topics() -> dict[str, topics.Topic]:
     drone = topics.drone_topics("drone1", "drone1", SENSORS, TYPES)
     cluster = topics.cluster_topics("main", "main", TYPES)
     run = topics.run_topics(topics.RosNames({"drone1": "drone1"}, {"main": "main"}))
-    return {topic.name: topic for topic in (*run, *drone, *cluster)}
+    cameras = DroneCameras("drone1", "drone1").topics()
+    return {topic.name: topic for topic in (*run, *drone, *cameras, *cluster)}
 
 
 def convert(topic: str, message: Any) -> Any:

@@ -4,18 +4,21 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import pytest
 from federation import PAIR
 from refused import has_terms
+from synthetic_pictures import NO_JPEG, image, info, jpeg
 
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
 from zsim.contract.run_messages import ControlAnswer
+from zsim.math.frames import rotate
 from zsim.scenario import scenario_file
 from zsim.transport.session import RawSample, ReceivedSample
 from zsim.transport.zenoh_settings import Mode
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.ros2 import rmw_zenoh
+from zsim_bridges.ros2 import conversions, rmw_zenoh
 from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, RosContext
 from zsim_bridges.ros2.ros2_bridge import Ros2Bridge
 from zsim_bridges.ros2.ros_types import RosTypes
@@ -44,6 +47,7 @@ class Link:
         self.kept: list[tuple[str, bytes, bytes]] = []
         self.hearing: dict[str, list[Callable[[RawSample], None]]] = {}
         self.tokens: list[str] = []
+        self.reads: list[str] = []
         self.services: dict[str, Callable[[Any], None]] = {}
         self.asked: list[tuple[str, str, str, dict[str, Any]]] = []
         self.last: dict[str, bytes] = {}
@@ -360,3 +364,79 @@ def test_what_is_dropped_is_told_in_health(mode: Mode) -> None:
     bench.turn()
     assert len(bench.link.sent) == SAMPLES_MAX
     assert bench.observer.health.dropped == 20
+
+
+# Cameras
+
+IMAGE, CAMERA_INFO = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
+FRONT, BOTTOM = keys.camera("drone-1", "front"), keys.camera("drone-1", "bottom")
+FRONT_INFO = keys.camera_info("drone-1", "front")
+
+
+def published(bench: Bench, topic: str, kind: str) -> list[Any]:
+    """Return what was published on a topic."""
+    key = bench.key(topic, kind)
+    return [TYPES.decode(payload, kind) for at, payload, _ in bench.link.sent if at == key]
+
+
+def test_a_picture_is_on_its_camera_s_topic_with_its_bytes_and_the_time_of_exposure() -> None:
+    bench = Bench()
+    bench.reader("/drone_1/front/image_raw/compressed", IMAGE)
+    assert not bench.link.hearing.get(BOTTOM)
+    bench.link.deliver(FRONT, messages.encode(image(20_000_000)))
+    bench.turn()
+    (got,) = published(bench, "/drone_1/front/image_raw/compressed", IMAGE)
+    assert (got.header.stamp.sec, got.header.stamp.nanosec) == (0, 16_000_000)
+    assert got.header.frame_id == "drone_1/front_camera_optical_frame"
+    assert (got.format, bytes(got.data)) == ("jpeg", jpeg())
+    bench.reader("/drone_1/front/image_raw/compressed", IMAGE, alive=False)
+    assert not bench.link.hearing[FRONT]
+
+
+def test_how_a_camera_sees_was_said_before_anybody_asked_and_comes_with_each_picture() -> None:
+    bench = Bench()
+    bench.link.last[FRONT_INFO] = messages.encode(info())
+    bench.reader("/drone_1/front/camera_info", CAMERA_INFO)
+    bench.turn()
+    for number in (1, 2):
+        bench.link.deliver(FRONT, messages.encode(image(number * 20_000_000)))
+    bench.turn()
+    first, second = published(bench, "/drone_1/front/camera_info", CAMERA_INFO)
+    assert (tuple(first.k), tuple(first.d), first.distortion_model) == (info().K, info().D, "plumb_bob")
+    assert (first.width, first.height, tuple(first.p[[0, 5, 10]])) == (info().width, info().height, (50.0, 51.0, 1.0))
+    assert [m.header.stamp.nanosec for m in (first, second)] == [16_000_000, 36_000_000]
+
+
+def test_togglecam_makes_the_other_camera_the_active_one() -> None:
+    bench = Bench()
+    bench.reader("/drone_1/image_raw/compressed", IMAGE)
+    for _ in range(2):
+        for key in (FRONT, BOTTOM):
+            bench.link.deliver(key, messages.encode(image(20_000_000)))
+        bench.turn()
+        (reply,) = bench.ask("/drone_1/togglecam").replies
+        assert TYPES.decode(reply[1], f"{TRIGGER}_Response").success
+    frames = [m.header.frame_id for m in published(bench, "/drone_1/image_raw/compressed", IMAGE)]
+    assert frames == ["drone_1/front_camera_optical_frame", "drone_1/bottom_camera_optical_frame"]
+
+
+@pytest.mark.parametrize("payload", [b"\xc1", messages.encode(image(0, 0, NO_JPEG)), messages.encode(info())])
+def test_what_is_no_picture_is_refused_and_the_next_is_passed_on(payload: bytes) -> None:
+    bench = Bench()
+    bench.reader("/drone_1/front/image_raw/compressed", IMAGE)
+    bench.link.deliver(FRONT, payload)
+    bench.link.deliver(FRONT, messages.encode(image(0)))
+    bench.turn()
+    assert bench.observer.health.refused == 1
+    assert len(published(bench, "/drone_1/front/image_raw/compressed", IMAGE)) == 1
+
+
+def test_the_cameras_of_the_scenario_are_among_the_frames_that_never_move() -> None:
+    text = PAIR.replace("preset: paper", "preset: paper, front_camera: {}, bottom_camera: {}")
+    drone = scenario_file.resolve(msgspec.yaml.decode(text.encode())).drones[0]
+    poses = {pose.child: pose for pose in conversions.static_frames("d", drone.sensors)}
+    ahead, down = poses["d/front_camera_optical_frame"], poses["d/bottom_camera_optical_frame"]
+    assert ahead.parent == down.parent == "d/base_link"
+    assert ahead.position_m == drone.sensors.cameras()["front"].mount.position_m
+    assert rotate(ahead.orientation_wxyz, (0.0, 0.0, 1.0)) == pytest.approx((1.0, 0.0, 0.0), abs=1e-12)
+    assert rotate(down.orientation_wxyz, (0.0, 0.0, 1.0)) == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from refused import has_terms, parts, refused
+from synthetic_pictures import image, info, sightings
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth, Velocity
@@ -417,3 +418,52 @@ def test_a_kill_on_record_kills_nobody_who_takes_part(tmp_path: Path):
     assert [listed.seq for listed in on(keys.FAULTS, whole)] == [0, 1, 2]
     assert [listed.faults for listed in on(keys.FAULTS, late)] == [()]
     assert next(payload for key, payload in whole if key == keys.FAULTS) == messages.encode(recorded[1][1])
+
+
+# Cameras
+
+FRONT, FRONT_INFO, DETECTIONS = keys.camera("d1", "front"), keys.camera_info("d1", "front"), keys.detections("d1")
+
+
+@pytest.fixture
+def filmed(tmp_path: Path) -> Iterator[RecordReader]:
+    """Six gates with a picture, and what was seen in it, each; how the camera sees was said once, at the start."""
+    recorded: list[KeyedMessage] = [(keys.INFO, INFO), (FRONT_INFO, info(0))]
+    for number in range(6):
+        t_ns = number * GATE_NS
+        recorded += [*gate(number), (FRONT, image(t_ns, number)), (DETECTIONS, sightings(t_ns, number))]
+    with write(tmp_path, recorded) as reader:
+        yield reader
+
+
+def test_pictures_are_played_as_recorded_each_with_its_gate(filmed: RecordReader):
+    published = played(playback(filmed))
+    assert [payload for key, payload in published if key == FRONT] == [
+        messages.encode(image(number * GATE_NS, number)) for number in range(6)
+    ]
+    newest, gates_of_pictures = -1, []
+    for key, payload in published:
+        newest = messages.decode(key, payload).t_ns if key == keys.CLOCK else newest
+        gates_of_pictures += [newest] if key == FRONT else []
+    assert gates_of_pictures == [number * GATE_NS for number in range(6)]
+    assert on(DETECTIONS, published) == [sightings(number * GATE_NS, number) for number in range(6)]
+
+
+def test_how_a_camera_sees_is_said_also_when_a_replay_begins_later(filmed: RecordReader):
+    assert on(FRONT_INFO, played(playback(filmed))) == [info(0)]
+    assert on(FRONT_INFO, played(playback(filmed, from_ns=3 * GATE_NS))) == [info(0)]
+    assert on(FRONT_INFO, played(playback(filmed, from_ns=3 * GATE_NS, keys=("drone/*/truth",)))) == []
+
+
+def test_pictures_are_left_out_by_their_keys(filmed: RecordReader):
+    published = played(playback(filmed, keys=("drone/*/truth", "drone/*/sensor/*")))
+    assert on(FRONT, published) == []
+    assert len(on(keys.truth("d1"), published)) == 6
+
+
+def test_a_camera_that_takes_part_renders_in_place_of_the_record(filmed: RecordReader):
+    made = playback(filmed)
+    join(made, "camera.d1", 0)
+    published = played(made)
+    assert (on(FRONT, published), on(FRONT_INFO, published)) == ([], [])
+    assert len(on(DETECTIONS, published)) == 6  # its detector's does not

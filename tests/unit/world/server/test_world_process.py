@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import pytest
 from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
 from refused import has_terms, parts, refused
+from synthetic_pictures import image, info, sightings
 
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.flight_messages import ClusterState, Estimate, Velocity
@@ -13,7 +15,8 @@ from zsim.contract.framing import decode_batch
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Health, Join
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
-from zsim.scenario import scenario_file
+from zsim.scenario import rights, scenario_file
+from zsim.schema.message import Message
 from zsim_world.fleet.fleet import DivergedError
 from zsim_world.flight.world import DURATION_OVER, World
 from zsim_world.server.world_process import WorldProcess
@@ -21,6 +24,7 @@ from zsim_world.server.world_process import WorldProcess
 GATE_NS = 20_000_000
 GATES = 10
 ME = "tester.one"
+FRONT, FRONT_INFO, DETECTIONS = keys.camera("d1", "front"), keys.camera_info("d1", "front"), keys.detections("d1")
 ESTIMATE, STATE, VELOCITY = keys.estimate("d1"), keys.cluster_state("main"), keys.command("d1", "velocity")
 SCENARIO = f"""
 name: one
@@ -108,6 +112,55 @@ def test_healths_are_shown_with_the_name_of_the_process():
     assert healths[0] == (health, "estimator.d1")
     assert {name for _, name in healths[1:]} == {"world"}
     assert healths[-1][0].received == 1
+
+
+# What cameras say
+
+
+def test_how_a_camera_sees_is_kept_and_handed_on_and_its_pictures_are_not():
+    made, link = world(), FakeLink()
+    for key, message in ((FRONT_INFO, info()), (FRONT, image(0)), (DETECTIONS, sightings(0))):
+        link.deliver(key, message)
+    process = run(made, link)
+    assert process.health.refused == 0
+    assert process._history.last(FRONT_INFO) == [(FRONT_INFO, messages.encode(info()))]
+    assert process._history.last(FRONT) == []
+    passed = [key for at, payload in link.published if at == keys.BATCH for key, _ in decode_batch(payload)]
+    assert [key for key in passed if key in (FRONT_INFO, FRONT, DETECTIONS)] == [FRONT_INFO, DETECTIONS]
+
+
+def test_the_world_answers_how_a_camera_sees():
+    assert any(keys.matches(expression, FRONT_INFO) for expression in rights.LAST_VALUES)
+    assert not any(keys.matches(expression, FRONT) for expression in rights.LAST_VALUES)
+
+
+@pytest.mark.parametrize(("key", "message"), [(FRONT_INFO, image(0)), (DETECTIONS, info()), (FRONT_INFO, info(10**12))])
+def test_what_a_camera_cannot_say_changes_nothing(key: str, message: Message):
+    made, link = world(), FakeLink()
+    link.deliver(key, info() if key == FRONT_INFO else sightings(0))
+    link.deliver(key, message)
+    process = run(made, link)
+    assert process.health.refused == 1
+    assert [event.subject for event in events(link, "refused")] == [key]
+    assert process._history.last(key) != [(key, messages.encode(message))]
+
+
+def test_sightings_of_the_world_itself_are_nobodys_to_publish():
+    made, link = world(), FakeLink()
+    link.deliver(keys.sensor("d1", keys.SIGHTINGS), sightings(0))
+    assert run(made, link).health.refused == 1
+
+
+def test_pictures_of_a_replay_are_on_their_key_alone():
+    """A recorder reads pictures on their keys: in the batches too they would be on record twice."""
+    made, link = world(), FakeLink()
+    made.outbox.put(FRONT, msgspec.Raw(messages.encode(image(0))))
+    made.outbox.put(FRONT_INFO, msgspec.Raw(messages.encode(info())))
+    process = run(made, link)
+    assert link.published_on(FRONT) == [image(0)]
+    passed = [key for at, payload in link.published if at == keys.BATCH for key, _ in decode_batch(payload)]
+    assert (FRONT in passed, FRONT_INFO in passed) == (False, True)
+    assert process._history.last(FRONT) == []
 
 
 # Outputs that got lost
