@@ -26,6 +26,7 @@ from zsim.contract import flight_messages
 from zsim.contract.messages import Info
 from zsim.schema import message
 from zsim.transport.session import Session
+from zsim_bridges.console.camera_socket import CameraSockets
 from zsim_bridges.console.http_proxy import (
     BACKEND_HOST,
     MESSAGE_MAX,
@@ -36,6 +37,7 @@ from zsim_bridges.console.http_proxy import (
     ListenAddress,
     ViserBackend,
 )
+from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.scene_nodes import CameraFollow
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.observer_process import ObserverProcess
@@ -231,10 +233,12 @@ class Console:
         self._run_page: RunPage | None = None
         self._viser = PrivateViser()
         self._camera_follow = CameraFollow(self._viser.server)
+        self._frustums = CameraFrustums(self._viser.server)
         _show_text(self._viser.server.gui, "waiting for a world")
         controls = PageControls(self._viser.server.gui, self._camera_follow.switches)
         permits = partial(is_permitted, controls=controls)
-        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, permits)
+        sockets = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums.choose)
+        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, permits, sockets.serve)
         self._proxy = HttpProxy(address, token, backend)
 
     @contextmanager
@@ -262,7 +266,9 @@ class Console:
         say: Callable[[str], None],
     ) -> None:
         """Show a run until it is over or `stopped` returns true."""
-        self._run_page = page = RunPage(self._viser.server, link, info, observer, self._camera_follow, self._rate_hz)
+        self._run_page = page = RunPage(
+            self._viser.server, link, info, observer, self._camera_follow, self._frustums, self._rate_hz
+        )
         try:
             page.run(stopped)
         finally:
