@@ -16,7 +16,7 @@ from zsim_bridges.console.page.camera_marks import Mark
 from zsim_bridges.console.page.jpeg_header import PICTURE_BYTES_MAX, PictureError, check_picture
 from zsim_bridges.observer_process import ObserverProcess
 
-ASKED_S = 3.0  # wall; how long a camera stays subscribed to after a page has last asked for its pictures
+ASKED_S = 15.0  # wall; a page that has shown nothing for so long sleeps: a slow one takes seconds for a picture
 MESSAGE_BYTES = 1_000  # of a picture's message beside its data, at most; chosen
 SIGHTINGS_KEPT = 8  # of one camera from one key: half a second of 15 Hz
 MARKS_MAX = 40  # on a picture; more would hide it
@@ -36,6 +36,13 @@ class _Watched:
         self.payload: bytes | None = None  # newer than the picture; not decoded yet
         self.picture: CameraPicture | None = None
         self.sightings: dict[str, deque[Sightings]] = {}  # by key
+
+
+class _Asked(NamedTuple):
+    """What a page asks for."""
+
+    cameras: tuple[str, ...]
+    until_s: float  # wall
 
 
 class CameraFeed:
@@ -68,7 +75,7 @@ class CameraFeed:
         self._wall_s = wall_s
         self._lock = threading.Lock()
         self._infos: dict[str, CameraInfo] = {}
-        self._asked: dict[str, float] = {}  # wall time until which a camera is subscribed to
+        self._asked: dict[object, _Asked] = {}  # by page
         self._watched: dict[str, _Watched] = {}
         self._undeclare: dict[str, Callable[[], None]] = {}  # by key
         self._number = 0
@@ -96,10 +103,8 @@ class CameraFeed:
         """Subscribe to the cameras that pages have asked for lately, and to no others; to be called again and again."""
         with self._lock:
             now_s = self._wall_s()
-            self._asked = {camera: until_s for camera, until_s in self._asked.items() if until_s > now_s}
-            wanted = [camera for camera in self._asked if camera in self._infos]
-            if not wanted and not self._undeclare:
-                return
+            self._asked = {page: asked for page, asked in self._asked.items() if asked.until_s > now_s}
+            wanted = {camera for asked in self._asked.values() for camera in asked.cameras if camera in self._infos}
             self._watched = {camera: self._watched.get(camera) or _Watched() for camera in wanted}
         self._subscribe({key for camera in wanted for key in _keys_of(camera)})
 
@@ -117,11 +122,15 @@ class CameraFeed:
         infos = self._infos.copy()
         return tuple((camera, infos[camera]) for camera in self._order if camera in infos)
 
-    def ask(self, cameras: Iterable[str]) -> None:
-        """Ask for pictures of cameras; to be repeated within ASKED_S."""
+    def ask(self, page: object, cameras: Iterable[str]) -> None:
+        """Ask for pictures of these cameras on a page, and of no others; to be repeated within ASKED_S."""
         with self._lock:
-            until_s = self._wall_s() + ASKED_S
-            self._asked |= {camera: until_s for camera in cameras if camera in self._infos}
+            self._asked[page] = _Asked(tuple(cameras), self._wall_s() + ASKED_S)
+
+    def release(self, page: object) -> None:
+        """Ask for nothing any more on a page."""
+        with self._lock:
+            self._asked.pop(page, None)
 
     def picture(self, camera: str) -> CameraPicture | None:
         """Return the newest picture of a camera, None as long as there is none."""

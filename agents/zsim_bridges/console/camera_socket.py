@@ -134,7 +134,7 @@ class _Page:
             await self._ready.wait()
             feed, want = self._feed(), self._request.want
             if feed is not None:
-                feed.ask(want if not self._request.frustum else (*want, self._request.frustum))
+                feed.ask(self, (*want, self._request.frustum) if self._request.frustum else want)
             batch = batches.next(feed, want)
             if batch is not None:
                 self._ready.clear()
@@ -142,5 +142,8 @@ class _Page:
             await asyncio.sleep(PERIOD_S)
 
     def leave(self) -> None:
-        """Show the page's frustum no longer."""
+        """Show and ask for nothing any more."""
         self._choose(self._request.page, "")
+        feed = self._feed()
+        if feed is not None:
+            feed.release(self)
