@@ -1,6 +1,7 @@
 """What drones see, in the console: in a real browser, with pictures that a test publishes."""
 
 import io
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from synthetic_camera import NUMBER_BITS, SETTINGS
 from wire import PATIENCE_S, Client
 
 from zsim.contract import keys, messages
+from zsim_bridges.console.page.scene_nodes import OFFSET_M
 
 LAPTOP, DESK = {"width": 1280, "height": 720}, {"width": 1600, "height": 1000}
 SCREENS = (LAPTOP, DESK)
@@ -44,6 +46,7 @@ TWELVE = "\n".join(
 EMERGENCY = "EMERGENCY – all rotors stop"
 SKY = np.array(synthetic_camera.SKY[::-1])  # red, green, blue; nothing else in the scene has it
 SKY_PIXELS = 60  # of a frustum's picture, at least
+FIELD_DEG = 75.0  # of viser's camera, from top to bottom
 NEAR = 12  # levels of 255: JPEG, and the scene's light
 
 READ_NUMBERS = """() => Object.fromEntries([...document.querySelectorAll('#zsim-cameras .picture')].map(button => {
@@ -133,6 +136,20 @@ def sky_pixels(page: BrowserPage) -> int:
     return int(np.count_nonzero(np.abs(screen - SKY).max(axis=2) < NEAR))
 
 
+def place_of(page: BrowserPage, p_W: tuple[float, float, float]) -> tuple[float, float]:
+    """Return where a point of the scene is on the page, as long as nobody has moved the page's camera."""
+    centre = np.array([0.0, -0.5, 0.0])  # of TRIAD's drones
+    ahead = -OFFSET_M / np.linalg.norm(OFFSET_M)
+    right = np.cross(ahead, (0.0, 0.0, 1.0)) / np.linalg.norm(np.cross(ahead, (0.0, 0.0, 1.0)))
+    x, y, z = np.array([right, np.cross(ahead, right), ahead]) @ (np.array(p_W) - centre - OFFSET_M)
+    box: Any = page.page.locator("canvas[data-engine]").bounding_box()
+    focal_px = box["height"] / 2 / math.tan(math.radians(FIELD_DEG) / 2)
+    return (
+        box["x"] + box["width"] / 2 + focal_px * float(x / z),
+        box["y"] + box["height"] / 2 + focal_px * float(y / z),
+    )
+
+
 def click(page: BrowserPage, camera: str) -> None:
     page.page.locator(f'[data-camera="{camera}"]').click()
 
@@ -204,6 +221,11 @@ def test_what_each_drone_sees_stands_below_the_scene(
         assert page.page.locator("[aria-pressed=true]").get_attribute("data-camera") == "drone2/front"
         click(page, "drone2/front")
         until(page, lambda: sky_pixels(page), lambda seen: seen < SKY_PIXELS)
+
+        # and so does a click on the drone in the scene
+        page.page.mouse.click(*place_of(page, (-1.5, -1.5, 0.0)))
+        until(page, lambda: sky_pixels(page), lambda seen: seen > SKY_PIXELS)
+        assert page.page.locator("[aria-pressed=true]").get_attribute("data-camera") == "drone2/front"
 
         # what is no picture is counted, and nothing else is touched
         with repeated(client, "drone/drone3/camera/front", b"no message at all"):

@@ -9,6 +9,7 @@ from aiohttp import WSMsgType, web
 from msgspec import Meta, Struct
 
 from zsim_bridges.console.camera_feed import CameraFeed
+from zsim_bridges.console.page.camera_frustums import CameraFrustums
 
 PERIOD_S = 0.1  # wall, from a picture of a camera to the next, at least
 WANTED_MAX = 16  # pictures on one page
@@ -35,21 +36,22 @@ class PageBatches:
 
     A message is the length of its header (4 bytes, big-endian), the header as JSON, and the JPEGs one after the other.
     The header has `cameras` (name, width, height; null if they are as before) and `pictures` (camera, size [bytes; 0:
-    the picture is as before], t_s, marks).
+    the picture is as before], t_s, marks), and `clicked` where a drone was clicked in the scene.
     """
 
     def __init__(self) -> None:
         self._cameras: list[dict[str, Any]] = []
         self._shown: dict[str, tuple[Any, ...]] = {}
 
-    def next(self, feed: CameraFeed | None, want: tuple[str, ...]) -> bytes | None:
-        """Return the next message, None while nothing has changed."""
+    def next(self, feed: CameraFeed | None, want: tuple[str, ...], clicked: str = "") -> bytes | None:
+        """Return the next message, None while nothing has changed and no drone was clicked."""
         listed = self._listed(feed)
         pictures = [] if feed is None else [self._picture(feed, camera) for camera in dict.fromkeys(want)]
         changed = [each for each in pictures if each is not None]
-        if listed is None and not changed:
+        if listed is None and not changed and not clicked:
             return None
-        header = msgspec.json.encode({"cameras": listed, "pictures": [entry for entry, _ in changed]})
+        told = {"cameras": listed, "pictures": [entry for entry, _ in changed]}
+        header = msgspec.json.encode({**told, "clicked": clicked} if clicked else told)
         return b"".join((len(header).to_bytes(4, "big"), header, *(data for _, data in changed)))
 
     def _listed(self, feed: CameraFeed | None) -> list[dict[str, Any]] | None:
@@ -81,16 +83,16 @@ class CameraSockets:
 
     Args:
         feed: returns the cameras of the run that is shown, None without one.
-        choose: called with a page and the camera whose frustum it is to show, empty for none.
+        frustums: in the scenes of the pages.
     """
 
-    def __init__(self, feed: Callable[[], CameraFeed | None], choose: Callable[[str, str], None]) -> None:
+    def __init__(self, feed: Callable[[], CameraFeed | None], frustums: CameraFrustums) -> None:
         self._feed = feed
-        self._choose = choose
+        self._frustums = frustums
 
     async def serve(self, socket: web.WebSocketResponse) -> None:
         """Send pictures until the page closes its socket."""
-        page = _Page(socket, self._feed, self._choose)
+        page = _Page(socket, self._feed, self._frustums)
         sending = asyncio.ensure_future(page.send())
         try:
             await page.receive()
@@ -107,11 +109,11 @@ class _Page:
         self,
         socket: web.WebSocketResponse,
         feed: Callable[[], CameraFeed | None],
-        choose: Callable[[str, str], None],
+        frustums: CameraFrustums,
     ) -> None:
         self._socket = socket
         self._feed = feed
-        self._choose = choose
+        self._frustums = frustums
         self._request = NOTHING
         self._ready = asyncio.Event()
 
@@ -124,7 +126,7 @@ class _Page:
                 self._request = _DECODER.decode(message.data)
             except (msgspec.MsgspecError, ValueError, RecursionError):
                 return
-            self._choose(self._request.page, self._request.frustum)
+            self._frustums.choose(self._request.page, self._request.frustum)
             self._ready.set()
 
     async def send(self) -> None:
@@ -135,7 +137,7 @@ class _Page:
             feed, want = self._feed(), self._request.want
             if feed is not None:
                 feed.ask(self, (*want, self._request.frustum) if self._request.frustum else want)
-            batch = batches.next(feed, want)
+            batch = batches.next(feed, want, self._frustums.take_click(self._request.page))
             if batch is not None:
                 self._ready.clear()
                 await self._socket.send_bytes(batch)
@@ -143,7 +145,7 @@ class _Page:
 
     def leave(self) -> None:
         """Show and ask for nothing any more."""
-        self._choose(self._request.page, "")
+        self._frustums.choose(self._request.page, "")
         feed = self._feed()
         if feed is not None:
             feed.release(self)

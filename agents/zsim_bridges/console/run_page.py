@@ -32,6 +32,7 @@ from zsim_bridges.console.page.picture import (
     CanvasTrails,
     DronePoses,
     FormationShape,
+    drone_on_ray,
     drone_poses,
     ellipsoids,
     formation_shape,
@@ -111,6 +112,7 @@ class RunPage:
         hats = self._scenario.environment.hats
         self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
         self._frustums = frustums
+        self._has_clicks = False
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
         self._trails = CanvasTrails(len(names))
@@ -162,7 +164,7 @@ class RunPage:
     def _update(self, wall_s: float) -> None:
         self._observer.tick()
         new = self.views.update()
-        self.cameras.update()
+        self._update_cameras()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
@@ -175,6 +177,19 @@ class RunPage:
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
                 self._update_tables(wall_s)
+
+    def _update_cameras(self) -> None:
+        """Keep up with the cameras; once there are any, a click on a drone shows what it sees."""
+        self.cameras.update()
+        if not self._has_clicks and self.cameras.cameras():
+            self._has_clicks = True
+            self._scene.on_click(self._on_click)
+
+    def _on_click(self, event: Any) -> None:
+        drones = self._drones
+        drone = None if drones is None else drone_on_ray(drones, event.ray_origin, event.ray_direction)
+        if drone is not None:
+            self._frustums.click(event.client_id, drone)
 
     def _draw_end(self) -> None:
         """Draw the end of the run, for pages that are opened between two runs."""

@@ -56,6 +56,7 @@ class CameraFrustums:
         self._lock = threading.Lock()
         self._pages: dict[str, viser.ClientHandle] = {}  # by key
         self._chosen: dict[str, str] = {}  # camera by key
+        self._clicked: dict[str, str] = {}  # drone by key
         self._nodes: dict[str, _Frustum] = {}  # by key; only touched where it is drawn
         server.on_client_connect(self._on_connect)
         server.on_client_disconnect(self._on_disconnect)
@@ -67,6 +68,18 @@ class CameraFrustums:
                 self._chosen[page] = camera
             else:
                 self._chosen.pop(page, None)
+
+    def click(self, client_id: int, drone: str) -> None:
+        """Tell a page, by viser's number of it, that a drone was clicked in its scene."""
+        with self._lock:
+            for key, page in self._pages.items():
+                if page.client_id == client_id:
+                    self._clicked[key] = drone
+
+    def take_click(self, page: str) -> str:
+        """Return the drone that was clicked last in a page's scene, once; empty for none."""
+        with self._lock:
+            return self._clicked.pop(page, "")
 
     def draw(self, drones: DronePoses | None, shown: Shown) -> None:
         """Draw those that are chosen, and remove the others."""
@@ -109,6 +122,7 @@ class CameraFrustums:
             for key in [key for key, other in self._pages.items() if other.client_id == client.client_id]:
                 del self._pages[key]
                 self._chosen.pop(key, None)
+                self._clicked.pop(key, None)
 
 
 def drone_index(drones: DronePoses | None, camera: str) -> int | None:

@@ -79,7 +79,14 @@ class Page:
         self.socket: Any = Socket()
         self.feed: Any = Feed()
         self.chosen: list[tuple[str, str]] = []
-        self.sockets = CameraSockets(lambda: self.feed, lambda *choice: self.chosen.append(choice))
+        self.clicked = [""]
+        frustums: Any = SimpleNamespace(
+            choose=self._choose, take_click=lambda _: self.clicked.pop() if self.clicked else ""
+        )
+        self.sockets = CameraSockets(lambda: self.feed, frustums)
+
+    def _choose(self, page: str, camera: str) -> None:
+        self.chosen.append((page, camera))
 
 
 @pytest.fixture
@@ -182,5 +189,16 @@ def test_without_a_run_a_page_waits_for_one(periods: list[float]):
         assert page.socket.sent.empty()
         page.feed = feed
         assert (await page.socket.sent.get()).endswith(b"JPEG 1")
+
+    with_page(steps)
+
+
+def test_a_page_is_told_once_which_drone_was_clicked_in_its_scene(periods: list[float]):
+    async def steps(page: Page) -> None:
+        page.clicked = ["drone1"]
+        page.socket.say(want=(CAMERA,))
+        assert b'"clicked":"drone1"' in await page.socket.sent.get()
+        page.socket.say(want=(CAMERA,))
+        assert b"clicked" not in await page.socket.sent.get()
 
     with_page(steps)

@@ -12,7 +12,7 @@ import synthetic_camera
 
 from zsim.math import frames
 from zsim_bridges.console.page.camera_frustums import CameraFrustums, drone_index, frustum_pose
-from zsim_bridges.console.page.picture import DronePoses
+from zsim_bridges.console.page.picture import DronePoses, drone_on_ray
 
 FRONT, BOTTOM = synthetic_camera.info_of("front"), synthetic_camera.info_of("bottom")
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -177,3 +177,36 @@ def test_a_run_that_is_over_leaves_none(frustums: CameraFrustums, pages: list[Pa
     frustums.draw(drones(), shown)
     frustums.clear()
     assert pages[1].nodes == []
+
+
+def test_a_click_in_a_scene_is_for_its_page_and_told_once(frustums: CameraFrustums, pages: list[Page]):
+    frustums.click(2, "drone1")
+    assert frustums.take_click(pages[0].key) == ""
+    assert [frustums.take_click(pages[1].key) for _ in range(2)] == ["drone1", ""]
+
+
+def test_a_click_on_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, pages: list[Page], server: Server):
+    frustums.click(1, "drone1")
+    server.goes(pages[0])
+    frustums.click(1, "drone1")
+    assert frustums.take_click(pages[0].key) == ""
+
+
+@pytest.mark.parametrize(
+    ("direction", "drone"),
+    [
+        ((0.0, 0.0, -1.0), "near"),
+        ((5.0, 0.1, -10.0), "far"),  # passes by it at 0.1 m
+        ((0.0, 0.0, 1.0), "near"),  # behind: the nearest to where the ray begins
+        ((0.0, 0.0, 0.0), None),
+    ],
+)
+def test_a_click_is_on_the_drone_that_is_nearest_to_its_ray(direction: tuple[float, ...], drone: str | None):
+    p_W = np.array([(0.0, 0.0, 5.0), (5.0, 0.0, 0.0), (math.nan,) * 3])
+    poses = DronePoses(0, ("near", "far", "gone"), p_W, np.tile(LEVEL, (3, 1)), np.zeros((3, 4)), np.zeros(3))
+    assert drone_on_ray(poses, (0.0, 0.0, 10.0), direction) == drone
+
+
+def test_without_drones_a_click_is_on_none():
+    poses = DronePoses(0, ("gone",), np.full((1, 3), math.nan), LEVEL[None], np.zeros((1, 4)), np.zeros(3))
+    assert drone_on_ray(poses, (0.0, 0.0, 10.0), (0.0, 0.0, -1.0)) is None
