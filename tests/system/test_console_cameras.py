@@ -226,6 +226,7 @@ def test_what_each_drone_sees_stands_below_the_scene(
         page.page.mouse.click(*place_of(page, (-1.5, -1.5, 0.0)))
         until(page, lambda: sky_pixels(page), lambda seen: seen > SKY_PIXELS)
         assert page.page.locator("[aria-pressed=true]").get_attribute("data-camera") == "drone2/front"
+        click(page, "drone2/front")
 
         # what is no picture is counted, and nothing else is touched
         with repeated(client, "drone/drone3/camera/front", b"no message at all"):
