@@ -13,6 +13,8 @@ from zsim_bridges.console.page.camera_frustums import CameraFrustums
 
 PERIOD_S = 0.1  # wall, from a picture of a camera to the next, at least
 WANTED_MAX = 16  # pictures on one page
+REQUEST_MAX = 10_000  # bytes
+HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed
 NAME_MAX = 64  # characters of a camera's name, or of a page's
 
 Name = Annotated[str, Meta(max_length=NAME_MAX)]
@@ -89,6 +91,14 @@ class CameraSockets:
     def __init__(self, feed: Callable[[], CameraFeed | None], frustums: CameraFrustums) -> None:
         self._feed = feed
         self._frustums = frustums
+
+    async def respond(self, request: web.Request) -> web.StreamResponse:
+        """Answer a request for a socket; return when it has closed."""
+        socket = web.WebSocketResponse(compress=False, max_msg_size=REQUEST_MAX, heartbeat=HEARTBEAT_S)
+        await socket.prepare(request)
+        await self.serve(socket)
+        await socket.close()
+        return socket
 
     async def serve(self, socket: web.WebSocketResponse) -> None:
         """Send pictures until the page closes its socket."""

@@ -251,7 +251,7 @@ class Console:
         controls = PageControls(self._viser.server.gui, self._camera_follow.switches)
         permits = partial(is_permitted, controls=controls)
         sockets = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
-        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, permits, sockets.serve)
+        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, permits, sockets.respond)
         self._proxy = HttpProxy(address, token, backend)
 
     @contextmanager

@@ -135,14 +135,14 @@ class ViserBackend(NamedTuple):
         secret: that it asks for in SECRET_HEADER.
         state: returns what the console shows, as plain data.
         permits: returns whether a message of a page may reach viser, by the page's role.
-        serve_cameras: sends pictures of cameras over a socket of a page until it closes.
+        serve_cameras: answers a page's request for a socket of pictures, until it closes.
     """
 
     port: int
     secret: str
     state: Callable[[], dict[str, Any]]
     permits: Callable[[bytes, str], bool]
-    serve_cameras: Callable[[web.WebSocketResponse], Awaitable[None]]
+    serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class HttpProxy:
@@ -236,14 +236,7 @@ class HttpProxy:
         role = self._tokens.role_of(_page_request(request))
         if role is None:
             return _missing_token()
-        return await self._stream(f"cameras of {role}", lambda: self._send_pictures(request))
-
-    async def _send_pictures(self, request: web.Request) -> web.StreamResponse:
-        socket = web.WebSocketResponse(compress=False, max_msg_size=MESSAGE_MAX, heartbeat=HEARTBEAT_S)
-        await socket.prepare(request)
-        await self._backend.serve_cameras(socket)
-        await socket.close()
-        return socket
+        return await self._stream(f"cameras of {role}", lambda: self._backend.serve_cameras(request))
 
     async def _stream(self, what: str, serve: Callable[[], Awaitable[web.StreamResponse]]) -> web.StreamResponse:
         """Serve a socket, unless too many of its kind are open."""
