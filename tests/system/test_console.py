@@ -19,6 +19,7 @@ import msgspec
 import pytest
 import zstandard
 from chromium import needs_browser
+from console_browser import PATIENCE_MS, POLL_MS, BrowserPage, console
 from federation import Federation, Role, free_port
 from refused import has_terms
 from websockets.exceptions import ConnectionClosed
@@ -27,10 +28,8 @@ from wire import PATIENCE_S
 
 from zsim_bridges.console.console_server import Camera
 
-VIEWPORT = {"width": 860, "height": 420}  # pictures without a graphics card take long
 STRIP = {"width": 860, "height": 120}  # of a page whose picture nobody looks at
-POLL_MS = 100  # between two looks at what a page shows
-STEER, PATIENCE_MS = "a-good-token", 1000 * PATIENCE_S
+STEER = "a-good-token"
 TRIAD = """
 name: triad
 seed: 3
@@ -47,71 +46,6 @@ PLACE_OF_P = 9  # among the sliders: x_c, y_c, z_c, roll, pitch, yaw, three head
 CAMERA = Camera(  # what a page says first; before it, viser heeds no control of it
     (1.0, 0.0, 0.0, 0.0), (0.0, -5.0, 3.0), 1.0, 0.01, 1000.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
-
-
-class BrowserPage:
-    """A page of the console, and all that it requested for."""
-
-    def __init__(self, page: Any, address: str) -> None:
-        self.page = page
-        self.requested: list[str] = []
-        self.faults: list[str] = []
-        page.set_default_timeout(PATIENCE_MS)
-        page.on("request", lambda request: self.requested.append(request.url))
-        page.on("websocket", lambda socket: self.requested.append(socket.url))
-        page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.goto(address)
-
-    def press(self, name: str) -> None:
-        self.page.get_by_role("button", name=name, exact=True).click()
-
-    def select_tab(self, tab: str) -> None:
-        self.page.get_by_role("tab", name=tab, exact=True).click()
-
-    def wait_for_text(self, text: str) -> None:
-        """Wait until the page shows a text."""
-        self.page.get_by_text(text).first.wait_for()
-
-    def state(self) -> dict[str, Any]:
-        """Return what the page shows, as the page itself reads it."""
-        return self.page.evaluate("fetch(location.pathname.replace(/\\/$/, '') + '/state').then(r => r.json())")
-
-    def until(self, condition: str) -> dict[str, Any]:
-        """Wait until a condition (JavaScript) holds of the state `s`; return the state."""
-        there = f"(() => {{ try {{ return {condition}; }} catch {{ return false; }} }})()"  # it may show no run yet
-        look = f"async () => {{ const s = await (await fetch('/state')).json(); return [{there}, s]; }}"
-        until_s = time.monotonic() + PATIENCE_S
-        while True:
-            holds, state = self.page.evaluate(look)
-            if holds:
-                return state
-            assert time.monotonic() < until_s, f"{condition} never came true: {state}"
-            self.page.wait_for_timeout(POLL_MS)
-
-    def outside(self) -> set[str]:
-        """Return the hosts that it requested for something, beside this machine."""
-        urls = (urlsplit(url) for url in self.requested)
-        return {str(url.hostname) for url in urls if url.scheme not in ("data", "blob")} - {"127.0.0.1"}
-
-
-@pytest.fixture
-def opened(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
-    """Open an address in a browser of its own, with cookies of its own."""
-    with ExitStack() as stack:
-
-        def open_it(address: str, viewport: dict[str, int] = VIEWPORT) -> BrowserPage:
-            context = browser.new_context(viewport=viewport)
-            stack.callback(context.close)
-            return BrowserPage(context.new_page(), address)
-
-        yield open_it
-
-
-def console(federation: Federation, *options: str) -> tuple[Role, dict[str, str]]:
-    """Start a console; return it with its links."""
-    role = federation.role("console", "--port", str(free_port()), *options)
-    steer = role.line("steer at").text.rpartition(" ")[2]
-    return role, {"steer": steer, "look": role.line("look, without").text.rpartition(" ")[2]}
 
 
 def status(address: str, **headers: str) -> int:

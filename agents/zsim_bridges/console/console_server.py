@@ -26,6 +26,7 @@ from zsim.contract import flight_messages
 from zsim.contract.messages import Info
 from zsim.schema import message
 from zsim.transport.session import Session
+from zsim_bridges.console.camera_socket import CameraSockets
 from zsim_bridges.console.http_proxy import (
     BACKEND_HOST,
     MESSAGE_MAX,
@@ -36,10 +37,12 @@ from zsim_bridges.console.http_proxy import (
     ListenAddress,
     ViserBackend,
 )
+from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.scene_nodes import CameraFollow
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.observer_process import ObserverProcess
 
+NAME_MAX = 64  # characters of what is no text of a user's
 VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
 EXACT_MAX = 2**53  # a page's numbers are exact up to it; a larger one fits no message
 
@@ -148,7 +151,19 @@ class ControlUpdate(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unk
     updates: Updates
 
 
-_DECODER = msgspec.msgpack.Decoder(Camera | ControlUpdate)
+class DroneClick(Struct, tag_field="type", tag="SceneNodeClickMessage"):
+    """A page sends this when somebody clicks a drone in the scene; nothing but the ray is looked at."""
+
+    name: Annotated[str, Meta(pattern=r"^/drones(/[0-9]{1,4})?\Z")]
+    instance_index: int | None
+    ray_origin: message.Vector3
+    ray_direction: message.Vector3
+    screen_pos: tuple[message.Number, message.Number]
+    modifier: Annotated[str, Meta(max_length=NAME_MAX)] | None = None
+    owner: Annotated[str, Meta(max_length=NAME_MAX)] = ""
+
+
+_DECODER = msgspec.msgpack.Decoder(Camera | ControlUpdate | DroneClick)
 """All other messages are refused, such as to show the page on the Internet, or to upload files."""
 
 
@@ -202,7 +217,7 @@ def is_permitted(data: bytes, role: str, controls: PageControls) -> bool:
         message = _DECODER.decode(data)
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return False
-    if isinstance(message, Camera):
+    if not isinstance(message, ControlUpdate):
         return True
     permitted = role == OPERATOR or controls.is_local(message.uuid)
     return permitted and controls.accepts(message.uuid, message.updates.value)
@@ -231,10 +246,12 @@ class Console:
         self._run_page: RunPage | None = None
         self._viser = PrivateViser()
         self._camera_follow = CameraFollow(self._viser.server)
+        self._frustums = CameraFrustums(self._viser.server)
         _show_text(self._viser.server.gui, "waiting for a world")
         controls = PageControls(self._viser.server.gui, self._camera_follow.switches)
         permits = partial(is_permitted, controls=controls)
-        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, permits)
+        sockets = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
+        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, permits, sockets.respond)
         self._proxy = HttpProxy(address, token, backend)
 
     @contextmanager
@@ -262,7 +279,9 @@ class Console:
         say: Callable[[str], None],
     ) -> None:
         """Show a run until it is over or `stopped` returns true."""
-        self._run_page = page = RunPage(self._viser.server, link, info, observer, self._camera_follow, self._rate_hz)
+        self._run_page = page = RunPage(
+            self._viser.server, link, info, observer, self._camera_follow, self._frustums, self._rate_hz
+        )
         try:
             page.run(stopped)
         finally:

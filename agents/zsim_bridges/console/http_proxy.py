@@ -1,12 +1,10 @@
 """The console's HTTP server: serves the page to who may open it, and relays what viser and the page send each other."""
 
 import asyncio
-import gzip
-import importlib.resources
 import secrets
 import socket
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 from urllib.parse import quote, urlsplit
@@ -15,6 +13,7 @@ import msgspec
 from aiohttp import ClientError, ClientSession, WSMsgType, web
 
 from zsim.errors import RunError
+from zsim_bridges.console import page_html
 from zsim_bridges.web_server import (
     Site,
     check_token,
@@ -41,11 +40,6 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-VIEW_STYLE = (
-    "<style>body::before{content:'view only';position:fixed;top:8px;left:50%;transform:translateX(-50%);z-index:9999;"
-    "background:#1971c2;color:#fff;font:600 13px sans-serif;padding:3px 14px;border-radius:10px}"
-    ".mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"
-)
 
 
 class PageRequest(NamedTuple):
@@ -141,12 +135,14 @@ class ViserBackend(NamedTuple):
         secret: that it asks for in SECRET_HEADER.
         state: returns what the console shows, as plain data.
         permits: returns whether a message of a page may reach viser, by the page's role.
+        serve_cameras: answers a page's request for a socket of pictures, until it closes.
     """
 
     port: int
     secret: str
     state: Callable[[], dict[str, Any]]
     permits: Callable[[bytes, str], bool]
+    serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class HttpProxy:
@@ -167,8 +163,8 @@ class HttpProxy:
         self._view_token = secrets.token_urlsafe(12)
         self._tokens = PageTokens(address.host, address.port, token, self._view_token)
         self._backend = backend
-        self._pages = _pages()
-        self._open_pages: Counter[str] = Counter()  # by role
+        self._pages = {OPERATOR: page_html.operator_page(), VIEWER: page_html.viewer_page()}
+        self._open_pages: Counter[str] = Counter()  # sockets, by what they are for
         self._loop = asyncio.new_event_loop()
         self._client: ClientSession | None = None
 
@@ -191,6 +187,7 @@ class HttpProxy:
         app = web.Application()
         app.add_routes([web.get(path, self._page) for path in ("/", VIEW_PATH)])
         app.add_routes([web.get(path, self._state) for path in ("/state", f"{VIEW_PATH}/state")])
+        app.add_routes([web.get(path, self._cameras) for path in ("/cameras", f"{VIEW_PATH}/cameras")])
         try:
             site = await start_site(app, *self._address, shutdown_s=CLOSE_S)
         except OSError as error:
@@ -215,7 +212,7 @@ class HttpProxy:
         if page_request.token:
             return self._set_cookie(page_request)
         if request.headers.get("Upgrade", "").lower() == "websocket":
-            return await self._stream(request, role)
+            return await self._stream(role, lambda: self._relay(request, role))
         headers = {**HEADERS, "Content-Encoding": "gzip"}
         return web.Response(body=self._pages[role], content_type="text/html", charset="utf-8", headers=headers)
 
@@ -234,14 +231,22 @@ class HttpProxy:
         body = msgspec.json.encode(self._backend.state())
         return web.Response(body=body, content_type="application/json", headers=HEADERS)
 
-    async def _stream(self, request: web.Request, role: str) -> web.StreamResponse:
-        if self._open_pages[role] >= PAGES_MAX:
+    async def _cameras(self, request: web.Request) -> web.StreamResponse:
+        """Serve a page's socket for pictures of cameras: viewers see them, too."""
+        role = self._tokens.role_of(_page_request(request))
+        if role is None:
+            return _missing_token()
+        return await self._stream(f"cameras of {role}", lambda: self._backend.serve_cameras(request))
+
+    async def _stream(self, what: str, serve: Callable[[], Awaitable[web.StreamResponse]]) -> web.StreamResponse:
+        """Serve a socket, unless too many of its kind are open."""
+        if self._open_pages[what] >= PAGES_MAX:
             return web.Response(status=503, text=f"{PAGES_MAX} pages are open already; close one\n", headers=HEADERS)
-        self._open_pages[role] += 1
+        self._open_pages[what] += 1
         try:
-            return await self._relay(request, role)
+            return await serve()
         finally:
-            self._open_pages[role] -= 1
+            self._open_pages[what] -= 1
 
     async def _relay(self, request: web.Request, role: str) -> web.WebSocketResponse:
         """Relay messages both ways, until one side closes."""
@@ -290,12 +295,3 @@ def _page_request(request: web.Request) -> PageRequest:
 def _missing_token() -> web.Response:
     text = "This page needs the token of the console: open the link that it printed when it started.\n"
     return web.Response(status=401, text=text, headers=HEADERS)
-
-
-def _pages() -> dict[str, bytes]:
-    """Return viser's page, compressed, by role; that of viewers shows its controls disabled."""
-    html = importlib.resources.files("viser").joinpath("client/build/index.html").read_text()
-    styles = {OPERATOR: "", VIEWER: VIEW_STYLE}
-    return {
-        role: gzip.compress(html.replace("</head>", f"{style}</head>", 1).encode()) for role, style in styles.items()
-    }

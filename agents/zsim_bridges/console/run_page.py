@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from msgspec import UNSET
 
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
@@ -16,18 +17,22 @@ from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
+from zsim.sensors.camera import Hats
 from zsim.sensors.sensor_catalogue import own_rates
 from zsim.transport.session import Session
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
+from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows, console_state
+from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.console_page import ConsolePage
 from zsim_bridges.console.page.picture import (
     CanvasTrails,
     DronePoses,
     FormationShape,
+    drone_on_ray,
     drone_poses,
     ellipsoids,
     formation_shape,
@@ -71,8 +76,13 @@ class RunPage:
         link: an open session.
         info: of the run.
         observer: of the console in it.
-        camera_follow: moves the cameras that follow the formation.
+        camera_follow: moves the page's cameras that follow the formation.
+        frustums: of the drones' cameras, on the pages where they are chosen.
         rate_hz: pictures a second; None: fewer where there are many drones, or time flies.
+
+    Attributes:
+        views: the newest of everything.
+        cameras: of the drones.
     """
 
     def __init__(
@@ -82,6 +92,7 @@ class RunPage:
         info: Info,
         observer: ObserverProcess,
         camera_follow: CameraFollow,
+        frustums: CameraFrustums,
         rate_hz: float | None,
     ) -> None:
         self._server = server
@@ -98,6 +109,10 @@ class RunPage:
         self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
         self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command)
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
+        hats = self._scenario.environment.hats
+        self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
+        self._frustums = frustums
+        self._has_clicks = False
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
         self._trails = CanvasTrails(len(names))
@@ -118,10 +133,13 @@ class RunPage:
     def close(self) -> None:
         """Send nothing any more."""
         self._client.close()
+        self.cameras.close()
+        self._frustums.clear()
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Draw pictures until the run is over or `stopped` returns true."""
         self.views.open()
+        self.cameras.open()
         pause = threading.Event()
         next_s = time.monotonic()
         with self._time_monitor.polling():
@@ -133,7 +151,8 @@ class RunPage:
 
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
-        return console_state(self._info.run_id, self.views, self._time_monitor, dict(self._shapes))
+        state = console_state(self._info.run_id, self.views, self._time_monitor, dict(self._shapes))
+        return {**state, "cameras": self.cameras.state()}
 
     # A picture
 
@@ -145,6 +164,7 @@ class RunPage:
     def _update(self, wall_s: float) -> None:
         self._observer.tick()
         new = self.views.update()
+        self._update_cameras()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
@@ -153,9 +173,23 @@ class RunPage:
         with self._server.atomic():
             if new:
                 self._draw()
+            self._frustums.draw(self._drones, self.cameras.shown)
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
                 self._update_tables(wall_s)
+
+    def _update_cameras(self) -> None:
+        """Keep up with the cameras; once there are any, a click on a drone shows what it sees."""
+        self.cameras.update()
+        if not self._has_clicks and self.cameras.cameras():
+            self._has_clicks = True
+            self._scene.on_click(self._on_click)
+
+    def _on_click(self, event: Any) -> None:
+        drones = self._drones
+        drone = None if drones is None else drone_on_ray(drones, event.ray_origin, event.ray_direction)
+        if drone is not None:
+            self._frustums.click(event.client_id, drone)
 
     def _draw_end(self) -> None:
         """Draw the end of the run, for pages that are opened between two runs."""

@@ -86,6 +86,18 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
     return DronePoses(view.t_ns, tuple(names), p_W, q_WB, rotor, wind)
 
 
+def drone_on_ray(drones: DronePoses, origin_W: Sequence[float], direction_W: Sequence[float]) -> str | None:
+    """Return the drone that is nearest to a ray, None where none is in the view, or the ray has no direction."""
+    direction = np.array(direction_W)
+    length = float(np.linalg.norm(direction))
+    if not drones.present.any() or not 0.0 < length < math.inf:
+        return None
+    away = drones.p_W - np.array(origin_W)
+    ahead = np.maximum(away @ (direction / length), 0.0)
+    distances_m = np.linalg.norm(away - ahead[:, None] * (direction / length), axis=1)
+    return drones.names[int(np.nanargmin(distances_m))]
+
+
 def rotor_angles(angles: Array, speeds: Array, turns: Array, dt_s: float) -> Array:
     """Return the angles [rad] to which rotors are drawn dt_s later: slowed down to be visible.
 

@@ -2,7 +2,7 @@
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -186,6 +186,11 @@ class SceneNodes:
         for label, p_W in zip(self._names, drones.p_W, strict=False):
             label.position = p_W + LABEL_B
 
+    def on_click(self, act: Callable[[Any], None]) -> None:
+        """Call back with viser's event of each click on a drone."""
+        for _, node in self._airframes.nodes:
+            node.on_click(act)
+
     def wind(self, drones: DronePoses) -> None:
         """Set the arrow of the wind, above the drones."""
         speed = float(np.linalg.norm(drones.wind_W))
@@ -267,15 +272,15 @@ class _AirframeNodes:
     """The drones without their rotors: a node for all that look alike."""
 
     def __init__(self, scene: viser.SceneApi, looks: Sequence[airframe.DroneShape]) -> None:
-        self._nodes: list[tuple[NDArray[np.int64], Any]] = []
+        self.nodes: list[tuple[NDArray[np.int64], Any]] = []
         for k, look in enumerate(dict.fromkeys(looks)):
             owners = np.array([i for i, other in enumerate(looks) if other == look])
             p, q, _ = _padded(len(owners), np.zeros((0, 3)), np.zeros((0, 4)))
             name = f"/drones/{k}" if k else "/drones"
-            self._nodes.append((owners, scene.add_batched_glb(name, airframe.coloured(look), q, p, lod="off")))
+            self.nodes.append((owners, scene.add_batched_glb(name, airframe.coloured(look), q, p, lod="off")))
 
     def move(self, drones: DronePoses) -> None:
-        for owners, node in self._nodes:
+        for owners, node in self.nodes:
             node.batched_positions, node.batched_wxyzs = drones.p_W[owners], drones.q_WB[owners]
 
 

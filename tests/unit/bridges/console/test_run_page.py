@@ -19,6 +19,7 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_server import PrivateViser
 from zsim_bridges.console.page import scene_nodes as stages
+from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.picture import drone_poses
 from zsim_bridges.console.page.scene_nodes import CameraFollow
 from zsim_bridges.console.run_page import RunPage, picture_rate_hz
@@ -52,15 +53,19 @@ class Link:
     host = "lab"
 
     def __init__(self) -> None:
-        self.say: Callable[[Any], None] = lambda _: None
+        self.subscribers: list[tuple[str, Callable[[Any], None]]] = []
         self.tell: Callable[[Any], None] = lambda _: None
         self.asked: list[tuple[str, str, dict[str, Any]]] = []
 
     def declare_subscriber(self, expression: str, callback: Callable[[Any], None]) -> None:
         if expression == keys.EVENT:
             self.tell = callback
-        else:
-            self.say = callback
+        self.subscribers.append((expression, callback))
+
+    def say(self, sample: Any) -> None:
+        for expression, callback in self.subscribers[:]:
+            if keys.matches(expression, sample.key):
+                callback(sample)
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
         return []
@@ -83,7 +88,9 @@ class Seen:
         scenario = STEP.read_text()
         info: Any = SimpleNamespace(run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario)
         server.get_clients = lambda: {0: None} if watched else {}
-        self.show = RunPage(server, self.link, info, self.observer, CameraFollow(server), 1000.0)
+        self.show = RunPage(
+            server, self.link, info, self.observer, CameraFollow(server), CameraFrustums(server), 1000.0
+        )
 
     def draw(self, *samples: tuple[str, Any]) -> dict[str, Any]:
         """Say something, draw a picture, and return what is shown."""
@@ -162,7 +169,7 @@ def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(vise
     found = drone_poses(drones(NAMES[2])[1], NAMES)
     stage.drones(found, 0.05)
     stage.wind(found)
-    ((_, frames),) = stage._airframes._nodes
+    ((_, frames),) = stage._airframes.nodes
     p_W = np.asarray(frames.batched_positions)
     assert p_W[2].tolist() == [0.0, 3.0, 2.0]
     assert p_W[0].tolist() == p_W[1].tolist() == list(stages.HIDDEN)
@@ -178,7 +185,7 @@ def test_each_drone_is_drawn_with_the_rotors_that_it_has(viser: PrivateViser):
     six = DroneInfo(NAMES[2], "mine", tuple(RotorInfo(f"r{k}", x, y, 1, 0.05) for k, (x, y) in enumerate(ends)))
     stage = stages.SceneNodes(viser.server, (*DRONES[:2], six), ARMS_M, 3, 1)
     stage.drones(drone_poses(drones(*NAMES)[1], NAMES), 0.05)
-    assert [owners.tolist() for owners, _ in stage._airframes._nodes] == [[0, 1], [2]]
+    assert [owners.tolist() for owners, _ in stage._airframes.nodes] == [[0, 1], [2]]
     places = np.asarray(stage._rotors._node.batched_positions)
     assert len(places) == 4 + 4 + 6
     np.testing.assert_allclose(places[8:, :2] - (0.0, 3.0), ends, atol=1e-6)

@@ -1,0 +1,80 @@
+"""Pages of the console in a real browser, and all that they request."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from federation import Federation, Role, free_port
+from wire import PATIENCE_S
+
+VIEWPORT = {"width": 860, "height": 420}  # pictures without a graphics card take long
+POLL_MS = 100  # between two looks at what a page shows
+PATIENCE_MS = 1000 * PATIENCE_S
+
+
+class BrowserPage:
+    """A page of the console, and all that it requested for."""
+
+    def __init__(self, page: Any, address: str) -> None:
+        self.page = page
+        self.requested: list[str] = []
+        self.faults: list[str] = []
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("request", lambda request: self.requested.append(request.url))
+        page.on("websocket", lambda socket: self.requested.append(socket.url))
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+        page.goto(address)
+
+    def press(self, name: str) -> None:
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def select_tab(self, tab: str) -> None:
+        self.page.get_by_role("tab", name=tab, exact=True).click()
+
+    def wait_for_text(self, text: str) -> None:
+        """Wait until the page shows a text."""
+        self.page.get_by_text(text).first.wait_for()
+
+    def state(self) -> dict[str, Any]:
+        """Return what the page shows, as the page itself reads it."""
+        return self.page.evaluate("fetch(location.pathname.replace(/\\/$/, '') + '/state').then(r => r.json())")
+
+    def until(self, condition: str) -> dict[str, Any]:
+        """Wait until a condition (JavaScript) holds of the state `s`; return the state."""
+        there = f"(() => {{ try {{ return {condition}; }} catch {{ return false; }} }})()"  # it may show no run yet
+        look = f"async () => {{ const s = await (await fetch('/state')).json(); return [{there}, s]; }}"
+        until_s = time.monotonic() + PATIENCE_S
+        while True:
+            holds, state = self.page.evaluate(look)
+            if holds:
+                return state
+            assert time.monotonic() < until_s, f"{condition} never came true: {state}"
+            self.page.wait_for_timeout(POLL_MS)
+
+    def outside(self) -> set[str]:
+        """Return the hosts that it requested for something, beside this machine."""
+        urls = (urlsplit(url) for url in self.requested)
+        return {str(url.hostname) for url in urls if url.scheme not in ("data", "blob")} - {"127.0.0.1"}
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
+    """Open an address in a browser of its own, with cookies of its own."""
+    with ExitStack() as stack:
+
+        def open_it(address: str, viewport: dict[str, int] = VIEWPORT) -> BrowserPage:
+            context = browser.new_context(viewport=viewport)
+            stack.callback(context.close)
+            return BrowserPage(context.new_page(), address)
+
+        yield open_it
+
+
+def console(federation: Federation, *options: str) -> tuple[Role, dict[str, str]]:
+    """Start a console; return it with its links."""
+    role = federation.role("console", "--port", str(free_port()), *options)
+    steer = role.line("steer at").text.rpartition(" ")[2]
+    return role, {"steer": steer, "look": role.line("look, without").text.rpartition(" ")[2]}

@@ -1,0 +1,345 @@
+"""What drones see, in the console: in a real browser, with pictures that a test publishes."""
+
+import io
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import synthetic_camera
+from chromium import needs_browser
+from console_browser import PATIENCE_MS, POLL_MS, BrowserPage, console
+from federation import Federation
+from synthetic_camera import NUMBER_BITS, SETTINGS
+from wire import PATIENCE_S, Client
+
+from zsim.contract import keys, messages
+from zsim_bridges.console.page.scene_nodes import OFFSET_M
+
+LAPTOP, DESK = {"width": 1280, "height": 720}, {"width": 1600, "height": 1000}
+SCREENS = (LAPTOP, DESK)
+TRIAD = """
+name: triad
+seed: 3
+duration_s: 3600
+sensors: {preset: paper}
+drones:
+  - {name: drone1, position_m: [0.0, 1.5, 0.0], yaw_deg: 90}
+  - {name: drone2, position_m: [-1.5, -1.5, 0.0], yaw_deg: 90}
+  - {name: drone3, position_m: [1.5, -1.5, 0.0], yaw_deg: 90}
+clusters:
+  - {name: main, drones: [drone1, drone2, drone3]}
+"""
+THREE = ("drone1", "drone2", "drone3")
+SIX = [f"{drone}/{name}" for drone in THREE for name in SETTINGS]
+TWELVE = "\n".join(
+    [
+        "name: twelve\nduration_s: 3600\ndrones:",
+        *(f"  - {{name: drone{k + 1}, position_m: [{3 * (k % 4)}, {3 * (k // 4)}, 0.0]}}" for k in range(12)),
+    ]
+)
+EMERGENCY = "EMERGENCY – all rotors stop"
+SKY = np.array(synthetic_camera.SKY[::-1])  # red, green, blue; nothing else in the scene has it
+SKY_PIXELS = 60  # of a frustum's picture, at least
+FIELD_DEG = 75.0  # of viser's camera, from top to bottom
+NEAR = 12  # levels of 255: JPEG, and the scene's light
+
+READ_NUMBERS = """() => Object.fromEntries([...document.querySelectorAll('#zsim-cameras .picture')].map(button => {
+  const image = button.querySelector('img');
+  if (!image.complete || !image.naturalWidth) return [button.dataset.camera, null];
+  const canvas = new OffscreenCanvas(image.naturalWidth, image.naturalHeight), context = canvas.getContext('2d');
+  context.drawImage(image, 0, 0);
+  const side = Math.floor(image.naturalHeight / 16), y = image.naturalHeight - side / 2;
+  const bits = [...Array(BITS).keys()].map(bit => context.getImageData((bit + .5) * side, y, 1, 1).data[0] > 128);
+  return [button.dataset.camera, bits.reduce((sum, set, bit) => sum + (set ? 1 << bit : 0), 0)];
+}))""".replace("BITS", str(NUMBER_BITS))
+"""Returns the number that is drawn into each picture, as it stands on the page."""
+
+COVERED = """() => [...document.querySelectorAll('#zsim-cameras .picture, #zsim-cameras text, button')].filter(each => {
+  const box = each.getBoundingClientRect();
+  const ours = each.closest('#zsim-cameras') || each.textContent.includes('EMERGENCY');
+  if (!ours) return false;
+  const inside = box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight;
+  const at = [[.5, .5], [.05, .1], [.95, .9]].map(([x, y]) =>
+    document.elementFromPoint(box.left + x * box.width, box.top + y * box.height));
+  const on = each.closest('button');
+  return !inside || box.width < 10 || at.some(found => !found || !on.contains(found));
+}).map(each => `${each.className} ${each.dataset?.camera ?? each.textContent}`)"""
+"""Returns what of the pictures, their texts and the emergency button is cut off, or has something else over it."""
+
+CUT_TEXTS = """() => [...document.querySelectorAll('#zsim-cameras text')].filter(text => {
+  const box = text.getBoundingClientRect(), picture = text.closest('.picture').getBoundingClientRect();
+  return box.left < picture.left || box.right > picture.right || box.top < picture.top || box.bottom > picture.bottom;
+}).map(text => text.textContent)"""
+
+PLACES = """() => ['canvas[data-engine]', '#zsim-cameras'].map(
+  each => document.querySelector(each).getBoundingClientRect().toJSON())"""
+
+MARK = """() => {
+  const picture = document.querySelector('[data-camera="drone1/front"]'), circle = picture.querySelector('circle');
+  if (!circle) return null;
+  const image = picture.querySelector('img').getBoundingClientRect(), box = circle.getBoundingClientRect();
+  return [(box.x + box.width / 2 - image.x) / image.width, (box.y + box.height / 2 - image.y) / image.height,
+          picture.querySelector('text').textContent];
+}"""
+
+
+def until(page: BrowserPage, look: Callable[[], Any], holds: Callable[[Any], bool]) -> Any:
+    """Look again and again until something holds of what is seen; return that."""
+    until_s = time.monotonic() + PATIENCE_S
+    while True:
+        seen = look()
+        if holds(seen):
+            return seen
+        assert time.monotonic() < until_s, f"it never held: {seen}"
+        page.page.wait_for_timeout(POLL_MS)
+
+
+def numbers(page: BrowserPage) -> dict[str, int | None]:
+    return page.page.evaluate(READ_NUMBERS)
+
+
+def wait_until_all_change(page: BrowserPage, cameras: list[str]) -> None:
+    """Wait until every picture has become another."""
+    first = until(page, lambda: numbers(page), lambda seen: list(seen) == cameras and None not in seen.values())
+    changed: set[str] = set()
+
+    def look() -> set[str]:
+        changed.update(camera for camera, number in numbers(page).items() if number != first.get(camera))
+        return changed
+
+    until(page, look, lambda seen: seen >= set(cameras))
+
+
+def is_stacked(places: list[dict[str, float]], screen: dict[str, int]) -> bool:
+    """Return whether the scene has most of the screen's height, and the pictures stand below it, as wide as it."""
+    scene, pictures = places
+    return (
+        abs(scene["y"] + scene["height"] - pictures["y"]) < 1.5
+        and abs(pictures["y"] + pictures["height"] - screen["height"]) < 1.5
+        and scene["height"] > 0.55 * screen["height"]
+        and abs(scene["x"] - pictures["x"]) < 1.5
+        and abs(scene["width"] - pictures["width"]) < 1.5
+    )
+
+
+def sky_pixels(page: BrowserPage) -> int:
+    """Return how many pixels of the scene have the colour of the pictures' sky."""
+    image = pytest.importorskip("PIL.Image")
+    box: Any = page.page.locator("canvas[data-engine]").bounding_box()
+    screen = np.array(image.open(io.BytesIO(page.page.screenshot(clip=box, timeout=PATIENCE_MS))).convert("RGB"), int)
+    return int(np.count_nonzero(np.abs(screen - SKY).max(axis=2) < NEAR))
+
+
+def place_of(page: BrowserPage, p_W: tuple[float, float, float]) -> tuple[float, float]:
+    """Return where a point of the scene is on the page, as long as nobody has moved the page's camera."""
+    centre = np.array([0.0, -0.5, 0.0])  # of TRIAD's drones
+    ahead = -OFFSET_M / np.linalg.norm(OFFSET_M)
+    right = np.cross(ahead, (0.0, 0.0, 1.0)) / np.linalg.norm(np.cross(ahead, (0.0, 0.0, 1.0)))
+    x, y, z = np.array([right, np.cross(ahead, right), ahead]) @ (np.array(p_W) - centre - OFFSET_M)
+    box: Any = page.page.locator("canvas[data-engine]").bounding_box()
+    focal_px = box["height"] / 2 / math.tan(math.radians(FIELD_DEG) / 2)
+    return (
+        box["x"] + box["width"] / 2 + focal_px * float(x / z),
+        box["y"] + box["height"] / 2 + focal_px * float(y / z),
+    )
+
+
+def click(page: BrowserPage, camera: str) -> None:
+    page.page.locator(f'[data-camera="{camera}"]').click()
+
+
+def watched(page: BrowserPage) -> list[str]:
+    return [each["camera"] for each in page.state().get("cameras", ()) if each["watched"]]
+
+
+@contextmanager
+def repeated(client: Client, key: str, payload: bytes) -> Iterator[None]:
+    """Publish the same bytes again and again meanwhile."""
+    over = threading.Event()
+
+    def publish() -> None:
+        while not over.wait(0.01):
+            client.put_raw(key, payload)
+
+    thread = threading.Thread(target=publish, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@needs_browser
+@pytest.mark.slow
+def test_what_each_drone_sees_stands_below_the_scene(
+    federation: Federation, opened: Callable[..., BrowserPage]
+) -> None:
+    pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+    federation.run(TRIAD, "--rate", "1")
+    _, links = console(federation)
+    client = federation.client()
+    page = opened(links["steer"], LAPTOP)
+    page.until("s.drones.length == 3 && s.clock == 'running'")
+    strip = page.page.locator("#zsim-cameras")
+
+    # a run without cameras shows nothing of them
+    assert page.state()["cameras"] == []
+    assert not strip.is_visible()
+
+    with synthetic_camera.published(client, THREE, seen_by=["drone1"]):
+        # all six come, and change
+        strip.wait_for(state="visible")
+        wait_until_all_change(page, SIX)
+
+        # what was seen is drawn where it is, with its range
+        u, v, text = until(page, lambda: page.page.evaluate(MARK), lambda seen: seen is not None)
+        expected = synthetic_camera.projected("front", synthetic_camera.HAT_B)
+        assert (u * 640 - 0.5, v * 360 - 0.5) == pytest.approx(expected, abs=1.5)
+        assert text == "6.1 ± 0.2 m"
+        assert page.page.locator("#zsim-cameras circle").count() == 1
+
+        # nothing is cut off, nothing covered; the scene ends where the pictures begin
+        page.page.locator(".mantine-Notification-closeButton").click()  # "software WebGL", of this browser alone
+        for screen in SCREENS:
+            page.page.set_viewport_size(screen)
+            until(page, lambda: page.page.evaluate(COVERED), lambda seen: seen == [])
+            until(page, lambda: page.page.evaluate(CUT_TEXTS), lambda seen: seen == [])
+            until(page, lambda: page.page.evaluate(PLACES), lambda seen, screen=screen: is_stacked(seen, screen))
+        page.page.set_viewport_size(LAPTOP)
+
+        # a click shows the frustum with the picture on it, another hides it
+        assert sky_pixels(page) < SKY_PIXELS
+        click(page, "drone2/front")
+        until(page, lambda: sky_pixels(page), lambda seen: seen > SKY_PIXELS)
+        assert page.page.locator("[aria-pressed=true]").get_attribute("data-camera") == "drone2/front"
+        click(page, "drone2/front")
+        until(page, lambda: sky_pixels(page), lambda seen: seen < SKY_PIXELS)
+
+        # and so does a click on the drone in the scene
+        page.page.mouse.click(*place_of(page, (-1.5, -1.5, 0.0)))
+        until(page, lambda: sky_pixels(page), lambda seen: seen > SKY_PIXELS)
+        assert page.page.locator("[aria-pressed=true]").get_attribute("data-camera") == "drone2/front"
+        click(page, "drone2/front")
+
+        # what is no picture is counted, and nothing else is touched
+        with repeated(client, "drone/drone3/camera/front", b"no message at all"):
+            page.until("s.cameras.find(c => c.camera == 'drone3/front').refused > 0")
+        info = synthetic_camera.image_message("bottom", 1, b"no JPEG", 0)
+        with repeated(client, "drone/drone3/camera/bottom", messages.encode(info)):
+            page.until("s.cameras.find(c => c.camera == 'drone3/bottom').reason.includes('must be a whole JPEG')")
+        wait_until_all_change(page, SIX)
+
+        # who looks at none is sent none
+        page.press("Cameras ▾")
+        until(page, lambda: watched(page), lambda seen: seen == [])
+        until(page, lambda: page.page.evaluate(PLACES)[0]["height"], lambda seen: abs(seen - LAPTOP["height"]) < 1.5)
+        page.press("Cameras ▴")
+        wait_until_all_change(page, SIX)
+
+    assert page.outside() == set()
+    assert page.faults == []
+
+
+@needs_browser
+@pytest.mark.slow
+def test_who_may_only_look_sees_what_the_drones_see(federation: Federation, opened: Callable[..., BrowserPage]) -> None:
+    pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+    federation.run(TRIAD, "--rate", "1")
+    _, links = console(federation, "--token", "a-good-token")
+    client = federation.client()
+    viewer = opened(links["look"], LAPTOP)
+    with synthetic_camera.published(client, THREE):
+        wait_until_all_change(viewer, SIX)
+        viewer.page.locator(".mantine-Notification-closeButton").click()
+        click(viewer, "drone2/front")
+        until(viewer, lambda: sky_pixels(viewer), lambda seen: seen > SKY_PIXELS)
+    assert viewer.outside() == set()
+    assert viewer.faults == []
+
+
+@needs_browser
+@pytest.mark.slow
+def test_of_many_drones_one_chooses_whose_pictures_are_shown(
+    federation: Federation, opened: Callable[..., BrowserPage]
+) -> None:
+    pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+    federation.world(TWELVE, "--duration", "600")
+    role, links = console(federation)
+    role.line("console.1: in run")
+    client = federation.client()
+    page = opened(links["steer"], LAPTOP)
+    with synthetic_camera.published(client, [f"drone{k + 1}" for k in range(12)], rate_hz=5.0):
+        wait_until_all_change(page, SIX)  # there is room for three
+        assert sorted(watched(page)) == sorted(SIX)
+        page.page.get_by_label("drone of window 2").select_option("drone11")
+        now = [f"{drone}/{name}" for drone in ("drone1", "drone11", "drone3") for name in SETTINGS]
+        wait_until_all_change(page, now)
+        until(page, lambda: sorted(watched(page)), lambda seen: seen == sorted(now))
+        for screen in SCREENS:
+            page.page.set_viewport_size(screen)
+            until(page, lambda: page.page.evaluate(COVERED), lambda seen: seen == [])
+    page.page.close()
+    assert page.faults == []
+
+
+def test_pictures_are_for_those_who_may_see_the_page(federation: Federation) -> None:
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    _, links = console(federation, "--token", "a-good-token")
+    port = links["steer"].split(":")[2].split("/")[0]
+    for path in ("/cameras", "/view/cameras", "/cameras?token=wrong"):
+        with pytest.raises(InvalidStatus) as refusal:
+            connect(f"ws://127.0.0.1:{port}{path}")
+        assert refusal.value.response.status_code == 401
+    look = links["look"].partition("token=")[2]
+    with pytest.raises(InvalidStatus):
+        connect(f"ws://127.0.0.1:{port}/cameras?token={look}")
+    connect(f"ws://127.0.0.1:{port}/view/cameras?token={look}").close()
+    connect(f"ws://127.0.0.1:{port}/cameras?token=a-good-token").close()
+
+
+def test_a_page_that_says_what_is_no_request_is_hung_up_on(federation: Federation) -> None:
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    _, links = console(federation)
+    for said in (b"\x00", "no JSON", "[]", '{"want": 3}', '{"want": ["' + "x" * 100 + '"]}', '{"steer": true}'):
+        with connect(f"{links['steer'].replace('http', 'ws')}cameras") as socket:
+            socket.send(said)
+            with pytest.raises(ConnectionClosed):
+                socket.recv(timeout=PATIENCE_S)
+
+
+def test_a_page_is_sent_pictures_as_they_came(federation: Federation) -> None:
+    pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+    from websockets.sync.client import connect
+
+    federation.world(TRIAD, "--duration", "600")
+    role, links = console(federation)
+    role.line("console.1: in run")
+    client = federation.client()
+    made = synthetic_camera.picture("front", 3)
+    message = messages.encode(synthetic_camera.image_message("front", 3, made, 7_000_000_000))
+    info = messages.encode(synthetic_camera.info_of("front"))
+    with (
+        repeated(client, keys.camera_info("drone2", "front"), info),
+        repeated(client, keys.camera("drone2", "front"), message),
+        connect(f"{links['steer'].replace('http', 'ws')}cameras") as socket,
+    ):
+        while True:
+            socket.send('{"want": ["drone2/front"]}')
+            received: Any = socket.recv(timeout=PATIENCE_S)
+            size = int.from_bytes(received[:4], "big")
+            header = msgspec.json.decode(received[4 : 4 + size])
+            if header["pictures"]:
+                break
+    assert header["pictures"] == [{"camera": "drone2/front", "size": len(made), "t_s": 7.0, "marks": []}]
+    assert received[4 + size :] == made
