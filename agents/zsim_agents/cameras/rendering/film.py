@@ -15,6 +15,7 @@ MARGIN = 64  # px, by which the noise is larger than the picture
 NOISE_MAX = 48.0  # grey levels, standard deviation: the most that the gain makes of the noise
 SWEEP_MAX_PX = 24.0  # px; a longer way is blurred as this
 SAMPLES_PER_PX = 8
+FULL_COLOUR = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444  # hats are a few pixels wide
 MIX = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio, whose multiples spread (Knuth, TAOCP 3, 6.4)
 
 
@@ -80,5 +81,5 @@ def lens_blur(picture: Picture, sigma_px: float) -> None:
 
 def jpeg(picture: Picture, quality: int) -> bytes:
     """Return a picture as JPEG."""
-    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality, *FULL_COLOUR])
     return data.tobytes()
