@@ -32,13 +32,38 @@ CORE = 0.5  # of the most magenta, from which on a pixel is a hat's
 CORE_MIN_PX = 12  # of pixels that a hat covers wholly; with fewer its own colour is taken from how blurred it is
 BLUR_PX2 = 1.1  # px^2, variance of what lens, pixel, JPEG and a mean of nine make of a point; calibrated
 ROUND_MIN = 0.3  # of the smaller variance over the larger; less is no ball
+PIECE_GAP = 0.3  # of a ball's size, between two pieces of it; a guard before it is 0.2 wide
+LOST = 1.026  # of a covered area over what is measured of it: noise and shade are cut at the full share; calibrated
 ROUND = 0.75  # of one that nothing hides and no motion blurs; rounder ones are as good
-DIRECTION_PX = 0.11, 0.007  # standard deviation of a centre [px] of a small one, and per diameter; calibrated
+DIRECTION_PX = 0.18, 0.004  # standard deviation of a centre [px] of a small one, and per diameter; calibrated
 DIAMETER_PX = 0.2, 0.01, 1.2  # of a diameter [px]: at least, per diameter, and per 1/diameter; calibrated
+WHOLE = 0.93  # of the area of what is magenta over that of its convex hull, of one that nothing crosses
 OVAL = 0.25, 0.6  # of a diameter, per lack of roundness: of centre and diameter; calibrated
 
 _x = np.linspace(1e-3, 60, 6000)
 _PEAK = (1 - np.exp(-_x)) / _x  # of a blurred disc's middle over its own colour, times 1 / x, by x = r^2 / 2 s^2
+
+
+class Box(NamedTuple):
+    """A part of a picture: its upper left corner and its size [px]."""
+
+    u: int
+    v: int
+    wide: int
+    high: int
+
+    def touches(self, other: "Box") -> bool:
+        """Tell whether the other one is a piece of the same ball: nearer than a part of this one's size."""
+        gap = 1 + PIECE_GAP * max(self.wide, self.high)
+        across = max(self.u, other.u) - min(self.u + self.wide, other.u + other.wide)
+        down = max(self.v, other.v) - min(self.v + self.high, other.v + other.high)
+        return max(across, down) <= gap
+
+    def with_other(self, other: "Box") -> "Box":
+        """Return the part that holds both."""
+        u, v = min(self.u, other.u), min(self.v, other.v)
+        right, low = max(self.u + self.wide, other.u + other.wide), max(self.v + self.high, other.v + other.high)
+        return Box(u, v, right - u, low - v)
 
 
 class Blob(NamedTuple):
@@ -79,20 +104,19 @@ class HatDetector:
         blobs = [self._blob(picture, box) for box in self._boxes(picture)]
         return tuple(self._sighting(blob) for blob in blobs if blob is not None)
 
-    def _boxes(self, picture: Picture) -> list[tuple[int, int, int, int]]:
-        """Return where something is magenta: u, v, width, height [px], at half of the resolution."""
+    def _boxes(self, picture: Picture) -> list[Box]:
+        """Return where something is magenta, at half of the resolution."""
         blue, green, red = cv2.split(cv2.resize(picture, self._half, interpolation=cv2.INTER_AREA))
         level = cv2.subtract(red, green)
-        magenta = cv2.addWeighted(level, 1.0, red, -SHARE_MIN, 0.5 - LEVEL_MIN)
+        strong = cv2.addWeighted(level, 1.0, red, -SHARE_MIN, 0.5 - LEVEL_MIN)
         bluish = cv2.subtract(blue, green)
-        mask = cv2.bitwise_and(magenta, cv2.addWeighted(bluish, 1.0, level, -BLUE_SHARE, 0.0))
-        _, mask = cv2.threshold(cv2.min(magenta, cv2.addWeighted(bluish, 1.0, level, -BLUE_SHARE, 0.0)), 0, 255, 0)
+        mask = cv2.min(strong, cv2.addWeighted(bluish, 1.0, level, -BLUE_SHARE, 0.0))
         outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-        boxes = [cv2.boundingRect(outline) for outline in outlines]
-        large = [box for box in boxes if box[2] * box[3] >= AREA_MIN_PX]
-        return sorted(((u, v, w, h) for u, v, w, h in large), key=lambda box: (-box[2] * box[3], box))[:BLOBS_MAX]
+        boxes = [Box(*cv2.boundingRect(outline)) for outline in outlines]
+        large = [box for box in boxes if box.wide * box.high >= AREA_MIN_PX]
+        return joined(sorted(large, key=lambda box: (-box.wide * box.high, box))[:BLOBS_MAX])
 
-    def _blob(self, picture: Picture, box: tuple[int, int, int, int]) -> Blob | None:
+    def _blob(self, picture: Picture, box: Box) -> Blob | None:
         """Return the hat in a box of the picture at half of its resolution; None if it is none, or not all of it."""
         u, v, wide, high = (2 * side for side in box)
         room = ROOM_PX + max(wide, high) // 6
@@ -117,6 +141,19 @@ class HatDetector:
         return Seen((x, y, z), range_m, blob.sigma_centre_px * per_px, sigma_range_m)
 
 
+def joined(boxes: list[Box]) -> list[Box]:
+    """Return boxes, the largest first, with the pieces of one ball, which a rotor guard crosses, as one."""
+    whole: list[Box] = []
+    for box in boxes:
+        for i, other in enumerate(whole):
+            if other.touches(box):
+                whole[i] = other.with_other(box)
+                break
+        else:
+            whole.append(box)
+    return whole
+
+
 def magenta(picture: Picture) -> Field:
     """Return how magenta each pixel is, (h, w): R - G, less where too little blue is in it."""
     blue, green, red = (channel.astype(np.float32) for channel in cv2.split(picture))
@@ -132,17 +169,18 @@ def _measured(level: Field, noise: float, rays: Field, solid: Field, focal_px: f
     peak = float(mean[v, u])
     if peak < max(LEVEL_MIN / 2, 2 * noise / 3):  # the mean of nine has a third of the noise
         return None
-    core = _component(level > CORE * peak, u, v)
-    near = cv2.dilate(core, SQUARE_5)
+    core = (level > CORE * peak).astype(np.uint8)
+    near = cv2.dilate(core, SQUARE_5).astype(np.uint8)
     covered = _shares(level, core, near, peak)
     weights = (covered * solid).astype(np.float64)
-    solid_angle = float(weights.sum())
+    solid_angle = LOST * float(weights.sum())
     area = float(covered.sum())
     if not 0 < solid_angle < math.pi or area < 1:
         return None
-    lack = max(0.0, ROUND - _roundness(covered, area))
-    if lack > ROUND - ROUND_MIN:
+    roundness = _roundness(covered, area)
+    if roundness < ROUND_MIN:
         return None
+    lack = max(0.0, ROUND - roundness) + max(0.0, WHOLE - _wholeness(core))
     diameter = 2 * math.sqrt(area / math.pi)
     count = float(near.sum())
     of_noise = noise * math.sqrt(count) / (peak * area)  # of the covered area, relative
@@ -158,13 +196,6 @@ def _measured(level: Field, noise: float, rays: Field, solid: Field, focal_px: f
 
 
 SQUARE_3, SQUARE_5 = (np.ones((side, side), np.uint8) for side in (3, 5))
-
-
-def _component(mask: NDArray[np.bool_], u: int, v: int) -> Picture:
-    """Return the part of a mask that is connected with a pixel."""
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8))
-    wanted = labels[v, u]
-    return (labels == wanted).astype(np.uint8) if wanted else mask.astype(np.uint8)
 
 
 def _shares(level: Field, core: Picture, near: Picture, peak: float) -> Field:
@@ -190,3 +221,10 @@ def _roundness(covered: Field, area: float) -> float:
     uu, vv, uv = moments["mu20"] / area, moments["mu02"] / area, moments["mu11"] / area
     middle, half = (uu + vv) / 2, math.hypot((uu - vv) / 2, uv)
     return (middle - half) / max(middle + half, 1e-9)
+
+
+def _wholeness(core: Picture) -> float:
+    """Return the area of a blob over that of its convex hull."""
+    hull = cv2.convexHull(cv2.findNonZero(core))
+    area = cv2.contourArea(hull) + cv2.arcLength(hull, True) / 2 + 1  # through the middles of the outermost pixels
+    return float(core.sum()) / area
