@@ -71,7 +71,7 @@ def run(
     console: Annotated[bool, typer.Option("--console", help="Show it in the browser, and steer it there.")] = False,
     cameras: Annotated[
         bool,
-        typer.Option("--cameras", help="Draw what the drones' cameras see; with front and bottom where none has any."),
+        typer.Option("--cameras", help="Draw what cameras see; front and bottom where no drone has any."),
     ] = False,
     detect: Annotated[bool, typer.Option("--detect", help="Find hats in the cameras' pictures.")] = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,

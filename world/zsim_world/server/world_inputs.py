@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract import camera_messages, flight_messages, keys, messages, run_messages
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
@@ -225,8 +225,8 @@ class MessageIntake:
             elif key.startswith(PROCESSES) or (key.startswith("drone/") and "/cmd/" in key):
                 self.outputs.passed(sample)
                 self._hand_over(key, sample.payload, wall_ns)
-            elif kind is None:
-                self.outputs.passed(sample)  # a key outside of the contract
+            elif kind is None or _passes(key, sample.payload):
+                self.outputs.passed(sample)  # a key outside of the contract, or of cameras and detectors
                 self.history.add_foreign(key, sample.payload)
             else:
                 raise DecodeError(f"{key}: only the world publishes here")
@@ -312,3 +312,17 @@ def _head(key: str, payload: bytes) -> _Head:
         return _decode_head(payload)
     except messages.REFUSALS as error:
         raise DecodeError(f"{key}: {error}; must be a map with t_ns and seq") from error
+
+
+def _passes(key: str, payload: bytes) -> bool:
+    """Tell whether a message is one of a camera or detector, of which the world takes nothing and no done counts.
+
+    Raises:
+        DecodeError: it is to be one, and is none.
+    """
+    kind = messages.type_of(key)
+    of_detector = kind is camera_messages.Sightings and not keys.is_sensor(key)
+    if kind is camera_messages.CameraInfo or of_detector:
+        messages.decode(key, payload)
+        return True
+    return False

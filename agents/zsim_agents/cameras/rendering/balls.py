@@ -78,7 +78,9 @@ def _cover(view: View, rays: Field, ball: Ball, sun_K: Array) -> tuple[Field, Fi
     away2 = float(centre @ centre)
     products = rays @ np.stack([centre, sun_K], axis=-1).astype(np.float32)
     along, to_sun = products[..., 0], products[..., 1]
-    inside: Field = np.float32(ball.radius_m**2 - away2) + along * along  # of half the chord, squared
+    inside: Field = (along * along + (ball.radius_m**2 - away2)).astype(
+        np.float32, copy=False
+    )  # of half the chord, squared
     per_pixel = np.float32(view.lens.fx / math.sqrt(away2)) / (
         rays[..., 2] * np.sqrt(rays[..., 2])
     )  # px/m, mean of both
