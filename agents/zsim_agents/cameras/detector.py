@@ -34,11 +34,11 @@ BLUR_PX2 = 1.1  # px^2, variance of what lens, pixel, JPEG and a mean of nine ma
 ROUND_MIN = 0.3  # of the smaller variance over the larger; less is no ball
 PIECE_GAP = 0.3  # of a ball's size, between two pieces of it; a guard before it is 0.2 wide
 LOST = 1.026  # of a covered area over what is measured of it: noise and shade are cut at the full share; calibrated
-ROUND = 0.75  # of one that nothing hides and no motion blurs; rounder ones are as good
-DIRECTION_PX = 0.18, 0.004  # standard deviation of a centre [px] of a small one, and per diameter; calibrated
-DIAMETER_PX = 0.2, 0.01, 1.2  # of a diameter [px]: at least, per diameter, and per 1/diameter; calibrated
+ROUND = 0.92  # of one that nothing hides and no motion blurs; rounder ones are as good
+DIRECTION_PX = 0.075, 0.002  # standard deviation of a centre [px] of a small one, and per diameter; calibrated
+DIAMETER_PX = 0.12, 0.006, 0.8  # of a diameter [px]: at least, per diameter, and per 1/diameter; calibrated
 WHOLE = 0.93  # of the area of what is magenta over that of its convex hull, of one that nothing crosses
-OVAL = 0.25, 0.6  # of a diameter, per lack of roundness: of centre and diameter; calibrated
+OVAL = 0.25, 0.5  # of a diameter, per lack of roundness: of centre and diameter; calibrated
 
 _x = np.linspace(1e-3, 60, 6000)
 _PEAK = (1 - np.exp(-_x)) / _x  # of a blurred disc's middle over its own colour, times 1 / x, by x = r^2 / 2 s^2
@@ -177,7 +177,8 @@ def _measured(level: Field, noise: float, rays: Field, solid: Field, focal_px: f
     area = float(covered.sum())
     if not 0 < solid_angle < math.pi or area < 1:
         return None
-    roundness = _roundness(covered, area)
+    oblique = float(rays[v, u, 2]) ** 2  # variance of a round one in the plane of the picture: cos^2 off the axis
+    roundness = min(1.0, _roundness(covered, area) / oblique)
     if roundness < ROUND_MIN:
         return None
     lack = max(0.0, ROUND - roundness) + max(0.0, WHOLE - _wholeness(core))
