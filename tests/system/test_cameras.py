@@ -116,9 +116,10 @@ def expected(truths: dict[str, list[dict[str, Any]]], t_s: float) -> tuple[np.nd
 def pose(truths: list[dict[str, Any]], t_s: float) -> tuple[np.ndarray, np.ndarray]:
     k = min(int(t_s / GATE_S + 1e-9), len(truths) - 2)
     a, b = truths[k], truths[k + 1]
-    ends = [
-        (m["t_ns"] / 1e9, *(tuple(m[f]) for f in ("position_m", "velocity_m_s", "orientation_wxyz"))) for m in (a, b)
-    ]
+    (t0, p0, v0, q0), (t1, p1, v1, q1) = (
+        (m["t_ns"] / 1e9, m["position_m"], m["velocity_m_s"], m["orientation_wxyz"]) for m in (a, b)
+    )
+    ends = (t0, tuple(p0), tuple(v0), tuple(q0)), (t1, tuple(p1), tuple(v1), tuple(q1))
     p, _, q = pose_between(t_s, *ends[0], *ends[1])
     return np.array(p), np.array(q)
 

@@ -203,6 +203,8 @@ def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, f
 
 def _can_match(entry: str, kind: str) -> bool:
     """Return whether a pattern can match a name that begins so."""
+    if kind.removesuffix(".") in OF_CAMERAS:
+        return entry.startswith(kind)  # nobody has them unless they are named
     literal = entry[: min((entry.find(sign) for sign in "*?[" if sign in entry), default=len(entry))]
     wild = literal != entry
     return literal.startswith(kind) or (wild and kind.startswith(literal))
