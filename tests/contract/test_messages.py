@@ -38,6 +38,13 @@ CONTRACT = {
     "drone/*/sensor/flow": SENSOR + "velocity_m_s quality",
     "drone/*/sensor/status": "state battery_percent collision commander count",
     "drone/*/truth": "position_m velocity_m_s orientation_wxyz angular_velocity_rad_s accel_m_s2 rotor_rad_s",
+    **{f"drone/*/camera/{name}": "t_sample_ns source width height format data" for name in ("front", "bottom")},
+    **{
+        f"drone/*/camera/{name}/info": "source width height K D position_m orientation_wxyz rate_hz exposure_s gate_ns"
+        for name in ("front", "bottom")
+    },
+    "drone/*/sensor/sightings": "t_sample_ns source camera seen",
+    "drone/*/sightings": "t_sample_ns source camera seen",
     "drone/*/cmd/velocity": "source velocity_m_s yaw_rate_rad_s frame",
     "drone/*/cmd/ardrone": "source forward left up yaw_left hover",
     "drone/*/cmd/attitude": "source orientation_wxyz thrust_n yaw_rate_rad_s",
@@ -116,7 +123,8 @@ def values(info: Any) -> st.SearchStrategy[Any]:
     if isinstance(info, types.LiteralType):
         return st.sampled_from(info.values)
     if isinstance(info, types.IntType):
-        return st.integers(info.ge if info.ge is not None else -(2**63), 2**63 - 1)
+        least, most = (-(2**63) if info.ge is None else info.ge), (2**63 - 1 if info.le is None else info.le)
+        return st.integers(least, most)
     return {
         types.FloatType: finite,
         types.StrType: text,
