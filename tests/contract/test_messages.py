@@ -37,9 +37,15 @@ CONTRACT = {
     "drone/*/sensor/baro": SENSOR + "pressure_pa altitude_m",
     "drone/*/sensor/sonar": SENSOR + "range_m valid",
     "drone/*/sensor/flow": SENSOR + "velocity_m_s quality",
-    "drone/*/sensor/sightings": SENSOR + "source camera seen",
     "drone/*/sensor/status": "state battery_percent collision commander count",
     "drone/*/truth": "position_m velocity_m_s orientation_wxyz angular_velocity_rad_s accel_m_s2 rotor_rad_s",
+    **{f"drone/*/camera/{name}": "t_sample_ns source width height format data" for name in ("front", "bottom")},
+    **{
+        f"drone/*/camera/{name}/info": "source width height K D position_m orientation_wxyz rate_hz exposure_s gate_ns"
+        for name in ("front", "bottom")
+    },
+    "drone/*/sensor/sightings": "t_sample_ns source camera seen",
+    "drone/*/sightings": "t_sample_ns source camera seen",
     "drone/*/cmd/velocity": "source velocity_m_s yaw_rate_rad_s frame",
     "drone/*/cmd/ardrone": "source forward left up yaw_left hover",
     "drone/*/cmd/attitude": "source orientation_wxyz thrust_n yaw_rate_rad_s",

@@ -76,7 +76,7 @@ KINDS = (
 )
 ELSEWHERE = ("apt-get install ", "git clone ", "cd ", "python3 -m venv ", ".venv/bin/pip install ", "ssh ", "scp ",
              "rsync ", "sudo ", "zenohd ", "ufw ", "chrt ", "kill ", "docker ", "kubectl ", "sh ",
-             ".venv/bin/pip wheel ", "make bench", ".venv/bin/python -m benchmarks ")  # fmt: skip
+             ".venv/bin/pip wheel ", "make bench", ".venv/bin/python -m benchmarks")  # fmt: skip
 
 
 class Block(NamedTuple):
@@ -252,8 +252,8 @@ def lines(block: Block) -> list[str]:
 
 EXAMPLE_S = 25.0  # simulated seconds of an example: past the take-off at 20 s
 PORTS = ("7447", "7448", "8000", "7470", "11311")  # as printed: world, router, HTTP, lines, ROS master
-LEADERS = r"zsim (run|world|replay|router|gateway|ros1|ros2)\b"
-ANSWERED = ("estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2",
+LEADERS = r"zsim (run|world|replay|router|gateway|ros1|ros2|camera|detect)\b"
+ANSWERED = ("estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2", "camera", "detect",
             "fault (?:add|clear|list)")  # fmt: skip
 FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take the endpoint as an argument
 OURS = ("fly_square.py",)

@@ -52,6 +52,7 @@ ALL = Rights(*[EVERYTHING] * len(Rights._fields))
 def of(process: str, scenario: Scenario) -> Rights:
     """Return the rights of a process by its name, role.thing; there is one world and one recorder, without a thing.
 
+    A camera, or a detector, that is not named after a drone is for all that have cameras.
     A role that is not zsim's and is about a drone may do what the estimator of that drone may, one that is about a
     cluster what its controller may: it takes their place. One about neither takes part, and reads what all read.
     """
@@ -62,9 +63,17 @@ def of(process: str, scenario: Scenario) -> Rights:
         return union([_own(process), _READER])
     if role == OPERATOR:
         return union([_own(process), _READER, _OPERATOR])
+    if role in _OF_CAMERAS:
+        return union([_own(process), *(_OF_CAMERAS[role](drone) for drone in watched(thing, scenario))])
     about = AGENTS[role].about if role in AGENTS else None
     granted = [rights(thing, scenario, role) for kind, rights in _ABOUT.items() if about in (None, kind)]
     return union([_own(process), *granted])
+
+
+def watched(thing: str, scenario: Scenario) -> list[str]:
+    """Return the drones of a camera or detector: the one it is named after, or all that have cameras."""
+    names = [drone.name for drone in scenario.drones]
+    return [thing] if thing in names else [drone.name for drone in scenario.drones if drone.sensors.cameras()]
 
 
 def union(many: Iterable[Rights]) -> Rights:
@@ -134,4 +143,17 @@ def _about_cluster(thing: str, scenario: Scenario, role: str) -> Rights:
     )
 
 
+def _camera(drone: str) -> Rights:
+    """Return what a camera of a drone may do: it sees all drones."""
+    info = (keys.camera_info(drone, "*"),)
+    return Rights(reads=(keys.truth("*"),), writes=(keys.camera(drone, "*"), *info), answers=info)
+
+
+def _detector(drone: str) -> Rights:
+    """Return what a detector for a drone's cameras may do."""
+    info = keys.camera_info(drone, "*")
+    return Rights(reads=(keys.camera(drone, "*"), info), writes=(keys.detections(drone),), asks=(info,))
+
+
+_OF_CAMERAS = {"camera": _camera, "detector": _detector}
 _ABOUT = {"drone": _about_drone, "cluster": _about_cluster}

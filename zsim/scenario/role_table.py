@@ -32,6 +32,8 @@ ROLES = {
     "recorder": Role("record", "restart"),
     "estimator": Role("agents", "restart", "drone", "zsim_agents.estimation.estimator:Estimator", joint=True),
     "controller": Role("agents", "restart", "cluster", "zsim_agents.formation.controller:Controller"),
+    "camera": Role("cameras", "restart"),
+    "detector": Role("cameras", "restart"),
     "router": Role("", "restart"),
 }
 AGENTS = {name: role for name, role in ROLES.items() if role.about}

@@ -28,6 +28,7 @@ from zsim_deploy.arguments import (
 )
 from zsim_deploy.cli import (
     bridge_commands,
+    camera_commands,
     federation_commands,
     hosts_commands,
     inventory_commands,
@@ -68,6 +69,11 @@ def run(
         bool, typer.Option("--hosted", help="Estimators and controllers in one process: faster, the same bits.")
     ] = False,
     console: Annotated[bool, typer.Option("--console", help="Show it in the browser, and steer it there.")] = False,
+    cameras: Annotated[
+        bool,
+        typer.Option("--cameras", help="Draw what cameras see; front and bottom where no drone has any."),
+    ] = False,
+    detect: Annotated[bool, typer.Option("--detect", help="Find hats in the cameras' pictures.")] = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
     continue_: Annotated[
         bool, typer.Option("--continue", help="SCENARIO is the folder of a run that was interrupted: it goes on.")
@@ -84,23 +90,28 @@ def run(
         options_of,
         run_in_process,
         run_processes,
+        with_cameras,
     )
     from zsim_deploy.launch.run_folder import make_directory
     from zsim_deploy.launch.supervisor import Outcome
 
     if in_process:
-        _refuse_with_others(flight, listen, hosted, console)
+        _refuse_with_others(flight, listen, hosted, console, cameras, detect)
     if console:
         require("console", bridge_commands.CONSOLE_NEEDS)
+    if cameras or detect:
+        require("run", camera_commands.CAMERA_NEEDS)
     if continue_:
         _refuse_to_change(flight, out, in_process, listen, insecure, hosted)
         options, in_process = options_of(flight.path)
         options.console = console
+        options.cameras, options.detect = cameras, detect
     else:
         check_endpoint(listen, insecure)
         first = [name for name in order.split(",") if name]
         pace = flight.mode_and_rate()
-        options = RunOptions(flight.scenario(), Path(), *pace, listen, insecure, hosted, first, console)
+        scenario = with_cameras(flight.scenario()) if cameras else flight.scenario()
+        options = RunOptions(scenario, Path(), *pace, listen, insecure, hosted, first, console, cameras, detect)
     if not in_process:
         check_open_files(options)
     if not continue_:
@@ -113,7 +124,9 @@ def run(
     record_commands.conclude(outcome, options.out, report)
 
 
-def _refuse_with_others(flight: FlightOptions, listen: str | None, hosted: bool, console: bool) -> None:
+def _refuse_with_others(
+    flight: FlightOptions, listen: str | None, hosted: bool, console: bool, cameras: bool, detect: bool
+) -> None:
     """Refuse options that have no meaning for a run in one process."""
     options = {
         "--realtime": flight.realtime,
@@ -121,6 +134,8 @@ def _refuse_with_others(flight: FlightOptions, listen: str | None, hosted: bool,
         "--listen": listen is not None,
         "--hosted": hosted,
         "--console": console,
+        "--cameras": cameras,
+        "--detect": detect,
     }
     useless = " and ".join(name for name, is_given in options.items() if is_given)
     if useless:
@@ -168,6 +183,7 @@ def _version(wanted: bool) -> None:
 for family in (
     record_commands,
     role_commands,
+    camera_commands,
     hosts_commands,
     federation_commands,
     bridge_commands,

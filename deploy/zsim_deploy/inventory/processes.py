@@ -18,11 +18,14 @@ Rendered = dict[str, str]
 """Path inside the output folder to text."""
 PROJECT = "zsim"
 NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # there is one of each; in the order of placement
-KINDS = {f"{name}.": role.extra for name, role in AGENTS.items()}  # by the beginning of the process name
+OF_CAMERAS = ("camera", "detector")  # roles that nobody waits for, unless the scenario names them
+COMMANDS = {RECORDER: "record", "detector": "detect"}  # of roles whose command has another name
+KINDS = {f"{name}.": ROLES[name].extra for name in (*AGENTS, *OF_CAMERAS)}  # by the beginning of the process name
 MODULES = {  # what proves that an extra is whole, the installation without extras first
     "": "zsim.transport.session",
     "agents": "zsim_agents.estimation.estimator",
     "record": "zsim_agents.recorder",
+    "cameras": "zsim_agents.cameras.detector",
     "world": "zsim_world.server.world_process",
 }
 
@@ -75,7 +78,7 @@ class ProcessFiles(NamedTuple):
 
 
 def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> list[PlannedProcess]:
-    """Return the processes that zsim can start: the world, the recorder, estimators, controllers, then routers.
+    """Return the processes that zsim can start: the world, the recorder, agents, cameras, then routers.
 
     Args:
         placed: the inventory.
@@ -137,7 +140,7 @@ def used_hosts(planned: Sequence[PlannedProcess]) -> list[str]:
 
 def _known(name: str, scenario: Scenario) -> bool:
     """Return whether zsim has a command for a process."""
-    return name in (WORLD, RECORDER, *agent_names(scenario))
+    return name in (WORLD, RECORDER, *agent_names(scenario)) or name.partition(".")[0] in OF_CAMERAS
 
 
 def _role(
@@ -150,8 +153,11 @@ def _role(
         listen = inv.listening(placed, host, inventory.port)
         words = (WORLD, "--listen", listen, "--expect", RECORDER, *pace)
     else:
-        start = "record" if name == RECORDER else role
+        start = COMMANDS.get(role, role)
         words = (start, "--connect", inv.endpoint(placed, places, host), "--federation", scenario.federation)
+    if role in OF_CAMERAS:
+        words = (*words, "--name", name)
+        thing = thing if thing in {drone.name for drone in scenario.drones} else ""  # none: of all drones with cameras
     secure = not inventory.security.insecure
     return PlannedProcess(name, host, words, thing or None, port, secure, on_death(scenario.processes.on_death, name))
 
@@ -197,6 +203,8 @@ def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, f
 
 def _can_match(entry: str, kind: str) -> bool:
     """Return whether a pattern can match a name that begins so."""
+    if kind.removesuffix(".") in OF_CAMERAS:
+        return entry.startswith(kind)  # nobody has them unless they are named
     literal = entry[: min((entry.find(sign) for sign in "*?[" if sign in entry), default=len(entry))]
     wild = literal != entry
     return literal.startswith(kind) or (wild and kind.startswith(literal))

@@ -7,16 +7,20 @@ import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from zsim.errors import RecordError, RunError, SessionError
 from zsim.record import repair
 from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
+from zsim.sensors.camera import BottomCamera, FrontCamera
 from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
 from zsim_deploy.arguments import CONSOLE_PORT, load_scenario, pace_options
+from zsim_deploy.inventory.processes import COMMANDS
 from zsim_deploy.launch import interrupted_run
 from zsim_deploy.launch.child_process import ChildProcess
 from zsim_deploy.launch.end_signals import EndSignals
@@ -49,6 +53,8 @@ class RunOptions:
     hosted: bool = False
     order: list[str] = field(default_factory=list)
     console: bool = False
+    cameras: bool = False
+    detect: bool = False
     run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
     continued: bool = False
 
@@ -81,8 +87,19 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
     if options.console:
         show = ["console", "--name", CONSOLE, "--port", str(_page_port()), *reach]
         children.append(ChildProcess(CONSOLE, show, logs, launcher, supervisor.handle_line))
+    for role in (["camera"] * options.cameras) + (["detector"] * options.detect):
+        children.append(ChildProcess(f"{role}.main", [COMMANDS.get(role, role), *reach], logs, launcher))
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
+
+
+def with_cameras(scenario: Scenario) -> Scenario:
+    """Return a scenario in which some drone has a camera: where none has, all get the AR.Drone's two."""
+    if any(drone.sensors.cameras() for drone in scenario.drones):
+        return scenario
+    two = {"front_camera": FrontCamera(), "bottom_camera": BottomCamera()}
+    drones = [replace(drone, sensors=replace(drone.sensors, **two)) for drone in scenario.drones]
+    return replace(scenario, drones=drones)
 
 
 def check_endpoint(endpoint: str | None, insecure: bool) -> None:
@@ -107,7 +124,7 @@ def check_open_files(options: RunOptions) -> None:
         SessionError: with how many files there must be.
     """
     agents = 1 if options.hosted else len(options.scenario.expected())
-    count = 2 + agents + options.console
+    count = 2 + agents + options.console + options.cameras + options.detect
     require_files(launcher_files(count), f"{count} processes")
 
 

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from trimesh.creation import annulus, box, capsule, cone, cylinder, icosphere
+from trimesh.creation import annulus, box, capsule, cylinder, icosphere
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from zsim.contract.messages import DroneInfo
+from zsim.sensors.camera import Hats
 from zsim.vehicles.vehicle import cross_layout
 
 ARM_M = 0.1785  # from the centre to a rotor's axis
@@ -85,11 +86,10 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
         "cross": [*map(_arm, hubs), *map(_motor, hubs), *map(_foot, hubs), _lens()],
         "hull": [*(_ring(hub, RING * radius) for hub in hubs), _body()],
         "nose": [_nose()],
-        "hat": _hat(),
     }
     for solid in (solid for of_one in solids.values() for solid in of_one):
         solid.apply_scale(shape.size)
-    return solids
+    return {**solids, "hat": [_hat()]}
 
 
 @cache
@@ -164,6 +164,7 @@ def _lens() -> trimesh.Trimesh:
     return _moved(lens, (0.162, 0, 0.012))
 
 
-def _hat() -> list[trimesh.Trimesh]:
-    """The coloured marker by which the paper's drones see each other."""
-    return [_moved(cone(0.062, 0.11, sections=24), (-0.03, 0, 0.062)), _moved(cylinder(0.02, 0.03), (-0.03, 0, 0.05))]
+def _hat() -> trimesh.Trimesh:
+    """The ball by which drones see each other, as large as the cameras have it."""
+    hats = Hats()
+    return _moved(icosphere(subdivisions=3, radius=hats.diameter_m / 2), hats.position_m)

@@ -135,7 +135,12 @@ def test_the_jacobian_is_that_of_what_is_expected():
         w, x, y, z = q
         i, j, k_ = half
         return normalised(
-            (w - i * x - j * y - k_ * z, x + i * w + j * z - k_ * y, y - i * z + j * w + k_ * x, z + i * y - j * x + k_ * w)
+            (
+                w - i * x - j * y - k_ * z,
+                x + i * w + j * z - k_ * y,
+                y - i * z + j * w + k_ * x,
+                z + i * y - j * x + k_ * w,
+            )
         )
 
     def moved(m: Moment, state: int) -> Moment:

@@ -1,0 +1,1 @@
+"""Cameras: pictures rendered from the truth, and hats found in pictures."""

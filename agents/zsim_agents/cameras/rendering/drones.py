@@ -1,0 +1,200 @@
+"""Drones in the picture: hull, arms, motors, nose, lens, and rotors as their blades sweep during the exposure. Pure.
+
+They look like the console's (zsim_bridges.console.page.airframe); lengths are the AR.Drone's, scaled by the arms.
+"""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim_agents.cameras.rendering.balls import exposures, steps_of
+from zsim_agents.cameras.rendering.faces import SHIFT, bgr, fixed
+from zsim_agents.cameras.rendering.scene import ARM_M, DroneLook
+from zsim_agents.cameras.rendering.view import View
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Fixed = NDArray[np.int32]
+
+CROSS, HULL, HULL_LOW, NOSE, ROTOR = (  # B, G, R; as the console has them, the hull's lower side in its own shade
+    np.array([48.0, 44.0, 42.0]),
+    np.array([96.0, 88.0, 84.0]),
+    np.array([62.0, 57.0, 54.0]),
+    np.array([24.0, 108.0, 240.0]),
+    np.array([30.0, 28.0, 28.0]),
+)
+RING = 1.31  # rotor radii, outer radius of a hull ring
+RING_POINTS = 16
+RING_Z_M, RING_HIGH_M = 0.022, 0.042  # m, middle and height of a ring
+ARM_Z_M, ARM_WIDE_M = 0.004, 0.014  # m
+ROTOR_Z_M, ROTOR_CHORD_M = 0.030, 0.016  # m
+LENS_M = 0.013  # m, radius
+MOTOR_WIDE_M = 0.034  # m
+REACH_M = 0.36  # m, farthest point of the AR.Drone from its middle, rotors and hull
+SECTOR = 5  # points of a blade's sweep along the circle
+BLADES = 2
+STEP_PX = 2.0  # px between two instants that are drawn; hulls need not be as exact as hats
+DETAIL_PX = 14.0  # across; of smaller ones neither rings nor rotors are told apart
+THICKNESS_MAX_PX = 80
+
+
+class DroneModel(NamedTuple):
+    """The points of a drone (P, 3) [m; B], part by part, and how much larger it is than the AR.Drone."""
+
+    points: Array
+    parts: dict[str, slice]
+    rotors: int
+    size: float
+
+
+def _ellipsoid(middle: float, length: float, width: float, height: float, points: int) -> Array:
+    """Return points of an ellipsoid whose outline in any direction is about its own."""
+    k = np.arange(points) + 0.5
+    z = 1 - 2 * k / points  # Fibonacci's lattice
+    r, angle = np.sqrt(1 - z * z), math.pi * (3 - math.sqrt(5)) * k
+    unit = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
+    return unit * (length / 2, width / 2, height / 2) + (middle, 0.0, 0.012)
+
+
+_BODY_POINTS, _NOSE_POINTS = 40, 20
+_BLADES = math.pi * np.arange(BLADES)  # rad, of each over the first
+_SWEEP = np.linspace(-0.5, 0.5, SECTOR)
+
+
+def drone_model(look: DroneLook) -> DroneModel:
+    """Return the points of a drone."""
+    size = float(np.hypot(*look.hubs_B.T).max()) / ARM_M
+    angles = 2 * math.pi * np.arange(RING_POINTS) / RING_POINTS
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(RING_POINTS)], axis=-1)
+    hubs = np.column_stack([look.hubs_B, np.zeros(len(look.hubs_B))])
+    rings = hubs[:, None] + RING * look.radius_m * circle + np.array([0.0, 0.0, RING_Z_M * size])
+    arms = np.stack([np.zeros_like(hubs), hubs], axis=1) + np.array([0.0, 0.0, ARM_Z_M * size])
+    motors = np.stack([hubs, hubs + np.array([0.0, 0.0, ROTOR_Z_M * size])], axis=1)
+    points = {
+        "body": size * _ellipsoid(0.0, 0.28, 0.09, 0.065, _BODY_POINTS),
+        "nose": size * _ellipsoid(0.115, 0.105, 0.084, 0.065, _NOSE_POINTS),
+        "lens": size * np.array([[0.165, 0.0, 0.012]]),
+        "arms": arms.reshape(-1, 3),
+        "motors": motors.reshape(-1, 3),
+        "rings": rings.reshape(-1, 3),
+    }
+    ends = np.cumsum([len(part) for part in points.values()]).tolist()
+    parts = {name: slice(end - len(points[name]), end) for name, end in zip(points, ends, strict=True)}
+    return DroneModel(np.concatenate([*points.values()]), parts, len(hubs), size)
+
+
+def blade_points(look: DroneLook, size: float, t_s: float, exposure_s: float, speeds: Array) -> Array:
+    """Return what blades sweep over the exposure, (..., R BLADES (SECTOR + 1), 3) [m; B]: hub, then along the circle.
+
+    Rotors have no angle in the truth: it is taken as their speed times the time, which nobody can tell from another.
+
+    Args:
+        speeds: of the rotors, (..., R) [rad/s].
+    """
+    middle = np.remainder(-look.turns * speeds * t_s, 2 * math.pi)
+    sweep = np.clip(np.abs(speeds) * exposure_s, 2 * ROTOR_CHORD_M * size / look.radius_m, math.pi)
+    angles = (middle[..., None] + _BLADES)[..., None] + sweep[..., None, None] * _SWEEP
+    points = np.zeros((*angles.shape[:-1], SECTOR + 1, 3))
+    points[..., 1:, 0] = look.radius_m * np.cos(angles)
+    points[..., 1:, 1] = look.radius_m * np.sin(angles)
+    points[..., :2] += look.hubs_B[:, None, None]
+    points[..., 2] = ROTOR_Z_M * size
+    return points.reshape(*speeds.shape[:-1], -1, 3)
+
+
+class DroneImage(NamedTuple):
+    """A drone as it is to be drawn.
+
+    Attributes:
+        model: its points.
+        pixels: of the model's points, then of its blades' sweeps, in sixteenths, (P + R BLADES (SECTOR + 1), 2).
+        middle_px: pixel of its centre, (2,).
+        depth_m: of its centre in K.
+        way_px: its way over the picture during the exposure, (2,).
+        from_above: whether the camera is above its rotors.
+        shows_lens: whether the camera is before it.
+        brightness: of the light.
+        opacity: of what a blade sweeps over.
+    """
+
+    model: DroneModel
+    pixels: Fixed
+    middle_px: Array
+    depth_m: float
+    way_px: Array
+    from_above: bool
+    shows_lens: bool
+    brightness: float
+    opacity: float
+
+
+def draw_drone(picture: Picture, view: View, drone: DroneImage) -> None:
+    """Draw a drone but its hat; one that moves over the picture at several instants of the exposure, and their mean."""
+    scale = view.lens.fx * drone.model.size / drone.depth_m  # px/m of the AR.Drone
+    box = view.box(drone.middle_px, 2.0 + 1.5 * REACH_M * scale + float(np.hypot(*drone.way_px)) / 2)
+    if box is None:
+        return
+    u0, v0, u1, v1 = box
+    part = picture[v0:v1, u0:u1]
+    corner = np.array([u0, v0])
+    steps = steps_of(math.hypot(*drone.way_px), STEP_PX)
+    if steps == 1:
+        _draw(part, drone, scale, drone.pixels - fixed(corner))
+        return
+    total = np.zeros(part.shape, np.float32)
+    for share in exposures(steps):
+        one = part.copy()
+        _draw(one, drone, scale, drone.pixels + fixed(drone.way_px * share - corner))
+        cv2.accumulate(one, total)
+    part[:] = np.rint(total / steps).astype(np.uint8)
+
+
+def _draw(picture: Picture, drone: DroneImage, scale: float, pixels: Fixed) -> None:
+    model, parts = drone.model, drone.model.parts
+    hull, cross = (drone.brightness * colour for colour in (HULL if drone.from_above else HULL_LOW, CROSS))
+    detailed = 2 * REACH_M * scale > DETAIL_PX
+    turning = pixels[len(model.points) :].reshape(-1, SECTOR + 1, 2)
+    if detailed and not drone.from_above:
+        _rotors(picture, drone, turning)
+    _lines(picture, pixels[parts["rings"]].reshape(model.rotors, RING_POINTS, 2), True, hull, 0.6 * RING_HIGH_M * scale)
+    _lines(picture, pixels[parts["arms"]].reshape(-1, 2, 2), False, cross, ARM_WIDE_M * scale)
+    if detailed:
+        _lines(picture, pixels[parts["motors"]].reshape(-1, 2, 2), False, cross, MOTOR_WIDE_M * scale)
+    _hull(picture, pixels[parts["body"]], hull)
+    if drone.shows_lens:
+        _hull(picture, pixels[parts["nose"]], drone.brightness * NOSE)
+        if detailed:
+            _dot(picture, pixels[parts["lens"]][0], LENS_M * scale, cross)
+    if detailed and drone.from_above:
+        _rotors(picture, drone, turning)
+
+
+def _lines(picture: Picture, lines: Fixed, closed: bool, colour: Array, wide_px: float) -> None:
+    thickness = min(max(1, round(wide_px)), THICKNESS_MAX_PX)
+    cv2.polylines(picture, [*lines], closed, bgr(colour), thickness, cv2.LINE_AA, SHIFT)
+
+
+def _hull(picture: Picture, pixels: Fixed, colour: Array) -> None:
+    cv2.fillConvexPoly(picture, cv2.convexHull(pixels), bgr(colour), cv2.LINE_AA, SHIFT)
+
+
+def _dot(picture: Picture, pixel: Fixed, radius_px: float, colour: Array) -> None:
+    u, v = pixel.tolist()
+    cv2.circle(picture, (u, v), round(max(radius_px, 0.5) * (1 << SHIFT)), bgr(colour), cv2.FILLED, cv2.LINE_AA, SHIFT)
+
+
+def _rotors(picture: Picture, drone: DroneImage, sweeps: Fixed) -> None:
+    """Darken what the blades sweep over."""
+    mask = np.zeros(picture.shape[:2], np.uint8)
+    level = round(255 * drone.opacity)
+    for sweep in sweeps:
+        cv2.fillConvexPoly(mask, sweep, level, cv2.LINE_AA, SHIFT)
+    u, v, wide, high = cv2.boundingRect(mask)
+    if wide == 0:
+        return
+    part = picture[v : v + high, u : u + wide]
+    share = mask[v : v + high, u : u + wide, None] * np.float32(1 / 255)
+    part[:] = part + share * ((drone.brightness * ROTOR).astype(np.float32) - part)

@@ -1,0 +1,166 @@
+"""Draws what a drone's camera sees, from the true poses of all drones. Pure: the same inputs give the same bits."""
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.scenario.obstacle import nearest
+from zsim.sensors.camera import Camera
+from zsim.sensors.camera_model import Lens, camera_pose, lens_of
+from zsim_agents.cameras.rendering import film
+from zsim_agents.cameras.rendering.balls import draw_ball
+from zsim_agents.cameras.rendering.drones import draw_drone
+from zsim_agents.cameras.rendering.faces import draw_obstacle
+from zsim_agents.cameras.rendering.fleet import SEEN_M, DroneImages, Fleet, balls
+from zsim_agents.cameras.rendering.ground import Backdrop, Ground, colour_map, field
+from zsim_agents.cameras.rendering.scene import SUN_W, Bodies, Scene
+from zsim_agents.cameras.rendering.view import CameraMotion, View, camera_motion
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+SWEPT_PX = 0.8  # px, from which on ground and sky are blurred by the motion
+WIDER_MAX = 2.0  # of the pinhole picture that a lens bends, over its own; rays beyond it repeat the edge
+
+
+class Seen(NamedTuple):
+    """What is to be drawn: its distance, and which it is of its kind."""
+
+    distance_m: float
+    kind: str
+    which: int
+
+
+class Renderer:
+    """One camera of one drone.
+
+    Args:
+        camera: its settings.
+        scene: what stands still.
+        carrier: which of the drones carries it.
+        seed: of the noise.
+        name: of the noise's random stream, e.g. "drone1/front".
+        ground: None for a meadow with lines every metre.
+    """
+
+    def __init__(
+        self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
+    ) -> None:
+        gain = film.gain(scene.light)
+        self._camera, self._scene, self._carrier = camera, scene, carrier
+        self._exposure_s = camera.exposure_ms * 1e-3
+        self._pose = camera_pose(camera)
+        self._view = _view(lens_of(camera))
+        self._brightness = scene.light * gain
+        self._colours = colour_map(self._brightness)
+        self._fleet = Fleet(self._view, scene, carrier, self._exposure_s, self._brightness)
+        self._noise = None
+        if camera.noise > 0:
+            shape = self._view.lens.height, self._view.lens.width
+            self._noise = film.Noise(seed, f"{name}/noise", shape, camera.noise * gain)
+        self._bend: tuple[Picture, Picture] | None = None
+        flat = self._view
+        if self._view.distorts:
+            flat, self._bend = _pinhole(self._view)
+        self._backdrop = Backdrop(flat, ground or _field())
+
+    def picture(self, number: int, t_s: float, bodies: Bodies) -> Picture:
+        """Return the picture of an exposure as B, G, R, (height, width, 3).
+
+        Args:
+            number: of the picture; its noise goes by it.
+            t_s: the middle of the exposure [s].
+            bodies: all drones then, in the scene's order.
+        """
+        motion = camera_motion(self._pose, bodies, self._carrier)
+        grey = self._swept(self._backdrop.draw(motion), motion)
+        if self._bend is not None:
+            grey = cv2.remap(grey, *self._bend, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        picture: Picture = cv2.applyColorMap(grey, self._colours)  # type: ignore[assignment]
+        images = self._fleet.images(motion, t_s, bodies)
+        for seen in sorted(self._order(motion, images), reverse=True):
+            self._draw(picture, seen, motion, images)
+        film.lens_blur(picture, self._camera.blur_px)
+        if self._noise is not None:
+            self._noise.add(picture, number)
+        return picture
+
+    def jpeg(self, number: int, t_s: float, bodies: Bodies) -> bytes:
+        """Return the picture of an exposure as JPEG; see `picture`."""
+        return film.jpeg(self.picture(number, t_s, bodies), self._camera.jpeg_quality)
+
+    def _swept(self, grey: Picture, motion: CameraMotion) -> Picture:
+        """Return ground and sky blurred by the motion of the middle of the picture's lower half over the exposure."""
+        ray_K = np.array([0.0, self._view.lens.height / 4 / self._view.lens.fy, 1.0])
+        down = -float(motion.R_WK[2] @ ray_K)
+        point_K = ray_K * (max(float(motion.p_WK[2]), 0.1) / down if down > 1e-3 else SEEN_M)
+        way_px = self._view.flow_px(point_K, motion.rates_K(point_K, np.zeros(3))) * self._exposure_s
+        if np.hypot(*way_px) < SWEPT_PX:
+            return grey
+        return cv2.filter2D(grey, -1, film.sweep_kernel(way_px), borderType=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
+
+    def _order(self, motion: CameraMotion, images: DroneImages) -> list[Seen]:
+        """Return what may be in view, in any order."""
+        seen = [Seen(images.distances_m[i], "drone", i) for i in images.in_view]
+        for i, row in enumerate(self._scene.obstacles):
+            seen.append(Seen(_distance(row, motion.p_WK), "obstacle", i))
+        for i, place in enumerate(self._scene.hats.false_m):
+            seen.append(Seen(math.dist(place, motion.p_WK.tolist()), "hat", i))
+        return seen
+
+    def _draw(self, picture: Picture, seen: Seen, motion: CameraMotion, images: DroneImages) -> None:
+        if seen.kind == "obstacle":
+            draw_obstacle(picture, self._view, self._scene.obstacles[seen.which], motion, self._brightness)
+        elif seen.kind == "hat":
+            self._false_hat(picture, np.array([self._scene.hats.false_m[seen.which]]), motion)
+        else:
+            self._drone(picture, seen.which, SUN_W @ motion.R_WK, images)
+
+    def _false_hat(self, picture: Picture, place_W: Array, motion: CameraMotion) -> None:
+        centre_K = motion.points_K(place_W)
+        if centre_K[0, 2] > 0:
+            way_K = motion.rates_K(centre_K, np.zeros(3)) * self._exposure_s
+            for ball in balls(self._view, centre_K, way_K, self._scene.hats.diameter_m / 2, self._brightness):
+                draw_ball(picture, self._view, ball, SUN_W @ motion.R_WK)
+
+    def _drone(self, picture: Picture, i: int, sun_K: Array, images: DroneImages) -> None:
+        """Draw a drone and its hat: which of them is before the other depends on where the camera is."""
+        image, hat, hats = images.drones.get(i), images.hats.get(i), self._scene.hats
+        above = images.cameras_B[i, 2] > hats.position_m[2] - hats.diameter_m / 2
+        if hat is not None and not above:
+            draw_ball(picture, self._view, hat, sun_K)
+        if image is not None:
+            draw_drone(picture, self._view, image)
+        if hat is not None and above:
+            draw_ball(picture, self._view, hat, sun_K)
+
+
+def _distance(row: tuple[float, ...], p_WK: Array) -> float:
+    """Return how far the nearest point of an obstacle is, by which drones before it are drawn after it."""
+
+    x, y, z = p_WK.tolist()
+    return nearest(row, x, y, z)[0]
+
+
+@cache
+def _field() -> Ground:
+    return field()
+
+
+@cache
+def _view(lens: Lens) -> View:
+    return View(lens)
+
+
+def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
+    """Return a view without distortion that holds all that a lens sees, and the map that bends its picture."""
+    lens = view.lens
+    half = np.abs(view.plane).max(axis=(0, 1)) * (lens.fx, lens.fy)
+    most = np.array([lens.width, lens.height]) * WIDER_MAX / 2
+    width, height = (int(2 * math.ceil(side + 2)) for side in np.minimum(half, most))
+    flat = Lens(lens.fx, lens.fy, (width - 1) / 2, (height - 1) / 2, 0, 0, 0, 0, 0, width, height)
+    at = (view.plane * (lens.fx, lens.fy) + (flat.cx, flat.cy)).astype(np.float32)
+    return _view(flat), cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)  # type: ignore[return-value]

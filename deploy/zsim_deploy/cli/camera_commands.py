@@ -1,0 +1,66 @@
+"""`zsim camera` and `zsim detect`: pictures of what drones see, and what is found in pictures."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Annotated
+
+import typer
+
+from zsim_deploy.arguments import WorldAccess, participant_options, positive, require
+
+ROLES = "Roles, started by hand, on any machine, in any order"
+CAMERA_NEEDS = {"cameras": ("cv2",)}  # modules by extra
+SOME_DRONES = "Drones, or patterns: 'drone*'; all that have cameras if not given."
+
+app = typer.Typer()
+Drones = Annotated[list[str] | None, typer.Argument(metavar="[DRONE]...", help=SOME_DRONES, show_default=False)]
+
+
+@app.command(rich_help_panel=ROLES)
+@participant_options
+def camera(
+    reach: WorldAccess,
+    drones: Drones = None,
+    name: Annotated[
+        str, typer.Option(help="Process name (default camera.DRONE, camera.main for several, or the certificate's).")
+    ] = "",
+) -> None:
+    """Draw what the cameras of one drone see, or of several in one process, as JPEG."""
+    require("camera", CAMERA_NEEDS)
+    from zsim_deploy.roles import camera_roles
+    from zsim_deploy.roles.process_identity import process_name
+    from zsim_deploy.roles.roles import lower_priority, serve_runs
+
+    lower_priority()
+    own_name = process_name("camera", name, reach.who, _thing(drones))
+    serve_runs(own_name, partial(camera_roles.camera, names=drones or ()), reach)
+
+
+@app.command(rich_help_panel=ROLES)
+@participant_options
+def detect(
+    reach: WorldAccess,
+    drones: Drones = None,
+    diameter: Annotated[
+        float | None, typer.Option(callback=positive, help="Of a hat, m (default the scenario's).", show_default=False)
+    ] = None,
+    name: Annotated[
+        str,
+        typer.Option(help="Process name (default detector.DRONE, detector.main for several, or the certificate's)."),
+    ] = "",
+) -> None:
+    """Find magenta hats in the pictures of one drone, or of several in one process."""
+    require("detect", CAMERA_NEEDS)
+    from zsim_deploy.roles import camera_roles
+    from zsim_deploy.roles.process_identity import process_name
+    from zsim_deploy.roles.roles import lower_priority, serve_runs
+
+    lower_priority()
+    own_name = process_name("detector", name, reach.who, _thing(drones))
+    serve_runs(own_name, partial(camera_roles.detector, names=drones or (), diameter_m=diameter), reach)
+
+
+def _thing(drones: Sequence[str] | None) -> str:
+    """Return what a process for some drones is named after: the only one, if it is named."""
+    one = drones[0] if drones and len(drones) == 1 else ""
+    return one if one and not set(one) & set("*?[") else "main"

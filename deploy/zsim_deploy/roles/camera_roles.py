@@ -1,0 +1,63 @@
+"""Cameras and detectors as processes of a run: of which drones they are, once the run is known."""
+
+from collections.abc import Callable, Sequence
+
+from msgspec import UNSET
+
+from zsim.contract.messages import Info
+from zsim.scenario import scenario_file
+from zsim.scenario.rights import watched
+from zsim.scenario.scenario import Scenario
+from zsim.sensors.camera import Hats
+from zsim.transport.session import Session
+from zsim_agents.cameras import camera_process, detector_process
+from zsim_agents.hosting import chosen
+from zsim_bridges.observer_process import ObserverProcess
+
+Stopped = Callable[[], bool]
+Say = Callable[[str], None]
+
+
+def camera(
+    link: Session, info: Info, presence: ObserverProcess, stopped: Stopped, say: Say, names: Sequence[str]
+) -> None:
+    """Serve a run with pictures of the cameras of some drones, named or by patterns.
+
+    Raises:
+        RunError: no drone with a camera has such a name.
+    """
+    scenario = scenario_file.from_text(info.scenario)
+    with_cameras = [drone.name for drone in scenario.drones if drone.sensors.cameras()]
+    drones = chosen("camera: drone with a camera", names or ["*"], with_cameras)
+    say(f"{presence.name}: draws for {', '.join(drones)}")
+    camera_process.serve(link, info, presence, stopped, scenario, drones)
+
+
+def detector(
+    link: Session,
+    info: Info,
+    presence: ObserverProcess,
+    stopped: Stopped,
+    say: Say,
+    names: Sequence[str],
+    diameter_m: float | None,
+) -> None:
+    """Serve a run with what is seen in the pictures of some drones; their cameras need not be zsim's.
+
+    Args:
+        diameter_m: of a hat; None for the scenario's.
+
+    Raises:
+        RunError: no drone has such a name.
+    """
+    scenario = scenario_file.from_text(info.scenario)
+    everybody = [drone.name for drone in scenario.drones]
+    drones = chosen("detect: drone", names, everybody) if names else watched("", scenario) or everybody
+    say(f"{presence.name}: looks at the pictures of {', '.join(drones)}")
+    detector_process.serve(link, presence, stopped, say, drones, diameter_m or hat_diameter_m(scenario))
+
+
+def hat_diameter_m(scenario: Scenario) -> float:
+    """Return the diameter of the hats of a scenario."""
+    hats = scenario.environment.hats
+    return (Hats() if hats is UNSET else hats).diameter_m

@@ -1,0 +1,145 @@
+"""The detector on pictures of which the truth is known: bearing, range, and whether its sigmas are honest."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from pictures import BOTTOM, FRONT, HATS, bodies, hat_K, looks, renderer, scene
+
+from zsim.sensors.camera import Camera, FrontCamera
+from zsim.sensors.camera_model import camera_pose, lens_of, pixel
+from zsim_agents.cameras.detector import HatDetector
+from zsim_agents.cameras.jpeg import decoded
+from zsim_agents.cameras.rendering.balls import AMBIENT, Ball, draw_ball
+from zsim_agents.cameras.rendering.view import View
+
+ASSOCIATED_RAD = 0.03  # rad, within which a sighting is that of the hat
+
+
+def detector(camera: Camera = FRONT) -> HatDetector:
+    return HatDetector(lens_of(camera), camera_pose(camera), HATS.diameter_m)
+
+
+def errors(camera: Camera, count: int, seed: int, light: float = 1.0, **of_looks: Any) -> np.ndarray:
+    """Return, of each hat that was seen, the apparent diameter [px], the normalised errors of the direction in its two
+    axes and of the range, and the relative error of the range, (M, 5); and refuse any sighting of anything else."""
+    drawn, found = renderer(camera, scene(light=light)), detector(camera)
+    rows = []
+    for number, look in enumerate(looks(count, seed, **of_looks)):
+        data = drawn.jpeg(number, number / 15, look.where)
+        seen = found.seen(decoded(data, camera.width_px, camera.height_px))
+        d = look.direction_B
+        across = np.cross(d, (0, 0, 1)) / np.hypot(*d[:2])
+        for each in seen:
+            off = np.array(each.direction_B) - d
+            assert np.linalg.norm(off) < ASSOCIATED_RAD, look
+            axes = np.array([off @ across, off @ np.cross(d, across)]) / each.sigma_direction_rad
+            miss = each.range_m - look.range_m
+            size = lens_of(camera).fx * HATS.diameter_m / look.range_m
+            rows.append((size, *axes, miss / each.sigma_range_m, miss / look.range_m))
+    assert len(rows) <= count
+    return np.array(rows)
+
+
+def test_range_and_bearing_are_right_and_their_sigmas_are_honest() -> None:
+    of_all = errors(FRONT, 220, seed=3)
+    assert len(of_all) > 205
+    assert 0.7 < np.sqrt((of_all[:, 1:3] ** 2).mean()) < 1.3
+    assert 0.7 < np.sqrt((of_all[:, 3] ** 2).mean()) < 1.3
+
+
+@pytest.mark.parametrize(
+    ("ranges_m", "rms"), [((1.2, 2.5), 0.02), ((2.5, 5.0), 0.04), ((5.0, 8.0), 0.06), ((8.0, 12.0), 0.15)]
+)
+def test_the_range_errs_by_no_more_than_so_much_at_any_range(ranges_m: Any, rms: float) -> None:
+    of_all = errors(FRONT, 60, seed=4, ranges_m=ranges_m)
+    assert len(of_all) > 50
+    assert np.sqrt((of_all[:, 4] ** 2).mean()) < rms
+
+
+@pytest.mark.parametrize("fields", [{"light": 0.15}, {"rate_rad_s": 0.7}])
+def test_sigmas_hold_at_dusk_and_when_the_body_turns(fields: Any) -> None:
+    of_all = errors(FRONT, 120, seed=5, ranges_m=(1.5, 6.0), **fields)
+    assert len(of_all) > 100
+    assert np.sqrt((of_all[:, 1:3] ** 2).mean()) < 1.5
+    assert np.sqrt((of_all[:, 3] ** 2).mean()) < 1.5
+
+
+def test_a_distorting_lens_makes_no_difference() -> None:
+    of_all = errors(FrontCamera(distortion=(-0.28, 0.09, 0.0, 0.0, 0.0)), 100, seed=6, ranges_m=(1.5, 6.0))
+    assert len(of_all) > 80
+    assert np.sqrt((of_all[:, 1:4] ** 2).mean()) < 1.4
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.8, 0.0), (-0.78, 0.38)])
+def test_a_ball_anywhere_in_the_picture_has_its_range_and_direction(place: Any) -> None:
+    lens, distance = lens_of(FRONT), 2.0
+    direction_K = np.array([*place, 1.0]) / np.linalg.norm([*place, 1.0])
+    picture = np.full((lens.height, lens.width, 3), 90, np.uint8)
+    centre = direction_K * distance
+    at = np.array(pixel(lens, *centre.tolist()))
+    colour = np.array([134.0, 0.0, 226.0]) / AMBIENT  # in the shade everywhere, so that nothing but geometry counts
+    draw_ball(picture, View(lens), Ball(centre, np.zeros(3), at, 0.0, HATS.diameter_m / 2, colour), direction_K)
+    (seen,) = detector().seen(picture)
+    off = np.array(seen.direction_B) - camera_pose(FRONT).R_BK @ direction_K
+    assert np.linalg.norm(off) < 5e-4  # 0.2 px
+    assert seen.range_m == pytest.approx(distance, rel=0.02)
+
+
+def test_the_bottom_camera_sees_drones_below() -> None:
+    where = bodies([(0, 0, 8), (0.5, -0.4, 4.5)])
+    (seen,) = detector(BOTTOM).seen(renderer(BOTTOM).picture(0, 1.0, where))
+    found_K = camera_pose(BOTTOM).R_BK.T @ np.array(seen.direction_B) * seen.range_m
+    assert found_K == pytest.approx(hat_K(BOTTOM, where), abs=4 * seen.sigma_range_m)
+
+
+def test_all_hats_of_a_formation_are_seen_and_nothing_else() -> None:
+    where = bodies([(0, 0, 6), (4, 1.5, 5.5), (6, -2, 5.0), (5, 0, 4.0)])
+    seen = detector().seen(renderer(FRONT, scene(4)).picture(0, 1.0, where))
+    R_KB = camera_pose(FRONT).R_BK.T
+    off = [
+        min(float(np.linalg.norm(R_KB @ s.direction_B - k / np.linalg.norm(k))) for s in seen)
+        for k in (hat_K(FRONT, where, i) for i in (1, 2, 3))
+    ]
+    assert len(seen) == 3
+    assert max(off) < 2e-3
+
+
+def test_nothing_is_seen_where_no_hat_is() -> None:
+    drawn = renderer(FRONT, scene(1))
+    for yaw in np.linspace(-3, 3, 12):
+        assert detector().seen(drawn.picture(0, 1.0, bodies([(2, 3, 4)], [(0.1, -0.1, yaw)]))) == ()
+
+
+def test_a_hat_that_the_edge_of_the_picture_cuts_is_left_out() -> None:
+    camera = replace(FRONT, noise=0.0)
+    edge = 320 / lens_of(camera).fx  # tangent of the angle to it
+    assert detector().seen(renderer(camera).picture(0, 1.0, bodies([(0, 0, 5), (2.16, 2 * edge, 4.8)]))) == ()
+
+
+@pytest.mark.parametrize("kind", ["noise", "magenta", "black", "stripes"])
+def test_any_picture_is_taken(kind: str) -> None:
+    shape = FRONT.height_px, FRONT.width_px, 3
+    picture = np.zeros(shape, np.uint8)
+    if kind == "noise":
+        picture = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+    elif kind == "magenta":
+        picture[:] = (134, 0, 226)
+    elif kind == "stripes":
+        picture[::8] = picture[1::8] = (134, 0, 226)
+    for seen in detector().seen(picture):
+        assert np.isfinite([*seen.direction_B, seen.range_m, seen.sigma_range_m, seen.sigma_direction_rad]).all()
+
+
+def test_a_picture_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match="320 x 240"):
+        detector().seen(np.zeros((240, 320, 3), np.uint8))
+
+
+def test_orange_red_and_purple_balls_are_no_hats() -> None:
+    picture = np.full((360, 640, 3), 120, np.uint8)
+    for i, colour in enumerate([(24, 108, 240), (20, 20, 220), (30, 200, 220), (220, 60, 40), (60, 180, 60)]):
+        cv2.circle(picture, (80 + 100 * i, 180), 12, colour, cv2.FILLED, cv2.LINE_AA)
+    assert detector().seen(picture) == ()
