@@ -53,12 +53,6 @@ CONTRACT = {
     "drone/*/cmd/mode": "source mode",
     "drone/*/estimate": "position_m velocity_m_s orientation_wxyz yaw_rad covariance yaw_sigma_rad gyro_bias_rad_s "
     "sensors",
-    "drone/*/sightings": SENSOR + "source camera seen",
-    **{f"drone/*/camera/{camera}": SENSOR + "source width height format data" for camera in ("front", "bottom")},
-    **{
-        f"drone/*/camera/{camera}/info": "source width height K D position_m orientation_wxyz rate_hz"
-        for camera in ("front", "bottom")
-    },
     "cluster/*/state": "phase drones names value desired desired_rate trajectory_t_s margin reason",
     "cluster/*/request": "op args source ok",
     "process/*/join": "run_id incarnation role host pid period_ns version fingerprint",
