@@ -66,7 +66,8 @@ def test_a_world_goes_on_where_another_one_ended(tmp_path: Path):
     assert not (tmp_path / "journal").exists()
 
 
-def test_a_long_flight_goes_on_from_a_checkpoint(tmp_path: Path):
+def test_a_long_flight_goes_on_from_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(run_journal, "CHECKPOINT_WALL_NS", 0)
     fly(tmp_path, 560)
     again = RunJournal(tmp_path, "run1", "a" * 64)
     checkpoint = again.open()
