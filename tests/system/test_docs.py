@@ -41,7 +41,7 @@ from msgspec import inspect as types
 from zsim.contract import messages
 from zsim.scenario import scenario, scenario_file
 from zsim.schema import quantities
-from zsim.sensors.camera import CAMERAS
+from zsim.sensors.camera import CAMERAS, BottomCamera, FrontCamera, Hats, SightingModel
 from zsim.sensors.sensor import ErrorModel, Mount, Sensor
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors
 from zsim.vehicles import vehicle
@@ -389,6 +389,7 @@ _INFO: dict[str, Any] = {
 
 # The reference of fields: a table after `<!-- fields: Name -->` for each section of zsim/scenario/scenario.py
 
+CAMERA_SECTIONS = (FrontCamera, BottomCamera, SightingModel, Hats)
 SECTIONS = {
     name: section
     for name, section in {**vars(scenario), "Limits": vehicle.Limits}.items()
@@ -397,12 +398,12 @@ SECTIONS = {
     and section is not scenario.Spec
 } | {
     section.__name__: section
-    for section in (Sensors, Sensor, Mount, ErrorModel, *(kind.settings for kind in STOCK.values()))
+    for section in (Sensors, Sensor, Mount, ErrorModel, *CAMERA_SECTIONS, *(kind.settings for kind in STOCK.values()))
 }
 UNITS = {
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_n_s_m": "N s/m", "_nm_s2": "N m s²", "_n_s2": "N s²", "_1_s2": "1/s²",
     "_1_s": "1/s", "_rad_s": "rad/s", "_deg_s": "deg/s", "_m_s2": "m/s²", "_m_s": "m/s", "_deg": "deg", "_mah": "mAh",
-    "_percent": "%", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT", "_m": "m", "_s": "s",
+    "_percent": "%", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT", "_px": "px", "_m": "m", "_s": "s",
 }  # fmt: skip
 OWN_UNITS = {
     "noise": "channel's", "density": "channel's/√Hz", "bias": "channel's", "bias_walk": "channel's/√s",

@@ -5,13 +5,14 @@ The defaults are the AR.Drone 2.0's own figures. None of them is there unless th
 
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from zsim.schema.quantities import Fraction, NonNegative, Positive, Real, Vector3
 from zsim.sensors.sensor import LatencyMs, Mount
 
 CAMERAS = ("front", "bottom")
 CameraName = Literal["front", "bottom"]
+DroneName = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
 WidthPx = Annotated[int, Meta(ge=32, le=1920)]
 HeightPx = Annotated[int, Meta(ge=24, le=1080)]
 CameraRateHz = Annotated[float, Meta(ge=0.1, le=60)]
@@ -59,7 +60,7 @@ class BottomCamera(Camera, frozen=True, kw_only=True):
 class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What a detector of hats makes of pictures, without pictures: held against rendered ones by a test."""
 
-    cameras: Annotated[tuple[CameraName, ...], Meta(min_length=1, max_length=2)] = ("front",)
+    cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
     latency_ms: LatencyMs = 0.0
     """Of the detector, after the camera's."""
     centre_px: NonNegative = 0.25
@@ -83,7 +84,7 @@ class Hats(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # chosen: a tennis cap's crown, on the AR.Drone's hull
     position_m: Vector3 = (-0.03, 0.0, 0.11)  # in B, chosen: on top of the hull, behind the middle
-    covered: Annotated[tuple[str, ...], Meta(max_length=1000)] = ()
+    covered: Annotated[list[DroneName], Meta(max_length=1000)] = []
     """Drones whose hat cannot be seen."""
-    false_m: Annotated[tuple[Vector3, ...], Meta(max_length=100)] = ()
+    false_m: Annotated[list[Vector3], Meta(max_length=100)] = []
     """Centres of balls as large and as magenta as a hat, in W."""

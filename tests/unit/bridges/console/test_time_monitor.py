@@ -25,6 +25,7 @@ class Link:
     """A session on which only the test speaks."""
 
     host = "lab"
+    reads: tuple[str, ...] = ()
 
     def __init__(self) -> None:
         self.now: Clock | bytes | None = None

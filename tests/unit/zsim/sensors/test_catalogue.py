@@ -43,7 +43,8 @@ def paths(**given: Any) -> list[str]:
 
 
 def test_the_stock_sensors_are_those_of_a_scenario():
-    assert tuple(STOCK) == FIELDS[2:] == keys.SENSORS
+    assert tuple(STOCK) == FIELDS[2 : 2 + len(STOCK)] == keys.SENSORS
+    assert FIELDS[2 + len(STOCK) :] == ("front_camera", "bottom_camera", keys.SIGHTINGS)
     for name, kind in STOCK.items():
         assert messages.type_of(keys.sensor("d1", name)) is kind.message
         assert {channel.settings for channel in kind.channels} < set(kind.settings.__struct_fields__)

@@ -1,0 +1,159 @@
+"""The joint filter against truth over 20 seeds, and against the bound of a Kalman filter that is written apart.
+
+Relative position has three degrees of freedom; its normalised squared error must lie, as a mean over runs, in the 95 %
+band of chi-square (Bar-Shalom, Li and Kirubarajan, section 5.4.2). The bound is the steady state of a filter of positions
+and velocities alone, as if attitudes were known: no estimator with the same sensors can be better.
+"""
+
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_estimator_consistency import TAKEOFF_S, band, feed
+
+from zsim.contract.camera_messages import Sightings
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_agents.estimation.joint.joint_bank import JointBank
+from zsim_world.fleet.fleet import Fleet
+
+SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"
+SIGHTED = ["sensors.front_camera={}", "sensors.sightings={}", "estimation.use_sightings=true"]
+SEEDS = range(1, 21)
+END_S, CONVERGED_S = 45.0, 25.0
+EVERY = 25  # gates between two that are compared
+GATE_S = 0.02
+ACCEL_M_S2, IMU_S = 0.35, 0.005  # per sample; preset paper
+GPS_M, GPS_M_S, GPS_S = 2.0, 0.43, 0.2
+FLOW_M_S, FLOW_S = 0.1, 1 / 15
+BARO_M, BARO_S = 0.1, 0.04
+SIGHTING_S = 1 / 15
+FOCAL_PX, HAT_M, CENTRE_PX, DIAMETER_PX = 354.55, 0.14, 0.25, 0.5
+Array = NDArray[np.float64]
+pytestmark = pytest.mark.xdist_group("sightings")
+
+
+class Relative(NamedTuple):
+    """Of drones 2 and 3 to drone 1, T times after convergence, of R flights."""
+
+    error: Array  # (R, T, 2, 3) [m]
+    covariance: Array  # (R, T, 2, 3, 3)
+    places: Array  # (3, 3), of the drones as they stand in the air [m]
+
+
+@cache
+def flown() -> Relative:
+    parts = [fly(scenario_file.load(SCENARIO, SIGHTED, seed=seed)) for seed in SEEDS]
+    error, covariance = (np.array([part[k] for part in parts]) for k in (0, 1))
+    return Relative(error, covariance, parts[0].places)
+
+
+def fly(scenario: Scenario) -> Relative:
+    """Take off and hover in gusts, heading north, so that drones 2 and 3 have drone 1 ahead."""
+    fleet, bank = Fleet(scenario), JointBank(scenario.drones, scenario.environment, scenario.estimation, GATE_S)
+    errors, covariances = [], []
+    for gate in range(round(END_S / GATE_S) + 1):
+        t_s = gate * GATE_S
+        if gate:
+            fleet.advance()
+        for sample in fleet.samples():
+            feed(bank, sample, fleet.gps_sigma_m[sample.drone])
+        for each in fleet.sightings.values():
+            message = Sightings(t_ns=each.t_ns, seq=0, t_sample_ns=each.t_sample_ns, camera=each.camera, seen=each.seen)
+            bank.receive(each.drone, "sightings", message, each.t_ns * 1e-9)
+        estimates = bank.estimate(t_s)
+        if abs(t_s - TAKEOFF_S) < GATE_S / 2:
+            assert [fleet.takeoff(i) for i in range(3)] == [None] * 3
+        if t_s > CONVERGED_S and gate % EVERY == 0:
+            p = np.array([each.position_m for each in estimates]) - fleet.truth().position_m
+            errors.append(p[1:] - p[0])
+            covariances.append([relative(bank.rows.joint, bank.rows.covariance.shape[1], i) for i in (1, 2)])
+    return Relative(np.array(errors), np.array(covariances), fleet.truth().position_m)
+
+
+def relative(J: Array, n: int, i: int) -> Array:
+    """Return the covariance of drone i's position to that of the first, (3, 3)."""
+    a, b = slice(0, 3), slice(i * n, i * n + 3)
+    return J[a, a] + J[b, b] - J[a, b] - J[b, a]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("i", [0, 1])
+def test_the_errors_of_relative_positions_are_as_large_as_the_filter_says(i: int) -> None:
+    runs = flown()
+    e, P = runs.error[:, :, i], runs.covariance[:, :, i]
+    nees = np.einsum("rti,rti->rt", e, np.linalg.solve(P, e[..., None])[..., 0])
+    low, high = band(3, len(SEEDS))
+    means = nees.mean(axis=0)  # over runs, at each instant; instants are half a second apart, about a correlation time
+    assert np.mean((means > low) & (means < high)) > 0.85
+    assert low < nees.mean() < high
+
+
+@pytest.mark.slow
+def test_the_relative_positions_are_as_good_as_they_can_be() -> None:
+    runs = flown()
+    rms = np.sqrt(np.mean(runs.error**2, axis=(0, 1)))  # (2, 3)
+    best = bound(runs.places)
+    horizontal = np.linalg.norm(rms[:, :2], axis=1) / np.linalg.norm(best[:, :2], axis=1)
+    assert np.all(horizontal > 0.9)
+    assert np.all(horizontal < 1.15)
+
+
+def bound(places: Array) -> Array:
+    """Return the least standard deviation of the relative positions per axis, (2, 3) [m]."""
+    C = np.diag(np.tile([4.0] * 3 + [1.0] * 3, 3))
+    F, q = np.eye(18), ACCEL_M_S2**2 * IMU_S
+    Q = np.zeros((18, 18))
+    for k in (0, 1, 2, 6, 7, 8, 12, 13, 14):
+        F[k, k + 3] = GATE_S
+        Q[k, k], Q[k + 3, k + 3] = q * GATE_S**3 / 3, q * GATE_S
+        Q[k, k + 3] = Q[k + 3, k] = q * GATE_S**2 / 2
+    for gate in range(1, round(120 / GATE_S)):
+        C = F @ C @ F.T + Q
+        due = [period for period in (GPS_S, FLOW_S, BARO_S, SIGHTING_S) if _is_due(gate, period)]
+        for i in range(3):
+            C = _own_sensors(C, i, due)
+        if SIGHTING_S in due:
+            for i in (1, 2):
+                C = _sighting(C, places, i)
+    apart = [C[:3, :3] + C[k : k + 3, k : k + 3] - C[:3, k : k + 3] - C[k : k + 3, :3] for k in (6, 12)]
+    return np.sqrt([np.diag(each) for each in apart])
+
+
+def _is_due(gate: int, period_s: float) -> bool:
+    return int(gate * GATE_S / period_s + 1e-9) > int((gate - 1) * GATE_S / period_s + 1e-9)
+
+
+def _own_sensors(C: Array, i: int, due: list[float]) -> Array:
+    p, v = slice(6 * i, 6 * i + 3), slice(6 * i + 3, 6 * i + 6)
+    if GPS_S in due:
+        C = _updated(_updated(C, np.eye(18)[p], [GPS_M] * 3), np.eye(18)[v], [GPS_M_S] * 3)
+    if FLOW_S in due:
+        C = _updated(C, np.eye(18)[v], [FLOW_M_S] * 3)
+    return _updated(C, np.eye(18)[6 * i + 2 : 6 * i + 3], [BARO_M]) if BARO_S in due else C
+
+
+def _sighting(C: Array, places: Array, i: int) -> Array:
+    """Use what drone i, heading north, sees of the first one."""
+    d = places[0] - places[i]
+    away = float(np.linalg.norm(d))
+    d = d / away
+    side = np.cross(d, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    scale = FOCAL_PX / d[1] ** 1.5  # px/rad off the axis
+    across, along = away * CENTRE_PX / scale, away * DIAMETER_PX / (HAT_M / away * scale)
+    H = np.zeros((3, 18))
+    for k, axis in enumerate((d, side, np.cross(d, side))):
+        H[k, :3], H[k, 6 * i : 6 * i + 3] = axis, -axis
+    return _updated(C, H, [along, across, across])
+
+
+def _updated(C: Array, H: Array, sigmas: list[float]) -> Array:
+    R = np.diag(np.square(sigmas))
+    K = C @ H.T @ np.linalg.inv(H @ C @ H.T + R)
+    A = np.eye(len(C)) - K @ H
+    C = A @ C @ A.T + K @ R @ K.T
+    return (C + C.T) / 2
