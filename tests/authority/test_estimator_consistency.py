@@ -9,20 +9,20 @@ section 5.4.2).
 import math
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from consistency import band, feed
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from zsim.contract import messages
 from zsim.math.frames import heading, wrap_angle
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank
-from zsim_world.fleet.fleet import GPS_FIX, Fleet, SensorSample
+from zsim_world.fleet.fleet import Fleet
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"  # three drones, preset paper, gusts of 0.5 m/s
 SEEDS = range(1, 21)
@@ -86,25 +86,6 @@ def fly(scenario: Scenario) -> Runs:
     return Runs(*(np.stack(parts, 1) for parts in zip(*rows, strict=True)))
 
 
-def feed(bank: EstimatorBank, sample: SensorSample, gps_sigma_m: float) -> None:
-    v: Any = sample.values
-    stamps = (sample.t_ns, 0, sample.t_sample_ns)
-    match sample.sensor:
-        case "imu":
-            message = messages.Imu(*stamps, v[:3], v[3:6])
-        case "gps":
-            message = messages.Gps(*stamps, v[0], v[1], v[2], v[3:6], v[6:9], gps_sigma_m, GPS_FIX, 9)
-        case "mag":
-            message = messages.Mag(*stamps, v[:3])
-        case "baro":
-            message = messages.Baro(*stamps, v[0], v[1])
-        case "sonar":
-            message = messages.Sonar(*stamps, v[0], bool(v[1]))
-        case _:
-            message = messages.Flow(*stamps, v[:3], v[3])
-    bank.receive(sample.drone, sample.sensor, message, sample.t_ns * 1e-9)
-
-
 def steer(fleet: Fleet, scenario: Scenario, estimates: list[StateEstimate], t: float, gate_s: float) -> None:
     for i, (drone, estimate) in enumerate(zip(scenario.drones, estimates, strict=True)):
         if abs(t - TAKEOFF_S) < gate_s / 2.0:
@@ -127,12 +108,6 @@ def compare(fleet: Fleet, estimates: list[StateEstimate]) -> tuple[Array, Array,
     yaw = np.array([e.yaw_rad for e in estimates]) - heading(truth.orientation_wxyz)
     P = np.array([e.covariance for e in estimates]).reshape(-1, 6, 6)
     return np.hstack([p, v]), P, wrap_angle(yaw), np.array([e.yaw_sigma_rad for e in estimates])
-
-
-def band(dof: int, runs: int) -> tuple[float, float]:
-    """Return the 95 % band of the mean NEES over independent runs."""
-    low, high = chi2.ppf([0.025, 0.975], dof * runs) / runs
-    return float(low), float(high)
 
 
 @pytest.mark.slow

@@ -32,6 +32,10 @@ SIGHTING = columns(  # one hat that was seen
 )
 # by which y^T S^-1 y of the second best must be more than that of the best: chosen, a likelihood ratio of 150
 AMBIGUITY = 10.0
+# Standard deviations by which the places of two hats must be apart: before the filter knows them so well, as while GPS
+# is averaged on the ground, one hat is taken for another once in some starts, and stays so.
+APART = 6.0
+NEAREST_M = 0.1  # nearer, a direction is not defined
 RANGE_MAX_M = 1e4  # no hat is seen farther away
 SIGMA_MIN_RAD, SIGMA_MIN_M = 1e-4, 1e-3  # what interpolation of past states loses
 NOBODY = -1
@@ -81,59 +85,92 @@ def across(d: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 @portable
-def judge(
-    rows: Rows,
-    sighting: np.ndarray,
-    j: int,
-    hat_B: Vector,
-    H: np.ndarray,
-    y: np.ndarray,
-    PHt: np.ndarray,
-    S_out: np.ndarray,
-) -> float:
-    """Return y^T S^-1 y of a sighting taken as one of drone j; inf where it cannot be one. Writes H, y, P H^T and S."""
-    i, n, J = int(sighting[SIGHTING.drone]), rows.covariance.shape[1], rows.joint
+def predict_sighting(
+    rows: Rows, sighting: np.ndarray, j: int, hat_B: Vector, H: np.ndarray, PHt: np.ndarray, S: np.ndarray
+) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
+    """Return where the hat of drone j should be seen, and axes along and across; write H, P H^T and S along these.
+
+    Args:
+        rows: of all drones.
+        sighting: (SIGHTING.size,).
+        j: whose hat it is taken for.
+        hat_B: centre of a hat in the body of its drone [m].
+        H: (3, D), written.
+        PHt: (D, 3), written.
+        S: covariance of the innovation, (3, 3), written.
+    """
+    i, n = int(sighting[SIGHTING.drone]), rows.covariance.shape[1]
     t_s = sighting[SIGHTING.t_sample]
     a = recall(rows.counts[i], rows.history[i], rows.layout[i, LAYOUT.history], t_s, moment(rows.nominal[i]))
     b = recall(rows.counts[j], rows.history[j], rows.layout[j, LAYOUT.history], t_s, moment(rows.nominal[j]))
-    p_BK = vector(sighting, SIGHTING.p_BK)
-    r = expected(a, b, hat_B, p_BK)
-    away = norm(r)
-    if away < 0.1:
-        return math.inf
+    r = expected(a, b, hat_B, vector(sighting, SIGHTING.p_BK))
+    away = max(norm(r), NEAREST_M)
     axes = across(scaled(r, 1.0 / away))
-    seen = scaled(vector(sighting, SIGHTING.direction_B), sighting[SIGHTING.range])
-    miss = subtract(seen, r)
     H[:] = 0.0
     lags = (rows.nominal[i, NOMINAL.t] - a[0], rows.nominal[j, NOMINAL.t] - b[0])
     write_rows(H, i, j, n, a, b, hat_B, axes, lags)
     sideways = away * max(sighting[SIGHTING.sigma_direction], SIGMA_MIN_RAD)
     along = max(sighting[SIGHTING.sigma_range], SIGMA_MIN_M)
     variance = np.array([along * along, sideways * sideways, sideways * sideways])
-    for k in range(3):
-        y[k] = dot(axes[k], miss)
-    S_out[:] = innovation_covariance(J, H, variance, PHt)
+    S[:] = innovation_covariance(rows.joint, H, variance, PHt)
+    return r, axes
+
+
+@portable
+def innovation(axes: tuple[Vector, Vector, Vector], seen: Vector, r: Vector) -> np.ndarray:
+    """Return by how much what was seen misses what was expected, along and across, (3,) [m]."""
+    miss = subtract(seen, r)
+    return np.array([dot(axes[0], miss), dot(axes[1], miss), dot(axes[2], miss)])
+
+
+@portable
+def distance_squared(rows: Rows, S: np.ndarray, y: np.ndarray) -> float:
+    """Return y^T S^-1 y."""
     blocks, distances = np.array([[0, 3]]), np.zeros(1)
-    within_gates(S_out, y, blocks, rows.limits, distances)
+    within_gates(S, y, blocks, rows.limits, distances)
     return distances[0]
 
 
 @portable
+def place_of(sighting: np.ndarray) -> Vector:
+    """Return where a hat was seen, from the camera in axes of the body [m]."""
+    return scaled(vector(sighting, SIGHTING.direction_B), sighting[SIGHTING.range])
+
+
+@portable
 def owner(rows: Rows, sighting: np.ndarray, hat_B: Vector, taken: np.ndarray) -> int:
-    """Return whose hat was seen, NOBODY where none fits or two do; `taken` are those seen in the same picture."""
-    size = rows.joint.shape[0]
-    H, y, PHt, S = np.zeros((3, size)), np.zeros(3), np.zeros((size, 3)), np.zeros((3, 3))
+    """Return whose hat was seen, NOBODY where none fits, two do, or the filter could not tell two from each other.
+
+    Args:
+        rows: of all drones.
+        sighting: (SIGHTING.size,).
+        hat_B: centre of a hat in the body of its drone [m].
+        taken: whose hats were seen already in the same picture, (N,).
+    """
+    size, count, i = rows.joint.shape[0], rows.nominal.shape[0], int(sighting[SIGHTING.drone])
+    H, PHt, S = np.zeros((3, size)), np.zeros((size, 3)), np.zeros((3, 3))
+    places, seen = np.zeros((count, 3)), place_of(sighting)
     best, second, found = math.inf, math.inf, NOBODY
-    for j in range(rows.nominal.shape[0]):
-        if j == int(sighting[SIGHTING.drone]) or not rows.counts[j, COUNT.heading_known]:
+    for j in range(count):
+        if j == i:
             continue
-        distance = judge(rows, sighting, j, hat_B, H, y, PHt, S)
+        if not rows.counts[j, COUNT.heading_known]:
+            return NOBODY  # it could be anywhere
+        r, axes = predict_sighting(rows, sighting, j, hat_B, H, PHt, S)
+        places[j, 0], places[j, 1], places[j, 2] = r[0], r[1], r[2]
+        distance = distance_squared(rows, S, innovation(axes, seen, r))
         if distance < best:
             best, second, found = distance, best, j
         elif distance < second:
             second = distance
-    if best > rows.limits[3] or second - best < AMBIGUITY or taken[found]:
+    if found == NOBODY or best > rows.limits[3] or second - best < AMBIGUITY or taken[found]:
         return NOBODY
+    r, axes = predict_sighting(rows, sighting, found, hat_B, H, PHt, S)
+    for j in range(count):
+        if j not in (i, found):
+            other = (places[j, 0], places[j, 1], places[j, 2])
+            if distance_squared(rows, S, innovation(axes, other, r)) < APART * APART:
+                return NOBODY
     return found
 
 
@@ -159,7 +196,7 @@ def use_sightings(rows: Rows, sightings: np.ndarray, hat_B: Vector) -> None:
     """
     size = rows.joint.shape[0]
     taken = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
-    H, y, PHt, S = np.zeros((3, size)), np.zeros(3), np.zeros((size, 3)), np.zeros((3, 3))
+    H, PHt, S = np.zeros((3, size)), np.zeros((size, 3)), np.zeros((3, 3))
     for m in range(sightings.shape[0]):
         sighting, i = sightings[m], int(sightings[m, SIGHTING.drone])
         if m == 0 or sighting[0] != sightings[m - 1, 0] or sighting[2] != sightings[m - 1, 2]:
@@ -170,5 +207,5 @@ def use_sightings(rows: Rows, sightings: np.ndarray, hat_B: Vector) -> None:
             continue
         taken[j] = True
         rows.counts[i, COUNT.sightings_used] += 1
-        judge(rows, sighting, j, hat_B, H, y, PHt, S)
-        correct_all(rows, rows.joint, PHt, S, y)
+        r, axes = predict_sighting(rows, sighting, j, hat_B, H, PHt, S)
+        correct_all(rows, rows.joint, PHt, S, innovation(axes, place_of(sighting), r))
