@@ -148,7 +148,7 @@ def test_a_nearer_drone_hides_the_hat_of_a_farther_one() -> None:
 def test_a_covered_hat_is_not_drawn_and_a_false_one_is() -> None:
     bare = scene()._replace(drones=tuple(look._replace(has_hat=False) for look in scene().drones))
     assert not has_magenta(draw(of=bare))
-    false = draw(FrontCamera(**CLEAN), of=bare._replace(hats=Hats(false_m=((5.0, -1.0, 4.0),))))
+    false = draw(FrontCamera(**CLEAN), of=bare._replace(hats=Hats(false_m=[(5.0, -1.0, 4.0)])))
     assert np.abs(magenta_centre(false) - hat_pixel(FRONT, bodies([(0, 0, 5), (5.03, -1.0, 3.89)]))).max() < CENTRE_PX
 
 
