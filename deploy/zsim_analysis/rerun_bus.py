@@ -132,6 +132,8 @@ def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Differen
     )
 
 
+_Joined = tuple[str, int]  # name and incarnation
+JOINED = ("join", "restart", "superseded")  # events of joins that were let in
 Requests = dict[int, list[tuple[str, ControlRequest]]]
 
 
@@ -178,6 +180,8 @@ class RerunBus(Bus):
         self._rerun = agents.names
         self.truth: dict[str, bytes] = {}
         self.refused: list[str] = []
+        self._admitted: set[_Joined] | None = None  # in this gate; None before the start, when nothing hangs on it
+        self._withheld: dict[_Joined, run_messages.Join] = {}
         self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)
 
     def fly_to(self, gate: GateInputs) -> None:
@@ -186,6 +190,7 @@ class RerunBus(Bus):
         Raises:
             RunError: an agent does not answer, since what it waits for is not on record.
         """
+        self._admitted = _admitted(gate.inputs) if gate.t_ns else None
         for recorded in gate.inputs:
             self._feed(recorded)
         while self._round():
@@ -230,7 +235,20 @@ class RerunBus(Bus):
             else:
                 self._world.handle(key, message, 0)
         elif keys.thing(key) not in self._rerun:
+            self._feed_process(key, message)
+
+    def _feed_process(self, key: str, message: Any) -> None:
+        """Repeat a join, done or bye of another process; a join only when it was let in, as its event says."""
+        joined = (keys.thing(key), message.incarnation) if isinstance(message, run_messages.Join) else None
+        if joined is None or self._admitted is None or joined in self._admitted:
             self._world.handle(key, message, 0)
+        else:
+            self._withheld[joined] = message
+
+    def _admit(self, joined: _Joined) -> None:
+        join = self._withheld.pop(joined, None)
+        if join is not None:
+            self._world.handle(keys.process(joined[0], "join"), join, 0)
 
     def _feed_output(self, key: str, message: Any) -> None:
         """Pass the estimate, or the output about a cluster, of another process to the agents that read it."""
@@ -249,7 +267,9 @@ class RerunBus(Bus):
         self._world.count_output(source)
 
     def _feed_event(self, event: run_messages.Event) -> None:
-        """Repeat what reached the world other than as a message: deaths, and requests."""
+        """Repeat what reached the world other than as a message: deaths, requests, and joins that were withheld."""
+        if event.kind in JOINED and event.source not in self._rerun:
+            self._admit(_joined(event))
         if event.kind == "death" and event.subject not in self._rerun:
             self._world.handle_death(event.subject, 0)
         elif event.kind == "control" and event.subject in FLIGHT_REQUESTS and event.data.get("ok"):
@@ -258,6 +278,20 @@ class RerunBus(Bus):
             answer = self._world.control(request)
             if not answer.ok:
                 self.refused.append(f"{event.subject} at {event.t_ns / 1e9:.2f} s: {answer.error}")
+
+
+def _joined(event: run_messages.Event) -> _Joined:
+    """Return whom the event of a join is about."""
+    return event.subject, event.data.get("incarnation", -1)
+
+
+def _admitted(inputs: Sequence[Recorded]) -> set[_Joined]:
+    """Return who was let in before a gate and had published its join in that gate, too: its place is that of its join.
+
+    A join that was withheld longer has its event in a later gate.
+    """
+    events = (decode_or_none(recorded) for recorded in inputs if recorded.key == keys.EVENT)
+    return {_joined(event) for event in events if event is not None and event.kind in JOINED}
 
 
 def _by_gate(requests: Sequence[tuple[str, run_messages.ClusterRequest]]) -> Requests:

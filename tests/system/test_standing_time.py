@@ -67,14 +67,15 @@ def test_a_join_of_another_s_process_is_answered_by_a_newer_one(federation: Fede
     watched.flies_on()
 
 
-def test_a_join_without_a_token_holds_time_up_for_a_moment_only(federation: Federation) -> None:
+def test_strangers_without_tokens_stop_no_time(federation: Federation) -> None:
     watched = Watched(federation)
     watched.join_as(VISITOR)
-    standing = watched.clock.until(lambda m: any(w["name"] == VISITOR for w in m["waiting_for"]))
-    assert standing.message["waiting_for"][0]["host"] == "nowhere"
-    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("drop", VISITOR))
+    watched.events.until(lambda m: (m["kind"], m["subject"]) == ("no_show", VISITOR))
     watched.run.line(f"no_show: {VISITOR} on nowhere")
+    for number in range(20):
+        watched.join_as(f"{VISITOR}.{number}")
     watched.flies_on()
+    assert not [event for event in federation.record().events("join", "drop") if event["subject"].startswith(VISITOR)]
 
 
 def test_who_takes_a_place_and_does_nothing_gives_it_back(federation: Federation) -> None:
@@ -85,6 +86,18 @@ def test_who_takes_a_place_and_does_nothing_gives_it_back(federation: Federation
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("superseded", CONTROLLER))
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("death", CONTROLLER))
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("restart", CONTROLLER))
+    watched.flies_on()
+    for token in tokens:
+        token.undeclare()
+
+
+def test_in_realtime_too(federation: Federation) -> None:
+    watched = Watched(federation, "--realtime")
+    client = watched.client
+    tokens = [client.token(CONTROLLER), client.token(f"{CONTROLLER}/session/{client.session.info.zid()}")]
+    watched.join_as(CONTROLLER)
+    for kind in ("superseded", "no_show", "restart"):
+        watched.events.until(lambda m, kind=kind: (m["kind"], m["subject"]) == (kind, CONTROLLER))
     watched.flies_on()
     for token in tokens:
         token.undeclare()

@@ -26,6 +26,7 @@ ROUND_TRIPS = 3.0  # … so many of its round trips
 HELD_BYTES, HELD_S = 1 << 20, 1.0  # one that takes something all the time, but never catches up
 FRESH_S = 0.2  # between two looks at who is at which far end
 SPARED, SPARED_S = 3, 60.0  # times within so long that the link of a session is closed before it is kept out …
+TOLD_S = 10.0  # between two reports of one session
 KEPT_OUT_S = 30.0  # … for so long
 
 
@@ -79,7 +80,7 @@ class LinkWatch:
         wall_s: monotonic.
 
     Attributes:
-        closed: links that were closed, in order; to be taken from it.
+        closed: links that were closed, in order, one of a session in TOLD_S; to be taken from it.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class LinkWatch:
         self._far_ends: dict[str, FarEnd] = {}
         self._refreshed_s = -FRESH_S
         self._times: dict[str, list[float]] = {}  # at which links of a session were closed
+        self._told_s: dict[str, float] = {}  # when a link of a session was last reported
         self._kept_out_s: dict[str, float] = {}
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="links", daemon=True)
@@ -161,8 +163,16 @@ class LinkWatch:
         times.append(now_s)
         if len(times) >= SPARED and now_s - times[-SPARED] < SPARED_S:
             self._kept_out_s[far.session] = now_s + KEPT_OUT_S
-        names = self._tokens.processes(far.session)
-        self.closed.append(ClosedLink(address, command(pid), names, held_bytes, len(times)))
+        if self._is_told(far.session, held_bytes, now_s):
+            names = self._tokens.processes(far.session)
+            self.closed.append(ClosedLink(address, command(pid), names, held_bytes, len(times)))
+
+    def _is_told(self, session: str, held_bytes: int, now_s: float) -> bool:
+        """Tell whether to report a link: not one that held nothing back, as of a session that is kept out."""
+        if held_bytes < STALL_BYTES or now_s - self._told_s.get(session, -TOLD_S) < TOLD_S:
+            return False
+        self._told_s[session] = now_s
+        return True
 
     def _may_be_awaited(self, far: FarEnd, inode: str) -> bool:
         """Tell whether a far end is waited for: by its tokens, or else by its pid, if that can be known."""

@@ -10,9 +10,10 @@ from zsim.runtime.link_faults import NEVER, RADIO, WORLD, distance_between, join
 from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.flight.barrier import Barrier
+from zsim_world.flight.budgets import Budgets
 from zsim_world.flight.command_queue import CommandQueue, QueuedCommand
 from zsim_world.flight.run_clock import Operation, RunClock, number, refused_argument
-from zsim_world.flight.run_outbox import Refusal, RunOutbox
+from zsim_world.flight.run_outbox import Refusal, RunOutbox, too_many
 
 LinkFaultsAt = Callable[[int], Sequence[Fault]]
 """Returns the faults of links and radios that act in a gate."""
@@ -78,6 +79,7 @@ class CommandIntake:
     queue: CommandQueue
     fleet: Fleet
     faults_at: LinkFaultsAt
+    budgets: Budgets
 
     def __post_init__(self) -> None:
         self._index = {name: i for i, name in enumerate(self.fleet.names)}
@@ -106,7 +108,10 @@ class CommandIntake:
         if late_ns is None:
             return True  # the link loses it; its sender has sent it all the same
         apply_ns = gate_ns + self.clock.delay_ns + late_ns
-        if not gating:
+        if not gating:  # a rerun needs the event: without it the command is not carried out
+            if not self.budgets.spend(source, f"drone/{drone}/cmd/", source in self.barrier.participants):
+                self.outbox.refuse(source, f"drone/{drone}/cmd/{kind}", too_many(source))
+                return True
             self._publish_command(drone, kind, message, apply_ns)
         return self.queue.push(index, kind, message, apply_ns)
 

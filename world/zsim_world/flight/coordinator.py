@@ -17,16 +17,18 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError
 from zsim.runtime.agent import Output
 from zsim.scenario.rights import WORLD
-from zsim.scenario.role_table import on_death
+from zsim.scenario.role_table import agent_names, on_death
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Barrier, Participant
+from zsim_world.flight.budgets import STRANGERS_MAX, Budgets
 from zsim_world.flight.data_flow import DataFlow
 from zsim_world.flight.run_clock import Operation, RunClock, number
-from zsim_world.flight.run_outbox import CHANGES_MAX, ChangeBudget, KeyedMessage, Refusal, RunOutbox
+from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox, too_many
 from zsim_world.flight.run_statistics import RunStatistics
 
 RETURNS = ("restart", "wait")  # of on_death: a process that died comes back, or may
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # that change a flight
+_JOIN = "process/"  # before a name: what is counted of its joins
 ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
 
 
@@ -46,7 +48,7 @@ class Coordinator(ABC):
         clock: simulated time.
         barrier: who takes part.
         outbox: what is to be published.
-        changes: that sources may still make.
+        budgets: of what sources may still do.
         requests: on `world/control`, all of them counted.
         statistics: of the run so far.
         refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
@@ -69,12 +71,13 @@ class Coordinator(ABC):
         self.names = [drone.name for drone in scenario.drones]
         self.clock = RunClock(scenario.time, mode, rate)
         self.outbox = RunOutbox(lambda: self.clock.now_ns)
-        self.changes = ChangeBudget(lambda: self.clock.now_ns, self.clock.gate_ns)
+        self.budgets = Budgets(lambda: self.clock.now_ns, self.clock.gate_ns)
         self.requests = 0
         self.barrier = Barrier(self.run_id, self.clock.gate_ns, expected)
         self.statistics = RunStatistics()
         self.diverged: RunError | None = None
         self._expected = expected
+        self._own_names = {"recorder", *expected, *agent_names(scenario)}
         self._data_flow = DataFlow(scenario)
         self._start_wall_ns = wall_ns()
         self._operations: dict[str, Operation] = self.clock.operations()
@@ -146,11 +149,15 @@ class Coordinator(ABC):
 
     def _handle_join(self, name: str, message: run_messages.Join, wall_ns: int) -> None:
         former, replaced = self.barrier.participants.get(name), self.barrier.replaced(name, message)
-        may_join = message.period_ns > 0 or self.changes.spend(f"process/{name}")  # time may stand for who gates
-        refusal = self.barrier.join(name, message, self.clock.next_ns, wall_ns) if may_join else _too_many(name)
+        is_new = self._is_new(name)
+        refusal = self._join_refusal(name, message, is_new)
+        refusal = refusal or self.barrier.join(name, message, self.clock.next_ns, wall_ns)
         if refusal:
             self.outbox.refuse(name, f"process/{name}/join", refusal)
             return
+        self.budgets.changes.spend(_JOIN + name)
+        if is_new:
+            self.budgets.strangers.spend("join")
         joined = self.barrier.participants[name]
         kind, data = "join", joined.entry()
         if former is not None and former.join.incarnation != message.incarnation:
@@ -159,6 +166,18 @@ class Coordinator(ABC):
         for dead in replaced:
             self._release_drones(dead.name)
         self._warn_of(joined)
+
+    def _is_new(self, name: str) -> bool:
+        """Tell whether the scenario has no process of a name, which never took part either."""
+        is_known = name in self._own_names or name in self.barrier.participants
+        return not is_known and not self.budgets.changes.knows(_JOIN + name)
+
+    def _join_refusal(self, name: str, message: run_messages.Join, is_new: bool) -> Refusal | None:
+        """Return why there have been too many joins; time may stand for who gates and was there before."""
+        if is_new and not self.budgets.strangers.allows("join"):
+            return Refusal("newcomers", f"beyond {STRANGERS_MAX} at once", "must wait: one may join each second")
+        may_join = message.period_ns > 0 or self.budgets.changes.allows(_JOIN + name)
+        return None if may_join else too_many(name)
 
     def _warn_of(self, joined: Participant) -> None:
         """Publish that a newcomer computes with other bits, or does the work of others too."""
@@ -240,12 +259,20 @@ class Coordinator(ABC):
 
     def handle_slow_reader(self, text: str, data: dict[str, Any]) -> None:
         """Take it that a reader nobody waits for has lost its link, since it took nothing."""
-        self.outbox.event("slow_reader", data["address"], text, data)
+        if self.budgets.strangers.spend("slow_reader"):
+            self.outbox.event("slow_reader", data["address"], text, data)
 
     def handle_false_join(self, name: str, join: run_messages.Join, fault: str) -> None:
-        """Take it that nobody is behind a join in the place of a process, which keeps it."""
+        """Take it that nobody is behind a join which was withheld: who is in that place keeps it.
+
+        It is counted like a refusal, and is an event as long as there have not been too many.
+        """
+        if not self.budgets.strangers.spend("no_show"):
+            self.outbox.refusals.count += 1
+            return
         data = {"host": join.host, "pid": join.pid, "incarnation": join.incarnation}
-        text = f"a join as {name} from {join.host} (pid {join.pid}) {fault}; it takes nobody's place"
+        what = "takes nobody's place" if name in self.barrier.participants else "is not waited for"
+        text = f"{name} on {join.host} (pid {join.pid}) {fault}; its join {what}"
         self.outbox.event("no_show", name, text, data)
 
     def handle_no_show(self, name: str, fault: str, wall_ns: int) -> None:
@@ -285,10 +312,11 @@ class Coordinator(ABC):
         """
         self.requests += 1
         op, source = request.op[:40], request.source if keys.PROCESS_NAME.fullmatch(request.source) else ""
-        may_change = op not in FLIGHT_REQUESTS or self.changes.allows(source)
-        answer = self._answer(request) if may_change else ControlAnswer(False, str(_too_many(source)))
+        has_joined = source in self.barrier.participants
+        may_change = op not in FLIGHT_REQUESTS or self.budgets.allows(source, "", has_joined)
+        answer = self._answer(request) if may_change else ControlAnswer(False, str(too_many(source)))
         if answer.ok:
-            is_event = self.changes.spend(source)
+            is_event = self.budgets.spend(source, "", has_joined)
         else:
             is_event = self.outbox.refused_requests.add(source, op, answer.error) is not None
         if is_event:
@@ -381,11 +409,6 @@ class Coordinator(ABC):
     def take_outbox(self) -> list[KeyedMessage]:
         """Return what is to be published, in order, and forget it."""
         return self.outbox.take()
-
-
-def _too_many(source: str) -> Refusal:
-    """Return the refusal of what a source does too often."""
-    return Refusal(source or "source", f"beyond {CHANGES_MAX} changes at once", "must wait: one is allowed each gate")
 
 
 def _shortened(args: dict[str, Any]) -> dict[str, Any]:

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, run_messages
 from zsim.contract.snapshot import State
 from zsim.scenario.rights import WORLD
+from zsim_world.flight.budgets import CHANGES_MAX, SECOND_NS, SUBJECTS_MAX, ChangeBudget
 
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
 EVENTS_MAX = 20  # events per source, subject and reason; further refusals are counted only
 REASONS_MAX = 10  # of a source and subject that are kept apart; all further ones count as one
-CHANGES_MAX = 1000  # of a source at once, as many as there may be faults; then 50 a simulated second at gates of 20 ms
-SUBJECTS_MAX = 10_000  # sources and subjects
+REFUSED_MAX = 1000  # events of all sources at once, whose names cost nothing; then one a simulated second
 
 _FIGURE = re.compile(r"\d[\d.e+-]*")
 
@@ -34,15 +34,24 @@ class Refusal(NamedTuple):
         return f"{self.where} is {self.actual}; {self.allowed}"
 
 
+def too_many(source: str) -> Refusal:
+    """Return the refusal of what a source does too often."""
+    return Refusal(source or "source", f"beyond {CHANGES_MAX} changes at once", "must wait: one is allowed each gate")
+
+
 class RefusalLog:
-    """Counts refusals, and limits how many of them become events.
+    """Counts refusals, and limits how many of them become events: of each source, and of all together.
+
+    Args:
+        now_ns: returns the newest gate [ns].
 
     Attributes:
         count: of all of them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, now_ns: Callable[[], int] = lambda: 0) -> None:
         self.count = 0
+        self._total = ChangeBudget(now_ns, SECOND_NS, REFUSED_MAX)
         self._counts: dict[tuple[str, str], dict[str, int]] = {}
 
     def add(self, source: str, subject: str, reason: str) -> str | None:
@@ -59,58 +68,21 @@ class RefusalLog:
             pattern = ""
         former = by_reason.get(pattern, 0)
         by_reason[pattern] = former + 1
+        if former >= EVENTS_MAX or not self._total.spend(""):
+            return None
         last = " (further ones are counted only)" if former == EVENTS_MAX - 1 else ""
-        return f"{subject}: {reason}{last}" if former < EVENTS_MAX else None
+        return f"{subject}: {reason}{last}"
 
     def snapshot(self) -> State:
         """Return what was counted."""
-        return {"count": self.count, "counts": [[*about, counts] for about, counts in self._counts.items()]}
+        counts = [[*about, counts] for about, counts in self._counts.items()]
+        return {"count": self.count, "counts": counts, "total": self._total.snapshot()}
 
     def restore(self, state: State) -> None:
         """Take over what `snapshot` returned."""
         self.count = state["count"]
         self._counts = {(source, subject): counts for source, subject, counts in state["counts"]}
-
-
-class ChangeBudget:
-    """Bounds what each source may change: CHANGES_MAX at once, and one more with every gate.
-
-    It counts in simulated time, so that a run that is flown again from its record allows the same.
-
-    Args:
-        now_ns: returns the newest gate [ns].
-        gate_ns: between two gates [ns].
-    """
-
-    def __init__(self, now_ns: Callable[[], int], gate_ns: int) -> None:
-        self._now_ns = now_ns
-        self._gate_ns = gate_ns
-        self._spent: dict[str, tuple[float, int]] = {}  # changes that count still, and at which gate they did [ns]
-
-    def snapshot(self) -> State:
-        """Return what each source has spent."""
-        return {"spent": [[source, *spent] for source, spent in self._spent.items()]}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._spent = {source: (count, at_ns) for source, count, at_ns in state["spent"]}
-
-    def allows(self, source: str) -> bool:
-        """Return whether a source may make one more change."""
-        return self._counted(source) <= CHANGES_MAX - 1
-
-    def spend(self, source: str) -> bool:
-        """Count a change; return False where there was none left."""
-        if not self.allows(source):
-            return False
-        if len(self._spent) > SUBJECTS_MAX:
-            self._spent.clear()
-        self._spent[source] = self._counted(source) + 1, self._now_ns()
-        return True
-
-    def _counted(self, source: str) -> float:
-        spent, at_ns = self._spent.get(source, (0.0, 0))
-        return max(0.0, spent - (self._now_ns() - at_ns) / self._gate_ns)
+        self._total.restore(state["total"])
 
 
 class RunOutbox:
@@ -129,8 +101,8 @@ class RunOutbox:
         self._now_ns = now_ns
         self._next_seq: dict[str, int] = {}
         self.pending: list[KeyedMessage] = []
-        self.refusals = RefusalLog()
-        self.refused_requests = RefusalLog()
+        self.refusals = RefusalLog(now_ns)
+        self.refused_requests = RefusalLog(now_ns)
 
     def snapshot(self) -> State:
         """Return the numbers of the keys, and what was refused."""

@@ -57,7 +57,9 @@ class World(Coordinator):
         self.fleet = Fleet(scenario)
         self.queue = CommandQueue(self.names)
         self.faults = FaultInjector(scenario, clock, barrier, outbox, self.fleet.impairment)
-        self._intake = CommandIntake(scenario, clock, barrier, outbox, self.queue, self.fleet, self.faults.of_links)
+        self._intake = CommandIntake(
+            scenario, clock, barrier, outbox, self.queue, self.fleet, self.faults.of_links, self.budgets
+        )
         self._operations |= {**self._intake.operations(), **self.faults.operations()}
         self._publication = GatePublication(self.fleet)
         self._hash = TruthHash(self.fleet.count)
@@ -112,7 +114,7 @@ class World(Coordinator):
         return {
             "clock": self.clock,
             "outbox": self.outbox,
-            "changes": self.changes,
+            "budgets": self.budgets,
             "barrier": self.barrier,
             "statistics": self.statistics,
             "fleet": self.fleet,

@@ -1,7 +1,8 @@
 """Whose join counts: who takes the place of one that lives shows that it is there; who joins has a token and a done.
 
 A join is only a message, which anybody can publish in any name. What shows that a process is there is a token of its
-own session, or, of a program that has none of these, the done that follows the join.
+own session, or, of a program that has none of these, the done that follows the join. Time never stands for a stranger
+without a token: under fresh names many of them would stop it for good.
 """
 
 from dataclasses import dataclass
@@ -20,12 +21,13 @@ HELD_NS = 1_000_000_000  # wall time that time stands for one that lives from wh
 DONE_NS = 10_000_000_000  # wall time that time may stand for one that never published a done; first steps take 1 s
 LOOK_NS = 200_000_000  # wall time between two looks at those who still have to show that they are there
 NO_TOKEN = "has no liveliness token"
+WITHHELD_MAX = 1000  # joins of strangers that wait for their tokens
 NO_DONE = "has never published a done"
 
 
 @dataclass
 class _Withheld:
-    """A join in another's place, since when there is one, and whether a done has followed it."""
+    """A join in another's place, or of a stranger; since when there is one, and whether a done has followed it."""
 
     join: Join
     since_ns: int
@@ -57,19 +59,31 @@ class Admission:
 
     def take(self, name: str, join: Join, wall_ns: int) -> None:
         """Take a join, or withhold it until it is clear that somebody is behind it."""
-        if not self._barrier.takes_place(name, join):
+        if self._is_clear(name, join):
             self._admit(name, join, wall_ns)
             return
         former = self._withheld.get(name)
+        if former is None and len(self._withheld) >= WITHHELD_MAX and name not in self._barrier.participants:
+            self._handle_false_join(name, join, NO_TOKEN)
+            return
         self._withheld[name] = _Withheld(join, former.since_ns if former else wall_ns)
-        self._check_withheld(wall_ns)
+        self._check(name, wall_ns)
+
+    def _is_clear(self, name: str, join: Join) -> bool:
+        """Tell whether a join costs nobody his place, and time nothing, though nobody may be behind it."""
+        return not (self._barrier.takes_place(name, join) or self._is_stranger(name, join))
+
+    def _is_stranger(self, name: str, join: Join) -> bool:
+        """Tell whether time would stand for a newcomer that the start does not wait for, and that has no token."""
+        stands = (join.period_ns > 0 or join.slack_ns > 0) and name not in self._barrier.participants
+        return stands and not (self._trusts or name in self._barrier.absent() or self._tokens.is_alive(name))
 
     def done_received(self, name: str, incarnation: int, wall_ns: int) -> None:
         """Take the news that a process has published a done, before the world has it."""
         withheld = self._withheld.get(name)
         if withheld is not None and withheld.join.incarnation == incarnation:
             withheld.has_done = True
-            self._check_withheld(wall_ns)
+            self._check(name, wall_ns)
 
     def _admit(self, name: str, join: Join, wall_ns: int) -> None:
         self._withheld.pop(name, None)
@@ -94,19 +108,29 @@ class Admission:
         self._count_standing(min(passed_ns, 2 * LOOK_NS), wall_ns)
 
     def _check_withheld(self, wall_ns: int) -> None:
-        for name, withheld in list(self._withheld.items()):
-            join = withheld.join
-            if not self._barrier.takes_place(name, join) or self._may_take_place(name, withheld, wall_ns):
-                self._admit(name, join, wall_ns)
-                continue
-            reason = NO_DONE if self._tokens.is_alive(name) else NO_TOKEN
-            if wall_ns - withheld.since_ns >= (SHOWN_NS if reason == NO_DONE else TOKEN_NS):
-                del self._withheld[name]
-                self._world.handle_false_join(name, join, reason)
-                self._note(FalselyJoined(name, messages.encode(join), reason))
+        for name in list(self._withheld):
+            self._check(name, wall_ns)
+
+    def _check(self, name: str, wall_ns: int) -> None:
+        """Admit a join that was withheld, once it may be, or give it up after its time."""
+        withheld = self._withheld[name]
+        join = withheld.join
+        if self._is_clear(name, join) or self._may_take_place(name, withheld, wall_ns):
+            self._admit(name, join, wall_ns)
+            return
+        reason = NO_DONE if self._tokens.is_alive(name) else NO_TOKEN
+        if wall_ns - withheld.since_ns >= (SHOWN_NS if reason == NO_DONE else TOKEN_NS):
+            del self._withheld[name]
+            self._handle_false_join(name, join, reason)
+
+    def _handle_false_join(self, name: str, join: Join, reason: str) -> None:
+        self._world.handle_false_join(name, join, reason)
+        self._note(FalselyJoined(name, messages.encode(join), reason))
 
     def _may_take_place(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
         """Tell whether somebody is behind a join in the place of another, or the other is not there any more."""
+        if self._is_stranger(name, withheld.join):
+            return False
         if self._trusts or withheld.has_done or self._tokens.sessions(name) - self._sessions.get(name, Sessions()):
             return True
         former = self._barrier.participants.get(name)
@@ -130,15 +154,26 @@ class Admission:
                 self._handle_no_show(name, NO_TOKEN, wall_ns)
 
     def _count_standing(self, passed_ns: int, wall_ns: int) -> None:
-        """Count how long time stands for nobody but those that have never published a done, as victims may have not."""
-        blocking = self._world.standing_for()
-        if not blocking or any(p.name not in self._standing_ns or not _owes_done(p) for p in blocking):
+        """Count how long those have owed their first done that never published one, and drop them in the end.
+
+        In lockstep only while time stands for nobody else, as victims of others may not have published any; in
+        realtime, where time stands for nobody, all the time.
+        """
+        owing = self._owing() if self._world.clock.mode == "realtime" else self._world.standing_for()
+        if any(p.name not in self._standing_ns or not _owes_done(p) for p in owing):
             return
-        for participant in blocking:
+        for participant in owing:
             if not self._world.must_wait_for(participant):
                 self._standing_ns[participant.name] += passed_ns
                 if self._standing_ns[participant.name] >= DONE_NS:
                     self._handle_no_show(participant.name, NO_DONE, wall_ns)
+
+    def _owing(self) -> list[Participant]:
+        """Return, in realtime, whose first done is due while time runs."""
+        clock = self._world.clock
+        runs = clock.state == "running" and not clock.is_halted
+        due = self._world.blocking() if runs else ()
+        return [p for p in due if p.alive and p.name in self._standing_ns and _owes_done(p)]
 
     def _handle_no_show(self, name: str, reason: str, wall_ns: int) -> None:
         self._world.handle_no_show(name, reason, wall_ns)

@@ -1,4 +1,4 @@
-"""Requests and joins that repeat without end: counted to the last, published up to a bound, never done unpublished."""
+"""Requests, commands and joins that repeat without end: counted to the last, published up to a bound, never done unpublished."""
 
 from typing import Any
 
@@ -6,9 +6,11 @@ import pytest
 from refused import has_terms
 
 from zsim.contract import keys
+from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest, Event, Join
 from zsim.scenario import scenario_file
-from zsim_world.flight.run_outbox import CHANGES_MAX, EVENTS_MAX
+from zsim_world.flight.budgets import CHANGES_MAX, STRANGERS_MAX, UNJOINED
+from zsim_world.flight.run_outbox import EVENTS_MAX, REFUSED_MAX
 from zsim_world.flight.world import World
 
 FLOOD = 5000  # requests, several times what is published
@@ -80,3 +82,90 @@ def test_a_process_that_gates_nobody_joins_and_leaves_so_often_only(world: World
         "refused": EVENTS_MAX,
     }
     assert world.result()["refused"] == FLOOD - CHANGES_MAX
+
+
+def command(world: World, source: str, seq: int) -> None:
+    world.handle(keys.command("d1", "velocity"), Velocity(0, seq, source, (0.0, 0.0, 0.0), 0.0), 0)
+
+
+def kinds(world: World) -> dict[str, int]:
+    found = [event.kind for event in events(world)]
+    return {kind: found.count(kind) for kind in set(found)}
+
+
+def test_a_command_of_who_does_not_gate_is_an_event_or_is_refused(world: World) -> None:
+    for seq in range(FLOOD):
+        command(world, "me.x", seq)
+    assert kinds(world) == {"command": CHANGES_MAX, "refused": EVENTS_MAX}
+    assert world.result()["refused"] == FLOOD - CHANGES_MAX
+    command(world, "other.x", 0)
+    assert kinds(world) == {"command": 1}
+    world.advance(0)
+    events(world)
+    command(world, "me.x", FLOOD)
+    assert kinds(world) == {"command": 1}
+
+
+def test_other_names_allow_those_who_have_not_joined_so_many_commands_only(world: World) -> None:
+    world.handle(keys.process("me.x", "join"), Join(0, 0, "run1", 1, "me", "here", 1, 0), 0)
+    events(world)
+    for number in range(4 * UNJOINED * CHANGES_MAX):
+        command(world, f"s.{number}", 0)
+    assert kinds(world) == {"command": UNJOINED * CHANGES_MAX, "refused": REFUSED_MAX}
+    command(world, "me.x", 0)
+    assert kinds(world) == {"command": 1}
+
+
+def join(world: World, name: str, period_ns: int = 0, run_id: str = "run1") -> None:
+    world.handle(keys.process(name, "join"), Join(0, 0, run_id, 1, name.split(".")[0], "here", 1, period_ns), 0)
+
+
+@pytest.mark.parametrize("period_ns", [0, 20_000_000])
+def test_newcomers_join_so_often_only_all_names_together(world: World, period_ns: int) -> None:
+    for number in range(FLOOD):
+        join(world, f"console.{number}", run_id="another")
+        join(world, f"console.{number}", period_ns)
+    assert kinds(world) == {"join": STRANGERS_MAX, "refused": REFUSED_MAX}
+    assert len(world.barrier.participants) == STRANGERS_MAX
+    assert world.result()["refused"] == 2 * FLOOD - STRANGERS_MAX
+    join(world, "estimator.d1", period_ns)
+    join(world, "console.0", period_ns)
+    world.handle(keys.process("console.0", "bye"), Bye(0, 0, "over"), 0)
+    join(world, "console.0", period_ns)
+    assert kinds(world) == {"join": 3, "leave": 1}
+
+
+def test_every_second_allows_one_newcomer_more(world: World) -> None:
+    for number in range(FLOOD):
+        join(world, f"console.{number}")
+    for _ in range(50):
+        world.advance(0)
+    events(world)
+    join(world, "late.1")
+    join(world, "late.2")
+    assert kinds(world) == {"join": 1, "refused": 1}
+
+
+def test_refusals_of_all_sources_together_are_so_many_events(world: World) -> None:
+    for number in range(FLOOD):
+        world.outbox.refuse(f"s.{number}", "clock", "no")
+    assert kinds(world) == {"refused": REFUSED_MAX}
+    assert world.result()["refused"] == FLOOD
+
+
+def test_news_of_joins_that_nobody_is_behind_is_bounded(world: World) -> None:
+    for number in range(FLOOD):
+        message = Join(0, 0, "run1", 1, "x", "here", 1, 20_000_000)
+        world.handle_false_join(f"x.{number}", message, "no token")
+    assert kinds(world) == {"no_show": STRANGERS_MAX}
+    assert world.result()["refused"] == FLOOD - STRANGERS_MAX
+
+
+def test_what_was_spent_is_in_a_snapshot(world: World) -> None:
+    for number in range(FLOOD):
+        join(world, f"console.{number}")
+    events(world)
+    again = World(world.scenario, run_id="run1")
+    again.restore(world.snapshot())
+    join(again, "late.1")
+    assert kinds(again) == {}

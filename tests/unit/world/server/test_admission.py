@@ -4,11 +4,12 @@ import pytest
 from fake_link import FakeLink
 
 from zsim.contract import keys
-from zsim.contract.run_messages import Done, Join
+from zsim.contract.run_messages import ControlRequest, Done, Event, Join
 from zsim.scenario import scenario_file
 from zsim.transport.session_tokens import SessionTokens
+from zsim_world.flight.budgets import STRANGERS_MAX
 from zsim_world.flight.world import World
-from zsim_world.server.admission import DONE_NS, HELD_NS, LOOK_NS, SHOWN_NS, TOKEN_NS, Admission
+from zsim_world.server.admission import DONE_NS, HELD_NS, LOOK_NS, SHOWN_NS, TOKEN_NS, WITHHELD_MAX, Admission
 
 GATE_NS = 20_000_000
 ME = "estimator.d1"
@@ -25,9 +26,9 @@ KINDS = {"join", "restart", "superseded", "no_show", "death", "drop"}
 class Case:
     """A world, who holds which token, and a wall clock that a test turns."""
 
-    def __init__(self, trusts: bool = False) -> None:
+    def __init__(self, trusts: bool = False, mode: str = "lockstep") -> None:
         self.link = FakeLink()
-        self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
+        self.world = World(scenario_file.from_text(SCENARIO), mode, run_id="run1")
         tokens = SessionTokens(self.link)  # type: ignore[arg-type]
         tokens.watch()
         self.admission = Admission(tokens, self.world, trusts)
@@ -65,6 +66,10 @@ class Case:
             self.done(ME, self.world.now_ns, incarnation)
             self.passes(0)
 
+    def gates(self, count: int) -> None:
+        for _ in range(count):
+            self.world.advance(self.wall_ns)
+
     def advance(self) -> None:
         while self.world.may_advance():
             self.world.advance(self.wall_ns)
@@ -76,9 +81,11 @@ class Case:
             self.advance()
         self.done(ME, self.world.now_ns, incarnation=1)
 
+    def events(self) -> list[Event]:
+        return [message for key, message in self.world.outbox.pending if key == keys.EVENT]
+
     def kinds(self, name: str = ME) -> list[str]:
-        events = (message for key, message in self.world.outbox.pending if key == keys.EVENT)
-        return [event.kind for event in events if event.subject == name and event.kind in KINDS]
+        return [event.kind for event in self.events() if event.subject == name and event.kind in KINDS]
 
     def incarnation(self, name: str = ME) -> int:
         return self.world.barrier.participants[name].join.incarnation
@@ -176,13 +183,41 @@ def test_access_control_is_trusted() -> None:
     assert case.kinds() == ["join", "superseded"]
 
 
-def test_who_joins_without_a_token_is_dropped(case: Case) -> None:
+@pytest.mark.parametrize("name", [VISITOR, "recorder"])
+def test_who_joins_without_a_token_is_not_waited_for(case: Case, name: str) -> None:
+    case.join(name, pid=9, incarnation=1)
+    case.done(name, 0, incarnation=1)
+    case.flies_for(TOKEN_NS)
+    assert case.kinds(name) == ["no_show"]
+    assert name not in case.world.barrier.participants
+
+
+def test_a_visitor_joins_as_soon_as_its_token_is_there(case: Case) -> None:
     case.join(VISITOR, pid=9, incarnation=1)
     case.fly()
-    assert [waiting.name for waiting in case.world.waiting_for(case.wall_ns)] == [VISITOR]
-    case.passes(TOKEN_NS)
+    assert case.world.waiting_for(case.wall_ns) == ()
+    case.show(VISITOR)
+    case.passes(LOOK_NS)
+    assert case.kinds(VISITOR) == ["join"]
+    assert case.world.barrier.participants[VISITOR].from_ns > 0
+
+
+def test_strangers_under_fresh_names_stop_no_time_and_fill_no_memory(case: Case) -> None:
+    for number in range(3 * WITHHELD_MAX):
+        case.join(f"x.{number}", pid=9, incarnation=1)
+    before_ns = case.world.now_ns
+    case.flies_for(TOKEN_NS)
+    assert case.world.now_ns > before_ns
+    assert list(case.world.barrier.participants) == [ME]
+    assert len([event for event in case.events() if event.kind == "no_show"]) == STRANGERS_MAX
+    assert case.world.outbox.refusals.count >= 3 * WITHHELD_MAX - STRANGERS_MAX
+
+
+def test_one_that_does_not_gate_joins_at_once(case: Case) -> None:
+    case.join(VISITOR, pid=9, incarnation=1, period_ns=0)
+    assert case.kinds(VISITOR) == ["join"]
+    case.flies_for(TOKEN_NS)
     assert case.kinds(VISITOR) == ["join", "no_show", "drop"]
-    assert VISITOR not in case.world.barrier.participants
 
 
 def test_who_never_publishes_a_done_is_dropped(case: Case) -> None:
@@ -228,3 +263,49 @@ def test_before_the_start_the_scenario_s_process_is_waited_for_again() -> None:
     case.passes(TOKEN_NS)
     assert case.kinds() == ["join", "no_show", "drop"]
     assert set(case.world.barrier.absent()) == {ME, "recorder"}
+
+
+@pytest.fixture
+def realtime() -> Case:
+    """A realtime run in which ME takes part, with a token, and has published a done."""
+    made = Case(mode="realtime")
+    made.show(ME, "a")
+    made.join(ME, pid=7, incarnation=1)
+    made.gates(2)
+    made.done(ME, 0, incarnation=1)
+    made.passes(LOOK_NS)
+    return made
+
+
+def test_in_realtime_a_successor_that_publishes_nothing_is_dead_too(realtime: Case) -> None:
+    realtime.show(ME, "b")
+    realtime.join(ME, pid=8, incarnation=2)
+    realtime.gates(1)
+    realtime.passes(DONE_NS // 2)
+    assert realtime.kinds() == ["join", "superseded"]
+    realtime.passes(DONE_NS // 2)
+    assert realtime.kinds() == ["join", "superseded", "no_show", "death"]
+
+
+def test_in_realtime_one_that_publishes_a_done_stays(realtime: Case) -> None:
+    realtime.show(ME, "b")
+    realtime.join(ME, pid=8, incarnation=2)
+    realtime.gates(1)
+    realtime.passes(DONE_NS // 2)
+    realtime.done(ME, realtime.world.now_ns, incarnation=2)
+    realtime.gates(3)
+    realtime.passes(2 * DONE_NS)
+    assert realtime.kinds() == ["join", "superseded"]
+
+
+def test_in_realtime_no_done_is_due_while_the_run_is_paused_or_before_a_period_is_over(realtime: Case) -> None:
+    realtime.show(VISITOR, "v")
+    realtime.join(VISITOR, pid=9, incarnation=1, period_ns=100 * GATE_NS)
+    realtime.gates(3)
+    realtime.passes(2 * DONE_NS)
+    assert realtime.kinds(VISITOR) == ["join"]
+    realtime.show(ME, "b")
+    realtime.join(ME, pid=8, incarnation=2)
+    realtime.world.control(ControlRequest("pause", {}, "me.x"))
+    realtime.passes(2 * DONE_NS)
+    assert realtime.kinds() == ["join", "superseded"]

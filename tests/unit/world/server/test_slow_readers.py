@@ -8,6 +8,7 @@ from zsim.contract.run_messages import Health
 from zsim.scenario import scenario_file
 from zsim.transport.link_watch import ClosedLink
 from zsim.transport.session_tokens import SessionTokens
+from zsim_world.flight.budgets import STRANGERS_MAX
 from zsim_world.flight.world import World
 from zsim_world.journal.run_journal import RunJournal
 from zsim_world.server.message_history import MessageHistory
@@ -46,3 +47,10 @@ def test_a_process_of_the_run_is_named_with_what_it_reads(readers: SlowReaders) 
 def test_a_stranger_on_this_machine_is_named_by_its_command(readers: SlowReaders) -> None:
     data = reported(readers, STRANGER)
     assert (data["host"], data["process"], data["reads"], data["times"]) == ("laptop", STRANGER.process, [], 2)
+
+
+def test_ever_new_sessions_are_so_many_events_only(readers: SlowReaders) -> None:
+    readers.watch.closed.extend(STRANGER._replace(address=f"127.0.0.1:{port}") for port in range(3 * STRANGERS_MAX))
+    readers.report()
+    events = [message for key, message in readers._world.take_outbox() if key == keys.EVENT]
+    assert [event.kind for event in events] == ["slow_reader"] * STRANGERS_MAX

@@ -7,7 +7,17 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.transport.link_sockets import Progress
-from zsim.transport.link_watch import HELD_BYTES, KEPT_OUT_S, LOOK_S, SPARED, STALL_BYTES, STALL_S, Awaited, LinkWatch
+from zsim.transport.link_watch import (
+    HELD_BYTES,
+    KEPT_OUT_S,
+    LOOK_S,
+    SPARED,
+    STALL_BYTES,
+    STALL_S,
+    TOLD_S,
+    Awaited,
+    LinkWatch,
+)
 from zsim.transport.session import FarEnd
 from zsim.transport.session_tokens import SessionTokens
 
@@ -127,3 +137,28 @@ def test_who_comes_back_to_do_it_again_is_kept_out_for_a_while():
     case.sockets.held = {READER: 0}
     case.passes(2.0)
     assert len(case.sockets.closed) == SPARED + 1
+
+
+def test_of_a_session_one_closed_link_is_reported_in_a_while_with_their_number():
+    case = Case()
+    for _ in range(SPARED - 1):
+        case.sockets.held = {READER: HELD_BYTES}
+        case.passes(1.0)
+    assert [closed.times for closed in case.watch.closed] == [1]
+    case.passes(TOLD_S)
+    case.sockets.held = {READER: HELD_BYTES}
+    case.passes(1.0)
+    assert [closed.times for closed in case.watch.closed] == [1, SPARED]
+
+
+def test_a_session_that_is_kept_out_is_reported_only_if_it_holds_something_back():
+    case = Case()
+    for _ in range(SPARED):
+        case.sockets.held = {READER: HELD_BYTES}
+        case.passes(1.0)
+    case.watch.closed.clear()
+    case.passes(TOLD_S)
+    case.sockets.held = {READER: STALL_BYTES - 1}
+    case.passes(1.0)
+    assert len(case.sockets.closed) == SPARED + 1
+    assert list(case.watch.closed) == []
