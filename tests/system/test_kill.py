@@ -283,7 +283,7 @@ def test_a_world_that_was_restarted_in_realtime_counts_only_its_own_time(federat
     run.ends(with_code=0)
     end = federation.record().end()
     assert end["sim_s"] == pytest.approx(end["last_ns"] / 1e9)
-    assert end["deadline_misses"] < end["deadlines"] / 3  # half of them were
+    assert max(end["deadline_misses_by"].values()) < 400  # of 800 gates, some 650 of them after the death
 
 
 def test_a_world_that_is_not_to_be_restarted(federation: Federation) -> None:
