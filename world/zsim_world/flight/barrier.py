@@ -301,6 +301,10 @@ class Barrier:
         """Return who has not come back yet."""
         return [p for p in self.participants.values() if p.away]
 
+    def waiting_for_return(self, wall_ns: int) -> tuple[Waiting, ...]:
+        """Return who has not come back yet, as `clock` names them."""
+        return tuple(participant.waiting(wall_ns) for participant in self.away())
+
     def substitute(self, name: str) -> Participant | None:
         """Return who lives and does all the work of a participant beside its own."""
         served = self.participants[name].served_names
