@@ -5,15 +5,17 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from federation import ONE
+from federation import ONE, PAIR
 from forked_commands import ROOT, USER_FAULT, ZSIM
 from refused import has_terms
 
 PATIENCE_S = 120.0  # wall time in which a run of a simulated second ends, on a machine with much to do
 TOO_FEW = (10, 16, 24)  # of these one was a traceback, one a panic, and one hung
 BRIEF = ONE.replace("expect: []", "expect: [estimator.drone1]").replace("duration_s: 10", "duration_s: 1")
+BRIEF_PAIR = PAIR.replace("duration_s: 12", "duration_s: 1")
 COMMANDS: dict[str, tuple[str, ...]] = {
     "run": ("run", "{one}", "--no-report", "--out", "{out}"),
+    "a hosted run": ("run", "{pair}", "--hosted", "--no-report", "--out", "{out}"),
     "world": ("world", "{one}", "--listen", "tcp/127.0.0.1:9"),
     "an agent": ("estimator", "drone1", "--connect", "tcp/127.0.0.1:9"),
     "an observer": ("keys", "--connect", "tcp/127.0.0.1:9"),
@@ -25,9 +27,10 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 
 def zsim(folder: Path, files: int, *arguments: str) -> "subprocess.CompletedProcess[str]":
     """Run a command that may open so many files."""
-    one, out = folder / "one.yaml", folder / "out"
+    one, pair, out = folder / "one.yaml", folder / "pair.yaml", folder / "out"
     one.write_text(BRIEF)
-    words = [word.format(one=one, out=out) for word in arguments]
+    pair.write_text(BRIEF_PAIR)
+    words = [word.format(one=one, pair=pair, out=out) for word in arguments]
     command = ["bash", "-c", f'ulimit -n {files}; exec "$@"', "zsim", *ZSIM, *words]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, cwd=ROOT)
 
@@ -44,9 +47,10 @@ def test_too_few_files_are_a_line_with_the_number_needed(tmp_path: Path, name: s
     assert not (tmp_path / "out" / "logs").exists()
 
 
-def test_the_number_that_is_said_is_enough(tmp_path: Path) -> None:
-    refused = zsim(tmp_path, 16, *COMMANDS["run"])
+@pytest.mark.parametrize("name", ["run", "a hosted run"])
+def test_the_number_that_is_said_is_enough(tmp_path: Path, name: str) -> None:
+    refused = zsim(tmp_path, 16, *COMMANDS[name])
     needed = re.search(r"must be (\d+)", refused.stderr)
     assert needed is not None, refused.stderr
-    flown = zsim(tmp_path, int(needed[1]), *COMMANDS["run"])
+    flown = zsim(tmp_path, int(needed[1]), *COMMANDS[name])
     assert flown.returncode == 0, flown.stderr

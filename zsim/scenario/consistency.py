@@ -24,6 +24,7 @@ from zsim.vehicles.vehicle import Vehicle
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
 TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
 TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
+WORLD, WORLD_DEATHS = "world", ("restart", "end")
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
 
 
@@ -296,6 +297,7 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
 
 
 def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+    yield from _death_faults(processes and processes.on_death)
     first: dict[str, int] = {}
     things = {role: (each.about, drones if each.about == "drone" else clusters) for role, each in AGENTS.items()}
     for index, name in _entries(processes and processes.expect):
@@ -308,6 +310,13 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
             named = fault_check.listed(known) or f"a {kind}, and there is none"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
+
+
+def _death_faults(on_death: Mapping[str, Any] | None) -> Iterator[Fault]:
+    """Yield what the death of a world cannot mean: nobody else keeps the run, so there is nothing to go on with."""
+    action = (on_death or {}).get(WORLD)
+    if action is not None and action not in WORLD_DEATHS:
+        yield f"processes.on_death.{WORLD}", f"is {action!r}; must be {' or '.join(WORLD_DEATHS)}"
 
 
 def _injected_faults(

@@ -21,9 +21,14 @@ def hub_files(clients: int) -> int:
     return SESSION_FILES + CLIENT_FILES * (clients + SPARE_CLIENTS)
 
 
-def launcher_files(roles: int) -> int:
-    """Return how many files a run of so many processes needs, in the process that needs most."""
-    return max(hub_files(roles - 1), SESSION_FILES + ROLE_FILES * roles)
+def launcher_files(roles: int, names: int) -> int:
+    """Return how many files a run needs, in the process that needs most.
+
+    Args:
+        roles: processes that are started, the world among them.
+        names: of processes that the world waits for: more than are started, where one does the work of many.
+    """
+    return max(hub_files(max(roles - 1, names)), SESSION_FILES + ROLE_FILES * roles)
 
 
 def host_launcher_files(roles: int, hosts: int) -> int:

@@ -141,6 +141,8 @@ class AccessCheck:
         except ConnectionError:
             raise
         except Exception as error:  # a fault of the gateway: other requests are served on
+            if isinstance(error, RuntimeError) and request.transport is None:  # aiohttp's for a body that is cut
+                raise ConnectionResetError("the client is gone") from error
             self._report(f"{request.method} {request.path[:80]}: {error!r}")
             return error_response(500, f"the gateway failed ({type(error).__name__}); its terminal says more")
 

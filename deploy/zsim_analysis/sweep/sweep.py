@@ -99,12 +99,14 @@ class SweepRequest(Struct, frozen=True):
         out: folder of the sweep.
         workers: processes on this host, None: one per core.
         dask: address of a Dask scheduler whose workers are used instead.
+        force: whether the folder may hold other files.
     """
 
     plan: SweepPlan
     out: Path
     workers: int | None = None
     dask: str | None = None
+    force: bool = False
 
 
 class WorkerPool(Protocol):
@@ -122,7 +124,7 @@ def sweep(request: SweepRequest) -> list[Row]:
         RunError: the folder holds something else, or cannot be written; workers cannot start.
         KeyboardInterrupt: the finished runs are in the table.
     """
-    with locked(request.out, request.plan) as folder:
+    with locked(request.out, request.plan, request.force) as folder:
         done = {row["run"] for row in folder.compact()}
         missing = [run for run in range(request.plan.runs) if run not in done]
         with SweepScreen(request.plan.runs, len(done)) as screen:

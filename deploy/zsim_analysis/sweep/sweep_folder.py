@@ -18,11 +18,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from zsim.errors import ReportError, RunError
+from zsim.output_folder import refuse_others
 from zsim_analysis.sweep.axes import SEED, Axis, Grid
 from zsim_analysis.sweep.design import PLAN, SweepDesign, SweepPlan, difference, is_sweep
 from zsim_analysis.sweep.sweep_run import FIXED, Row
 
 JOURNAL, TABLE, RUNS, LOCK = "journal.jsonl", "sweep.parquet", "runs", ".lock"
+NEW_PLAN = f".{PLAN}.new"
 PLAN_METADATA = b"zsim_sweep"  # key of the plan in the table's metadata
 _TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
@@ -78,14 +80,20 @@ def load(path: Path) -> SweepFolder:
 
 
 @contextmanager
-def locked(path: Path, plan: SweepPlan) -> Iterator[SweepFolder]:
+def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFolder]:
     """Yield the folder of a sweep, new or continued, locked against other sweeps.
+
+    Args:
+        path: of the folder.
+        plan: of the sweep.
+        force: take one that holds other files, too; a run, or another sweep, is refused always.
 
     Raises:
         RunError: another sweep is at work there, or it holds something else.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
+        _refuse_others(path, force)
         lock = (path / LOCK).open("w")
     except OSError as error:
         raise RunError(f"{path}: cannot be made ({error.strerror}); give --out another folder") from error
@@ -98,17 +106,24 @@ def locked(path: Path, plan: SweepPlan) -> Iterator[SweepFolder]:
         yield SweepFolder(path, plan)
 
 
+def _refuse_others(path: Path, force: bool) -> None:
+    """Refuse a folder that is no sweep's and is not empty."""
+    if is_sweep(path):
+        return
+    if (path / "run.mcap").exists() or (path / TABLE).exists():
+        raise RunError(f"{path}: holds something else already; give --out another folder")
+    refuse_others(path, (LOCK, NEW_PLAN), force, "sweep into")
+
+
 def _write_plan(path: Path, plan: SweepPlan) -> None:
-    """Write the plan, unless the folder holds something else; a sweep without a finished run may be replaced."""
+    """Write the plan, unless the folder holds another sweep; a sweep without a finished run may be replaced."""
     content = _plan_json(path, plan)
     if is_sweep(path):
         present = load(path)
         other = difference(present.plan, msgspec.json.decode(content, type=SweepPlan))  # both as decoded from JSON
         if other and present.rows():
             raise RunError(f"{path}: holds another sweep ({other}); give --out another folder")
-    elif (path / "run.mcap").exists() or (path / TABLE).exists():
-        raise RunError(f"{path}: holds something else already; give --out another folder")
-    new = path / f".{PLAN}.new"
+    new = path / NEW_PLAN
     try:
         new.write_bytes(content)
         new.replace(path / PLAN)

@@ -11,7 +11,7 @@ import typer
 from zsim.errors import ZsimError, printable
 from zsim_analysis.export import Format
 from zsim_deploy import INTERRUPTED
-from zsim_deploy.arguments import RUN, Duration, From, Keys, ScenarioPath, Seed, Set, To, check_range, require
+from zsim_deploy.arguments import RUN, Duration, Force, From, Keys, ScenarioPath, Seed, Set, To, check_range, require
 from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:
@@ -159,6 +159,7 @@ def sweep(
     dask: Annotated[str | None, typer.Option(help="Scheduler of a Dask cluster that flies the runs instead.")] = None,
     keep_records: Annotated[bool, typer.Option("--keep-records", help="Keep the record of every run.")] = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
+    force: Force = False,
 ) -> None:
     """Fly a scenario many times, with other seeds and values of its fields: one table, one report."""
     if dask is not None and (keep_records or workers is not None):
@@ -172,7 +173,7 @@ def sweep(
     folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        rows = fly(SweepRequest(plan, folder, workers, dask))
+        rows = fly(SweepRequest(plan, folder, workers, dask, force))
     except KeyboardInterrupt:
         print(
             printable(f"interrupted; the same command with --out {folder} goes on, the table so far is in it"),

@@ -30,6 +30,7 @@ from zsim_deploy.launch.supervisor import Outcome, Supervisor
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 DEFAULT_PORT = 7447  # Zenoh's own
+RECORDER = "recorder"
 CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
 
@@ -67,12 +68,12 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
     launched = ["--launched", options.run_id, *(["--insecure"] if options.insecure else [])]
     reach = ["--connect", endpoint, "--federation", federation, *launched]
     pace = pace_options(options.mode, options.rate)
-    world = ["world", str(file), "--listen", endpoint, "--expect", "recorder", *pace, *launched]
+    world = ["world", str(file), "--listen", endpoint, "--expect", RECORDER, *pace, *launched]
     world += ["--journal", str(options.out / JOURNAL), *(["--all-died"] if options.continued else [])]
     record = ["record", "--out", str(options.out), *reach]
     children = [
         ChildProcess("world", world, logs, launcher, supervisor.handle_line),
-        ChildProcess("recorder", record, logs, launcher),
+        ChildProcess(RECORDER, record, logs, launcher),
     ]
     wanted = scenario.processes.expect
     names = [name for name in agents_of(scenario) if wanted is None or name in wanted]
@@ -123,9 +124,10 @@ def check_open_files(options: RunOptions) -> None:
     Raises:
         SessionError: with how many files there must be.
     """
-    agents = 1 if options.hosted else len(options.scenario.expected())
+    expected = {*options.scenario.expected(), RECORDER}
+    agents = 1 if options.hosted else len(expected) - 1
     count = 2 + agents + options.console + options.cameras + options.detect
-    require_files(launcher_files(count), f"{count} processes")
+    require_files(launcher_files(count, len(expected)), f"{count} processes")
 
 
 def _is_free(port: int) -> bool:

@@ -4,12 +4,12 @@ import time
 from pathlib import Path
 
 from zsim.errors import RunError
+from zsim.output_folder import refuse_others
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.launch.interrupted_run import JOURNAL
 
 RECORD, LOGS, SCENARIO = "run.mcap", "logs", "scenario.yaml"
 LEFT = (SCENARIO, "run.log", "up.log")  # beside empty logs and an empty journal: all that a run leaves that never flew
-OTHERS_NAMED = 3  # in a refusal
 
 
 def make_directory(out: Path | None, scenario: Scenario, force: bool = False) -> Path:
@@ -27,12 +27,9 @@ def make_directory(out: Path | None, scenario: Scenario, force: bool = False) ->
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _refuse_run(folder)
-        others = sorted(each.name for each in folder.iterdir() if each.name not in (*LEFT, LOGS, JOURNAL))
+        refuse_others(folder, (*LEFT, LOGS, JOURNAL), force, "fly into")
     except OSError as error:
         raise RunError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
-    if others and not force:
-        named = ", ".join(others[:OTHERS_NAMED]) + (", …" if len(others) > OTHERS_NAMED else "")
-        raise RunError(f"{folder}: holds {named}; give --out an empty folder, or --force to fly into this one")
     return folder
 
 

@@ -130,6 +130,7 @@ class Supervisor:
         self._world_watch.received(time.monotonic())
         if "clock" in line:
             self._flies = self._flies or line["clock"].get("state") == "running"
+            self._world_watch.clock(line["clock"])
             self._show.clock(line["clock"])
         elif "event" in line:
             self._on_event(line["event"])

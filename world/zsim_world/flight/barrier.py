@@ -29,6 +29,7 @@ class Participant:
         missing: outputs that it counted in its dones and that have not come in.
         done_seq: number of its newest done, None before the first of its process.
         lost_done: whether a done was lost, and with it the count of the outputs before it.
+        was_incomplete: whether it was at the last gate, in realtime.
         rejoined: whether another incarnation of its name was there before.
         repeats: whether it may publish once more what was counted before.
         successor: whether that one lived, and has ended for it.
@@ -47,6 +48,7 @@ class Participant:
     missing: int = 0
     done_seq: int | None = None
     lost_done: bool = False
+    was_incomplete: bool = False
     rejoined: bool = False
     repeats: bool = False
     successor: bool = False
@@ -299,6 +301,10 @@ class Barrier:
         """Return who has not come back yet."""
         return [p for p in self.participants.values() if p.away]
 
+    def waiting_for_return(self, wall_ns: int) -> tuple[Waiting, ...]:
+        """Return who has not come back yet, as `clock` names them."""
+        return tuple(participant.waiting(wall_ns) for participant in self.away())
+
     def substitute(self, name: str) -> Participant | None:
         """Return who lives and does all the work of a participant beside its own."""
         served = self.participants[name].served_names
@@ -330,6 +336,16 @@ class Barrier:
     def incomplete(self) -> list[Participant]:
         """Return of whom outputs or a done were lost, or are still on their way."""
         return [p for p in self.participants.values() if p.incomplete]
+
+    def give_up_late(self) -> None:
+        """At a gate in realtime, wait no longer for outputs that were missing at the one before: they are lost.
+
+        Nobody asks for them again there, and every later gate would count as a deadline miss of their sender.
+        """
+        for participant in self.participants.values():
+            if participant.incomplete and participant.was_incomplete:
+                participant.reset_counts()
+            participant.was_incomplete = participant.incomplete
 
     def waiting_for(
         self, need_ns: int, wall_ns: int, start_wall_ns: int, feeds: Callable[[str, str], bool] = lambda *_: False

@@ -382,8 +382,13 @@ class Coordinator(ABC):
 
     def is_waiting_to_leave(self) -> bool:
         """Tell, after the end, whether a participant has yet to leave, or a dead recorder to come back for the rest."""
+        return bool(self.waiting_to_leave())
+
+    def waiting_to_leave(self, since_end_ns: int = 0) -> tuple[run_messages.Waiting, ...]:
+        """Return who has yet to leave, or to come back for the rest, so long after the end."""
         participants = self.barrier.participants.values()
-        return any(p.alive or (p.join.slack_ns > 0 and self._on_death(p) in RETURNS) for p in participants)
+        waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self._on_death(p) in RETURNS)]
+        return tuple(run_messages.Waiting(p.name, p.join.host, since_end_ns / 1e9) for p in waited)
 
     # Publication
 

@@ -86,7 +86,7 @@ class RealTimeFactor:
         if self._start_wall_ns is not None:
             self._start_wall_ns += wall_ns - self._last[1]
             self._last = (self._last[0], wall_ns)
-        self._marks.clear()
+            self._marks = deque([self._last])
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""

@@ -154,6 +154,7 @@ class World(Coordinator):
         """Integrate one gate; return whether the state is still finite."""
         if self.clock.mode == "realtime":
             self.statistics.deadlines(self.barrier.participants.values(), self.clock.required_ns)
+            self.barrier.give_up_late()
         self._intake.apply(self.now_ns)
         self.faults.apply(self.now_ns)
         try:

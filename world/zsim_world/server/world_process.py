@@ -29,10 +29,10 @@ from zsim_world.server.pacing import Pacer, Pipelining
 from zsim_world.server.query_service import QueryService
 from zsim_world.server.resumption import Resumption
 from zsim_world.server.slow_readers import SlowReaders
+from zsim_world.server.turn_watch import TurnWatch
 from zsim_world.server.world_inputs import TICK_S, MessageIntake, ProgressCallback, open_inputs
 from zsim_world.server.world_outputs import WorldOutputs
 
-STUCK_NS = 2_000_000_000  # wall time in one turn from which on it is an event; a turn takes milliseconds
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 HEALTH = keys.process(WORLD, "health")
@@ -203,11 +203,15 @@ class WorldProcess:
         """Publish the clock once a second while time stands still, and wait for whatever comes."""
         self._outputs.flush()
         self._pipelining.pause(wall_ns)
+        self._publish_clock(wall_ns, self._world.waiting_for)
+        self._inputs.wait_for(self._required_dones())
+
+    def _publish_clock(self, wall_ns: int, waiting_for: Callable[[int], tuple[run_messages.Waiting, ...]]) -> None:
+        """Publish once a second whom the world waits for."""
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
-            clock = self._world.clock_message(self._world.waiting_for(wall_ns))
+            clock = self._world.clock_message(waiting_for(wall_ns))
             self._outputs.publish(Output(keys.CLOCK, clock))
             self._on_message(keys.CLOCK, clock)
-        self._inputs.wait_for(self._required_dones())
 
     def _required_dones(self) -> set[str]:
         """Return the keys of the dones without which the world cannot go on."""
@@ -217,25 +221,30 @@ class WorldProcess:
 
     def _end(self) -> None:
         """Publish the end, then wait until nobody has to be waited for any more, BYE_S at most."""
-        self._turn_wall_ns = 0
         self._await_return()
         self._world.publish_end()
         self._outputs.flush()
-        until_s = time.monotonic() + BYE_S
-        while time.monotonic() < until_s and self._world.is_waiting_to_leave():
-            self._inputs.wait(TICK_S)
-            self._take_in()
-            self._serve_others()
+        end_ns = self._clock_wall_ns = time.monotonic_ns()
+        while time.monotonic_ns() - end_ns < BYE_S * 1e9 and self._world.is_waiting_to_leave():
+            self._wait_at_end()
             self._outputs.put_batch()
+            self._publish_clock(self._turn_wall_ns, lambda wall_ns: self._world.waiting_to_leave(wall_ns - end_ns))
         self._outputs.flush()
+        self._turn_wall_ns = 0
 
     def _await_return(self) -> None:
         """Wait for who has yet to come back to a world that was started again as its run was over."""
         while self._world.barrier.away() and self._stopped() is None:
-            self._inputs.wait(TICK_S)
-            self._take_in()
-            self._serve_others()
+            self._wait_at_end()
             self._outputs.flush()
+            self._publish_clock(self._turn_wall_ns, self._world.barrier.waiting_for_return)
+
+    def _wait_at_end(self) -> None:
+        """Take what comes where time passes no more; a put that does not return is named as before."""
+        self._inputs.wait(TICK_S)
+        self._turn_wall_ns = time.monotonic_ns()
+        self._take_in()
+        self._serve_others()
 
     # What other threads bring
 
@@ -249,13 +258,12 @@ class WorldProcess:
             self._inputs.wake()
 
     def _tick(self) -> None:
-        shown_ns = 0
+        watch = TurnWatch(time.monotonic_ns())
         while not self._over.wait(TICK_S):
             self._inputs.wake()
-            now_ns = time.monotonic_ns()
-            if self._turn_wall_ns and now_ns - max(self._turn_wall_ns, shown_ns) > STUCK_NS:
-                shown_ns = now_ns
-                self._show_stuck((now_ns - self._turn_wall_ns) / 1e9)
+            stuck_s = watch.stuck_s(time.monotonic_ns(), self._turn_wall_ns)
+            if stuck_s is not None:
+                self._show_stuck(stuck_s)
 
     def _show_stuck(self, since_s: float) -> None:
         """Show that a put does not return; `clock` cannot, since it would have to go the same way."""

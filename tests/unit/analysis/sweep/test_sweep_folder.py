@@ -111,6 +111,19 @@ def test_a_folder_goes_on_with_its_own_plan_and_refuses_any_other(tmp_path: Path
         load(out)
 
 
+def test_a_folder_with_other_files_is_refused_unless_forced(tmp_path: Path) -> None:
+    of, stranger = plan("seed", runs=1), tmp_path / "thesis.tex"
+    stranger.write_text("mine")
+    with refused(RunError, str(tmp_path), "thesis.tex", "--out", "--force"), locked(tmp_path, of):
+        pass
+    assert list(tmp_path.iterdir()) == [stranger]
+    with locked(tmp_path, of, force=True):
+        pass
+    with locked(tmp_path, of):  # a sweep by now, which goes on
+        pass
+    assert stranger.read_text() == "mine"
+
+
 def test_a_sweep_of_which_nothing_is_finished_claims_no_folder(tmp_path: Path) -> None:
     with locked(tmp_path, plan("seed", runs=1_000_000)) as folder:
         folder.compact()

@@ -15,3 +15,13 @@ def test_a_stopped_world_is_named_once_within_two_seconds_and_once_when_it_is_ba
     watch.received(110.0)
     assert has_terms(watch.change(110.1, 7) or "", "world", "back")
     assert watch.change(110.2, 7) is None
+
+
+def test_a_world_that_ends_is_not_taken_for_the_one_that_it_waits_for():
+    watch = WorldWatch()
+    watch.received(100.0)
+    watch.clock({"state": "running", "waiting_for": [{"name": "estimator.d1"}]})
+    watch.clock({"state": "stopped", "waiting_for": [{"name": "recorder"}]})
+    text = watch.change(102.0, 7) or ""
+    assert has_terms(text, "world", "ended", "recorder")
+    assert "kill" not in text

@@ -320,6 +320,22 @@ def test_what_is_short_of_two_dones_adds_up():
     assert made.incomplete() == []
 
 
+def test_in_realtime_what_is_missing_for_a_whole_gate_is_lost():
+    made = barrier("a")
+    made.done("a", done(0, sent=2), GATE_NS, 0)
+    made.give_up_late()
+    assert names(made.incomplete()) == ["a"]
+    made.give_up_late()
+    assert made.incomplete() == []
+    made.done("a", done(1, sent=2), GATE_NS, 0)
+    made.give_up_late()
+    made.count_output("a")
+    made.count_output("a")
+    made.give_up_late()
+    made.done("a", done(2, sent=2), 2 * GATE_NS, 0)
+    assert names(made.incomplete()) == ["a"]
+
+
 @pytest.mark.parametrize(("recovered", "missing"), [(0, 2), (1, 1), (2, 0), (3, 0)])
 def test_after_a_reset_a_loss_hides_none_that_comes_after(recovered: int, missing: int):
     made = barrier("a")

@@ -94,6 +94,17 @@ def test_time_that_jumps_does_not_pass():
     assert rate.wall_s == pytest.approx(5.0)
 
 
+def test_simulated_time_passes_from_before_a_stand_to_the_gate_after_it():
+    rate = RealTimeFactor()
+    rate.gate(0, 0)
+    rate.gate(GATE_NS, 20 * MS)
+    rate.stand_still(5_000 * MS)
+    rate.gate(2 * GATE_NS, 5_010 * MS)
+    assert rate.sim_s == pytest.approx(2 * GATE_NS / 1e9)
+    assert rate.wall_s == pytest.approx(0.03)
+    assert rate.now() == pytest.approx(2.0)
+
+
 def test_gates_further_apart_than_a_second_still_have_a_rate():
     rate = RealTimeFactor()
     for gate in range(4):

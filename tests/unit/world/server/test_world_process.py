@@ -326,3 +326,12 @@ def test_the_end_waits_for_a_recorder_that_died_where_it_comes_back(action: str,
     assert made.is_waiting_to_leave()
     made.handle(keys.process("recorder", "bye"), run_messages.Bye(0, 0, "over"), 0)
     assert not made.is_waiting_to_leave()
+
+
+def test_the_end_names_whom_it_waits_for():
+    made, link = world("recorder"), FakeLink()
+    link.deliver(keys.process("recorder", "join"), Join(0, 0, "run1", 1, "recorder", "here", 1, 0, slack_ns=10**12))
+    run(made, link)
+    waited = [clock for clock in link.published_on(keys.CLOCK) if clock.state == "stopped" and clock.waiting_for]
+    assert [each.name for each in waited[0].waiting_for] == ["recorder"]
+    assert waited[0].waiting_for[0].since_wall_s == pytest.approx(1.0, abs=0.5)

@@ -505,6 +505,8 @@ def test_huge_whole_numbers_are_a_fault_and_no_crash(digits: int):
         ({"drones": [{"name": "a"}]}, ("drones[0].position_m", "missing", "list", "3", "'a'")),
         ({"drones": [drone("a", model="x")]}, ("drones[0].model", "'x'", "ardrone2")),
         ({"processes": {"on_death": {"world": "weep"}}}, ("drop", "end", "restart", "wait")),
+        ({"processes": {"on_death": {"world": "wait"}}}, ("processes.on_death.world", "'wait'", "restart", "end")),
+        ({"processes": {"on_death": {"world": "drop"}}}, ("processes.on_death.world", "'drop'", "restart", "end")),
         ({7: 1}, ("step.yaml", "7", "known", "clusters")),
     ],
 )

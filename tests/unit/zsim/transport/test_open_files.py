@@ -51,4 +51,8 @@ def test_what_is_only_wanted_is_raised_as_far_as_it_goes(limits: Limits) -> None
 @pytest.mark.parametrize(("clients", "measured"), [(2, 26), (4, 31), (11, 48), (31, 92)])
 def test_a_hub_needs_what_was_measured_and_room(clients: int, measured: int) -> None:
     assert measured < hub_files(clients) < 2 * measured + open_files.SESSION_FILES
-    assert launcher_files(clients + 1) >= hub_files(clients)
+    assert launcher_files(clients + 1, clients) >= hub_files(clients)
+
+
+def test_a_host_of_many_agents_is_as_many_as_its_world_waits_for() -> None:
+    assert launcher_files(roles=3, names=5) >= hub_files(5)
