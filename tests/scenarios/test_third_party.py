@@ -79,6 +79,7 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
     assert client.request("world/control", "rate", value=0.2)["ok"]  # time enough to take over
     truth = client.subscribe("drone/drone2/truth")
     former_pid = federation.pid("estimator.drone2")
+    own = client.token(f"estimator.drone2/session/{client.session.info.zid()}")  # else its first done lets it in
     foreign = client.join("estimator.drone2", client.info(), GATE_NS)
     taken = events.until(lambda m: m["kind"] == "superseded").message["data"]
     assert taken["former_pid"] == former_pid
@@ -90,6 +91,7 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
     assert record.end()["last_ns"] == PAIR_DURATION_S * 10**9
     assert record.events("restart") == []
     assert record.all("cluster/main/state")[-1]["phase"] == "engaged"
+    own.undeclare()
 
 
 def answer_from(client: Client, participant: Participant, truth: Subscription, from_ns: int) -> None:
