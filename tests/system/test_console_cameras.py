@@ -248,7 +248,7 @@ def test_what_each_drone_sees_stands_below_the_scene(
 
 
 @needs_browser
-@pytest.mark.slow
+@pytest.mark.soak
 def test_who_may_only_look_sees_what_the_drones_see(federation: Federation, opened: Callable[..., BrowserPage]) -> None:
     pytest.importorskip("cv2", reason="pip install opencv-python-headless")
     federation.run(TRIAD, "--rate", "1")
@@ -265,7 +265,7 @@ def test_who_may_only_look_sees_what_the_drones_see(federation: Federation, open
 
 
 @needs_browser
-@pytest.mark.slow
+@pytest.mark.soak
 def test_of_many_drones_one_chooses_whose_pictures_are_shown(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:

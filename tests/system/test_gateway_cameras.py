@@ -186,6 +186,7 @@ def test_pictures_are_for_those_who_show_the_token(federation: Federation) -> No
 
 
 @needs_browser
+@pytest.mark.soak
 def test_a_browser_shows_them(gateway: GatewayProcess, camera: Client, browser: Any) -> None:
     page = browser.new_context().new_page()
     page.set_default_timeout(1000 * PATIENCE_S)
