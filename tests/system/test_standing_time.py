@@ -145,8 +145,10 @@ config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
 session = zenoh.open(config)
-subscriber = session.declare_subscriber("**", lambda sample: time.sleep(1000))
-print("reads", flush=True)
+def take(sample):
+    print("reads", flush=True)
+    time.sleep(1000)
+subscriber = session.declare_subscriber("**", take)
 time.sleep(1000)
 """
 
