@@ -190,6 +190,20 @@ def count_outcome(row: np.ndarray, counts: np.ndarray, kind: int, passed: bool) 
 
 
 @portable
+def keep(rows: Rows, i: int, used: bool, distances: np.ndarray, blocks: np.ndarray, kinds: np.ndarray) -> np.ndarray:
+    """Count the outcome of each block; return the rows (m,) to use: all, or those inside of their own gates."""
+    kept, m = np.zeros(ROWS_MAX, dtype=np.int64), 0
+    for b in range(blocks.shape[0]):
+        first, size = blocks[b, 0], blocks[b, 1]
+        good = used or distances[b] <= rows.limits[size]
+        count_outcome(rows.nominal[i], rows.counts[i], kinds[b], good)
+        for k in range(size if good else 0):
+            kept[m] = first + k
+            m += 1
+    return kept[:m]
+
+
+@portable
 def _correct_jointly(
     rows: Rows,
     i: int,
@@ -201,19 +215,11 @@ def _correct_jointly(
     kinds: np.ndarray,
 ) -> np.ndarray:
     """Do as `correct` does, with the covariance of all drones, whose states it corrects."""
-    row, counts, distances = rows.nominal[i], rows.counts[i], np.zeros(ROWS_MAX)
+    distances = np.zeros(ROWS_MAX)
     put_block(rows.joint, i, P)  # it may have been inflated
     used = use_own(rows, i, H, variance, y, blocks, distances)
-    kept, m = np.zeros(y.shape[0], dtype=np.int64), 0
-    for b in range(blocks.shape[0]):
-        first, size = blocks[b, 0], blocks[b, 1]
-        good = used or distances[b] <= rows.limits[size]
-        count_outcome(row, counts, kinds[b], good)
-        for k in range(size if good else 0):
-            kept[m] = first + k
-            m += 1
-    if not used and m:
-        kept = kept[:m]
+    kept = keep(rows, i, used, distances, blocks, kinds)
+    if not used and kept.shape[0]:
         use_own(rows, i, H[kept], variance[kept], y[kept], blocks[:0], distances)
     return block(rows.joint, i, P.shape[0])
 
@@ -234,24 +240,15 @@ def correct(
 
     All are tried together; those whose own innovation lies outside of its gate are then left out.
     """
-    row, counts = rows.nominal[i], rows.counts[i]
     y, distances = z - expected, np.zeros(ROWS_MAX)
     if rows.joint.shape[0]:
         return _correct_jointly(rows, i, P, H, y, variance, blocks, kinds)
     used, x, P, _ = stacked_update(P, H, variance, y, blocks, rows.limits, distances)
-    kept, m = np.zeros(y.shape[0], dtype=np.int64), 0
-    for b in range(blocks.shape[0]):
-        first, size = blocks[b, 0], blocks[b, 1]
-        good = used or distances[b] <= rows.limits[size]
-        count_outcome(row, counts, kinds[b], good)
-        for k in range(size if good else 0):
-            kept[m] = first + k
-            m += 1
-    if not used and m:
-        kept = kept[:m]
+    kept = keep(rows, i, used, distances, blocks, kinds)
+    if not used and kept.shape[0]:
         _, x, P, _ = stacked_update(P, H[kept], variance[kept], y[kept], blocks[:0], rows.limits, distances)
-    if m:
-        strapdown.correct(row, rows.layout[i], rows.setting[i, SETTING.gravity], x)
+    if kept.shape[0]:
+        strapdown.correct(rows.nominal[i], rows.layout[i], rows.setting[i, SETTING.gravity], x)
         if rows.layout[i, LAYOUT.aiding_biases]:
             for k in range(P.shape[0]):
                 rows.bias[i, k] += x[k]
