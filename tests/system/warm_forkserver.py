@@ -3,10 +3,12 @@
 python warm_forkserver.py     standard input and the rest as of zsim_deploy.cli.forkserver
 
 What a run's fork server would import and load, it has already: that is half of the processor time of a short run.
-A world that stands publishes its clock more often than the contract wants, since tests wait for it.
+A world that stands publishes its clock more often than the contract wants, since tests wait for it. What a test has
+started ends with the process that runs the test, even if that is killed; what a run under test has started does not.
 """
 
 import atexit
+import ctypes
 import os
 import signal
 import socket
@@ -24,6 +26,7 @@ from zsim_world.server import world_process
 
 STANDING_NS = 100_000_000  # instead of a second
 FILES_MAX = 256  # more than a launcher has open before it starts a role
+RENEW_STREAMS = forkserver._renew_streams
 
 
 class ForkedServer:
@@ -63,6 +66,7 @@ def serve(line: int, run: str) -> NoReturn:
         os.closerange(3, FILES_MAX)
         sys.argv = ["forkserver", run]
         forkserver._prepare = lambda: None  # it is
+        forkserver._renew_streams = RENEW_STREAMS
         code = forkserver.main()
     except SystemExit as end:
         code = end.code
@@ -82,7 +86,14 @@ def _finish(code: object) -> NoReturn:
     os._exit(code if isinstance(code, int) else 0 if code is None else 1)
 
 
+def end_with_parent() -> None:
+    """Begin a role that is killed when the process ends that runs the test."""
+    ctypes.CDLL(None).prctl(forkserver.PR_SET_PDEATHSIG, signal.SIGKILL)
+    RENEW_STREAMS()
+
+
 if __name__ == "__main__":
+    forkserver._renew_streams = end_with_parent
     role_launcher.RoleLauncher._start_forkserver = start
     world_process.CLOCK_STANDING_NS = STANDING_NS
     sys.exit(forkserver.main())

@@ -220,10 +220,14 @@ class Barrier:
 
     def takes_place(self, name: str, message: Join) -> bool:
         """Tell whether a join would put a process into the place of another one."""
-        if self._join_refusal(name, message):
+        if not self.accepts(name, message):
             return False
         former = self.participants.get(name)
         return (former is not None and not former.is_process_of(message)) or bool(self.replaced(name, message))
+
+    def accepts(self, name: str, message: Join) -> bool:
+        """Tell whether a join fits the run."""
+        return self._join_refusal(name, message) is None
 
     def replaced(self, name: str, message: Join) -> list[Participant]:
         """Return the dead whose work a newcomer of another name is to do."""

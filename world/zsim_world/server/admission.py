@@ -75,8 +75,10 @@ class Admission:
 
     def _is_stranger(self, name: str, join: Join) -> bool:
         """Tell whether time would stand for a newcomer that the start does not wait for, and that has no token."""
-        stands = (join.period_ns > 0 or join.slack_ns > 0) and name not in self._barrier.participants
-        return stands and not (self._trusts or name in self._barrier.absent() or self._tokens.is_alive(name))
+        stands = (join.period_ns > 0 or join.slack_ns > 0) and self._barrier.accepts(name, join)
+        if not stands or name in self._barrier.participants:
+            return False
+        return not (self._trusts or name in self._barrier.absent() or self._tokens.is_alive(name))
 
     def done_received(self, name: str, incarnation: int, wall_ns: int) -> None:
         """Take the news that a process has published a done, before the world has it."""

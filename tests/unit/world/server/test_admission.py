@@ -213,6 +213,12 @@ def test_strangers_under_fresh_names_stop_no_time_and_fill_no_memory(case: Case)
     assert case.world.outbox.refusals.count >= 3 * WITHHELD_MAX - STRANGERS_MAX
 
 
+def test_one_that_does_not_fit_the_run_is_refused_at_once_token_or_not(case: Case) -> None:
+    case.join(VISITOR, 2, 2, period_ns=GATE_NS + 1)
+    case.passes(TOKEN_NS)
+    assert [(e.kind, e.subject) for e in case.events()[1:]] == [("refused", keys.process(VISITOR, "join"))]
+
+
 def test_one_that_does_not_gate_joins_at_once(case: Case) -> None:
     case.join(VISITOR, pid=9, incarnation=1, period_ns=0)
     assert case.kinds(VISITOR) == ["join"]
