@@ -101,6 +101,8 @@ class Recorder:
         self._successor: str | None = None
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
+        self._held: list[Passed] = []  # arrived, but not to be written before what was missed
+        self._is_back = False  # whether nothing has shown yet how much a lost link missed in realtime
         self._quiet_since_s: float | None = None  # since when no clock has come, after a lost link in realtime
         self._now_ns = 0
         self._on_disk_ns = 0  # when everything taken was put there last
@@ -129,6 +131,7 @@ class Recorder:
         ticker.start()
         try:
             reason = self._loop()
+            self._write_held()
             self._writer.close()
         except RecordError as error:
             self._bye(str(error))
@@ -172,6 +175,7 @@ class Recorder:
             self._fetch_missed()
         else:  # the world may be far ahead of what is on its way
             self._quiet_since_s = time.monotonic()
+            self._is_back = True
         self._join_again()
         return False
 
@@ -244,23 +248,40 @@ class Recorder:
         """Fetch what nothing comes after, as the end of the run, when no clock has come since a link is back."""
         if self._quiet_since_s is not None and time.monotonic() - self._quiet_since_s > QUIET_S:
             self._quiet_since_s = None
+            self._is_back = False
             self._fetch_missed()
+            self._write_held()
 
     def _write_arrived(self, arrived: Iterable[Passed]) -> None:
         """Write what has arrived; where clocks are missing before it, what the world still has since comes first.
 
-        What stands before a clock is held until that is looked at: it may have passed after what is missing.
+        What stands before a clock is held until that is looked at: it may have passed after what is missing. After a
+        lost link in realtime, where time does not stand for this process, what is missing need not be a clock: so it
+        looks at the first one after its own join, which has passed since.
         """
-        held: list[Passed] = []
         for passed in arrived:
-            held.append(passed)
+            self._held.append(passed)
             if isinstance(passed, ReceivedSample) and passed.key == keys.CLOCK:
                 clock = self._clock_in(passed.payload)
-                if clock is not None and self._gates.misses(clock) and self._reaches_run():
+                if clock is not None and (self._gates.misses(clock) or self._has_joined()) and self._reaches_run():
+                    self._is_back = False
                     self._fetch_missed(clock)
-                self._write_all(held)
-                held.clear()
-        self._write_all(held)
+                self._write_held()
+        if not self._is_back:
+            self._write_held()
+
+    def _has_joined(self) -> bool:
+        """Tell whether the join that follows a lost link in realtime is among what is held."""
+        events = (each.payload for each in self._held if isinstance(each, ReceivedSample) and each.key == keys.EVENT)
+        return self._is_back and any(self._is_own_join(payload) for payload in events)
+
+    def _is_own_join(self, payload: bytes) -> bool:
+        """Tell whether an event is that of the newest join of this process."""
+        try:
+            event = messages.decode(keys.EVENT, payload)
+        except DecodeError:
+            return False
+        return event.subject == self._name and event.data.get("incarnation") == self._incarnation
 
     def _reaches_run(self) -> bool:
         """Tell whether the world of this run answers."""
@@ -274,9 +295,10 @@ class Recorder:
             self._over.wait(TICK_S)
         return info
 
-    def _write_all(self, held: Iterable[Passed]) -> None:
-        for passed in held:
+    def _write_held(self) -> None:
+        for passed in self._held:
             self._write_passed(passed)
+        self._held.clear()
 
     def _catch_up(self, before: run_messages.Clock | None = None) -> None:
         """Write what was published while this process was not there: the world keeps it for a while."""

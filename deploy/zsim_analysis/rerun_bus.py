@@ -271,7 +271,9 @@ class RerunBus(Bus):
         if event.kind in JOINED and event.source not in self._rerun:
             self._admit(_joined(event))
         if event.kind == "death" and event.subject not in self._rerun:
-            self._world.handle_death(event.subject, 0)
+            self._world.losses.died(event.subject, 0)
+        elif event.kind == "overdue" and event.subject not in self._rerun:
+            self._world.losses.expired(event.subject)
         elif event.kind == "control" and event.subject in FLIGHT_REQUESTS and event.data.get("ok"):
             args = event.data.get("args")
             request = ControlRequest(event.subject, args if isinstance(args, dict) else {}, event.source)

@@ -215,7 +215,7 @@ def test_what_each_drone_sees_stands_below_the_scene(
         page.page.set_viewport_size(LAPTOP)
 
         # a click shows the frustum with the picture on it, another hides it
-        assert sky_pixels(page) < SKY_PIXELS
+        until(page, lambda: sky_pixels(page), lambda seen: seen < SKY_PIXELS)  # laid out for the laptop again
         click(page, "drone2/front")
         until(page, lambda: sky_pixels(page), lambda seen: seen > SKY_PIXELS)
         assert page.page.locator("[aria-pressed=true]").get_attribute("data-camera") == "drone2/front"

@@ -126,6 +126,21 @@ def test_who_does_not_come_back_in_its_time_ends_the_run(federation: Federation)
     assert (federation.out / "journal").exists()
 
 
+def test_or_the_run_goes_on_without_it(federation: Federation) -> None:
+    options = (
+        "processes.on_death={controller: wait}",
+        "processes.return_s=1.5",
+        "processes.on_overdue={controller: drop}",
+    )
+    flight = Flight(federation, *(word for option in options for word in ("--set", option)))
+    federation.kill("controller.main")
+    flight.event("overdue", "controller.main")
+    flight.event("drop", "controller.main")
+    flight.finish()
+    record = check_end(federation, whole=True)
+    assert [event["data"]["on_overdue"] for event in record.events("overdue")] == ["drop"]
+
+
 @pytest.mark.parametrize("name", [pytest.param("estimator.drone1", marks=pytest.mark.soak), "controller.main"])
 def test_drop(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: drop}}")

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 OnDeath = Literal["wait", "restart", "drop", "end"]
+OnOverdue = Literal["drop", "end"]
 
 
 class Role(NamedTuple):
@@ -60,3 +61,8 @@ def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None)
     role = role or name.partition(".")[0]
     default = ROLES[role].on_death if role in ROLES else "drop"
     return actions.get(name) or actions.get(role) or default
+
+
+def on_overdue(actions: Mapping[str, OnOverdue], name: str, role: str | None = None) -> OnOverdue:
+    """Return what is to be done when a process has not come back in its time; arguments as of `on_death`."""
+    return actions.get(name) or actions.get(role or name.partition(".")[0]) or "end"

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from zsim.scenario.role_table import OnDeath, agent_names
+from zsim.scenario.role_table import OnDeath, OnOverdue, agent_names
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
 from zsim.sensors.camera import Hats
@@ -221,6 +221,7 @@ class Processes(Spec, frozen=True, kw_only=True):
     expect: Annotated[list[Name], Meta(max_length=PROCESSES_MAX)] | None = None
     on_death: Annotated[dict[str, OnDeath], Meta(max_length=PROCESSES_MAX)] = {}
     return_s: Positive | None = None  # wall; how long one that is to come back may stay away
+    on_overdue: Annotated[dict[str, OnOverdue], Meta(max_length=PROCESSES_MAX)] | UnsetType = UNSET  # then; unset: end
     snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s for who goes on
 
 

@@ -75,7 +75,7 @@ class HostRun:
         self._status = status
         self._logs = options.out / "logs"
         self._plan = HostPlan(options.placed, options.scenario, options.run_id, options.pace())
-        self._supervisor = Supervisor(options.scenario.processes.on_death, status)
+        self._supervisor = Supervisor(options.scenario.processes, status)
         self._loop = EventLoopThread()
         self._links = HostLinks(options.placed, self._plan.hosts(), self._loop)
         self._record_stays = False

@@ -213,7 +213,7 @@ def _interrupt(number: int, _: object) -> None:
 
 
 def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher, signals: EndSignals) -> Outcome:
-    supervisor = Supervisor(options.scenario.processes.on_death, screen)
+    supervisor = Supervisor(options.scenario.processes, screen)
     supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
 
     def end_with_output() -> None:

@@ -15,8 +15,8 @@ from typing import Any, Protocol
 
 from zsim.errors import RunError
 from zsim.runtime.progress import ProgressSink
-from zsim.scenario.role_table import on_death
-from zsim.scenario.scenario import OnDeath
+from zsim.scenario.role_table import on_death, on_overdue
+from zsim.scenario.scenario import Processes
 from zsim_deploy.launch.world_watch import WorldWatch
 from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
@@ -65,16 +65,16 @@ class Supervisor:
     """Starts the processes of a run, watches them, and leaves nothing behind.
 
     Args:
-        on_death: of the scenario, by process name or role.
+        processes: what the scenario says of their deaths.
         show: takes progress.
 
     Attributes:
         members: to be given before `run`; the world among them.
     """
 
-    def __init__(self, on_death: dict[str, OnDeath], show: ProgressSink) -> None:
+    def __init__(self, processes: Processes, show: ProgressSink) -> None:
         self.members: list[RunProcess] = []
-        self._on_death = on_death
+        self._processes = processes
         self._show = show
         self._reason = ""
         self._failed = False
@@ -144,11 +144,24 @@ class Supervisor:
         if event["kind"] == "end":
             self._reason = self._reason or event["text"]
         elif event["kind"] == "overdue":
-            self._fail(event["text"])
+            self._on_overdue(event)
         elif event["kind"] == "death" and event["data"].get("on_death") == "end":
             self._fail(f"{event['subject']} died")
         elif event["kind"] == "death" and event["data"].get("on_death") == "restart":
             self.submit(lambda: self._restart_superseded(event["subject"]))
+
+    def _on_overdue(self, event: dict[str, Any]) -> None:
+        """End what has not come back in its time, if the run goes on without it."""
+        if event["data"].get("on_overdue") == "drop":
+            self.submit(lambda: self._give_up(event["subject"]))
+        else:
+            self._fail(event["text"])
+
+    def _give_up(self, name: str) -> None:
+        for child in self.members:
+            if child.name == name:
+                self._dead.add(name)
+                child.kill()
 
     # Watching
 
@@ -181,7 +194,7 @@ class Supervisor:
         flew = code is not None and code not in (0, USER_FAULT) and (self._flies or code < 0)
         if not flew or self._reason or self._interrupted:
             return False
-        policy = on_death(self._on_death, world.name)
+        policy = on_death(self._processes.on_death, world.name)
         if policy != "restart" or self._too_often(world):
             return False
         self._show.say(f"{world.name} (pid {world.pid}) ended: {world.outcome()}; on_death: {policy}")
@@ -253,9 +266,11 @@ class Supervisor:
             if child.code == SUPERSEDED:
                 self._show.say(child.last_log_line())
             return
-        policy = on_death(self._on_death, child.name)
-        if child.code == USER_FAULT or (policy == "restart" and self._too_often(child)):
+        policy = on_death(self._processes.on_death, child.name)
+        if child.code == USER_FAULT:
             policy = "end"
+        elif policy == "restart" and self._too_often(child):
+            policy = on_overdue(self._processes.on_overdue or {}, child.name)
         self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {policy}")
         if policy == "restart":
             child.restarts += 1

@@ -138,7 +138,7 @@ def _clock_line(clock: run_messages.Clock, phase: str) -> dict[str, Any]:
 
 
 def _event_line(event: run_messages.Event) -> dict[str, Any]:
-    data = event.data if event.kind in ("end", "death") else {}
+    data = event.data if event.kind in ("end", "death", "overdue") else {}
     return {
         "t_s": event.t_ns / 1e9,
         "kind": event.kind,

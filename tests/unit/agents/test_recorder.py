@@ -340,6 +340,33 @@ def test_the_end_of_a_run_that_passed_while_the_link_was_lost_is_asked_for(
     assert completed(path).complete
 
 
+def test_what_passed_before_a_link_was_back_is_asked_for_in_realtime_though_no_clock_is_missing(tmp_path: Path):
+    """A world that was started again has published events, and the recorder comes back when only clocks follow."""
+    path, link, info = tmp_path / "run.mcap", FakeLink(), replace(INFO, mode="realtime")
+    missed = [pair(keys.EVENT, Event(0, number, "superseded", "x.y", "x.y", "")) for number in (0, 1)]
+    replays = iter([page(gates(0)), page([*gates(0), *missed, *gates(1)])])
+    link.on_request = lambda key, args: next(replays)
+    link.last = dict([pair(keys.INFO, info)])
+
+    def cut(key: str, payload: bytes) -> None:
+        joins = link.published_on("process/recorder/join")
+        if key == "process/recorder/join" and len(joins) == 1:
+            link.cut(False)
+            link.cut(True)
+        elif key == "process/recorder/join":
+            data = {"incarnation": joins[-1].incarnation, "host": link.host, "pid": os.getpid()}
+            back = pair(keys.EVENT, Event(0, 2, "superseded", "recorder", "recorder", "", data))
+            link.deliver(keys.BATCH, encode_batch([back]))
+            link.deliver(keys.BATCH, encode_batch([*gates(1, 2), clock(3, "stopped")]))
+
+    link.on_publish = cut
+    assert record(link, info, path) == RUN_ENDED  # type: ignore[arg-type]
+    with RecordReader(path) as reader:
+        written = [(each.key, each.payload) for each in reader.messages([keys.EVENT, keys.CLOCK], by_time=False)]
+    assert [messages.decode(*each).seq for each in written if each[0] == keys.EVENT] == [0, 1, 2]
+    assert [messages.decode(*each).seq for each in written if each[0] == keys.CLOCK] == [0, 1, 2, 3]
+
+
 def test_another_run_is_not_asked_for_gates_that_are_missing(tmp_path: Path):
     path, link = tmp_path / "run.mcap", FakeLink()
     replays = iter([page(gates(0))])

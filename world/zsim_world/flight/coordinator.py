@@ -1,6 +1,6 @@
 """What a flight (World) and a replay (Playback) have in common: who takes part, who is waited for, what is published.
 
-No session, no clock: a runner hands it what arrives (`handle`, `handle_death`, `control`), asks whether it may go on
+No session, no clock: a runner hands it what arrives (`handle`, `losses`, `control`), asks whether it may go on
 (`may_advance`), lets it go on (`advance`), and publishes its outbox. Wall times are passed in.
 """
 
@@ -17,16 +17,16 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError
 from zsim.runtime.agent import Output
 from zsim.scenario.rights import WORLD
-from zsim.scenario.role_table import agent_names, on_death
+from zsim.scenario.role_table import OnDeath, agent_names, on_death
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.budgets import STRANGERS_MAX, Budgets
 from zsim_world.flight.data_flow import DataFlow
+from zsim_world.flight.process_losses import ProcessLosses
 from zsim_world.flight.run_clock import Operation, RunClock, number
 from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox, too_many
 from zsim_world.flight.run_statistics import RunStatistics
 
-RETURNS = ("restart", "wait")  # of on_death: a process that died comes back, or may
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # that change a flight
 _JOIN = "process/"  # before a name: what is counted of its joins
 ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
@@ -49,6 +49,7 @@ class Coordinator(ABC):
         barrier: who takes part.
         outbox: what is to be published.
         budgets: of what sources may still do.
+        losses: what the loss of a process means.
         requests: on `world/control`, all of them counted.
         statistics: of the run so far.
         refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
@@ -81,6 +82,7 @@ class Coordinator(ABC):
         self._data_flow = DataFlow(scenario)
         self._start_wall_ns = wall_ns()
         self._operations: dict[str, Operation] = self.clock.operations()
+        self.losses = ProcessLosses(self)
 
     @abstractmethod
     def info(self) -> messages.Info:
@@ -102,8 +104,12 @@ class Coordinator(ABC):
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
         """Take a command to a drone; return False for a duplicate."""
 
-    def _release_drones(self, name: str) -> None:  # noqa: B027 - a replay has no commanders
+    def release_drones(self, name: str) -> None:  # noqa: B027 - a replay has no commanders
         """Take the drones from a process that flew them and is gone."""
+
+    def on_death(self, participant: Participant) -> OnDeath:
+        """Return what the death of a participant means."""
+        return on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
     @property
     def now_ns(self) -> int:
@@ -164,7 +170,7 @@ class Coordinator(ABC):
             kind, data["former_pid"] = "superseded" if former.alive else "restart", former.join.pid
         self.outbox.event(kind, name, f"{name} on {message.host} (pid {message.pid})", data, name)
         for dead in replaced:
-            self._release_drones(dead.name)
+            self.release_drones(dead.name)
         self._warn_of(joined)
 
     def _is_new(self, name: str) -> bool:
@@ -194,11 +200,11 @@ class Coordinator(ABC):
         if participant is None:
             return
         self.outbox.event("leave", name, f"{name} left: {message.reason}", {"reason": message.reason}, name)
-        self._release_drones(name)
-        self._expect_again(participant)
+        self.release_drones(name)
+        self.expect_again(participant)
         self._after_bye(participant, message.reason)
 
-    def _expect_again(self, participant: Participant) -> None:
+    def expect_again(self, participant: Participant) -> None:
         """Wait at the start for whom a process that is gone has stood for."""
         if self.clock.state == "waiting":
             for each in self._expected:
@@ -209,90 +215,6 @@ class Coordinator(ABC):
         """Do what the leave of a process means for the run."""
         if participant.join.role == "recorder":
             self.clock.stop(f"the recorder left: {reason}")
-
-    def handle_death(self, name: str, wall_ns: int) -> None:
-        """Take the death of a process: its token is gone without a bye."""
-        participant = self.barrier.mark_dead(name, wall_ns)
-        if participant is None:
-            return
-        substitute = self.barrier.substitute(name)
-        action = "drop" if substitute else self._on_death(participant)
-        then = f"{substitute.name} does its work" if substitute else f"on_death: {action}"
-        host, pid = participant.join.host, participant.join.pid
-        data = {"host": host, "pid": pid, "on_death": action}
-        self.outbox.event("death", name, f"{name} on {host} (pid {pid}) died; {then}", data)
-        if self.clock.mode == "realtime" or action == "drop":
-            self._release_drones(name)
-        if action == "drop":
-            self.barrier.remove(name)
-        if action == "drop" and substitute is None:
-            self.outbox.event("drop", name, f"{name} is waited for no longer", {"from_ns": self.now_ns})
-        if action == "end":
-            self.clock.stop(f"{name} died")
-
-    def overdue(self, wall_ns: int) -> str | None:
-        """Return who has died and had its time to come back, None if nobody has."""
-        return_s = self.scenario.processes.return_s
-        if return_s is None:
-            return None
-        dead = (p for p in self.barrier.participants.values() if not p.alive and self._on_death(p) in RETURNS)
-        return next((p.name for p in dead if wall_ns - p.since_wall_ns > return_s * 1e9), None)
-
-    def handle_overdue(self, name: str) -> None:
-        """End the run for a process that has not come back in its time."""
-        text = f"{name} has not come back within {self.scenario.processes.return_s:g} s"
-        self.outbox.event("overdue", name, text)
-        self.clock.stop(text)
-
-    def handle_silence(self, name: str, since_wall_ns: int | None) -> None:
-        """Take it that a process publishes its health no longer, since its last; or does again (None)."""
-        participant = self.barrier.participants.get(name)
-        if participant is None or not participant.alive:
-            return
-        participant.silent_wall_ns = since_wall_ns
-        who = f"{name} on {participant.join.host} (pid {participant.join.pid})"
-        data = {"host": participant.join.host, "pid": participant.join.pid}
-        if since_wall_ns is None:
-            self.outbox.event("silent_end", name, f"{who} is back", data)
-        else:
-            self.outbox.event("silent", name, f"{who} shows no sign of life; it is stopped, or its host is gone", data)
-
-    def handle_slow_reader(self, text: str, data: dict[str, Any]) -> None:
-        """Take it that a reader nobody waits for has lost its link, since it took nothing."""
-        if self.budgets.strangers.spend("slow_reader"):
-            self.outbox.event("slow_reader", data["address"], text, data)
-
-    def handle_false_join(self, name: str, join: run_messages.Join, fault: str) -> None:
-        """Take it that nobody is behind a join which was withheld: who is in that place keeps it.
-
-        It is counted like a refusal, and is an event as long as there have not been too many.
-        """
-        if not self.budgets.strangers.spend("no_show"):
-            self.outbox.refusals.count += 1
-            return
-        data = {"host": join.host, "pid": join.pid, "incarnation": join.incarnation}
-        what = "takes nobody's place" if name in self.barrier.participants else "is not waited for"
-        text = f"{name} on {join.host} (pid {join.pid}) {fault}; its join {what}"
-        self.outbox.event("no_show", name, text, data)
-
-    def handle_no_show(self, name: str, fault: str, wall_ns: int) -> None:
-        """Take it that a process which joined is not there: what it stands for is as if it had not come."""
-        participant = self.barrier.participants.get(name)
-        if participant is None or not participant.alive:
-            return
-        host, pid = participant.join.host, participant.join.pid
-        self.outbox.event("no_show", name, f"{name} on {host} (pid {pid}) {fault}", {"host": host, "pid": pid})
-        if participant.rejoined:
-            self.handle_death(name, wall_ns)
-            return
-        self.barrier.remove(name)
-        self._release_drones(name)
-        self._expect_again(participant)
-        self.outbox.event("drop", name, f"{name} is waited for no longer", {"from_ns": self.now_ns})
-
-    def _on_death(self, participant: Participant) -> str:
-        """Return the action when a process has died."""
-        return on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
         """Let time stand, in a world that was started again, until those who took part are back or dead.
@@ -387,7 +309,7 @@ class Coordinator(ABC):
     def waiting_to_leave(self, since_end_ns: int = 0) -> tuple[run_messages.Waiting, ...]:
         """Return who has yet to leave, or to come back for the rest, so long after the end."""
         participants = self.barrier.participants.values()
-        waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self._on_death(p) in RETURNS)]
+        waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self.losses.may_return(p))]
         return tuple(run_messages.Waiting(p.name, p.join.host, since_end_ns / 1e9) for p in waited)
 
     # Publication

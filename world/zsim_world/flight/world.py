@@ -132,7 +132,7 @@ class World(Coordinator):
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
         return self._intake.accept(drone, kind, message)
 
-    def _release_drones(self, name: str) -> None:
+    def release_drones(self, name: str) -> None:
         self._intake.release_all(name)
 
     # Time

@@ -95,7 +95,14 @@ class ReaderClosed(Entry, tag=11):
     data: dict[str, Any]
 
 
+class Expired(Entry, tag=12):
+    """That a process has not come back in its time."""
+
+    name: str
+
+
 _OfWorld = Advanced | Kept | Resumed
-_OfOthers = Taken | Died | Controlled | GivenUp | Joined | FalselyJoined | NotShown | FellSilent | ReaderClosed
+_OfOthers = Taken | Controlled | GivenUp | Joined | ReaderClosed
+_OfLosses = Died | FalselyJoined | NotShown | FellSilent | Expired
 encode = msgspec.msgpack.Encoder().encode
-decode = msgspec.msgpack.Decoder(list[_OfWorld | _OfOthers]).decode
+decode = msgspec.msgpack.Decoder(list[_OfWorld | _OfOthers | _OfLosses]).decode

@@ -18,6 +18,7 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Output
+from zsim.scenario.role_table import OnDeath
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
@@ -256,7 +257,7 @@ class Playback(Coordinator):
     def _after_bye(self, participant: Participant, reason: str) -> None:
         """Go on: the record is there already."""
 
-    def _on_death(self, participant: Participant) -> str:
+    def on_death(self, participant: Participant) -> OnDeath:
         return "drop"
 
 

@@ -126,7 +126,7 @@ class Admission:
             self._handle_false_join(name, join, reason)
 
     def _handle_false_join(self, name: str, join: Join, reason: str) -> None:
-        self._world.handle_false_join(name, join, reason)
+        self._world.losses.falsely_joined(name, join, reason)
         self._note(FalselyJoined(name, messages.encode(join), reason))
 
     def _may_take_place(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
@@ -178,7 +178,7 @@ class Admission:
         return [p for p in due if p.alive and p.name in self._standing_ns and _owes_done(p)]
 
     def _handle_no_show(self, name: str, reason: str, wall_ns: int) -> None:
-        self._world.handle_no_show(name, reason, wall_ns)
+        self._world.losses.not_shown(name, reason, wall_ns)
         self._note(NotShown(wall_ns, name, reason))
 
     def _note(self, entry: Entry) -> None:

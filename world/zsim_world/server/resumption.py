@@ -14,6 +14,7 @@ from zsim_world.journal.journal_entries import (
     Controlled,
     Died,
     Entry,
+    Expired,
     FalselyJoined,
     FellSilent,
     GivenUp,
@@ -84,17 +85,19 @@ class Resumption:
             case Joined(wall_ns, name, join):
                 self.world.handle(keys.process(name, "join"), _join(join), wall_ns)
             case FalselyJoined(name, join, reason):
-                self.world.handle_false_join(name, _join(join), reason)
+                self.world.losses.falsely_joined(name, _join(join), reason)
             case NotShown(wall_ns, name, reason):
-                self.world.handle_no_show(name, reason, wall_ns)
+                self.world.losses.not_shown(name, reason, wall_ns)
             case Died(wall_ns, name):
-                self.world.handle_death(name, wall_ns)
+                self.world.losses.died(name, wall_ns)
+            case Expired(name):
+                self.world.losses.expired(name)
             case Controlled(request):
                 self.world.control(messages.decode_as(ControlRequest, request, keys.CONTROL))
             case FellSilent(name, since_wall_ns):
-                self.world.handle_silence(name, since_wall_ns)
+                self.world.losses.silence_changed(name, since_wall_ns)
             case ReaderClosed(text, data):
-                self.world.handle_slow_reader(text, data)
+                self.world.losses.reader_closed(text, data)
             case GivenUp(name):
                 self.world.give_up_outputs(name)
             case Resumed(wall_ns, all_died):

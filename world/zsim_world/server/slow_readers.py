@@ -53,7 +53,7 @@ class SlowReaders:
             host = self._own_host if closed.process else far_host
             reads = [expression for name in closed.names for expression in self._reads(name)]
             text, data = _text(closed, host, reads), {**closed._asdict(), "host": host, "reads": reads}
-            self._world.handle_slow_reader(text, data)
+            self._world.losses.reader_closed(text, data)
             self._journal.note(ReaderClosed(text, data))
 
     def _reads(self, name: str) -> tuple[str, ...]:

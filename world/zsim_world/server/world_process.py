@@ -20,7 +20,7 @@ from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.world import World
-from zsim_world.journal.journal_entries import Advanced, Died, FellSilent, Resumed
+from zsim_world.journal.journal_entries import Advanced, Died, Expired, FellSilent, Resumed
 from zsim_world.journal.run_journal import RunJournal
 from zsim_world.server.admission import Admission
 from zsim_world.server.liveliness import LivelinessMonitor
@@ -148,14 +148,20 @@ class WorldProcess:
             self._shown("resumed", self._world.now_ns, WORLD)
 
     def _handle_death(self, name: str, wall_ns: int) -> None:
-        self._world.handle_death(name, wall_ns)
+        self._world.losses.died(name, wall_ns)
         if self._world.ended is None:
             self._journal.note(Died(wall_ns, name))
 
     def _handle_silence(self, name: str, since_wall_ns: int | None) -> None:
-        self._world.handle_silence(name, since_wall_ns)
+        self._world.losses.silence_changed(name, since_wall_ns)
         if self._world.ended is None:
             self._journal.note(FellSilent(name, since_wall_ns))
+
+    def _check_overdue(self) -> None:
+        losses = self._world.losses
+        if self._world.ended is None and (name := losses.overdue(time.monotonic_ns())):
+            losses.expired(name)
+            self._journal.note(Expired(name))
 
     def _add_checkpoint(self, wall_ns: int) -> None:
         """Put the state of the run into the journal, now that nothing is pending."""
@@ -279,8 +285,7 @@ class WorldProcess:
             self._service.serve(self._queries.popleft())
             self._outputs.flush()
         self._liveliness.check_due()
-        if name := self._world.overdue(time.monotonic_ns()):
-            self._world.handle_overdue(name)
+        self._check_overdue()
         self._readers.report()
         self._admission.check_due(time.monotonic_ns())
         if self.health.due():

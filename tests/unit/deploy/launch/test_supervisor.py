@@ -10,6 +10,7 @@ import pytest
 from refused import has_terms
 
 from zsim.errors import RunError
+from zsim.scenario.scenario import Processes
 from zsim_deploy.launch.supervisor import RESTARTS_MAX, SILENT_S, SUPERSEDED, USER_FAULT, Supervisor
 
 
@@ -36,7 +37,7 @@ class Member:
         self._codes, self._left, self._lives_for = list(codes), 0, lives_for
         self.code: int | None = None
         self.stopped_for: str | None = None
-        self.closed = False
+        self.closed = self.killed = False
 
     def start(self) -> None:
         self.pid += 1
@@ -60,6 +61,7 @@ class Member:
         self.stopped_for = reason
 
     def kill(self) -> None:
+        self.killed = True
         self.code = -signal.SIGKILL
 
     def close(self) -> None:
@@ -69,11 +71,9 @@ class Member:
 class Team:
     """A world that lives for so many looks, a recorder, and others; the looks let the others live on too."""
 
-    def __init__(
-        self, *others: Member, looks: int = 20, on_death: dict[str, Any] | None = None, world: Sequence[int] = (0,)
-    ) -> None:
+    def __init__(self, *others: Member, looks: int = 20, world: Sequence[int] = (0,), **deaths: Any) -> None:
         self.show = Show()
-        self.watch = Supervisor(on_death or {}, self.show)
+        self.watch = Supervisor(Processes(**deaths), self.show)
         self.world = Member("world", *world, lives_for=looks)
         self.recorder = Member("recorder", 0, lives_for=looks + 1)
         self.others = others
@@ -137,6 +137,21 @@ def test_too_many_deaths_in_a_row_end_the_run():
     assert outcome.failed
     assert outcome.reason.startswith("estimator.d1 ended")
     assert team.others[0].restarts == RESTARTS_MAX
+
+
+def test_or_it_is_left_to_the_world_to_go_on_without_it():
+    team = Team(Member("estimator.d1", *[1] * 20), looks=100, return_s=1, on_overdue={"estimator": "drop"})
+    assert not team.go().failed
+    assert team.others[0].restarts == RESTARTS_MAX
+
+
+@pytest.mark.parametrize(("action", "fails"), [("drop", False), ("end", True)])
+def test_who_does_not_come_back_in_its_time(action: str, fails: bool):
+    team = Team(Member("estimator.d1"))
+    overdue = {"kind": "overdue", "subject": "estimator.d1", "text": "late", "data": {"on_overdue": action}}
+    outcome = team.go(lambda: team.watch.handle_line(json.dumps({"event": overdue})))
+    assert outcome.failed == fails
+    assert team.others[0].killed is not fails
 
 
 def test_deaths_far_apart_do_not_add_up(monkeypatch):

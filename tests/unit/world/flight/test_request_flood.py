@@ -156,7 +156,7 @@ def test_refusals_of_all_sources_together_are_so_many_events(world: World) -> No
 def test_news_of_joins_that_nobody_is_behind_is_bounded(world: World) -> None:
     for number in range(FLOOD):
         message = Join(0, 0, "run1", 1, "x", "here", 1, 20_000_000)
-        world.handle_false_join(f"x.{number}", message, "no token")
+        world.losses.falsely_joined(f"x.{number}", message, "no token")
     assert kinds(world) == {"no_show": STRANGERS_MAX}
     assert world.result()["refused"] == FLOOD - STRANGERS_MAX
 

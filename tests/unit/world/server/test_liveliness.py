@@ -31,9 +31,9 @@ class Case:
         self.liveliness = LivelinessMonitor(
             FakeLink(),  # type: ignore[arg-type]
             self.world.barrier,
-            self.world.handle_death,
+            self.world.losses.died,
             lambda: self.take_in(),
-            self.world.handle_silence,
+            self.world.losses.silence_changed,
         )
         self.period_ns = period_ns
         self.join(incarnation=1, pid=7)

@@ -1,0 +1,107 @@
+"""What a loss means for a run: who comes back in its time, and what is done without it."""
+
+from typing import Any
+
+import pytest
+
+from zsim.contract import keys
+from zsim.contract.run_messages import Event, Join
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim_world.flight.world import World
+
+GATE_NS = 20_000_000
+ME = "estimator.d1"
+RETURN_NS = 2_000_000_000
+SCENARIO = """
+name: one
+duration_s: 1
+drones: [{name: d1, position_m: [0, 0, 0]}]
+processes: {expect: [], PROCESSES}
+"""
+
+
+def world(processes: str, mode: str = "lockstep") -> World:
+    """Return a world that ME has taken part in since wall time 0, and whose time stands for ME."""
+    made = World(scenario_file.from_text(SCENARIO.replace("PROCESSES", processes)), mode, run_id="run1")
+    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "estimator", "h", 7, GATE_NS), 0)
+    while made.may_advance():
+        made.advance(0)
+    made.take_outbox()
+    return made
+
+
+def events(made: World) -> list[tuple[str, str]]:
+    """Return kinds and subjects of the events since the last look."""
+    taken = [message for _, message in made.take_outbox()]
+    return [(message.kind, message.subject) for message in taken if isinstance(message, Event)]
+
+
+def test_one_that_died_is_overdue_after_its_time_and_not_before() -> None:
+    made = world("return_s: 2")
+    assert made.losses.overdue(10 * RETURN_NS) is None
+    made.losses.died(ME, 1)
+    assert made.losses.overdue(RETURN_NS + 1) is None
+    assert made.losses.overdue(RETURN_NS + 2) == ME
+
+
+def test_without_a_time_nobody_is_overdue() -> None:
+    made = world("on_death: {}")
+    made.losses.died(ME, 1)
+    assert made.losses.overdue(10**18) is None
+
+
+def test_then_the_run_ends() -> None:
+    made = world("return_s: 2")
+    made.losses.died(ME, 1)
+    made.losses.expired(ME)
+    assert events(made) == [("death", ME), ("overdue", ME)]
+    assert made.ended == f"{ME} has not come back within 2 s"
+
+
+@pytest.mark.parametrize("whose", ["estimator", ME])
+def test_or_goes_on_without_it(whose: str) -> None:
+    made = world(f"return_s: 2, on_overdue: {{{whose}: drop}}")
+    made.losses.died(ME, 1)
+    assert not made.may_advance()
+    made.losses.expired(ME)
+    assert events(made) == [("death", ME), ("overdue", ME), ("drop", ME)]
+    assert made.ended is None
+    assert made.may_advance()
+
+
+@pytest.mark.parametrize(("on_death", "ends"), [("wait", True), ("restart", True), ("end", True), ("drop", False)])
+def test_one_that_is_stopped_is_overdue_too_and_on_death_says_what_it_means(on_death: str, ends: bool) -> None:
+    made = world(f"return_s: 2, on_death: {{estimator: {on_death}}}")
+    made.losses.silence_changed(ME, 5)
+    assert made.losses.overdue(RETURN_NS + 5) is None
+    assert made.losses.overdue(RETURN_NS + 6) == ME
+    made.losses.expired(ME)
+    assert (made.ended is not None) is ends
+
+
+def test_unless_it_goes_on_before() -> None:
+    made = world("return_s: 2")
+    made.losses.silence_changed(ME, 5)
+    made.losses.silence_changed(ME, None)
+    assert made.losses.overdue(10 * RETURN_NS) is None
+
+
+@pytest.mark.parametrize(
+    ("processes", "path"),
+    [
+        ("on_overdue: {estimator: drop}", "processes.on_overdue"),
+        ("return_s: 1, on_overdue: {estimator: wait}", "processes.on_overdue.estimator"),
+    ],
+)
+def test_what_is_refused(processes: str, path: str) -> None:
+    with pytest.raises(ScenarioError) as refused:
+        scenario_file.from_text(SCENARIO.replace("PROCESSES", processes))
+    assert path in str(refused.value)
+
+
+def test_the_journal_has_it() -> None:
+    from zsim_world.journal import journal_entries as entries
+
+    made: Any = entries.decode(entries.encode([entries.Expired(ME)]))
+    assert made == [entries.Expired(ME)]
