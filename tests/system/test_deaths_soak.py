@@ -4,6 +4,7 @@ import random
 import re
 import signal
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -18,12 +19,14 @@ from zsim.record import RecordReader
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_analysis.in_process import fly
+from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX
 
 pytestmark = pytest.mark.soak
 
 ROUNDS = 15  # in each, everybody dies once and is stopped once
 STOPPED_S, CUT_S = 0.3, 3.0  # wall time; the second is long enough to be noticed
-PAUSE_S = 0.5  # wall time between two at most: some come while others are on their way back
+PAUSE_S = 0.5  # wall time between two at most: most come while others are on their way back
+ROUND_S = 1.2 * RESTART_WINDOW_S / RESTARTS_MAX  # wall time of a round at least: a launcher takes more for a fault
 ESTIMATORS = ("estimator.drone1", "estimator.drone2", "estimator.drone3")
 LAB_ROLES = (*ESTIMATORS, "controller.main", "recorder", "world")
 BACK = {"world": "world: goes on at t = "}
@@ -31,7 +34,7 @@ Act = Callable[[], object]
 
 
 class Deaths:
-    """Lets one after the other happen, and waits each time until a line shows that it is over.
+    """Lets them happen in rounds, each before the last one is over.
 
     Args:
         run: the launcher.
@@ -44,14 +47,19 @@ class Deaths:
         self.count = 0
 
     def round(self, acts: Sequence[tuple[Act, str]]) -> None:
-        """Do all of these in a random order; each has the pattern of its last line, none for what nobody notices."""
-        for act, back in self._chance.sample(acts, len(acts)):
-            seen = len(re.findall(back, self._run.text())) if back else 0
+        """Do all of these in a random order, then wait until all are over.
+
+        Each has the pattern of the line that shows that it is over, none for what nobody notices.
+        """
+        until_s = time.monotonic() + ROUND_S
+        expected = {back: len(re.findall(back, self._run.text())) + 1 for _, back in acts if back}
+        for act, _ in self._chance.sample(acts, len(acts)):
             act()
             self.count += 1
-            if back:
-                self._run.line(back, START_S, seen + 1)
             threading.Event().wait(self._chance.uniform(0, PAUSE_S))
+        for pattern, number in expected.items():
+            self._run.line(pattern, START_S, number)
+        threading.Event().wait(max(0.0, until_s - time.monotonic()))
 
 
 def back(role: str) -> str:

@@ -5,13 +5,17 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from federation import PAIR, Federation, Record, Role
+from forked_commands import ROOT
 from wire import PATIENCE_S, Client, Received, Subscription
 
-from zsim.record import repair
+from zsim.record import RecordReader, repair
 from zsim.record.completeness import record_completeness
+from zsim.scenario import scenario_file
+from zsim_analysis.in_process import fly
 from zsim_deploy.launch.end_signals import UNREAD
 
 REASONS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "terminated"}
@@ -21,6 +25,12 @@ ENGAGED_NS, END_NS = 6_000_000_000, 12_000_000_000
 LATE_NS = 7_900_000_000  # of 8 s
 FROZEN_S = 14  # longer than LEASE_READER_MS
 IN_FLIGHT = r" [1-9][0-9]*\.[0-9] . 100000 s"  # a line of progress after the first second
+APART_M = 0.3  # of a run with deaths from one without, in realtime
+MOVING = PAIR.replace(
+    "{takeoff_s: 0.5}",
+    "{takeoff_s: 0.5, trajectory: {start_s: 6, waypoints: [{at_s: 0, values: {x_c: 0}}, {at_s: 8, values: {x_c: 2}}]}}",
+)
+STEP = (ROOT / "scenarios" / "step.yaml").read_text()
 UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes waits half a second or more in a recorder
 
 
@@ -299,6 +309,34 @@ def test_a_world_that_was_restarted_in_realtime_counts_only_its_own_time(federat
     end = federation.record().end()
     assert end["sim_s"] == pytest.approx(end["last_ns"] / 1e9)
     assert max(end["deadline_misses_by"].values()) < 400  # of 800 gates, some 650 of them after the death
+
+
+@pytest.mark.parametrize(
+    ("scenario", "kills_s", "end_s"),
+    [
+        pytest.param(MOVING, (7.0, 9.0, 11.0), 14.0, id="two that move"),
+        pytest.param(STEP, (30.0, 40.0, 50.0), 70.0, id="Test 1", marks=pytest.mark.soak),
+    ],
+)
+def test_in_realtime_the_formation_flies_on_as_without_the_deaths(
+    federation: Federation, tmp_path: Path, scenario: str, kills_s: tuple[float, ...], end_s: float
+) -> None:
+    """A controller, an estimator and the world, one after the other, on the way to a target."""
+    run = federation.run(scenario, "--realtime", "--duration", str(end_s))
+    clock = federation.client().subscribe("clock")
+    for name, at_s in zip(("controller.main", "estimator.drone1", "world"), kills_s, strict=True):
+        clock.until(lambda m, at_s=at_s: m["t_ns"] >= at_s * 1e9)
+        federation.kill(name)
+    run.line("world: goes on at t = ")
+    run.ends(with_code=0)
+    assert {event["subject"] for event in federation.record().events("death")} >= {"controller.main"}
+    undisturbed = msgspec.structs.replace(scenario_file.from_text(scenario), duration_s=end_s)
+    fly(undisturbed, tmp_path / "undisturbed.mcap")
+    with RecordReader(tmp_path / "undisturbed.mcap") as reader:
+        wanted = Record(reader)
+        for drone in ("drone1", "drone2"):
+            apart = federation.record().positions(drone) - wanted.positions(drone)
+            assert np.linalg.norm(apart, axis=1).max() < APART_M
 
 
 def test_a_world_that_is_not_to_be_restarted(federation: Federation) -> None:
