@@ -309,6 +309,9 @@ class Fleet:
 
     def _add_sightings(self, sightings: list[Sighting]) -> None:
         """Put sightings among the samples of the gate, behind those of the same drone and time."""
+        self.sightings = {}
+        if not sightings:
+            return
         number = len(self.sensors.names)
         rows = [(number, each.drone, each.t_ns, each.t_sample_ns) for each in sightings]
         whose = np.concatenate((self.sampled.whose, np.array(rows, dtype=np.int64).reshape(-1, WHOSE.size)))

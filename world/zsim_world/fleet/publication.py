@@ -190,9 +190,12 @@ class UserMessages:
             counts: (N, kinds), messages that each key has had.
         """
         whose, values = self._fleet.sampled
+        places = np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist()
+        if not places:
+            return NO_PAYLOADS
         sizes, payloads = np.zeros(len(whose), dtype=np.int64), []
         seq: dict[tuple[int, int], int] = {}
-        for m in np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist():
+        for m in places:
             s, i, t_ns, t_sample_ns = whose[m].tolist()
             number = seq.setdefault((i, s), int(counts[i, s + 2]))
             seq[i, s] += 1

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate
-from zsim.contract.framing import GateMessages
+from zsim.contract.framing import GateMessages, PerPattern
 from zsim.errors import DecodeError
 from zsim.math.compiled import portable
 from zsim.math.rotation import Vector
@@ -47,8 +47,7 @@ class JointBank(EstimatorBank):
         self._hat_B: Vector = float(x), float(y), float(z)
         self._cameras = [{name: camera_pose(c).p_BK for name, c in d.sensors.cameras().items()} for d in drones]
         self._drones = {keys.sensor(drone.name, keys.SIGHTINGS): i for i, drone in enumerate(drones)}
-        self._table: Sequence[str] = ()
-        self._places: dict[int, int] = {}
+        self._places = PerPattern(self._sighting_places)
         self._sighted: list[list[float]] = []
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
@@ -63,17 +62,18 @@ class JointBank(EstimatorBank):
             self._sighted.append([*row, seen.sigma_direction_rad, seen.sigma_range_m])
 
     def receive_gate(self, gate: GateMessages) -> bool:
-        if gate.table is not self._table:
-            self._table = gate.table
-            self._places = {place: self._drones[key] for place, key in enumerate(gate.table) if key in self._drones}
         if not super().receive_gate(gate):
             return False
-        for m, which in enumerate(gate.which.tolist()) if self._places else ():
-            if which in self._places:
-                with suppress(DecodeError):
-                    message = messages.decode(gate.table[which], gate.payload(m))
-                    self.receive(self._places[which], keys.SIGHTINGS, message, message.t_ns * 1e-9)
+        for m, i, key in self._places.of(gate):
+            with suppress(DecodeError):
+                message = messages.decode(key, gate.payload(m))
+                self.receive(i, keys.SIGHTINGS, message, message.t_ns * 1e-9)
         return True
+
+    def _sighting_places(self, gate: GateMessages) -> list[tuple[int, int, str]]:
+        """Return which messages of a gate are sightings, whose, and on which key."""
+        by_message = ((m, gate.table[which]) for m, which in enumerate(gate.which.tolist()))
+        return [(m, self._drones[key], key) for m, key in by_message if key in self._drones]
 
     def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
         super().warm_start(i, last)
