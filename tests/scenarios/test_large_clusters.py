@@ -112,6 +112,7 @@ def test_they_take_off_assemble_and_follow_a_trajectory(name: str, n: int, kind:
 
 
 @pytest.mark.slow
+@pytest.mark.soak
 def test_a_cluster_of_clusters_as_processes(federation: Federation) -> None:
     """Three triads, each of nine estimators a process, then the same in one process.
 

@@ -42,6 +42,7 @@ def doctored(record: Path, into: Path, change: Callable[[str, bytes], bytes | No
     return into
 
 
+@pytest.mark.soak
 def test_a_plain_run(federation: Federation, pair_sha256: str) -> None:
     """PAIR, every role a process.
 

@@ -288,6 +288,7 @@ def test_a_run_with_a_console_prints_its_link_and_ends_as_a_whole(federation: Fe
     federation.nobody_left()
 
 
+@pytest.mark.soak
 def test_a_console_serves_one_run_after_the_other(federation: Federation) -> None:
     role, links = console(federation)
     world = federation.world(TRIAD, "--duration", "600")
@@ -304,6 +305,7 @@ def test_a_console_serves_one_run_after_the_other(federation: Federation) -> Non
     role.ends(with_code=0)
 
 
+@pytest.mark.soak
 def test_a_second_console_has_a_name_of_its_own(federation: Federation) -> None:
     federation.world(TRIAD, "--duration", "600")
     first, _ = console(federation)

@@ -178,6 +178,7 @@ def repeated(client: Client, key: str, payload: bytes) -> Iterator[None]:
 
 @needs_browser
 @pytest.mark.slow
+@pytest.mark.soak
 def test_what_each_drone_sees_stands_below_the_scene(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:

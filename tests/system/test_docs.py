@@ -52,6 +52,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
 LONG = (
+    "cameras.md",
     "clients.md",
     "deployment.md",
     "estimation.md",

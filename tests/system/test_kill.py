@@ -174,6 +174,7 @@ def test_end(federation: Federation, name: str) -> None:
     check_end(federation, whole=False)
 
 
+@pytest.mark.soak
 def test_who_is_terminated_has_died(federation: Federation) -> None:
     """SIGTERM from somebody who is not the launcher: first to an estimator, then to the recorder."""
     flight = Flight(federation)
@@ -201,7 +202,7 @@ def check_whole(record: Record) -> None:
             assert list(by_number) == list(range(len(by_number))), key
 
 
-@pytest.mark.parametrize("pace", [4, 1000])
+@pytest.mark.parametrize("pace", [4, pytest.param(1000, marks=pytest.mark.soak)])
 def test_a_recorder_that_is_killed_again_and_again_leaves_no_gap(
     federation: Federation, undisturbed: dict[str, np.ndarray], pace: int
 ) -> None:
@@ -218,7 +219,7 @@ def test_a_recorder_that_is_killed_again_and_again_leaves_no_gap(
         assert np.array_equal(record.positions(drone)[: len(wanted)], wanted)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.soak), signal.SIGKILL])
 def test_a_recorder_that_ends_just_before_the_run(federation: Federation, number: signal.Signals) -> None:
     """The last gates are written by the one in its place, or the run has failed, and says why."""
     run = federation.run(PAIR, "--rate", "4", "--duration", "8")
@@ -299,6 +300,7 @@ def test_a_world_that_is_killed_again_and_again_costs_no_bit(
     assert (federation.out / "journal").exists()  # it was stopped, and can go on
 
 
+@pytest.mark.soak
 def test_a_world_that_was_restarted_in_realtime_counts_only_its_own_time(federation: Federation) -> None:
     """What was lost with the former one is a miss or two of each agent, not one at every gate after it."""
     run = federation.run(PAIR, "--realtime", "--rate", "2", "--duration", "16")
@@ -347,7 +349,7 @@ def test_a_world_that_is_not_to_be_restarted(federation: Federation) -> None:
     check_end(federation, whole=False)
 
 
-@pytest.mark.parametrize("how", ["Ctrl-C", "kill -9 of everything"])
+@pytest.mark.parametrize("how", [pytest.param("Ctrl-C", marks=pytest.mark.soak), "kill -9 of everything"])
 def test_an_interrupted_run_goes_on(federation: Federation, undisturbed: dict[str, np.ndarray], how: str) -> None:
     flight = Flight(federation)
     if how == "Ctrl-C":
@@ -424,6 +426,7 @@ def test_a_pipe_that_nobody_reads_any_more(federation: Federation, tmp_path: Pat
     assert f"ended: {UNREAD}" in (federation.out / "run.log").read_text()
 
 
+@pytest.mark.soak
 def test_interrupt_while_time_stands(federation: Federation) -> None:
     flight = Flight(federation)
     federation.kill("estimator.drone2", signal.SIGSTOP)

@@ -37,6 +37,7 @@ def test_it_flies_in_processes_of_its_own_as_in_one(federation: Federation, besi
     assert summary["truth_sha256"] == record.sha256()
 
 
+@pytest.mark.soak
 def test_a_sweep_compares_it_with_the_others(federation: Federation, beside: Path) -> None:
     path, out = federation.write(PAIR, "pair.yaml"), federation.folder / "sweep"
     vary = ("--vary", f"estimation.algorithm=ekf,paper,{MINE}")

@@ -45,6 +45,7 @@ def test_processes_give_the_bits_of_one_process(federation: Federation, tmp_path
 
 
 @pytest.mark.usefixtures("examples")
+@pytest.mark.soak
 def test_a_sweep_compares_laws(federation: Federation) -> None:
     """Also flies the command `zsim run --in-process`, whose hash a run of the sweep has."""
     out = federation.folder / "sweep"

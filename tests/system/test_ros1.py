@@ -114,6 +114,7 @@ def graph(flight: Flight) -> RosGraph:
     return flight.graph
 
 
+@pytest.mark.soak
 def test_pictures_are_as_a_camera_publishes_them(flight: Flight, graph: RosGraph):
     """A camera of somebody's own: rospy's tools have its pictures, and what their pixels mean."""
     camera = flight.federation.client()
@@ -242,6 +243,7 @@ def test_a_master_may_come_late_and_be_restarted_and_is_left_in_order(federation
         graph.close()
 
 
+@pytest.mark.soak
 def test_nodes_outlive_a_world_and_end_the_bridge(federation: Federation, tmp_path: Path):
     graph = RosGraph(tmp_path)
     try:

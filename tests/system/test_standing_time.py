@@ -45,7 +45,7 @@ class Watched:
         self.run.ends(with_code=0)
 
 
-@pytest.mark.parametrize("has_token", [False, True])
+@pytest.mark.parametrize("has_token", [False, pytest.param(True, marks=pytest.mark.soak)])
 def test_a_join_in_another_s_name_takes_no_place(federation: Federation, has_token: bool) -> None:
     watched = Watched(federation)
     if has_token:  # of the name alone, as a program has that knows no more than the contract
@@ -91,6 +91,7 @@ def test_who_takes_a_place_and_does_nothing_gives_it_back(federation: Federation
         token.undeclare()
 
 
+@pytest.mark.soak
 def test_in_realtime_too(federation: Federation) -> None:
     watched = Watched(federation, "--realtime")
     client = watched.client

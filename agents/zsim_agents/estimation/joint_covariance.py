@@ -4,12 +4,14 @@ Compiled. D = N n: the error states of N drones one behind the other, n each (fi
 none, J is (0, 0), and every drone's covariance stands for itself.
 """
 
+import math
+
 import numpy as np
 
 from zsim.math.compiled import portable
 from zsim_agents.estimation import strapdown
 from zsim_agents.estimation.filter_state import LAYOUT, SETTING, Rows
-from zsim_agents.estimation.kalman_update import gain, innovation_covariance, within_gates
+from zsim_agents.estimation.kalman_update import within_gates
 
 
 @portable
@@ -39,45 +41,84 @@ def predict_jointly(J: np.ndarray, i: int, F: np.ndarray, Q: np.ndarray) -> None
             if c != r and f != 0.0:
                 for d in range(size):
                     J[first + r, d] += f * former[c, d]
-    for d in range(size):  # the rows of others stand in the columns as well
-        if d < first or d >= first + n:
-            for r in range(n):
-                J[d, first + r] = J[first + r, d]
     own = J[first : first + n, first : first + n].copy()
     for r in range(n):
-        for c in range(n):
+        for c in range(r, n):
             total = Q[r, c]
             for k in range(n):
                 f = F[c, k]
                 if f != 0.0:
                     total += own[r, k] * f
-            J[first + r, first + c] = total
+            J[first + r, first + c] = J[first + c, first + r] = total
+    for d in range(size):  # the rows of others stand in the columns as well
+        if d < first or d >= first + n:
+            for r in range(n):
+                J[d, first + r] = J[first + r, d]
 
 
 @portable
-def correct_all(rows: Rows, J: np.ndarray, PHt: np.ndarray, S: np.ndarray, y: np.ndarray) -> None:
+def add_projection(J: np.ndarray, H: np.ndarray, first: int, HJ: np.ndarray) -> None:
+    """Add H J to HJ, (m, D), for a Jacobian by the errors from `first` on, (m, n), mostly zeros."""
+    for j in range(H.shape[0]):
+        for k in range(H.shape[1]):
+            h = H[j, k]
+            if h != 0.0:
+                for d in range(J.shape[0]):
+                    HJ[j, d] += h * J[first + k, d]
+
+
+@portable
+def add_innovation_covariance(HJ: np.ndarray, H: np.ndarray, first: int, S: np.ndarray) -> None:
+    """Add H J H^T to S, (m, m), for a Jacobian as of `add_projection`."""
+    for i in range(H.shape[0]):
+        for k in range(H.shape[1]):
+            h = H[i, k]
+            if h != 0.0:
+                for j in range(H.shape[0]):
+                    S[i, j] += h * HJ[j, first + k]
+
+
+@portable
+def whiten(S: np.ndarray, HJ: np.ndarray, y: np.ndarray) -> None:
+    """Replace HJ by W = L^-1 HJ and y by u = L^-1 y, with S = L L^T: then J^+ = J - W^T W, and x = W^T u."""
+    m = S.shape[0]
+    L = np.zeros((m, m))
+    for i in range(m):
+        for j in range(i + 1):
+            rest = S[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
+    for i in range(m):
+        for k in range(i):
+            y[i] -= L[i, k] * y[k]
+            for d in range(HJ.shape[1]):
+                HJ[i, d] -= L[i, k] * HJ[k, d]
+        y[i] /= L[i, i]
+        for d in range(HJ.shape[1]):
+            HJ[i, d] /= L[i, i]
+
+
+@portable
+def correct_all(rows: Rows, HJ: np.ndarray, S: np.ndarray, y: np.ndarray) -> None:
     """Use innovations y (m,) of covariance S: correct every drone, and the covariance.
 
     Args:
-        rows: of N drones.
-        J: of all; changed.
-        PHt: J H^T, (D, m).
+        rows: of N drones; `rows.joint` is J.
+        HJ: H J, (m, D); overwritten, as y is.
     """
-    K = gain(S, PHt)
-    size, m, n = J.shape[0], y.shape[0], rows.covariance.shape[1]
-    x = np.zeros(size)
-    for d in range(size):
-        for k in range(m):
-            x[d] += K[d, k] * y[k]
-    for r in range(size):
-        for k in range(m):
-            weight = K[r, k]
+    whiten(S, HJ, y)
+    J, x = rows.joint, np.zeros(HJ.shape[1])
+    for k in range(y.shape[0]):
+        for d in range(x.shape[0]):
+            x[d] += y[k] * HJ[k, d]
+    for r in range(x.shape[0]):
+        for k in range(y.shape[0]):
+            weight = HJ[k, r]
             if weight != 0.0:
-                for c in range(r, size):
-                    J[r, c] -= weight * PHt[c, k]
-    for r in range(size):
-        for c in range(r + 1, size):
-            J[c, r] = J[r, c]
+                for c in range(x.shape[0]):
+                    J[r, c] -= weight * HJ[k, c]
+    n = rows.covariance.shape[1]
     for i in range(rows.nominal.shape[0]):
         error = x[i * n : i * n + n]
         strapdown.correct(rows.nominal[i], rows.layout[i], rows.setting[i, SETTING.gravity], error)
@@ -100,12 +141,11 @@ def use_own(
         y: innovations, (m,).
         blocks, distances: see `kalman_update.within_gates`.
     """
-    J, m, n = rows.joint, H.shape[0], H.shape[1]
-    wide = np.zeros((m, J.shape[0]))
-    wide[:, i * n : i * n + n] = H
-    PHt = np.zeros((J.shape[0], m))
-    S = innovation_covariance(J, wide, variance, PHt)
+    first, HJ = i * H.shape[1], np.zeros((H.shape[0], rows.joint.shape[0]))
+    add_projection(rows.joint, H, first, HJ)
+    S = np.diag(variance)
+    add_innovation_covariance(HJ, H, first, S)
     if not within_gates(S, y, blocks, rows.limits, distances):
         return False
-    correct_all(rows, J, PHt, S, y)
+    correct_all(rows, HJ, S, y.copy())
     return True

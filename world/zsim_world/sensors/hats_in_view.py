@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined, kernel
+from zsim.math.interpolation import attitude_between, position_between
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
 from zsim.scenario import obstacle
 from zsim.sensors.camera_model import Lens, pixel
@@ -53,6 +54,30 @@ def _three(row: NDArray, at: int) -> Vector:
 @inlined
 def _four(row: NDArray, at: int) -> Quaternion:
     return (row[at], row[at + 1], row[at + 2], row[at + 3])
+
+
+@kernel()
+def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_ns: int) -> NDArray:
+    """Return the poses of all drones at an instant between two gates, (N, POSE.size).
+
+    Args:
+        former, now: at the gates, (N, POSE.size or more), of which the rest is mixed.
+    """
+    if t_ns >= now_ns or now_ns <= former_ns:
+        return now.copy()
+    s, dt = (t_ns - former_ns) / (now_ns - former_ns), (now_ns - former_ns) * 1e-9
+    poses = former + s * (now - former)
+    for i in range(len(poses)):
+        a, b = former[i], now[i]
+        p = position_between(
+            s, dt, _three(a, POSE.p_WB), _three(a, POSE.v_WB), _three(b, POSE.p_WB), _three(b, POSE.v_WB)
+        )
+        q = attitude_between(s, _four(a, POSE.q_WB), _four(b, POSE.q_WB))
+        for k in range(3):
+            poses[i, POSE.p_WB + k] = p[k]
+        for k in range(4):
+            poses[i, POSE.q_WB + k] = q[k]
+    return poses
 
 
 @inlined

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from zsim.contract.camera_messages import Seen
 from zsim.contract.snapshot import State
-from zsim.math.interpolation import attitude_between, position_between
 from zsim.math.random_streams import stream
 from zsim.scenario.obstacle import COLUMNS, row_of
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.camera import Camera, Hats, SightingModel
 from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
 from zsim_world.physics.normal_variates import place, words
-from zsim_world.sensors.hats_in_view import POSE, VIEW, MountedCamera, hats_in_view
+from zsim_world.sensors.hats_in_view import VIEW, MountedCamera, hats_in_view, poses_between
 from zsim_world.state.fleet_arrays import STATE
 
 FULL_LIGHT = 0.25  # of a clear day, below which a picture is too dark for the same errors
@@ -97,10 +96,12 @@ class SightingSampler:
         """Return what falls due by a gate, given the state of all drones there, (N, STATE.size or more)."""
         now = state[:, : STATE.size].copy()
         former, former_ns = (now, now_ns) if self._former is None else (self._former, self._former_ns)
+        known: dict[int, NDArray[np.float64]] = {}  # poses by instant: cameras of the same rate look together
         for watcher in self._watchers:
             while watcher.next_ns <= now_ns:
-                poses = _poses(former, former_ns, now, now_ns, watcher.next_ns)
-                self._later.append(watcher.look(poses, self._in_view(watcher, poses)))
+                if watcher.next_ns not in known:
+                    known[watcher.next_ns] = poses_between(former, former_ns, now, now_ns, watcher.next_ns)
+                self._later.append(watcher.look(self._in_view(watcher, known[watcher.next_ns])))
         self._former, self._former_ns = now, now_ns
         due = [sighting for sighting in self._later if sighting.t_ns <= now_ns]
         if due:
@@ -115,7 +116,15 @@ class SightingSampler:
 
 
 class _Watcher:
-    """One camera of one drone, and the detector behind it."""
+    """One camera of one drone, and the detector behind it.
+
+    Attributes:
+        drone: its number.
+        camera: as mounted.
+        next_ns: instant of the next picture.
+    """
+
+    next_ns: int
 
     def __init__(
         self,
@@ -134,29 +143,31 @@ class _Watcher:
         self._rng = stream(seed, f"{spec.name}/sightings/{name}")
         p, q = pose.p_BK.tolist(), pose.q_BK
         self.camera = MountedCamera(lens_of(camera), (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]))
-        self._R_BK = pose.R_BK @ _turned(math.radians(model.misalignment_deg) * self._rng.standard_normal(3))
+        R_BK = pose.R_BK @ _turned(math.radians(model.misalignment_deg) * self._rng.standard_normal(3))
+        self._R_BK: list[list[float]] = R_BK.tolist()
         self._misaligned_rad = math.radians(model.misalignment_deg)
         self._rate_hz, self._count = camera.rate_hz, 0
         self._latency_ns = round((camera.latency_ms + model.latency_ms) * 1e6)
         self._exposure_s = camera.exposure_ms * 1e-3
         self._dark = max(1.0, FULL_LIGHT / light)
+        self._set_next()
 
-    @property
-    def next_ns(self) -> int:
-        """Instant of the next picture."""
-        return round(self._count * 1e9 / self._rate_hz)
+    def _set_next(self) -> None:
+        self.next_ns = round(self._count * 1e9 / self._rate_hz)
 
     def snapshot(self) -> State:
         return {"count": self._count, "stream": words(self._rng)}
 
     def restore(self, state: State) -> None:
         self._count = state["count"]
+        self._set_next()
         place(self._rng, state["stream"])
 
-    def look(self, poses: NDArray[np.float64], view: NDArray[np.float64]) -> Sighting:
+    def look(self, view: NDArray[np.float64]) -> Sighting:
         """Return what the detector makes of what is in view."""
         at_ns, model = self.next_ns, self._model
         self._count += 1
+        self._set_next()
         normal = self._rng.standard_normal((len(view), DRAWS))
         seen = [
             self._seen(row, noise)
@@ -165,7 +176,8 @@ class _Watcher:
         ]
         if model.false_hz:
             seen += self._false(self._rng.random(FALSE_DRAWS).tolist())
-        seen.sort(key=_azimuth)
+        if len(seen) > 1:
+            seen.sort(key=_azimuth)
         return Sighting(self.drone, at_ns + self._latency_ns, at_ns, self._name, tuple(seen))
 
     def _is_missed(self, row: list[float], normal: float) -> bool:
@@ -187,13 +199,20 @@ class _Watcher:
         a, b = centre_px / scale * noise[0], centre_px / scale * noise[1]
         measured = max(angle + diameter_px / scale * noise[2], 0.1 * angle)
         range_m = self._radius_m / math.sin(0.5 * measured)
-        direction = self._in_body([x + a * e1[0] + b * e2[0], y + a * e1[1] + b * e2[1], z + a * e1[2] + b * e2[2]])
+        direction = self._in_body(x + a * e1[0] + b * e2[0], y + a * e1[1] + b * e2[1], z + a * e1[2] + b * e2[2])
         sigma = math.hypot(centre_px / scale, self._misaligned_rad)
         return Seen(direction, range_m, sigma, range_m * diameter_px / (scale * measured))
 
-    def _in_body(self, to_K: list[float]) -> tuple[float, float, float]:
-        x, y, z = (self._R_BK @ to_K / math.sqrt(sum(each * each for each in to_K))).tolist()
-        return x, y, z
+    def _in_body(self, x: float, y: float, z: float) -> tuple[float, float, float]:
+        """Return the unit vector in B along (x, y, z) in K."""
+        r, s, t = self._R_BK
+        length = math.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        return (
+            r[0] * x + r[1] * y + r[2] * z,
+            s[0] * x + s[1] * y + s[2] * z,
+            t[0] * x + t[1] * y + t[2] * z,
+        )
 
     def _false(self, uniform: list[float]) -> list[Seen]:
         """Return a false alarm, if there is one in this picture: a small blob anywhere."""
@@ -205,7 +224,7 @@ class _Watcher:
         angle = size_px / lens.fx
         sigma = math.hypot(model.centre_px / lens.fx, self._misaligned_rad)
         range_m = self._radius_m / math.sin(0.5 * angle)
-        return [Seen(self._in_body([x, y, 1.0]), range_m, sigma, range_m * model.diameter_px / size_px)]
+        return [Seen(self._in_body(x, y, 1.0), range_m, sigma, range_m * model.diameter_px / size_px)]
 
 
 def _azimuth(seen: Seen) -> float:
@@ -222,19 +241,3 @@ def _turned(r: NDArray[np.float64]) -> NDArray[np.float64]:
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     U, _, Vt = np.linalg.svd(np.eye(3) + K)
     return U @ Vt
-
-
-def _poses(
-    former: NDArray[np.float64], former_ns: int, now: NDArray[np.float64], now_ns: int, t_ns: int
-) -> NDArray[np.float64]:
-    """Return the poses of all drones at an instant between two gates, (N, POSE.size)."""
-    if t_ns >= now_ns or now_ns <= former_ns:
-        return now
-    s, dt = (t_ns - former_ns) / (now_ns - former_ns), (now_ns - former_ns) * 1e-9
-    poses = former + s * (now - former)
-    for i, (a, b) in enumerate(zip(former.tolist(), now.tolist(), strict=True)):
-        poses[i, POSE.p_WB : POSE.p_WB + 3] = position_between(
-            s, dt, tuple(a[0:3]), tuple(a[3:6]), tuple(b[0:3]), tuple(b[3:6])
-        )
-        poses[i, POSE.q_WB : POSE.q_WB + 4] = attitude_between(s, tuple(a[6:10]), tuple(b[6:10]))
-    return poses

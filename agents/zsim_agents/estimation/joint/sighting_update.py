@@ -13,8 +13,8 @@ from zsim.math.compiled import portable
 from zsim.math.rotation import Vector, add, cross, dot, matrix, norm, product, scaled, subtract, transposed
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
 from zsim_agents.estimation.filter_state import COUNT, LAYOUT, NOMINAL, SETTING, Moment, Rows, moment, vector
-from zsim_agents.estimation.joint_covariance import correct_all
-from zsim_agents.estimation.kalman_update import innovation_covariance, within_gates
+from zsim_agents.estimation.joint_covariance import add_innovation_covariance, add_projection, correct_all
+from zsim_agents.estimation.kalman_update import within_gates
 from zsim_agents.estimation.strapdown import recall
 
 SIGHTING = columns(  # one hat that was seen
@@ -50,29 +50,31 @@ def expected(a: Moment, b: Moment, hat_B: Vector, p_BK: Vector) -> Vector:
 
 @portable
 def write_rows(
-    H: np.ndarray,
-    i: int,
-    j: int,
-    n: int,
+    H_i: np.ndarray,
+    H_j: np.ndarray,
     a: Moment,
     b: Moment,
     hat_B: Vector,
     axes: tuple[Vector, Vector, Vector],
     lags: tuple[float, float],
 ) -> None:
-    """Write the Jacobian of a sighting along three axes of the observer's body, (3, D), which comes in as zero."""
+    """Write the Jacobians of a sighting along three axes of the observer's body, (3, n), which come in as zero.
+
+    Args:
+        H_i, H_j: by the errors of who sees and of who is seen.
+    """
     R_a, hat_W = matrix(a[3]), product(matrix(b[3]), hat_B)
     away = subtract(add(b[1], hat_W), a[1])
     for r in range(3):
         w = product(R_a, axes[r])
         by_own, by_other = cross(w, away), cross(hat_W, w)
         for k in range(3):
-            H[r, j * n + POSITION + k] = w[k]
-            H[r, i * n + POSITION + k] = -w[k]
-            H[r, j * n + VELOCITY + k] = -lags[1] * w[k]
-            H[r, i * n + VELOCITY + k] = lags[0] * w[k]
-            H[r, i * n + ATTITUDE + k] = by_own[k]
-            H[r, j * n + ATTITUDE + k] = by_other[k]
+            H_j[r, POSITION + k] = w[k]
+            H_i[r, POSITION + k] = -w[k]
+            H_j[r, VELOCITY + k] = -lags[1] * w[k]
+            H_i[r, VELOCITY + k] = lags[0] * w[k]
+            H_i[r, ATTITUDE + k] = by_own[k]
+            H_j[r, ATTITUDE + k] = by_other[k]
 
 
 @portable
@@ -86,17 +88,16 @@ def across(d: Vector) -> tuple[Vector, Vector, Vector]:
 
 @portable
 def predict_sighting(
-    rows: Rows, sighting: np.ndarray, j: int, hat_B: Vector, H: np.ndarray, PHt: np.ndarray, S: np.ndarray
+    rows: Rows, sighting: np.ndarray, j: int, hat_B: Vector, HJ: np.ndarray, S: np.ndarray
 ) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
-    """Return where the hat of drone j should be seen, and axes along and across; write H, P H^T and S along these.
+    """Return where the hat of drone j should be seen, and axes along and across; write H J and S along these.
 
     Args:
-        rows: of all drones.
+        rows: of all drones; `rows.joint` is J.
         sighting: (SIGHTING.size,).
         j: whose hat it is taken for.
         hat_B: centre of a hat in the body of its drone [m].
-        H: (3, D), written.
-        PHt: (D, 3), written.
+        HJ: (3, D), written.
         S: covariance of the innovation, (3, 3), written.
     """
     i, n = int(sighting[SIGHTING.drone]), rows.covariance.shape[1]
@@ -106,13 +107,17 @@ def predict_sighting(
     r = expected(a, b, hat_B, vector(sighting, SIGHTING.p_BK))
     away = max(norm(r), NEAREST_M)
     axes = across(scaled(r, 1.0 / away))
-    H[:] = 0.0
+    H_i, H_j = np.zeros((3, n)), np.zeros((3, n))
     lags = (rows.nominal[i, NOMINAL.t] - a[0], rows.nominal[j, NOMINAL.t] - b[0])
-    write_rows(H, i, j, n, a, b, hat_B, axes, lags)
+    write_rows(H_i, H_j, a, b, hat_B, axes, lags)
     sideways = away * max(sighting[SIGHTING.sigma_direction], SIGMA_MIN_RAD)
     along = max(sighting[SIGHTING.sigma_range], SIGMA_MIN_M)
-    variance = np.array([along * along, sideways * sideways, sideways * sideways])
-    S[:] = innovation_covariance(rows.joint, H, variance, PHt)
+    HJ[:], S[:] = 0.0, 0.0
+    S[0, 0], S[1, 1], S[2, 2] = along * along, sideways * sideways, sideways * sideways
+    add_projection(rows.joint, H_i, i * n, HJ)
+    add_projection(rows.joint, H_j, j * n, HJ)
+    add_innovation_covariance(HJ, H_i, i * n, S)
+    add_innovation_covariance(HJ, H_j, j * n, S)
     return r, axes
 
 
@@ -138,8 +143,12 @@ def place_of(sighting: np.ndarray) -> Vector:
 
 
 @portable
-def owner(rows: Rows, sighting: np.ndarray, hat_B: Vector, taken: np.ndarray) -> int:
+def owner(
+    rows: Rows, sighting: np.ndarray, hat_B: Vector, taken: np.ndarray, HJ: np.ndarray, S: np.ndarray, y: np.ndarray
+) -> int:
     """Return whose hat was seen, NOBODY where none fits, two do, or the filter could not tell two from each other.
+
+    HJ, S and the innovation y, (3,), are those of the hat that is returned.
 
     Args:
         rows: of all drones.
@@ -147,8 +156,7 @@ def owner(rows: Rows, sighting: np.ndarray, hat_B: Vector, taken: np.ndarray) ->
         hat_B: centre of a hat in the body of its drone [m].
         taken: whose hats were seen already in the same picture, (N,).
     """
-    size, count, i = rows.joint.shape[0], rows.nominal.shape[0], int(sighting[SIGHTING.drone])
-    H, PHt, S = np.zeros((3, size)), np.zeros((size, 3)), np.zeros((3, 3))
+    count, i = rows.nominal.shape[0], int(sighting[SIGHTING.drone])
     places, seen = np.zeros((count, 3)), place_of(sighting)
     best, second, found = math.inf, math.inf, NOBODY
     for j in range(count):
@@ -156,7 +164,7 @@ def owner(rows: Rows, sighting: np.ndarray, hat_B: Vector, taken: np.ndarray) ->
             continue
         if not rows.counts[j, COUNT.heading_known]:
             return NOBODY  # it could be anywhere
-        r, axes = predict_sighting(rows, sighting, j, hat_B, H, PHt, S)
+        r, axes = predict_sighting(rows, sighting, j, hat_B, HJ, S)
         places[j, 0], places[j, 1], places[j, 2] = r[0], r[1], r[2]
         distance = distance_squared(rows, S, innovation(axes, seen, r))
         if distance < best:
@@ -165,12 +173,13 @@ def owner(rows: Rows, sighting: np.ndarray, hat_B: Vector, taken: np.ndarray) ->
             second = distance
     if found == NOBODY or best > rows.limits[3] or second - best < AMBIGUITY or taken[found]:
         return NOBODY
-    r, axes = predict_sighting(rows, sighting, found, hat_B, H, PHt, S)
+    r, axes = predict_sighting(rows, sighting, found, hat_B, HJ, S)
     for j in range(count):
         if j not in (i, found):
             other = (places[j, 0], places[j, 1], places[j, 2])
             if distance_squared(rows, S, innovation(axes, other, r)) < APART * APART:
                 return NOBODY
+    y[:] = innovation(axes, seen, r)
     return found
 
 
@@ -194,18 +203,16 @@ def use_sightings(rows: Rows, sightings: np.ndarray, hat_B: Vector) -> None:
         sightings: (M, SIGHTING.size), those of one picture one behind the other.
         hat_B: centre of a hat in the body of its drone [m].
     """
-    size = rows.joint.shape[0]
     taken = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
-    H, PHt, S = np.zeros((3, size)), np.zeros((size, 3)), np.zeros((3, 3))
+    HJ, S, y = np.zeros((3, rows.joint.shape[0])), np.zeros((3, 3)), np.zeros(3)
     for m in range(sightings.shape[0]):
         sighting, i = sightings[m], int(sightings[m, SIGHTING.drone])
         if m == 0 or sighting[0] != sightings[m - 1, 0] or sighting[2] != sightings[m - 1, 2]:
             taken[:] = False
-        j = owner(rows, sighting, hat_B, taken) if is_possible(rows, sighting) else NOBODY
+        j = owner(rows, sighting, hat_B, taken, HJ, S, y) if is_possible(rows, sighting) else NOBODY
         if j == NOBODY:
             rows.counts[i, COUNT.sightings_refused] += 1
             continue
         taken[j] = True
         rows.counts[i, COUNT.sightings_used] += 1
-        r, axes = predict_sighting(rows, sighting, j, hat_B, H, PHt, S)
-        correct_all(rows, rows.joint, PHt, S, innovation(axes, place_of(sighting), r))
+        correct_all(rows, HJ, S, y)

@@ -127,7 +127,7 @@ def test_the_jacobian_is_that_of_what_is_expected():
     hat, eye, n, step = (0.1, -0.2, 0.3), (0.2, 0.1, 0.05), 9, 1e-6
     axes = across((0.6, 0.0, 0.8))
     H = np.zeros((3, 2 * n))
-    write_rows(H, 0, 1, n, a, b, hat, axes, (0.0, 0.0))
+    write_rows(H[:, :n], H[:, n:], a, b, hat, axes, (0.0, 0.0))
 
     def turned(q: tuple[float, ...], k: int) -> tuple[float, float, float, float]:
         half = [0.0, 0.0, 0.0]

@@ -1,5 +1,7 @@
 """A world that goes on from a journal: it publishes what comes next, and nothing that was published before."""
 
+from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +29,24 @@ processes: {{expect: []}}
 """
 
 
+class AtOnce:
+    """An executor, as of `ThreadPoolExecutor`, that does not let a flight overtake the disk."""
+
+    def __init__(self, *_: Any) -> None: ...
+
+    def submit(self, act: Callable[..., None], *arguments: Any) -> Future[None]:
+        act(*arguments)
+        done: Future[None] = Future()
+        done.set_result(None)
+        return done
+
+    def shutdown(self, *_: Any, **__: Any) -> None: ...
+
+
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let checkpoints come so often that each part of these short flights has some."""
+    monkeypatch.setattr(run_journal, "ThreadPoolExecutor", AtOnce)
     monkeypatch.setattr(run_journal, "CHECKPOINT_NS", 1_000_000_000)
     monkeypatch.setattr(run_journal, "CHECKPOINT_WALL_NS", 0)
 
