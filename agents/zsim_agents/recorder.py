@@ -1,48 +1,42 @@
 """The recorder as a process: every message of every key into `run.mcap`.
 
-It gates nothing, but the world is never farther ahead of what is on disk than its history reaches back (SLACK_NS): a
+It gates nothing, but the world is never farther ahead of what is on disk than its history reaches back: a
 recorder that comes back, or that is started again in the place of one that died, goes on without a gap.
 
 Order of this file: `record`, the process, catching up, what arrives.
 """
 
-import os
-import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from itertools import chain
 from pathlib import Path
 
 import msgspec
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages, run_key_table
-from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
+from zsim.errors import RecordError, RunError, SupersededError
 from zsim.record import RecordWriter
 from zsim.record.completeness import GateCount
 from zsim.record.record_writer import CHANNELS_MAX
 from zsim.runtime.health import HealthMeter
-from zsim.schema import message
-from zsim.transport.connection import read_info
 from zsim.transport.session import ReceivedSample, Session
-from zsim.transport.traffic import Passed, Traffic, replay, samples
+from zsim.transport.traffic import Passed, Traffic, samples
 from zsim_agents.known_messages import KnownMessages, is_of_run
+from zsim_agents.missed_messages import MissedMessages
+from zsim_agents.participation import Participation
 
 NAME = "recorder"
 ANOTHER_RUN = "the world has begun another run"
 PAUSE_S = 0.01  # between two looks into the queue: nobody waits for the recorder, and waking up is what costs
 TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
-REPLAY_S = 5.0  # a hub answers within milliseconds
-JOIN_S = 1.0  # wall time after which a join is repeated of which there was no event: it may have met no world
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
 STOP_DRAIN_S = 0.5  # after a stop is requested, how long the end of the run is waited for: both may be stopped at once
 QUIET_S = 1.5  # a world whose time stands publishes its clock once a second
 FLUSH_NS = 1_000_000_000  # simulated time after which what was taken is put on disk
 REPEATED_NS = 1_000_000_000  # simulated, after catching up, in which others may repeat what they had published before
-SLACK_NS = 4_000_000_000  # that the world may be ahead of it; its history has 5 s
 
 
 class _Head(msgspec.Struct):
@@ -90,15 +84,15 @@ class Recorder:
         self._links: deque[bool] = deque()
         self._link_lost = False
         self._must_look = False
+        self._part = Participation(link, name, info.run_id)
+        self._missed = MissedMessages(link, name, info.run_id, self._pauses)
         self._writer = RecordWriter(path, goes_on=is_of_run(path, info.run_id))
         self._head = msgspec.msgpack.Decoder(_Head)
-        self._clock = msgspec.msgpack.Decoder(run_messages.Clock)
         self._known = KnownMessages()
         self._gates = GateCount()
         self._caught_up = False
         self._known_until_ns = 0
         self._over = threading.Event()
-        self._successor: str | None = None
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
         self._held: list[Passed] = []  # arrived, but not to be written before what was missed
@@ -106,13 +100,7 @@ class Recorder:
         self._quiet_since_s: float | None = None  # since when no clock has come, after a lost link in realtime
         self._now_ns = 0
         self._on_disk_ns = 0  # when everything taken was put there last
-        self._incarnation = secrets.randbits(62)
-        self._incarnations = {self._incarnation}
-        self._joined_s: float | None = None  # when it joined last, until the world has taken it in
-        self._seq = {"join": 0, "done": 0, "bye": 0, "health": 0}
         self._left_out = 0
-        self._leavers: set[str] = set()
-        self._joined: set[str] = set()
         self.health = HealthMeter(NAME, host=link.host, reads=link.reads)
 
     def run(self) -> str:
@@ -134,7 +122,7 @@ class Recorder:
             self._write_held()
             self._writer.close()
         except RecordError as error:
-            self._bye(str(error))
+            self._part.bye(self._now_ns, str(error))
             raise
         finally:
             self._over.set()
@@ -142,15 +130,15 @@ class Recorder:
         if self._left_out:
             why = f"a record holds {CHANNELS_MAX} keys, and theirs are further ones"
             self._print(f"{self._name}: {self._left_out} messages are not on record: {why}")
-        if self._successor:
+        if self._part.successor:
             raise SupersededError(
-                f"{self._name}: another process of this name joined from {self._successor}; this one ends, its record "
-                f"is {self._writer.path}"
+                f"{self._name}: another process of this name joined from {self._part.successor}; "
+                f"this one ends, its record is {self._writer.path}"
             )
         if reason == ANOTHER_RUN:
             raise RunError(f"{self._name}: {reason}; the record {self._writer.path} is complete as far as it goes")
         if not self._deserted():
-            self._bye(reason)
+            self._part.bye(self._now_ns, reason)
         return reason
 
     def _on_link(self, up: bool) -> None:
@@ -165,7 +153,7 @@ class Recorder:
                 self._print(f"{self._name}: lost the link to the world; waiting for it to come back")
             self._must_look = up and self._link_lost
             self._link_lost = not up
-        info = self._info_of_world() if self._must_look else None
+        info = self._missed.info() if self._must_look else None
         if info is None:
             return False
         self._must_look = False
@@ -176,7 +164,7 @@ class Recorder:
         else:  # the world may be far ahead of what is on its way
             self._quiet_since_s = time.monotonic()
             self._is_back = True
-        self._join_again()
+        self._join(again=True)
         return False
 
     def _loop(self) -> str:
@@ -194,9 +182,9 @@ class Recorder:
             if self._now_ns - self._on_disk_ns >= FLUSH_NS:
                 self._put_on_disk()
             self._count_left_out()
-            if self._joined_s is not None and time.monotonic() - self._joined_s > JOIN_S:
+            if self._part.is_to_be_repeated():
                 self._join()
-            if self._successor:
+            if self._part.successor:
                 return "superseded"
             if self._may_stop():
                 return "stopped"
@@ -218,14 +206,13 @@ class Recorder:
     def _all_left(self) -> bool:
         """Return whether every process has published bye, or has had the time to."""
         late = time.monotonic() - (self._ended_s or 0.0) > DRAIN_S
-        return late or self._joined <= self._leavers
+        return late or self._part.others_left()
 
     def _put_on_disk(self) -> None:
         """Write out all that was taken, and let the world go on as far as its history then reaches back to it."""
         self._writer.flush()
         self._on_disk_ns = t_ns = self._now_ns
-        run_id, seq = self._info.run_id, self._next("done")
-        self._publish("done", run_messages.Done(t_ns, seq, run_id, self._incarnation, t_ns, 0))
+        self._part.done(t_ns)
 
     # Catching up
 
@@ -233,7 +220,7 @@ class Recorder:
         """Learn what the record of the process that died has at its end, which may be that of the run."""
         if last := self._known.add_tail(self._writer.path):
             self._now_ns = last.t_ns
-            clock = self._clock_in(last.payload)
+            clock = self._missed.clock_in(last.payload)
             self._gates = GateCount(clock)
             if clock is not None and clock.state == "stopped":
                 self._ended_s = time.monotonic()
@@ -262,8 +249,12 @@ class Recorder:
         for passed in arrived:
             self._held.append(passed)
             if isinstance(passed, ReceivedSample) and passed.key == keys.CLOCK:
-                clock = self._clock_in(passed.payload)
-                if clock is not None and (self._gates.misses(clock) or self._has_joined()) and self._reaches_run():
+                clock = self._missed.clock_in(passed.payload)
+                if (
+                    clock is not None
+                    and (self._gates.misses(clock) or self._has_joined())
+                    and self._missed.reaches_run()
+                ):
                     self._is_back = False
                     self._fetch_missed(clock)
                 self._write_held()
@@ -273,27 +264,12 @@ class Recorder:
     def _has_joined(self) -> bool:
         """Tell whether the join that follows a lost link in realtime is among what is held."""
         events = (each.payload for each in self._held if isinstance(each, ReceivedSample) and each.key == keys.EVENT)
-        return self._is_back and any(self._is_own_join(payload) for payload in events)
+        return self._is_back and any(map(self._part.is_own_join, events))
 
-    def _is_own_join(self, payload: bytes) -> bool:
-        """Tell whether an event is that of the newest join of this process."""
-        try:
-            event = messages.decode(keys.EVENT, payload)
-        except DecodeError:
-            return False
-        return event.subject == self._name and event.data.get("incarnation") == self._incarnation
-
-    def _reaches_run(self) -> bool:
-        """Tell whether the world of this run answers."""
-        info = self._info_of_world()
-        return info is not None and info.run_id == self._info.run_id
-
-    def _info_of_world(self) -> messages.Info | None:
-        """Return what the world says of its run, which may take a while where it was just started again."""
-        until_s = time.monotonic() + REPLAY_S
-        while (info := read_info(self._link)) is None and time.monotonic() < until_s and not self._stopped():
-            self._over.wait(TICK_S)
-        return info
+    def _pauses(self) -> bool:
+        """Wait a little; return False once nothing is to be waited for any more."""
+        self._over.wait(TICK_S)
+        return not self._stopped()
 
     def _write_held(self) -> None:
         for passed in self._held:
@@ -303,27 +279,10 @@ class Recorder:
     def _catch_up(self, before: run_messages.Clock | None = None) -> None:
         """Write what was published while this process was not there: the world keeps it for a while."""
         self._caught_up = False
-        while not self._caught_up and not self._stopped():
-            try:
-                for key, payload in self._replayed(before):
-                    self._write(key, payload)
-                    self._known.add(key, payload)
-                self._caught_up, self._known_until_ns = True, self._now_ns + REPEATED_NS
-            except NoWorldError:
-                self._over.wait(TICK_S)
-
-    def _replayed(self, before: run_messages.Clock | None) -> Iterator[tuple[str, bytes]]:
-        """Yield what the world replays, up to a clock that has arrived: what came after that is on its way as well."""
-        held: list[tuple[str, bytes]] = []
-        for entry in replay(self._link, self._name, -1, ["**"], REPLAY_S):
-            held.append(entry)
-            clock = self._clock_in(entry[1]) if before is not None and entry[0] == keys.CLOCK else None
-            if before is not None and clock is not None and clock.seq >= before.seq:
-                yield from held[:-1] if clock.seq == before.seq else ()
-                return
-            if before is None or clock is not None:
-                yield from held
-                held.clear()
+        for key, payload in self._missed.messages(before):
+            self._write(key, payload)
+            self._known.add(key, payload)
+        self._caught_up, self._known_until_ns = True, self._now_ns + REPEATED_NS
 
     def _write_lasting(self) -> None:
         """Write of what run this is, the newest faults, and how cameras see: the replay has them no longer."""
@@ -356,9 +315,10 @@ class Recorder:
             self._now_ns = t_ns
             self._on_clock(payload)
         elif key == keys.EVENT:
-            self._on_event(payload)
+            if self._part.event_received(payload):
+                self._join(again=True)
         elif key.startswith("process/"):
-            self._on_process(key)
+            self._part.passed(key)
 
     def _stamp(self, payload: bytes) -> int:
         """Return the message's own time; one that has none is recorded at the world's."""
@@ -368,17 +328,9 @@ class Recorder:
             self.health.refused += 1
             return self._now_ns
 
-    def _clock_in(self, payload: bytes) -> run_messages.Clock | None:
-        """Return the clock of this run; None for garbage by somebody else on `clock`, which is recorded as it came."""
-        try:
-            clock = self._clock.decode(payload)
-        except messages.REFUSALS:
-            return None
-        return clock if clock.run_id == self._info.run_id else None
-
     def _count(self, payload: bytes) -> run_messages.Clock | None:
         """Count the gate of a clock of this run, and return it; print at once which gates are missing before it."""
-        clock = self._clock_in(payload)
+        clock = self._missed.clock_in(payload)
         if clock is not None and (gap := self._gates.add(clock)):
             self._print(f"{self._name}: gates are missing on record, the world has them no longer: {gap}")
         return clock
@@ -396,58 +348,13 @@ class Recorder:
         elif self._caught_up:
             self._known.keep_outputs()  # whatever passed after a clock that was not replayed was not replayed either
 
-    def _on_event(self, payload: bytes) -> None:
-        try:
-            event = messages.decode(keys.EVENT, payload)
-        except DecodeError:
-            return  # garbage by somebody else; recorded as it came
-        data = event.data
-        if event.subject != self._name:
-            return
-        if data.get("incarnation") == self._incarnation:
-            self._joined_s = None
-        if event.kind != "superseded":
-            return
-        if (data.get("host"), data.get("pid")) == (self._link.host, os.getpid()):
-            if data.get("incarnation") not in self._incarnations:
-                self._join_again()  # somebody else has joined as this process
-        elif data.get("former_pid") == os.getpid():
-            self._successor = f"{data.get('host')} (pid {data.get('pid')})"
-
-    def _on_process(self, key: str) -> None:
-        name, what = keys.thing(key), keys.leaf(key)
-        if what == "join" and name != self._name:
-            self._joined.add(name)
-            self._leavers.discard(name)
-        elif what == "bye":
-            self._leavers.add(name)
-
-    def _join(self) -> None:
+    def _join(self, again: bool = False) -> None:
         """Join; who records already keeps the world from going on faster than it writes."""
-        name, host, run_id, seq = self._name, self._link.host, self._info.run_id, self._next("join")
-        join = join_of(name, host, run_id, self._incarnation, seq, self._now_ns, calculates=False, slack_ns=SLACK_NS)
-        self._publish("join", join)
-        self._joined_s = time.monotonic()
+        self._part.join(self._now_ns, again)
         self._put_on_disk()
-
-    def _join_again(self) -> None:
-        """Join by a new incarnation, the newest of which counts."""
-        self._incarnation = secrets.randbits(62)
-        self._incarnations.add(self._incarnation)
-        self._join()
-
-    def _bye(self, reason: str) -> None:
-        self._publish("bye", run_messages.Bye(self._now_ns, self._next("bye"), reason))
-
-    def _publish(self, what: str, message: message.Message) -> None:
-        self._link.put(keys.process(self._name, what), message)
-
-    def _next(self, what: str) -> int:
-        self._seq[what] += 1
-        return self._seq[what] - 1
 
     def _tick(self) -> None:
         while not self._over.wait(TICK_S):
             self._traffic.wake()
             if self.health.due():
-                self._publish("health", self.health.message(self._now_ns, self._next("health")))
+                self._part.publish("health", self.health.message(self._now_ns, self._part.next("health")))

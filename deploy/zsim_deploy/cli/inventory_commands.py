@@ -33,6 +33,9 @@ rendering = typer.Typer(
 
 Hosts = Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder to write into; what was rendered there before is replaced.")]
+Force = Annotated[
+    bool, typer.Option("--force", help="Overwrite files that no rendering wrote, or that were changed since.")
+]
 
 
 def _days(value: float) -> float:
@@ -123,20 +126,20 @@ def _warn(placed: "InventoryFile") -> None:
 
 @rendering.command()
 @flight_options
-def systemd(flight: FlightOptions, hosts: Hosts, out: Out) -> None:
+def systemd(flight: FlightOptions, hosts: Hosts, out: Out, force: Force = False) -> None:
     """Write HOST/zsim-PROCESS.service and HOST/zsim.target for every host."""
     from zsim_deploy.render.systemd import render
 
-    _write(out, "systemd", render(*_read(hosts, flight), flight.pace()))
+    _write(out, "systemd", render(*_read(hosts, flight), flight.pace()), force)
 
 
 @rendering.command()
 @flight_options
-def compose(flight: FlightOptions, hosts: Hosts, out: Out) -> None:
+def compose(flight: FlightOptions, hosts: Hosts, out: Out, force: Force = False) -> None:
     """Write HOST/compose.yaml and HOST/Dockerfile for every host."""
     from zsim_deploy.render.compose import render
 
-    _write(out, "compose", render(*_read(hosts, flight), flight.pace()))
+    _write(out, "compose", render(*_read(hosts, flight), flight.pace()), force)
 
 
 @rendering.command()
@@ -146,11 +149,12 @@ def kubernetes(
     hosts: Hosts,
     out: Out,
     image: Annotated[str | None, typer.Option(help="Image as the nodes find it (default zsim:VERSION).")] = None,
+    force: Force = False,
 ) -> None:
     """Write the manifests of a run, a Dockerfile, and a script that makes the Secrets from the certificates."""
     from zsim_deploy.render.kubernetes import IMAGE, render
 
-    _write(out, "kubernetes", render(*_read(hosts, flight), flight.pace(), image or IMAGE))
+    _write(out, "kubernetes", render(*_read(hosts, flight), flight.pace(), image or IMAGE), force)
 
 
 def _read(hosts: Path, flight: FlightOptions) -> tuple[Any, Any]:
@@ -165,9 +169,9 @@ def _read(hosts: Path, flight: FlightOptions) -> tuple[Any, Any]:
     return placed, loaded
 
 
-def _write(out: Path, target: str, texts: Mapping[str, str]) -> None:
+def _write(out: Path, target: str, texts: Mapping[str, str], force: bool) -> None:
     from zsim_deploy.render.rendered_files import write
 
-    removed = write(out, target, texts)
+    removed = write(out, target, texts, force)
     more = f"; removed of an earlier rendering: {', '.join(removed)}" if removed else ""
     print(printable(f"{len(texts)} files in {out}{more}"))

@@ -25,22 +25,26 @@ CERTIFICATES, ACCESS, SCENARIO, RUNS = "/certs", "/access/access.json", "/scenar
 ENVIRONMENT = {**SINGLE_THREADED, "NUMBA_CACHE_DIR": CACHE}
 
 
-def write(out: Path, target: str, texts: Mapping[str, str]) -> list[str]:
+def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False) -> list[str]:
     """Write the texts into a folder; return the files of an earlier rendering for this target that were removed.
 
     Args:
         out: the folder, made if it is not there.
         target: what it is rendered for; each target has a list of its own.
         texts: by path inside the folder, HOST/FILE or FILE; a host named `..` does not lead out of it.
+        force: overwrite what no rendering wrote, or what was changed since.
 
     Raises:
-        RunError: it cannot be written, a path leads out of it, or a file that has to go was changed by somebody.
+        RunError: it cannot be written, a path leads out of it, or a file in the way is somebody's.
     """
     root, record = out.resolve(), out / listing(target)
     for name in texts:
         if not _inside(root, name):
             raise RunError(f"{name}: leads out of {out}; rename that host in the inventory")
-    stale = _stale(root, _read(record, out), texts)
+    former = _read(record, out)
+    if not force:
+        _refuse_changed(root, former, texts)
+    stale = _stale(root, former, texts)
     for name in stale:
         _remove(root, name)
     _put(record, "".join(f"{_digest(text.encode())}  {name}\n" for name, text in texts.items()))
@@ -64,6 +68,16 @@ def _stale(root: Path, former: Mapping[str, str], texts: Mapping[str, str]) -> l
                 "remove it, or give --out another folder"
             )
     return names
+
+
+def _refuse_changed(root: Path, former: Mapping[str, str], texts: Mapping[str, str]) -> None:
+    """Refuse to overwrite what is not as an earlier rendering wrote it, nor as this one would."""
+    for name, text in texts.items():
+        path, known = root / name, (former.get(name, ""), _digest(text.encode()))
+        if path.exists() and not any(_is(path, digest) for digest in known):
+            raise RunError(
+                f"{path}: no rendering wrote it as it is; give --out another folder, or --force to replace it"
+            )
 
 
 def _inside(root: Path, name: str) -> bool:

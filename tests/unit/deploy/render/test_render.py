@@ -585,6 +585,22 @@ def test_a_file_that_was_changed_is_not_removed(hosts: InventoryFile, tmp_path: 
     assert call(tmp_path, "systemd").exit_code == 0
 
 
+@pytest.mark.parametrize("changed", ["before", "since"])
+def test_a_file_of_somebody_s_is_not_overwritten_unless_forced(tmp_path: Path, changed: str) -> None:
+    out = tmp_path / "out"
+    if changed == "since":
+        write(out, "compose", {"one/compose.yaml": "a: 1"})
+    out.joinpath("one").mkdir(parents=True, exist_ok=True)
+    (out / "one/compose.yaml").write_text("mine")
+    with refused(RunError, f"{out}/one/compose.yaml", "--force"):
+        write(out, "compose", {"one/compose.yaml": "a: 2"})
+    assert (out / "one/compose.yaml").read_text() == "mine"
+    write(out, "compose", {"one/compose.yaml": "a: 2"}, force=True)
+    assert (out / "one/compose.yaml").read_text() == "a: 2"
+    write(out, "compose", {"one/compose.yaml": "a: 3"})
+    assert (out / "one/compose.yaml").read_text() == "a: 3"
+
+
 def test_a_list_that_leads_out_of_the_folder_removes_nothing(hosts: InventoryFile, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     call(tmp_path, "systemd")
