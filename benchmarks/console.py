@@ -33,7 +33,7 @@ from benchmarks.table import figure, spread, table
 from zsim.contract import keys, messages
 from zsim.transport import connection
 from zsim.transport.session import Session
-from zsim_bridges.console.console_server import Camera
+from zsim_bridges.console.console_server import ViewerCamera
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 SIZES = (3, 50)  # drones
@@ -50,7 +50,7 @@ PICTURES_HZ = {3: 20.0, 50: 10.0}  # of the console, by its number of drones
 LEAST_PICTURES = 0.8  # share of them; below it the console was starved, and looks cheap
 LEAST_RATE = 0.9  # of real time; below it the run was starved, and gave the console less to draw
 DRONES = "/drones"  # the node of the scene
-CAMERA = Camera(  # what a page says first; before it, viser heeds no control of it
+CAMERA = ViewerCamera(  # what a page says first; before it, viser heeds no control of it
     (1.0, 0.0, 0.0, 0.0), (0.0, -5.0, 3.0), 1.0, 0.01, 1000.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
 

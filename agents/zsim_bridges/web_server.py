@@ -20,7 +20,7 @@ Resource = TypeVar("Resource")
 _NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, not logged
 
 
-class Site(NamedTuple):
+class ServedSite(NamedTuple):
     """A web application on a port."""
 
     runner: web.AppRunner
@@ -32,7 +32,7 @@ class Site(NamedTuple):
         await self.runner.cleanup()
 
 
-async def start_site(app: web.Application, host: str, port: int, shutdown_s: float) -> Site:
+async def start_site(app: web.Application, host: str, port: int, shutdown_s: float) -> ServedSite:
     """Serve an application on a port, on a bounded number of connections.
 
     Raises:
@@ -50,7 +50,7 @@ async def start_site(app: web.Application, host: str, port: int, shutdown_s: flo
     except OSError:
         await runner.cleanup()
         raise
-    return Site(runner, listener)
+    return ServedSite(runner, listener)
 
 
 def check_token(process: str, host: str, token: str | None) -> None:

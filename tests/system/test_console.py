@@ -26,7 +26,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from wire import PATIENCE_S
 
-from zsim_bridges.console.console_server import Camera
+from zsim_bridges.console.console_server import ViewerCamera
 
 STRIP = {"width": 860, "height": 120}  # of a page whose picture nobody looks at
 STEER = "a-good-token"
@@ -43,7 +43,7 @@ clusters:
   - {name: main, drones: [drone1, drone2, drone3]}
 """
 PLACE_OF_P = 9  # among the sliders: x_c, y_c, z_c, roll, pitch, yaw, three headings, p
-CAMERA = Camera(  # what a page says first; before it, viser heeds no control of it
+CAMERA = ViewerCamera(  # what a page says first; before it, viser heeds no control of it
     (1.0, 0.0, 0.0, 0.0), (0.0, -5.0, 3.0), 1.0, 0.01, 1000.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
 

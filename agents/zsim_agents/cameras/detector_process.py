@@ -11,9 +11,10 @@ from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
 from zsim.errors import DecodeError
 from zsim.math.frames import rotation_matrix
 from zsim.sensors.camera_model import CameraPose, Lens
+from zsim.sensors.jpeg_header import PictureError
 from zsim.transport.session import RawSample, Session
 from zsim_agents.cameras.detector import HatDetector
-from zsim_agents.cameras.jpeg import PIXELS_MAX, PictureError, decoded
+from zsim_agents.cameras.jpeg import PIXELS_MAX, decoded
 from zsim_agents.cameras.presence import Bell, Presence
 
 ASK_S = 2.0  # wall; how often a camera is asked what its pixels mean, while pictures come of which that is not known

@@ -125,7 +125,7 @@ def _requiring_secret(secret: str) -> Iterator[None]:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-class Camera(Struct, tag_field="type", tag="ViewerCameraMessage"):
+class ViewerCamera(Struct, tag_field="type", tag="ViewerCameraMessage"):
     """Every page sends where its camera is."""
 
     wxyz: flight_messages.Quaternion
@@ -163,7 +163,7 @@ class DroneClick(Struct, tag_field="type", tag="SceneNodeClickMessage"):
     owner: Annotated[str, Meta(max_length=NAME_MAX)] = ""
 
 
-_DECODER = msgspec.msgpack.Decoder(Camera | ControlUpdate | DroneClick)
+_DECODER = msgspec.msgpack.Decoder(ViewerCamera | ControlUpdate | DroneClick)
 """All other messages are refused, such as to show the page on the Internet, or to upload files."""
 
 

@@ -15,7 +15,7 @@ from aiohttp import ClientError, ClientSession, WSMsgType, web
 from zsim.errors import RunError
 from zsim_bridges.console import page_html
 from zsim_bridges.web_server import (
-    Site,
+    ServedSite,
     check_token,
     is_loopback_authority,
     open_on_thread,
@@ -183,7 +183,7 @@ class HttpProxy:
         with open_on_thread(self._loop, "console server", self._open, self._close):
             yield
 
-    async def _open(self) -> Site:
+    async def _open(self) -> ServedSite:
         app = web.Application()
         app.add_routes([web.get(path, self._page) for path in ("/", VIEW_PATH)])
         app.add_routes([web.get(path, self._state) for path in ("/state", f"{VIEW_PATH}/state")])
@@ -196,7 +196,7 @@ class HttpProxy:
         self._client = ClientSession()
         return site
 
-    async def _close(self, site: Site) -> None:
+    async def _close(self, site: ServedSite) -> None:
         assert self._client is not None
         await self._client.close()
         await site.cleanup()

@@ -26,7 +26,7 @@ from zsim_bridges.gateway.run_access import RunAccess
 from zsim_bridges.gateway.stream_client import Client
 from zsim_bridges.observer_process import ANOTHER_RUN, ObserverProcess
 from zsim_bridges.picture_streams import PictureFeeds
-from zsim_bridges.web_server import Site, cancel_other_tasks, check_token, open_on_thread, start_site, url_host
+from zsim_bridges.web_server import ServedSite, cancel_other_tasks, check_token, open_on_thread, start_site, url_host
 
 CLIENTS_MAX = 500  # streams at once
 UNAUTHENTICATED_MAX = 100  # connections at once that have not shown the token yet
@@ -262,7 +262,7 @@ class Gateway:
         with open_on_thread(self.loop, "gateway servers", self._open, lambda servers: self._close(*servers)):
             yield
 
-    async def _open(self) -> tuple[Site, asyncio.Server]:
+    async def _open(self) -> tuple[ServedSite, asyncio.Server]:
         host, http_port, lines_port = self._ports
         line_server = LineServer(self._new_client, authenticated=not self._access_check.needs_token)
         rest = RestTree(self.run, self._full_key_subscriptions)
@@ -283,7 +283,7 @@ class Gateway:
         self._say(f"{self.name}: HTTP and WebSocket on {address}, lines on port {lines_port}")
         return site, lines
 
-    async def _close(self, site: Site, lines: asyncio.Server) -> None:
+    async def _close(self, site: ServedSite, lines: asyncio.Server) -> None:
         lines.close()
         for client in list(self._clients):
             client.close(connection_lost=False)

@@ -20,7 +20,7 @@ FIELD_MAX_RAD = 2.6  # of an angle of view that is drawn; beyond it the picture 
 PAGE_KEY_BYTES = 12
 
 
-class NumberedPicture(Protocol):
+class ShownPicture(Protocol):
     """A picture; another has another number."""
 
     @property
@@ -30,7 +30,7 @@ class NumberedPicture(Protocol):
     def image(self) -> CameraImage: ...
 
 
-Shown = Callable[[str], tuple[CameraInfo, NumberedPicture] | None]
+Shown = Callable[[str], tuple[CameraInfo, ShownPicture] | None]
 """Returns a camera with its newest picture, None while there is none."""
 
 

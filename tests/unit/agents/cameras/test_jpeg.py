@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from refused import has_terms
 
-from zsim_agents.cameras.jpeg import PictureError, decoded, size_of
+from zsim.sensors.jpeg_header import PictureError, frame_of
+from zsim_agents.cameras.jpeg import decoded
 
 PICTURE = np.random.default_rng(1).integers(0, 255, (48, 64, 3), dtype=np.uint8)
 
@@ -19,7 +20,7 @@ def jpeg(*options: int) -> bytes:
     [(), (cv2.IMWRITE_JPEG_PROGRESSIVE, 1), (cv2.IMWRITE_JPEG_RST_INTERVAL, 2), (cv2.IMWRITE_JPEG_QUALITY, 5)],
 )
 def test_the_size_of_any_jpeg_is_read(options: tuple[int, ...]) -> None:
-    assert size_of(jpeg(*options)) == (64, 48)
+    assert frame_of(jpeg(*options))[1:] == (64, 48)
     assert decoded(jpeg(*options), 64, 48).shape == (48, 64, 3)
 
 

@@ -18,7 +18,7 @@ from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_bridges.console import console_tables
-from zsim_bridges.console.console_server import Camera, PageControls, is_permitted
+from zsim_bridges.console.console_server import PageControls, ViewerCamera, is_permitted
 from zsim_bridges.console.http_proxy import OPERATOR, VIEWER, ListenAddress, PageRequest, PageTokens
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page import picture as pic
@@ -425,7 +425,9 @@ def test_others_need_a_token():
         PageTokens("127.0.0.1", 8080, "", "look")
 
 
-CAMERA = msgspec.to_builtins(Camera((1, 0, 0, 0), (1.0, 2.5, 3.0), 1.3, 0.01, 1000, 600, 800, (0, 0, 0), (0, 0, 1)))
+CAMERA = msgspec.to_builtins(
+    ViewerCamera((1, 0, 0, 0), (1.0, 2.5, 3.0), 1.3, 0.01, 1000, 600, 800, (0, 0, 0), (0, 0, 1))
+)
 UPDATE = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": True}}
 
 

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refused import has_terms
 
-from zsim_bridges.console.page.jpeg_header import PICTURE_BYTES_MAX, PictureError, check_picture, jpeg_size
+from zsim.sensors.jpeg_header import PictureError, frame_of
+from zsim_bridges.console.page.picture_check import PICTURE_BYTES_MAX, check_picture
 
 Image = pytest.importorskip("PIL.Image", reason="Pillow comes with viser; pip install 'zsim[console]'")
 
@@ -22,12 +23,12 @@ def encoded(width: int = 40, height: int = 30, kind: str = "JPEG", **options: An
 
 @pytest.mark.parametrize("options", [{}, {"progressive": True}, {"quality": 10}, {"comment": "x" * 3000}])
 def test_the_size_of_a_jpeg_is_read(options: dict[str, Any]):
-    assert jpeg_size(encoded(641, 363, **options)) == (641, 363)
+    assert frame_of(encoded(641, 363, **options))[1:] == (641, 363)
 
 
 def test_fill_bytes_before_a_marker_are_passed_over():
     whole = encoded()
-    assert jpeg_size(whole[:2] + b"\xff\xff" + whole[2:]) == (40, 30)
+    assert frame_of(whole[:2] + b"\xff\xff" + whole[2:])[1:] == (40, 30)
 
 
 @pytest.mark.parametrize(
@@ -44,13 +45,13 @@ def test_fill_bytes_before_a_marker_are_passed_over():
 )
 def test_what_is_no_jpeg_is_refused(data: bytes):
     with pytest.raises(PictureError):
-        jpeg_size(data)
+        check_picture(data, 40, 30)
 
 
 @given(st.binary(max_size=200))
 def test_any_bytes_have_a_size_or_are_refused(middle: bytes):
     with suppress(PictureError):
-        assert all(0 <= side < 2**16 for side in jpeg_size(b"\xff\xd8" + middle + b"\xff\xd9"))
+        assert all(0 < side < 2**16 for side in frame_of(b"\xff\xd8" + middle + b"\xff\xd9")[1:])
 
 
 @given(at=st.integers(0, 600), byte=st.integers(0, 255))
