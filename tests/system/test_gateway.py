@@ -16,6 +16,7 @@ from gateway_process import GatewayProcess, LineConnection
 from refused import has_terms, parts
 from wire import PATIENCE_S
 
+from zsim_bridges.gateway.gateway_server import UNAUTHENTICATED_MAX
 from zsim_bridges.http_connections import STRANGERS_MAX
 
 GATE_NS = 20_000_000
@@ -552,6 +553,22 @@ def test_a_token_is_required_on_every_port(federation):
     with gateway.connect() as stream:
         assert "token" in stream.next("error")["error"]
         assert stream.is_at_end()
+
+
+def test_who_shows_the_token_is_served_whatever_others_keep_open(federation):
+    """Half a request, or nothing at all, on more connections than each port keeps of those without a token."""
+    federation.world(STANDING)
+    gateway = GatewayProcess(federation, "--token", "open sesame").in_run()
+    with ExitStack() as stack:
+        for port, most in ((gateway.http_port, STRANGERS_MAX), (gateway.lines_port, UNAUTHENTICATED_MAX)):
+            for _ in range(most + 1):
+                half = stack.enter_context(socket.create_connection(("127.0.0.1", port), PATIENCE_S))
+                half.sendall(b"GET /json/clock HTTP/1.1" if port == gateway.http_port else b"")
+        shown = {"Authorization": "Bearer open sesame"}
+        assert gateway.http("GET", "/json/clock", headers=shown).status == 200
+        with gateway.connect() as stream:
+            assert stream.request("hello", token="open sesame")["op"] == "hello"
+            assert stream.request("latest", key="clock")["op"] == "latest"
 
 
 def test_bytes_that_are_no_header_are_refused(federation):

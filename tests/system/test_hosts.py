@@ -45,6 +45,14 @@ def test_ps_logs_restart_move_and_down(deployment: Deployment, tmp_path: Path) -
     }
     assert all(row["pid"] for row in rows.values())
     deployment.zsim("logs", "estimator.drone3").line("estimator.drone3: in run")
+    for role, named in (("estimator.drone3", "silent: estimator.drone3 on h3"), ("world", "world .* no sign of life")):
+        deployment.kill(role, signal.SIGSTOP)
+        run.line(named, START_S)
+        states = {each: row["state"] for each, row in deployment.ps().items()}
+        assert [each for each, state in states.items() if "no sign of life" in state] == [role]
+        assert role == "world" or states["controller.main"] == f"waits for {role}"
+        deployment.kill(role, signal.SIGCONT)
+        run.line(f"{role} .*is back", START_S)
     deployment.zsim("restart", "estimator.drone3").ends(with_code=0)
     run.line("restart: estimator.drone3 on h3|superseded: estimator.drone3 on h3", START_S)
     deployment.zsim("move", "estimator.drone3", "h2").ends(with_code=0)

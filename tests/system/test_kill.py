@@ -239,6 +239,21 @@ def test_a_recorder_that_ends_just_before_the_run(federation: Federation, number
 
 
 @pytest.mark.soak
+@pytest.mark.parametrize("pace", [("--realtime",), ("--rate", "4")])
+def test_a_recorder_that_is_stopped_just_before_the_end(federation: Federation, pace: tuple[str, ...]) -> None:
+    """It never goes on: the run has failed by what its record lacks, and nobody ends in another way for it."""
+    run = federation.run(PAIR, *pace, "--duration", "8")
+    federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= LATE_NS)
+    federation.kill("recorder", signal.SIGSTOP)
+    run.line("waiting for recorder")
+    run.ends(with_code=1, within_s=2 * PATIENCE_S)
+    found = record_completeness(federation.out / "run.mcap")
+    assert not found.complete
+    assert str(found) in run.text().splitlines()[-1]
+    assert "Traceback" not in "".join(log.read_text() for log in (federation.out / "logs").iterdir())
+
+
+@pytest.mark.soak
 def test_a_world_that_was_frozen(federation: Federation) -> None:
     """For longer than any reader's link lives; what of it the recorder missed it asks for."""
     flight = Flight(federation)

@@ -13,6 +13,7 @@ PATIENCE_S = 120.0  # wall time in which a run of a simulated second ends, on a 
 TOO_FEW = (10, 16, 24)  # of these one was a traceback, one a panic, and one hung
 BRIEF = ONE.replace("expect: []", "expect: [estimator.drone1]").replace("duration_s: 10", "duration_s: 1")
 BRIEF_PAIR = PAIR.replace("duration_s: 12", "duration_s: 1")
+HOSTS = "hosts: {h1: {address: 192.0.2.1}}\nroles: {'*': h1}\nsecurity: {insecure: true}\n"
 COMMANDS: dict[str, tuple[str, ...]] = {
     "run": ("run", "{one}", "--no-report", "--out", "{out}"),
     "a hosted run": ("run", "{pair}", "--hosted", "--no-report", "--out", "{out}"),
@@ -21,16 +22,18 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "an observer": ("keys", "--connect", "tcp/127.0.0.1:9"),
     "gateway": ("gateway", "--connect", "tcp/127.0.0.1:9"),
     "console": ("console", "--connect", "tcp/127.0.0.1:9"),
+    "up": ("up", "{pair}", "--hosts", "{hosts}", "--no-report", "--out", "{out}"),
     "sweep": ("sweep", "{one}", "--vary", "seed", "--runs", "2", "--workers", "2", "--out", "{out}"),
 }
 
 
 def zsim(folder: Path, files: int, *arguments: str) -> "subprocess.CompletedProcess[str]":
     """Run a command that may open so many files."""
-    one, pair, out = folder / "one.yaml", folder / "pair.yaml", folder / "out"
+    one, pair, out, hosts = (folder / name for name in ("one.yaml", "pair.yaml", "out", "hosts.yaml"))
+    hosts.write_text(HOSTS)
     one.write_text(BRIEF)
     pair.write_text(BRIEF_PAIR)
-    words = [word.format(one=one, pair=pair, out=out) for word in arguments]
+    words = [word.format(one=one, pair=pair, out=out, hosts=hosts) for word in arguments]
     command = ["bash", "-c", f'ulimit -n {files}; exec "$@"', "zsim", *ZSIM, *words]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, cwd=ROOT)
 

@@ -128,8 +128,9 @@ class LinkWatch:
 
     def stuck(self) -> list[str]:
         """Return who is at the far end of the links that take nothing, the fullest first."""
-        queued = self._sockets.queued()
-        full = sorted(self._backlogs, key=lambda address: -queued.get(address, 0))
+        queued, before_s = self._sockets.queued(), self._wall_s() - STALL_S
+        standing = [address for address, backlog in self._backlogs.copy().items() if backlog.moved_s <= before_s]
+        full = sorted(standing, key=lambda address: -queued.get(address, 0))
         return [" ".join((*self._who(address), f"at {address}")) for address in full]
 
     def _holds_up(self, address: str, held_bytes: int, now_s: float) -> bool:

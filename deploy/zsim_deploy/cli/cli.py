@@ -35,7 +35,7 @@ from zsim_deploy.cli import (
     record_commands,
     role_commands,
 )
-from zsim_deploy.launch.end_signals import STREAMS, is_unread
+from zsim_deploy.roles.closed_output import STREAMS, is_unread
 from zsim_deploy.roles.stop_channel import REASONS
 
 app = typer.Typer(

@@ -186,7 +186,7 @@ class Supervisor:
             look()
             world.wait(POLL_S)
         if world.code != 0:
-            self._fail(f"the world died: {world.outcome()}")
+            self._fail_after_end(f"the world died: {world.outcome()}")
 
     def _restarts_world(self, world: RunProcess) -> bool:
         """Start a world again that died in its run; return whether that was so."""
@@ -306,6 +306,12 @@ class Supervisor:
     def _fail(self, reason: str) -> None:
         self._reason, self._failed = self._reason or reason, True
 
+    def _fail_after_end(self, reason: str) -> None:
+        """Take a failure of who was to end with the run: that counts, and no end in order that the world reported."""
+        if not self._failed and not self._interrupted:
+            self._reason = ""
+        self._fail(reason)
+
     def _finish(self) -> None:
         """Let everybody leave; the recorder leaves last, by itself."""
         for child in self.members:
@@ -316,9 +322,7 @@ class Supervisor:
                 continue
         recorder = next(child for child in self.members if child.role == "recorder")
         if recorder.code not in (0, None) and recorder.name not in self._dead:
-            if not self._failed and not self._interrupted:
-                self._reason = ""  # an end in order: what the world reported is not all
-            self._fail(f"the recorder ended: {recorder.outcome()}")
+            self._fail_after_end(f"the recorder ended: {recorder.outcome()}")
 
     def _left_s(self) -> float:
         """Return how long the others may still take, now that the run is to end; Ctrl-C makes it shorter."""

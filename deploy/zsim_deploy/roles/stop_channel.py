@@ -22,8 +22,10 @@ from typing import Any
 
 from zsim.transport.tls import KEY, Identity
 from zsim_deploy import INTERRUPTED
+from zsim_deploy.roles.closed_output import CLOSED, redirect_output
 
 REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
+HANGUP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()  # not on Windows
 TWICE_INTERRUPTED = "interrupted twice, nobody was waited for"
 TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
 GRACE_S = 4.0  # a role that hangs after a request to stop is ended; the world waits 5 s for byes only if unstopped
@@ -93,14 +95,15 @@ class StopChannel:
         self._reason: str | None = None
         self._orphaned = self._terminated = False
         self._last_line_s = time.monotonic()
-        self._former = {number: signal.getsignal(number) for number in REASONS}
+        self._former = {number: signal.getsignal(number) for number in (*REASONS, *HANGUP)}
         if launched is not None:
-            signal.signal(signal.SIGTERM, self._on_kill)
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            handlers = {signal.SIGTERM: self._on_kill, signal.SIGINT: signal.SIG_IGN}
             threading.Thread(target=self._read, name="stop channel", daemon=True).start()
         else:
-            signal.signal(signal.SIGTERM, lambda *_: self._stop(REASONS[signal.SIGTERM]))
-            signal.signal(signal.SIGINT, self._on_interrupt)
+            handlers = {signal.SIGTERM: self._on_term, signal.SIGINT: self._on_interrupt}
+            handlers |= dict.fromkeys(filter(_is_nobodys, HANGUP), self._on_hangup)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
     def reason(self) -> str | None:
         """Return why to stop, None to go on."""
@@ -135,6 +138,14 @@ class StopChannel:
         if self._reason is None:
             self._orphaned = self._terminated = True
         self._stop(REASONS[signal.SIGTERM])
+
+    def _on_term(self, *_: object) -> None:
+        self._stop(REASONS[signal.SIGTERM])
+
+    def _on_hangup(self, *_: object) -> None:
+        """End as after SIGTERM, and write nothing more to what may be gone."""
+        redirect_output(Path(os.devnull))
+        self._stop(CLOSED)
 
     def _on_interrupt(self, *_: object) -> None:
         if self._reason is not None:
@@ -175,6 +186,11 @@ def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
     if launched is None or folder is None or folder.parts[-3:-1] != (launched, FOLDER):
         return None
     return KeyLease(folder)
+
+
+def _is_nobodys(number: int) -> bool:
+    """Return whether a signal would end this process at once: neither ignored, as under nohup, nor taken."""
+    return signal.getsignal(number) is signal.SIG_DFL
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

@@ -168,7 +168,7 @@ class CommandIntake:
         enter = {"takeoff": fleet.takeoff, "land": fleet.land, "emergency": fleet.emergency, "reset": fleet.reset}
         refusal = enter[mode](command.drone)
         if refusal is None:
-            self.outbox.event("mode", drone, f"{source} asks {drone} to {mode}", {"mode": mode}, source)
+            self.outbox.notice("mode", drone, f"{source} asks {drone} to {mode}", {"mode": mode}, source)
         return refusal
 
     def release_all(self, source: str) -> None:

@@ -146,7 +146,7 @@ class Coordinator(ABC):
         missing = self.barrier.participants[name].reset_counts()
         if missing:
             text = f"{name}: {missing} of its outputs did not come"
-            self.outbox.event("outputs_missing", name, text, {"missing": missing})
+            self.outbox.notice("outputs_missing", name, text, {"missing": missing})
 
     def _handle_done(self, name: str, message: run_messages.Done, wall_ns: int) -> None:
         refusal = self.barrier.done(name, message, self.now_ns, wall_ns)
@@ -179,11 +179,18 @@ class Coordinator(ABC):
         return not is_known and not self.budgets.changes.knows(_JOIN + name)
 
     def _join_refusal(self, name: str, message: run_messages.Join, is_new: bool) -> Refusal | None:
-        """Return why there have been too many joins; time may stand for who gates and was there before."""
+        """Return why there have been too many joins; for whom time stands may always come."""
         if is_new and not self.budgets.strangers.allows("join"):
             return Refusal("newcomers", f"beyond {STRANGERS_MAX} at once", "must wait: one may join each second")
-        may_join = message.period_ns > 0 or self.budgets.changes.allows(_JOIN + name)
+        may_join = self._stands_for(name) or self.budgets.changes.allows(_JOIN + name)
         return None if may_join else too_many(name)
+
+    def _stands_for(self, name: str) -> bool:
+        """Tell whether time stands until a process comes, or may do so soon."""
+        former = self.barrier.participants.get(name)
+        if former is None:
+            return self.clock.state == "waiting" and name in self._expected
+        return former.is_waited_for and former.is_missed
 
     def _warn_of(self, joined: Participant) -> None:
         """Publish that a newcomer computes with other bits, or does the work of others too."""

@@ -95,6 +95,7 @@ class RunOutbox:
         pending: keys and messages in order.
         refusals: counted, also those that are no events any more.
         refused_requests: the same of `world/control`.
+        left_out: events that were not published since there had been enough like them.
     """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
@@ -103,6 +104,8 @@ class RunOutbox:
         self.pending: list[KeyedMessage] = []
         self.refusals = RefusalLog(now_ns)
         self.refused_requests = RefusalLog(now_ns)
+        self.left_out = 0
+        self._notices = ChangeBudget(now_ns, SECOND_NS)
 
     def snapshot(self) -> State:
         """Return the numbers of the keys, and what was refused."""
@@ -110,6 +113,8 @@ class RunOutbox:
             "next_seq": self._next_seq,
             "refusals": self.refusals.snapshot(),
             "refused_requests": self.refused_requests.snapshot(),
+            "notices": self._notices.snapshot(),
+            "left_out": self.left_out,
         }
 
     def restore(self, state: State) -> None:
@@ -117,6 +122,8 @@ class RunOutbox:
         self._next_seq, self.pending = state["next_seq"], []
         self.refusals.restore(state["refusals"])
         self.refused_requests.restore(state["refused_requests"])
+        self._notices.restore(state["notices"])
+        self.left_out = state["left_out"]
 
     def put(self, key: str, message: Any) -> None:
         """Add a message."""
@@ -139,6 +146,15 @@ class RunOutbox:
         """Add an event."""
         seq = self.next_seq(keys.EVENT)
         self.put(keys.EVENT, run_messages.Event(self._now_ns(), seq, kind, source, subject, text, dict(data or {})))
+
+    def notice(
+        self, kind: str, subject: str, text: str, data: Mapping[str, Any] | None = None, source: str = WORLD
+    ) -> None:
+        """Add an event on which nobody acts, and which may repeat without end, unless there have been enough of it."""
+        if self._notices.spend(f"{kind} {subject} {source}"):
+            self.event(kind, subject, text, data, source)
+        else:
+            self.left_out += 1
 
     def refuse(self, source: str, subject: str, reason: Refusal | str) -> None:
         """Count a refusal, and add an event of it unless there have been too many like it."""

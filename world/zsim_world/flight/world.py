@@ -172,10 +172,10 @@ class World(Coordinator):
     def _publish_collisions(self) -> None:
         for i, j in self.fleet.collisions():
             name, other = self.names[i], self.names[j]
-            self.outbox.event("collision", name, f"{name} and {other} collide", {"other": other})
+            self.outbox.notice("collision", name, f"{name} and {other} collide", {"other": other})
         for i, m in self.fleet.bumps():
             name, other = self.names[i], self.scenario.environment.obstacles[m].name
-            self.outbox.event("collision", name, f"{name} runs into {other}", {"other": other})
+            self.outbox.notice("collision", name, f"{name} runs into {other}", {"other": other})
 
     def _publish_gate(self, wall_ns: int) -> None:
         self._hash.add(self.now_ns, self.fleet.bodies.state)
@@ -192,6 +192,7 @@ class World(Coordinator):
             "refused": self.outbox.refusals.count,
             "requests": self.requests,
             "requests_refused": self.outbox.refused_requests.count,
+            "events_left_out": self.outbox.left_out,
             "truth_sha256": self._hash.hexdigest(),
         }
 

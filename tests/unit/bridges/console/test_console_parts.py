@@ -548,6 +548,13 @@ def test_the_clock_says_whom_the_run_waits_for():
     assert "no clock" in console_tables.clock_line(None, 0)
 
 
+def test_the_clock_names_the_cause_and_not_who_only_waits_for_it():
+    waiting = (Waiting("estimator.d1", "lab", 3.0), Waiting("controller.main", "hall", 3.0, ("estimator.d1",)))
+    text = without_tags(console_tables.clock_line(Clock(0, 0, "r", 0, "running", 0.0, waiting), 0))
+    assert has_terms(text, "waiting", "estimator.d1", "lab")
+    assert "controller" not in text
+
+
 def test_the_clock_tells_a_pace_only_while_the_run_goes_on():
     running, paused = (Clock(2_020_000_000, 0, "r", 101, state, 3.0) for state in ("running", "paused"))  # type: ignore[arg-type]
     assert has_terms(without_tags(console_tables.clock_line(running, 2_010_000_000)), "2.0 s", "3.0")

@@ -1,7 +1,12 @@
 """Which extras a host needs, from the roles that an inventory gives it."""
 
+import re
+import tomllib
+from pathlib import Path
+
 import pytest
 
+from zsim.contract.fingerprint import PACKAGES
 from zsim_deploy.inventory.inventory import Host, Inventory, Router
 from zsim_deploy.inventory.processes import needed_extras
 
@@ -34,3 +39,23 @@ def test_a_router_needs_none_and_extras_can_be_added() -> None:
     inventory = Inventory(hosts=hosts, roles={"world": "a"}, routers={"north": Router(host="gate")})
     assert needed_extras(inventory)["gate"] == set()
     assert needed_extras(inventory, ["report"]) == {"a": {WORLD, RECORD, "report"}, "gate": {"report"}}
+
+
+def distributions(extra: str | None) -> set[str]:
+    """Return what is installed with an extra beside that which everybody has; with None, what everybody has."""
+    project = tomllib.loads((Path(__file__).parents[4] / "pyproject.toml").read_text())["project"]
+    found: set[str] = set()
+    for line in project["dependencies"] if extra is None else project["optional-dependencies"][extra]:
+        name, more = re.fullmatch(r"([A-Za-z0-9_.-]+)(?:\[(.*?)\])?.*", line).groups()  # type: ignore[union-attr]
+        found |= (
+            {name.lower()} if name != "zsim" else {each for part in more.split(",") for each in distributions(part)}
+        )
+    return found
+
+
+@pytest.mark.parametrize("extra", [AGENTS, WORLD])
+def test_who_calculates_has_all_that_its_bits_depend_on(extra: str) -> None:
+    """Else a host that `zsim push` has installed on would compute with another fingerprint."""
+    brought_along = {"llvmlite": "numba"}
+    wanted = {brought_along.get(package, package) for package in PACKAGES}
+    assert wanted <= distributions(extra) | distributions(None)

@@ -96,13 +96,15 @@ def test_a_run_that_ends_well():
     assert all(member.closed for member in team.members)
 
 
-def test_a_recorder_that_fails_at_the_end_is_why_the_run_failed():
-    team = Team()
-    team.recorder = team.watch.members[1] = Member("recorder", 143, lives_for=21)
+@pytest.mark.parametrize("name", ["recorder", "world"])
+def test_who_fails_after_the_end_is_why_the_run_failed(name: str):
+    team = Team(world=(143 if name == "world" else 0,))
+    if name == "recorder":
+        team.recorder = team.watch.members[1] = Member("recorder", 143, lives_for=21)
     team.watch.handle_line(json.dumps({"event": {"kind": "end", "text": "over", "data": {}}}))
     outcome = team.go()
     assert outcome.failed
-    assert has_terms(outcome.reason, "recorder", "143")
+    assert has_terms(outcome.reason, name, "143")
 
 
 def test_a_dead_estimator_is_started_again():

@@ -1,5 +1,6 @@
 """The private key that a launcher lends: it goes with the process, and not with the one before it."""
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,8 @@ import pytest
 from refused import has_terms
 
 from zsim.transport.tls import Identity
-from zsim_deploy.roles.stop_channel import KeyLease, key_lease
+from zsim_deploy.roles.closed_output import CLOSED
+from zsim_deploy.roles.stop_channel import REASONS, KeyLease, key_lease
 
 ROLE = """
 import os, sys, time
@@ -89,3 +91,38 @@ def test_who_hangs_after_its_launcher_is_gone_is_ended_and_its_log_ends_with_why
     )
     assert done.returncode == 1
     assert has_terms(done.stderr.splitlines()[-1], "launcher", "0.01")
+
+
+BY_HAND = """
+import signal, sys, time
+signal.signal(signal.SIGHUP, getattr(signal, sys.argv[1]))  # whoever runs the tests may be under nohup
+from zsim_deploy.roles.stop_channel import StopChannel
+stop = StopChannel()
+print("ready", flush=True)
+while not stop.stopped():
+    time.sleep(0.001)
+if sys.argv[1] == "SIG_DFL":
+    print("nobody reads this", flush=True)
+raise SystemExit(7 if stop.reason() == sys.argv[2] else 0)
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "numbers", "reason"),
+    [
+        ("SIG_DFL", (signal.SIGHUP, signal.SIGHUP), CLOSED),  # shells send it more than once
+        ("SIG_IGN", (signal.SIGHUP, signal.SIGTERM), REASONS[signal.SIGTERM]),
+    ],
+    ids=["terminal", "nohup"],
+)
+def test_a_closed_terminal_ends_a_process_in_order(
+    before: str, numbers: tuple[signal.Signals, ...], reason: str
+) -> None:
+    command = [sys.executable, "-c", BY_HAND, before, reason]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        assert process.stdout.readline() == "ready\n"
+        process.stdout.close()  # as a terminal: what is written to it fails
+        for number in numbers:
+            process.send_signal(number)
+        assert process.wait(60.0) == 7

@@ -3,17 +3,19 @@
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from refused import has_terms
 
 from zsim.contract import keys
-from zsim.contract.flight_messages import Velocity
-from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest, Event, Join
+from zsim.contract.flight_messages import Mode, Velocity
+from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest, Done, Event, Join
 from zsim.scenario import scenario_file
 from zsim_world.flight.budgets import CHANGES_MAX, STRANGERS_MAX, UNJOINED
 from zsim_world.flight.run_outbox import EVENTS_MAX, REFUSED_MAX
 from zsim_world.flight.world import World
 
 FLOOD = 5000  # requests, several times what is published
+GATE_NS = 20_000_000
 SCENARIO = """
 name: one
 duration_s: 1000
@@ -70,9 +72,10 @@ def test_every_gate_allows_one_change_more(world: World) -> None:
     assert [ask(world, "acquire", drone="d1").ok for _ in range(4)] == [True, True, True, False]
 
 
-def test_a_process_that_gates_nobody_joins_and_leaves_so_often_only(world: World) -> None:
+@pytest.mark.parametrize("period_ns", [0, GATE_NS])
+def test_a_process_joins_and_leaves_so_often_only(world: World, period_ns: int) -> None:
     for number in range(FLOOD):
-        join = Join(0, number, "run1", number, "console", "here", 1, 0)
+        join = Join(0, number, "run1", number, "console", "here", 1, period_ns)
         world.handle(keys.process("console.x", "join"), join, 0)
         world.handle(keys.process("console.x", "bye"), Bye(0, number, "flood"), 0)
     kinds = [event.kind for event in events(world)]
@@ -82,6 +85,40 @@ def test_a_process_that_gates_nobody_joins_and_leaves_so_often_only(world: World
         "refused": EVENTS_MAX,
     }
     assert world.result()["refused"] == FLOOD - CHANGES_MAX
+
+
+def test_a_process_takes_its_own_place_so_often_only_unless_time_stands_for_it(world: World) -> None:
+    first = Join(0, 0, "run1", 1, "estimator", "here", 1, GATE_NS)
+    for number in range(FLOOD):
+        world.handle(keys.process("estimator.d1", "join"), replace(first, incarnation=1 + number), 0)
+    assert kinds(world) == {"join": 1, "superseded": CHANGES_MAX - 1, "refused": EVENTS_MAX}
+    world.losses.died("estimator.d1", 0)
+    world.handle(keys.process("estimator.d1", "join"), replace(first, incarnation=2 * FLOOD), 0)
+    assert kinds(world) == {"death": 1, "restart": 1}
+
+
+def test_modes_of_who_gates_are_events_up_to_a_bound_and_all_of_them_are_done(world: World) -> None:
+    join(world, "me.x", GATE_NS)
+    events(world)
+    for number in range(FLOOD):
+        mode = Mode(0, number, "me.x", "emergency" if number % 2 else "reset")
+        world.handle(keys.command("d1", "mode"), mode, 0)
+    for _ in range(2):  # they take effect a gate later
+        world.advance(0)
+    assert kinds(world)["mode"] == CHANGES_MAX
+    refused, left_out = world.outbox.refusals.count, world.result()["events_left_out"]
+    assert CHANGES_MAX + refused + left_out == FLOOD
+    assert world.fleet.status(0)[0] == "emergency"
+
+
+def test_outputs_that_a_process_counts_and_never_publishes_are_events_up_to_a_bound(world: World) -> None:
+    join(world, "me.x", GATE_NS)
+    events(world)
+    for number in range(2 * CHANGES_MAX):
+        world.handle(keys.process("me.x", "done"), Done(0, number, "run1", 1, 0, 1), 0)
+        world.give_up_outputs("me.x")
+    assert kinds(world) == {"outputs_missing": CHANGES_MAX}
+    assert world.result()["events_left_out"] == CHANGES_MAX
 
 
 def command(world: World, source: str, seq: int) -> None:

@@ -8,7 +8,17 @@ from refused import has_terms
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
-from zsim.scenario.scenario import CLUSTERS_MAX, DRONES_MAX, OBSTACLES_MAX, PROCESSES_MAX, ROBOTS_MAX
+from zsim.scenario.scenario import (
+    CLUSTERS_MAX,
+    CONSTANTS_MAX,
+    DRONES_MAX,
+    FAULTS_MAX,
+    OBSTACLES_MAX,
+    PROCESSES_MAX,
+    ROBOTS_MAX,
+    VARIABLES_MAX,
+    WAYPOINTS_MAX,
+)
 from zsim.schema.yaml_file import VALUES_MAX
 
 SIZE = 1_000_000  # bytes
@@ -22,6 +32,7 @@ drones:
 MANY = "name: many\nduration_s: 10\ndrones:\n" + "".join(
     f"- {{name: d{i}, position_m: [{3 * (i % 32)}, {3 * (i // 32)}, 0]}}\n" for i in range(DRONES_MAX)
 )
+TRAJECTORY = PAIR + "clusters: [{name: main, drones: [drone1, drone2], plan: {takeoff_s: 0.5, trajectory: {"
 CLUSTER = PAIR + "clusters:\n- {name: main, drones: [drone1, drone2], %s}"
 
 
@@ -58,6 +69,19 @@ TEXTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "policies": (
         numbered(PAIR + "processes: {on_death: {", "e{}: 1,", "}}"),
         ("processes.on_death", str(PROCESSES_MAX)),
+    ),
+    "faults": (filled(PAIR + "faults: [", "{kind: gust, target: world, at_s: 1},", "]"), ("faults", str(FAULTS_MAX))),
+    "expressions": (
+        numbered(TRAJECTORY + "expressions: {", "x{}: t,", "}}}}]"),
+        ("clusters[0].plan.trajectory.expressions", str(VARIABLES_MAX)),
+    ),
+    "constants": (
+        numbered(TRAJECTORY + "expressions: {x_c: t}, constants: {", "c{}: 1,", "}}}}]"),
+        ("clusters[0].plan.trajectory.constants", str(CONSTANTS_MAX)),
+    ),
+    "waypoints": (
+        numbered(TRAJECTORY + "waypoints: [", "{{at_s: {}, values: {{x_c: 0}}}},", "]}}}]"),
+        ("clusters[0].plan.trajectory.waypoints", str(WAYPOINTS_MAX)),
     ),
     "fields of a fault": (numbered(PAIR + "faults: [{kind: gps_dropout, ", "k{}: 1,", "}]"), ("faults[0].k0",)),
 }

@@ -21,7 +21,7 @@ from zsim.transport.link_watch import (
 from zsim.transport.session import FarEnd
 from zsim.transport.session_tokens import SessionTokens
 
-READER, RECORDER, ROUTER = "10.0.0.1:1", "10.0.0.2:2", "10.0.0.3:3"
+READER, RECORDER, ROUTER, ESTIMATOR = (f"10.0.0.{number}:{number}" for number in range(1, 5))
 FAR_ENDS = {READER: FarEnd("r", False), RECORDER: FarEnd("rec", False), ROUTER: FarEnd("x", True)}
 
 
@@ -73,6 +73,18 @@ def test_who_takes_nothing_is_closed_and_named_and_who_is_waited_for_is_not():
     (closed,) = case.watch.closed
     assert (closed.names, closed.held_bytes, closed.times) == ((), STALL_BYTES, 1)
     assert case.watch.stuck()[0].startswith("recorder")
+
+
+def test_of_two_who_are_waited_for_only_the_one_that_takes_nothing_is_stuck():
+    """As after a host has vanished: the others have much to take at that moment, too, and take it."""
+    case = Case()
+    case.awaited.append(Awaited(("estimator.d1",), 8))
+    case.link.ends[ESTIMATOR] = FarEnd("e", False)
+    case.link.show(keys.session_token("estimator.d1", "e"))
+    case.sockets.held = {RECORDER: 10 * HELD_BYTES, ESTIMATOR: HELD_BYTES}
+    case.passes(2.0, taken=1)  # of the links that the case began with
+    assert case.watch.stuck() == [f"estimator.d1 at {ESTIMATOR}"]
+    assert case.sockets.closed == []
 
 
 def test_who_takes_something_of_little_is_left_alone():
