@@ -5,6 +5,7 @@ band of chi-square (Bar-Shalom, Li and Kirubarajan, section 5.4.2). The bound is
 and velocities alone, as if attitudes were known: no estimator with the same sensors can be better.
 """
 
+import math
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from zsim.contract.camera_messages import Sightings
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
+from zsim.sensors.camera import SightingModel
 from zsim_agents.estimation.joint.joint_bank import JointBank
 from zsim_world.fleet.fleet import Fleet
 
@@ -31,7 +33,10 @@ GPS_M, GPS_M_S, GPS_S = 2.0, 0.43, 0.2
 FLOW_M_S, FLOW_S = 0.1, 1 / 15
 BARO_M, BARO_S = 0.1, 0.04
 SIGHTING_S = 1 / 15
-FOCAL_PX, HAT_M, CENTRE_PX, DIAMETER_PX = 354.55, 0.14, 0.25, 0.5
+FOCAL_PX, HAT_M = 354.55, 0.14
+MODEL = SightingModel()
+WITHIN = 0.7  # of the instants; of a few millimetres the filter is cautious, which leaves the band below
+NOT_ABOVE = 0.95
 Array = NDArray[np.float64]
 pytestmark = pytest.mark.xdist_group("sightings")
 
@@ -88,7 +93,8 @@ def test_the_errors_of_relative_positions_are_as_large_as_the_filter_says(i: int
     nees = np.einsum("rti,rti->rt", e, np.linalg.solve(P, e[..., None])[..., 0])
     low, high = band(3, len(SEEDS))
     means = nees.mean(axis=0)  # over runs, at each instant; instants are half a second apart, about a correlation time
-    assert np.mean((means > low) & (means < high)) >= 0.8
+    assert np.mean((means > low) & (means < high)) >= WITHIN
+    assert np.mean(means < high) >= NOT_ABOVE
     assert low < nees.mean() < high
 
 
@@ -144,7 +150,11 @@ def _sighting(C: Array, places: Array, i: int) -> Array:
     side = np.cross(d, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     scale = FOCAL_PX / d[1] ** 1.5  # px/rad off the axis
-    across, along = away * CENTRE_PX / scale, away * DIAMETER_PX / (HAT_M / away * scale)
+    diameter_px = HAT_M / away * scale
+    centre, diameter = (
+        math.hypot(floor, MODEL.noise_px2 / diameter_px) for floor in (MODEL.centre_px, MODEL.diameter_px)
+    )
+    across, along = away * centre / scale, away * diameter / diameter_px
     H = np.zeros((3, 18))
     for k, axis in enumerate((d, side, np.cross(d, side))):
         H[k, :3], H[k, 6 * i : 6 * i + 3] = axis, -axis

@@ -1,11 +1,12 @@
 """Cameras that nobody renders: JPEGs whose content a test knows, and the messages about them, on a client's keys."""
 
-import threading
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from meanwhile import meanwhile
 
 from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo, Seen, Sightings
@@ -80,22 +81,15 @@ def sightings_message(number: int, t_ns: int) -> Sightings:
 @contextmanager
 def published(client: Any, drones: Sequence[str], rate_hz: float = 10.0, seen_by: Sequence[str] = ()) -> Iterator[None]:
     """Publish both cameras of drones meanwhile, again and again, and what was seen by some of them."""
-    over = threading.Event()
     made = {name: [picture(name, number) for number in range(2**NUMBER_BITS)] for name in SETTINGS}
+    numbers = itertools.count(1)
 
     def publish() -> None:
-        number = 0
-        while not over.wait(1.0 / rate_hz):
-            number += 1
-            _publish(client, drones, seen_by, made, number, round(number * 1e9 / rate_hz))
+        number = next(numbers)
+        _publish(client, drones, seen_by, made, number, round(number * 1e9 / rate_hz))
 
-    thread = threading.Thread(target=publish, daemon=True)
-    thread.start()
-    try:
+    with meanwhile(publish, 1.0 / rate_hz):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 def _publish(

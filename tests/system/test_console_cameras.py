@@ -2,10 +2,9 @@
 
 import io
 import math
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import msgspec
@@ -15,6 +14,7 @@ import synthetic_camera
 from chromium import needs_browser
 from console_browser import PATIENCE_MS, POLL_MS, BrowserPage, console
 from federation import Federation
+from meanwhile import meanwhile
 from synthetic_camera import NUMBER_BITS, SETTINGS
 from wire import PATIENCE_S, Client
 
@@ -158,22 +158,9 @@ def watched(page: BrowserPage) -> list[str]:
     return [each["camera"] for each in page.state().get("cameras", ()) if each["watched"]]
 
 
-@contextmanager
-def repeated(client: Client, key: str, payload: bytes) -> Iterator[None]:
+def repeated(client: Client, key: str, payload: bytes) -> AbstractContextManager[None]:
     """Publish the same bytes again and again meanwhile."""
-    over = threading.Event()
-
-    def publish() -> None:
-        while not over.wait(0.01):
-            client.put_raw(key, payload)
-
-    thread = threading.Thread(target=publish, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+    return meanwhile(lambda: client.put_raw(key, payload), 0.01)
 
 
 @needs_browser

@@ -37,6 +37,7 @@ LOST = 1.026  # of a covered area over what is measured of it: noise and shade a
 ROUND = 0.92  # of one that nothing hides and no motion blurs; rounder ones are as good
 DIRECTION_PX = 0.075, 0.002  # standard deviation of a centre [px] of a small one, and per diameter; calibrated
 DIAMETER_PX = 0.12, 0.006, 0.8  # of a diameter [px]: at least, per diameter, and per 1/diameter; calibrated
+DIAMETER_MIN_PX = 4.0  # px; the range of smaller ones errs to one side, by more than its sigma says
 WHOLE = 0.93  # of the area of what is magenta over that of its convex hull, of one that nothing crosses
 OVAL = 0.25, 0.5  # of a diameter, per lack of roundness: of centre and diameter; calibrated
 
@@ -183,6 +184,8 @@ def _measured(level: Field, noise: float, rays: Field, solid: Field, focal_px: f
         return None
     lack = max(0.0, ROUND - roundness) + max(0.0, WHOLE - _wholeness(core))
     diameter = 2 * math.sqrt(area / math.pi)
+    if diameter < DIAMETER_MIN_PX:
+        return None
     count = float(near.sum())
     of_noise = noise * math.sqrt(count) / (peak * area)  # of the covered area, relative
     ray_sum = np.tensordot(weights, rays, axes=((0, 1), (0, 1)))

@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from zsim_deploy.arguments import WorldAccess, participant_options, positive, require
+
+if TYPE_CHECKING:
+    from zsim_deploy.roles.roles import Serve
 
 ROLES = "Roles, started by hand, on any machine, in any order"
 CAMERA_NEEDS = {"cameras": ("cv2",)}  # modules by extra
@@ -28,12 +31,8 @@ def camera(
     """Draw what the cameras of one drone see, or of several in one process, as JPEG."""
     require("camera", CAMERA_NEEDS)
     from zsim_deploy.roles import camera_roles
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import lower_priority, serve_runs
 
-    lower_priority()
-    own_name = process_name("camera", name, reach.who, _thing(drones))
-    serve_runs(own_name, partial(camera_roles.camera, names=drones or ()), reach)
+    _serve("camera", partial(camera_roles.camera, names=drones or ()), reach, drones, name)
 
 
 @app.command(rich_help_panel=ROLES)
@@ -52,12 +51,17 @@ def detect(
     """Find magenta hats in the pictures of one drone, or of several in one process."""
     require("detect", CAMERA_NEEDS)
     from zsim_deploy.roles import camera_roles
+
+    _serve("detector", partial(camera_roles.detector, names=drones or (), diameter_m=diameter), reach, drones, name)
+
+
+def _serve(role: str, serve: "Serve", reach: WorldAccess, drones: Sequence[str] | None, name: str) -> None:
+    """Serve one run after the other with lower priority, as the process that the command means."""
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import lower_priority, serve_runs
 
     lower_priority()
-    own_name = process_name("detector", name, reach.who, _thing(drones))
-    serve_runs(own_name, partial(camera_roles.detector, names=drones or (), diameter_m=diameter), reach)
+    serve_runs(process_name(role, name, reach.who, _thing(drones)), serve, reach)
 
 
 def _thing(drones: Sequence[str] | None) -> str:

@@ -1,7 +1,7 @@
 """Which hats a camera has in view, and where: of true poses, without pictures. Compiled, without time or chance.
 
-A hat is a ball. It is in view where its centre falls on the picture and nothing stands before it: no obstacle, and no
-hull, a flat body of revolution about its drone's z axis.
+A hat is a ball. It is in view where all of it falls on the picture and nothing stands before its centre: no obstacle,
+and no hull, a flat body of revolution about its drone's z axis.
 """
 
 import math
@@ -33,6 +33,7 @@ VIEW = columns(  # of a hat in a camera
 AHEAD_MIN = 0.05  # cosine to the axis; flatter rays never fall on a picture of 150 deg
 HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
 SURFACE_M = 0.01  # m, nearer than which a ray has met an obstacle
+EDGE_PX = 3.0  # px, nearer than which to the picture's edge a detector takes a hat for cut; the blur of its rim
 STEPS_MAX = 64  # along a ray; each goes as far as the nearest surface
 
 nearest: Any = inlined(obstacle.nearest)
@@ -110,17 +111,20 @@ def _obstacle_hides(eye: Vector, ray: Vector, far: float, row: NDArray) -> bool:
 
 
 @inlined
-def _in_picture(lens: Lens, to_K: Vector) -> bool:
-    if to_K[2] < AHEAD_MIN * norm(to_K):
-        return False
-    u, v = pixel(lens, to_K[0], to_K[1], to_K[2])
-    return -0.5 <= u < lens.width - 0.5 and -0.5 <= v < lens.height - 0.5
-
-
-@inlined
 def _scale(lens: Lens, cosine: float) -> float:
     """Return pixels per radian off the axis: the mean of along and across the radius, f / cos^2 and f / cos."""
     return lens.fx / (cosine * math.sqrt(cosine))
+
+
+@inlined
+def _in_picture(lens: Lens, to_K: Vector, angle: float) -> bool:
+    """Tell whether all of a ball of an apparent diameter [rad] falls on the picture."""
+    cosine = to_K[2] / norm(to_K)
+    if cosine < AHEAD_MIN:
+        return False
+    u, v = pixel(lens, to_K[0], to_K[1], to_K[2])
+    edge = 0.5 * angle * _scale(lens, cosine) + EDGE_PX - 0.5
+    return edge <= u < lens.width - 1.0 - edge and edge <= v < lens.height - 1.0 - edge
 
 
 @kernel()
@@ -170,7 +174,10 @@ def hats_in_view(
         to_W = subtract(centre, eye)
         away = norm(to_W)
         to_K = rotate_back(camera.q_BK, rotate_back(q_WB, to_W))
-        if away <= diameter or not _in_picture(camera.lens, to_K):
+        if away <= diameter:
+            continue
+        angle = 2.0 * math.asin(0.5 * diameter / away)
+        if not _in_picture(camera.lens, to_K, angle):
             continue
         ray, hidden = scaled(to_W, 1.0 / away), False
         for i in range(drones):
@@ -190,6 +197,6 @@ def hats_in_view(
         for k in range(3):
             view[m, VIEW.direction_K + k] = to_K[k] / away
         view[m, VIEW.range] = away
-        view[m, VIEW.angle] = 2.0 * math.asin(0.5 * diameter / away)
+        view[m, VIEW.angle] = angle
         view[m, VIEW.scale] = _scale(camera.lens, to_K[2] / away)
         view[m, VIEW.rate] = norm(moves)

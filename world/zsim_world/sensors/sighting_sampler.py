@@ -1,7 +1,8 @@
 """Sightings of hats without pictures: exposures between two gates, what a detector would make of them, and chance.
 
 The errors are those of a detector on rendered pictures (tests hold them against each other): of a hat's centre and
-apparent diameter in pixels, more where it moves during the exposure and where the light is low; misses, false alarms.
+apparent diameter in pixels, more where it is small, where it moves during the exposure and where the light is low;
+misses, false alarms.
 Each camera has a random stream, from which the same count of numbers is drawn for every picture.
 """
 
@@ -23,7 +24,7 @@ from zsim_world.physics.normal_variates import place, words
 from zsim_world.sensors.hats_in_view import VIEW, MountedCamera, hats_in_view, poses_between
 from zsim_world.state.fleet_arrays import STATE
 
-FULL_LIGHT = 0.25  # of a clear day, below which a picture is too dark for the same errors
+NOISY_LIGHT = 0.4  # of a clear day, at which a picture's noise is half again of what it is by day; measured
 DRAWS = 4  # normal numbers for each hat of a picture: two for its centre, one for its diameter, one for a miss
 FALSE_DRAWS = 5  # uniform numbers for a false alarm: whether, where (2), how large, order
 
@@ -149,7 +150,7 @@ class _Watcher:
         self._rate_hz, self._count = camera.rate_hz, 0
         self._latency_ns = round((camera.latency_ms + model.latency_ms) * 1e6)
         self._exposure_s = camera.exposure_ms * 1e-3
-        self._dark = max(1.0, FULL_LIGHT / light)
+        self._noise_px2 = model.noise_px2 * math.hypot(1.0, NOISY_LIGHT / light) / math.hypot(1.0, NOISY_LIGHT)
         self._set_next()
 
     def _set_next(self) -> None:
@@ -172,7 +173,7 @@ class _Watcher:
         seen = [
             self._seen(row, noise)
             for row, noise in zip(view.tolist(), normal.tolist(), strict=True)
-            if row[VIEW.seen] and not self._is_missed(row, noise[3])
+            if row[VIEW.seen] and not self._is_missed(row, noise)
         ]
         if model.false_hz:
             seen += self._false(self._rng.random(FALSE_DRAWS).tolist())
@@ -180,15 +181,18 @@ class _Watcher:
             seen.sort(key=_azimuth)
         return Sighting(self.drone, at_ns + self._latency_ns, at_ns, self._name, tuple(seen))
 
-    def _is_missed(self, row: list[float], normal: float) -> bool:
-        small = row[VIEW.angle] * row[VIEW.scale] < self._model.diameter_min_px * self._dark
-        return small or 0.5 * math.erfc(normal / math.sqrt(2.0)) < self._model.miss
+    def _is_missed(self, row: list[float], noise: list[float]) -> bool:
+        """Tell whether a hat is missed by chance, or measured as too small."""
+        model, (_, diameter_px) = self._model, self._sigmas_px(row)
+        measured_px = row[VIEW.angle] * row[VIEW.scale] + diameter_px * noise[2]
+        return measured_px < model.diameter_min_px or 0.5 * math.erfc(noise[3] / math.sqrt(2.0)) < model.miss
 
     def _sigmas_px(self, row: list[float]) -> tuple[float, float]:
-        blur = self._model.blur_share * row[VIEW.rate] * self._exposure_s * row[VIEW.scale]
-        return self._dark * math.hypot(self._model.centre_px, blur), self._dark * math.hypot(
-            self._model.diameter_px, blur
-        )
+        """Return the standard deviations of a hat's centre and apparent diameter."""
+        model, scale = self._model, row[VIEW.scale]
+        blur = model.blur_share * row[VIEW.rate] * self._exposure_s * scale
+        of_noise = self._noise_px2 / (row[VIEW.angle] * scale)
+        return math.hypot(model.centre_px, of_noise, blur), math.hypot(model.diameter_px, of_noise, blur)
 
     def _seen(self, row: list[float], noise: list[float]) -> Seen:
         centre_px, diameter_px = self._sigmas_px(row)

@@ -119,6 +119,14 @@ def test_a_hat_that_the_edge_of_the_picture_cuts_is_left_out() -> None:
     assert detector().seen(renderer(camera).picture(0, 1.0, bodies([(0, 0, 5), (2.16, 2 * edge, 4.8)]))) == ()
 
 
+def test_a_hat_too_small_for_an_honest_range_is_left_out() -> None:
+    drawn = renderer(replace(FRONT, noise=0.0))
+    assert [len(detector().seen(drawn.picture(0, 1.0, bodies([(0, 0, 5), (away, 0, 4.5)])))) for away in (8, 18)] == [
+        1,
+        0,
+    ]
+
+
 @pytest.mark.parametrize("kind", ["noise", "magenta", "black", "stripes"])
 def test_any_picture_is_taken(kind: str) -> None:
     shape = FRONT.height_px, FRONT.width_px, 3

@@ -53,9 +53,9 @@ def test_a_hat_ahead_is_seen_where_it_is():
     assert view[1, VIEW.angle] == pytest.approx(2 * math.asin(DIAMETER_M / 2 / away))
 
 
-@pytest.mark.parametrize(("yaw_deg", "seen"), [(0, 1), (41, 1), (44, 0), (-41, 1), (-44, 0), (180, 0)])
+@pytest.mark.parametrize(("yaw_deg", "seen"), [(0, 1), (40, 1), (42, 0), (-40, 1), (-42, 0), (180, 0)])
 def test_a_hat_is_seen_within_the_picture_s_width(yaw_deg: float, seen: int):
-    # 92 deg across the diagonal of 640 x 360 are 84.2 deg across the width; the camera is level with the hat
+    # 92 deg across the diagonal of 640 x 360 are 84.2 deg across the width, less than the hat itself; all level
     view = look(
         [
             pose(

@@ -1,0 +1,65 @@
+"""The geometric tier of sightings held against rendered pictures and the detector, over the same truth.
+
+Errors of bearing and range are compared as distributions, by their median and nine-tenths, bias, misses and false
+alarms: by range, light and body rate. docs/cameras.md has the figures of the large version.
+"""
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from sighting_tiers import Condition, Tiers, measured
+
+RANGES_M = (2.0, 4.0), (4.0, 7.0), (7.0, 12.0)
+DAY, DULL, DUSK = 1.0, 0.4, 0.15  # of a clear day
+QUANTILES = 0.5, 0.9
+
+
+class Band(NamedTuple):
+    """How far the tiers may differ.
+
+    Attributes:
+        ratio: of the rendered tier's errors over the geometric one's, least and most.
+        bias: of either, in its own standard deviations.
+        missed: difference of the shares.
+        false: per picture, of either.
+        normalised: errors over what either says of them, root mean square, least and most.
+    """
+
+    ratio: tuple[float, float]
+    bias: float
+    missed: float
+    false: float
+    normalised: tuple[float, float]
+
+
+SMALL = Band((0.45, 1.9), 1.0, 0.07, 0.02, (0.45, 1.8))  # of 100 hats
+LARGE = Band((0.5, 1.6), 0.9, 0.04, 0.005, (0.5, 1.65))  # of 800
+
+
+def hold(tiers: Tiers, band: Band) -> None:
+    for quantile in QUANTILES:
+        of_both = zip(tiers.rendered.spread(quantile), tiers.geometric.spread(quantile), strict=True)
+        ratios = [rendered / geometric for rendered, geometric in of_both]
+        assert all(band.ratio[0] < each < band.ratio[1] for each in ratios), (quantile, ratios)
+    assert abs(tiers.rendered.missed - tiers.geometric.missed) < band.missed
+    for tier in tiers:
+        assert np.abs(tier.bias()).max() < band.bias
+        assert tier.false <= band.false
+        assert all(band.normalised[0] < each < band.normalised[1] for each in tier.normalised())
+
+
+@pytest.mark.parametrize("rate_deg_s", [0.0, 75.0])
+@pytest.mark.parametrize("light", [DAY, DUSK])
+@pytest.mark.parametrize("ranges_m", RANGES_M)
+def test_both_tiers_err_alike(ranges_m: tuple[float, float], light: float, rate_deg_s: float) -> None:
+    hold(measured(Condition(ranges_m, light, rate_deg_s), pictures=50), SMALL)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    "condition", [Condition(*each) for each in product(RANGES_M, (DAY, DULL, DUSK), (0.0, 35.0, 75.0))]
+)
+def test_both_tiers_err_alike_in_many_pictures(condition: Condition) -> None:
+    hold(measured(condition, pictures=400), LARGE)

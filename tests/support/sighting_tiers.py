@@ -1,0 +1,200 @@
+"""The two tiers of sightings over one truth: pictures with the detector, and the geometry of the world. No run, no keys.
+
+Each picture has a truth of its own, drawn at random: one drone looks at two others, whose hats are anywhere in its
+picture. Both tiers get this truth at the same instant; each has its own random stream.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pictures import FRONT, HATS, Look, bodies, renderer, scene
+
+from zsim.contract.camera_messages import Seen
+from zsim.math.frames import quaternion_from_rpy, rotation_matrix
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
+from zsim_agents.cameras.detector import HatDetector
+from zsim_agents.cameras.jpeg import decoded
+from zsim_agents.cameras.rendering.scene import Bodies
+from zsim_world.sensors.sighting_sampler import SightingSampler
+
+Array = NDArray[np.float64]
+RATE_HZ = 10.0  # of the geometric tier's camera; a picture at every gate of 0.1 s
+GATE_NS = 100_000_000
+OTHERS = 2
+HULL_M = 0.26  # m, radius of the AR.Drone's hull
+APART_RAD = 0.3  # rad between two hats, at least: no hull is before the other's hat
+ASSOCIATED_RAD = 0.04  # rad from a hat, within which a sighting is of it
+TILT_RAD = 0.06  # rad, standard deviation of roll and pitch
+FROM_ABOVE = (-0.35, -0.03)  # rise per metre from the camera to the hat: no hull is before its own drone's hat
+SCENARIO = """
+name: tiers
+seed: 5
+duration_s: 3600
+sensors: {{front_camera: {{rate_hz: {rate_hz}}}, sightings: {{}}}}
+environment: {{light: {light}}}
+drones:
+  - {{name: drone1, position_m: [0, 0, 0]}}
+  - {{name: drone2, position_m: [4, 0, 0]}}
+  - {{name: drone3, position_m: [8, 0, 0]}}
+processes: {{expect: []}}
+"""
+LENS, POSE = lens_of(FRONT), camera_pose(FRONT)
+
+
+class Condition(NamedTuple):
+    """Under which pictures are taken.
+
+    Attributes:
+        ranges_m: of the hats, from and to.
+        light: of a clear day.
+        rate_deg_s: of the body that carries the camera, about any axis.
+    """
+
+    ranges_m: tuple[float, float]
+    light: float = 1.0
+    rate_deg_s: float = 0.0
+
+
+class Tier(NamedTuple):
+    """What a tier made of M hats out of all that were in its pictures.
+
+    Attributes:
+        errors: to the side and down [rad], of the range over the range, (M, 3).
+        sigmas: what the tier said of them, direction [rad] and range over the range, (M, 2).
+        missed: of the hats, the share without a sighting.
+        false: sightings of nothing, per picture.
+    """
+
+    errors: Array
+    sigmas: Array
+    missed: float
+    false: float
+
+    def spread(self, quantile: float) -> tuple[float, float]:
+        """Return the quantile of the absolute errors of bearing [rad] and range."""
+        size = np.abs(self.errors)
+        return float(np.quantile(size[:, :2], quantile)), float(np.quantile(size[:, 2], quantile))
+
+    def deviation(self) -> tuple[float, float]:
+        """Return the standard deviations of bearing [rad], per axis, and range."""
+        return float(self.errors[:, :2].std()), float(self.errors[:, 2].std())
+
+    def bias(self) -> Array:
+        """Return the mean errors in their own standard deviations, (3,)."""
+        return self.errors.mean(axis=0) / self.errors.std(axis=0)
+
+    def normalised(self) -> tuple[float, float]:
+        """Return the root mean square errors of bearing and range in what the tier says of them."""
+        over = self.errors / self.sigmas[:, [0, 0, 1]]
+        return float(np.sqrt((over[:, :2] ** 2).mean())), float(np.sqrt((over[:, 2] ** 2).mean()))
+
+
+class Tiers(NamedTuple):
+    """Both over the same truth."""
+
+    rendered: Tier
+    geometric: Tier
+
+
+class _Tally:
+    """Sorts a tier's sightings into hats and nothing."""
+
+    def __init__(self) -> None:
+        self._rows: list[list[float]] = []
+        self._hats = self._false = self._pictures = 0
+
+    def take(self, seen: Sequence[Seen], hats: Sequence[Look]) -> None:
+        left = list(seen)
+        for hat in hats:
+            near = [each for each in left if _off(each, hat) < ASSOCIATED_RAD]
+            if near:
+                best = min(near, key=lambda each: _off(each, hat))
+                left.remove(best)
+                self._rows.append(_row(best, hat))
+        self._hats += len(hats)
+        self._false += len(left)
+        self._pictures += 1
+
+    def tier(self) -> Tier:
+        rows = np.array(self._rows)
+        return Tier(rows[:, :3], rows[:, 3:], 1 - len(rows) / self._hats, self._false / self._pictures)
+
+
+def _off(seen: Seen, hat: Look) -> float:
+    return math.dist(seen.direction_B, hat.direction_B.tolist())
+
+
+def _row(seen: Seen, hat: Look) -> list[float]:
+    d = hat.direction_B
+    side = np.cross(d, (0.0, 0.0, 1.0)) / math.hypot(*d[:2])
+    off = np.array(seen.direction_B) - d
+    sigmas = seen.sigma_direction_rad, seen.sigma_range_m / hat.range_m
+    return [float(off @ side), float(off @ np.cross(d, side)), seen.range_m / hat.range_m - 1, *sigmas]
+
+
+def measured(condition: Condition, pictures: int, seed: int = 3) -> Tiers:
+    """Return what both tiers make of so many pictures."""
+    rng = np.random.default_rng(seed)
+    drawn = renderer(FRONT, scene(1 + OTHERS, light=condition.light))
+    detector = HatDetector(LENS, POSE, HATS.diameter_m)
+    sampler = SightingSampler(scenario(condition.light), np.full(1 + OTHERS, HULL_M))
+    rendered, geometric = _Tally(), _Tally()
+    for number in range(pictures):
+        hats = looks(condition, rng)
+        data = drawn.jpeg(number, number / RATE_HZ, hats[0].where)
+        rendered.take(detector.seen(decoded(data, FRONT.width_px, FRONT.height_px)), hats)
+        due = sampler.due(state_of(hats[0].where), number * GATE_NS)
+        geometric.take([seen for each in due if each.drone == 0 for seen in each.seen], hats)
+    return Tiers(rendered.tier(), geometric.tier())
+
+
+def state_of(where: Bodies) -> Array:
+    """Return the rows that the world has of drones."""
+    return np.hstack([where.p_WB, where.v_WB, where.q_WB, where.w_WB_B])
+
+
+@cache
+def scenario(light: float) -> Scenario:
+    """Return a scenario with sightings as they are by default."""
+    with TemporaryDirectory() as folder:
+        place = Path(folder) / "tiers.yaml"
+        place.write_text(SCENARIO.format(rate_hz=RATE_HZ, light=light))
+        return scenario_file.load(place)
+
+
+def looks(condition: Condition, rng: np.random.Generator) -> list[Look]:
+    """Return the hats that one drone has in its picture, wholly or in part; all have the same drones."""
+    attitudes = [[*rng.normal(0, TILT_RAD, 2), rng.uniform(-math.pi, math.pi)] for _ in range(1 + OTHERS)]
+    R_WB, *R_WD = (rotation_matrix(quaternion_from_rpy(np.array(each))) for each in attitudes)
+    p = np.array([*rng.uniform(-20, 20, 2), rng.uniform(6, 9)])
+    directions = _directions(R_WB, rng)
+    near, far = (math.log(each) for each in condition.ranges_m)
+    ranges = np.exp(rng.uniform(near, far, OTHERS)).tolist()
+    hats_W = [p + R_WB @ (POSE.p_BK + away * d) for away, d in zip(ranges, directions, strict=True)]
+    others = [hat - R @ np.array(HATS.position_m) for hat, R in zip(hats_W, R_WD, strict=True)]
+    axis = rng.normal(size=3)
+    rates = np.zeros((1 + OTHERS, 3))
+    rates[0] = math.radians(condition.rate_deg_s) * axis / np.linalg.norm(axis)
+    where = bodies([p, *others], attitudes, w_B=rates)
+    return [Look(where, d, away) for d, away in zip(directions, ranges, strict=True)]
+
+
+def _directions(R_WB: Array, rng: np.random.Generator) -> list[Array]:
+    """Return directions in B to hats anywhere in the picture, as seen from above and apart from each other."""
+    found: list[Array] = []
+    while len(found) < OTHERS:
+        u, v = rng.uniform(0, LENS.width), rng.uniform(0, LENS.height)
+        ray = np.array([*undistorted(LENS, u - 0.5, v - 0.5), 1.0])
+        d = POSE.R_BK @ (ray / np.linalg.norm(ray))
+        is_above = FROM_ABOVE[0] < R_WB[2] @ d < FROM_ABOVE[1]
+        if is_above and all(np.linalg.norm(d - other) > APART_RAD for other in found):
+            found.append(d)
+    return found
