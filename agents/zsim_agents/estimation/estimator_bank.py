@@ -50,7 +50,7 @@ _p_WB, _v_WB, _gyro_bias = (
     itemgetter(first, first + 1, first + 2) for first in (ESTIMATE.p_WB, ESTIMATE.v_WB, ESTIMATE.gyro_bias)
 )
 _q_WB = itemgetter(*range(ESTIMATE.q_WB, ESTIMATE.q_WB + 4))
-_COUNTED = [*[*enumerate(SENSORS)][1:], (IMU, "imu")]  # in the order in which they are published
+_REFUSED = len(SENSORS)  # place of the refused of the first sensor behind its used
 
 _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # values and extra of a reading
     "imu": lambda m: (*m.accel_m_s2, *m.gyro_rad_s, 0.0, 0.0),
@@ -73,7 +73,12 @@ class EstimatorBank:
         environment: gravity and magnetic field.
         estimation: settings.
         gate_s: interval of the gates [s].
+
+    Attributes:
+        counted: sensors in the order in which they are published, and where their used and refused are counted.
     """
+
+    counted = (*((name, k, _REFUSED + k) for k, name in enumerate(SENSORS) if k != IMU), ("imu", IMU, _REFUSED + IMU))
 
     def __init__(
         self, drones: Sequence[Drone], environment: Environment, estimation: Estimation, gate_s: float
@@ -107,8 +112,9 @@ class EstimatorBank:
         """Use what has come since the last gate and return the estimates for `t_s`."""
         count, self._count = self._count, 0
         self.use(t_s, self._readings[:count])
-        counts = self.rows.counts[:, COUNT.used : COUNT.sightings_used].tolist()
-        return [_estimate(row, count) for row, count in zip(self._estimates.tolist(), counts, strict=True)]
+        counts = self.rows.counts[:, COUNT.used :].tolist()
+        rows = zip(self._estimates.tolist(), counts, strict=True)
+        return [_estimate(row, count, self.counted) for row, count in rows]
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Use readings (M, READING.size) and return the estimates for `t_s`, (N, ESTIMATE.size)."""
@@ -158,9 +164,8 @@ class EstimatorBank:
         self._readings = np.frombuffer(self._room).reshape(readings, READING.size)
 
 
-def _estimate(row: list[float], count: list[int]) -> StateEstimate:
+def _estimate(row: list[float], count: list[int], counted: Sequence[tuple[str, int, int]]) -> StateEstimate:
     """Return a row of estimates and its drone's (used, refused) by sensor as what is published."""
-    half = len(SENSORS)
     return StateEstimate(
         _p_WB(row),
         _v_WB(row),
@@ -169,7 +174,7 @@ def _estimate(row: list[float], count: list[int]) -> StateEstimate:
         tuple(row[_COVARIANCE]),
         row[_YAW_SIGMA],
         _gyro_bias(row),
-        {name: (count[k], count[half + k]) for k, name in _COUNTED},
+        {name: (count[used], count[refused]) for name, used, refused in counted},
     )
 
 

@@ -190,7 +190,7 @@ class UserMessages:
             counts: (N, kinds), messages that each key has had.
         """
         whose, values = self._fleet.sampled
-        places = np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist()
+        places = self._places(whose)
         if not places:
             return NO_PAYLOADS
         sizes, payloads = np.zeros(len(whose), dtype=np.int64), []
@@ -205,6 +205,14 @@ class UserMessages:
             payloads.append(messages.encode(message))
             sizes[m] = len(payloads[-1])
         return UserPayloads(np.frombuffer(bytearray(b"".join(payloads)), dtype=np.uint8), np.cumsum(sizes))
+
+    def _places(self, whose: NDArray[np.int64]) -> list[int]:
+        """Return which samples are not of stock sensors."""
+        return (
+            np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist()
+            if self._messages
+            else [*self._fleet.sightings]
+        )
 
     def _message(self, s: int, i: int, stamps: tuple[int, int, int], values: NDArray[np.float64]) -> Sample:
         """Return the message of a reading.

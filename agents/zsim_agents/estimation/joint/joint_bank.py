@@ -33,6 +33,11 @@ class JointBank(EstimatorBank):
         drones, environment, estimation, gate_s: as of EstimatorBank.
     """
 
+    counted = (
+        *EstimatorBank.counted,
+        (keys.SIGHTINGS, COUNT.sightings_used - COUNT.used, COUNT.sightings_refused - COUNT.used),
+    )
+
     def __init__(
         self, drones: Sequence[Drone], environment: Environment, estimation: Estimation, gate_s: float
     ) -> None:
@@ -84,14 +89,6 @@ class JointBank(EstimatorBank):
         sightings = np.array(sorted(sighted), dtype=float).reshape(-1, SIGHTING.size)
         step_jointly(self.rows, t_s, readings, sightings, self._hat_B, self._estimates)
         return self._estimates
-
-    def estimate(self, t_s: float) -> list[StateEstimate]:
-        estimates = super().estimate(t_s)
-        counts = self.rows.counts[:, COUNT.sightings_used :].tolist()
-        return [
-            each._replace(sensors={**each.sensors, keys.SIGHTINGS: (used, refused)})
-            for each, (used, refused) in zip(estimates, counts, strict=True)
-        ]
 
 
 @portable
