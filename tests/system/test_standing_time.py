@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from statistics import median
 
 import pytest
-from federation import PAIR, Federation
+from federation import PAIR, Federation, free_port
 from refused import parts
 from wire import Client, Subscription
 
@@ -190,6 +190,24 @@ def test_who_subscribes_to_everything_and_takes_nothing_costs_nobody_anything(
     watched.flies_on()
     if "--realtime" in pace:  # so no put has waited for them, and no gate was late by them
         assert median(held_bytes) < KERNEL_BYTES
+    assert re.search(r"\bstuck: ", watched.run.text()) is None
+    record = federation.record()
+    assert record.events("death", "silent", "outputs_missing") == []
+    assert [event for event in record.events("refused") if parts(event["data"]["reason"])[0] == "age"] == []
+
+
+@pytest.mark.parametrize("pace", [pytest.param(("--rate", "10"), marks=pytest.mark.soak), ("--realtime",)])
+def test_nor_behind_a_router(federation: Federation, pace: tuple[str, ...]) -> None:
+    watched = Watched(federation, *pace)
+    there, options = f"tcp/127.0.0.1:{free_port()}", [word for word in pace if word == "--realtime"]
+    router = federation.role("router", "site", "--listen", there, *options)
+    router.line("leads to")
+    with reader(there, stopped=True) as stopped, reader(there, stopped=False) as idle:
+        for pid in (stopped, idle):
+            router.line(f"router.site: pid {pid} .* took nothing")
+        t_ns = watched.clock.now()[-1].message["t_ns"]
+        watched.clock.until(lambda m: m["t_ns"] > t_ns + 5e9)
+    watched.flies_on()
     assert re.search(r"\bstuck: ", watched.run.text()) is None
     record = federation.record()
     assert record.events("death", "silent", "outputs_missing") == []

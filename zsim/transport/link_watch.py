@@ -185,8 +185,10 @@ class LinkWatch:
         return int(pid) in unknown if pid else bool(unknown)
 
     def _who(self, address: str) -> tuple[str, ...]:
+        """Return the processes at a far end, or else what is known of it."""
         far = self._far_ends.get(address)
-        return self._tokens.processes(far.session) if far else ()
+        names = self._tokens.processes(far.session) if far else ()
+        return names or ("a router" if far and far.is_router else "somebody",)
 
     def _far_end(self, address: str, now_s: float) -> FarEnd | None:
         if now_s - self._refreshed_s >= FRESH_S:

@@ -30,6 +30,10 @@ class SessionTokens:
         """Return the sessions that stand for a process; none for one that does not say so."""
         return self._sessions.get(process, Sessions())
 
+    def shown(self) -> list[str]:
+        """Return the processes of which sessions are known."""
+        return list(self._sessions)
+
     def is_alive(self, process: str) -> bool:
         """Tell whether any session has a token of a process."""
         return process in self._alive or process in self._sessions

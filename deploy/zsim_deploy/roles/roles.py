@@ -33,6 +33,7 @@ from zsim_bridges.observer_process import ObserverProcess
 from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.process_identity import check_certificate
 from zsim_deploy.roles.record_folder import RECORD, make, record_folder
+from zsim_deploy.roles.router_links import RouterLinks
 from zsim_deploy.roles.stop_channel import StopChannel
 
 TICK_S = 0.1  # how often a router looks for a stop
@@ -150,14 +151,22 @@ def router(
     say = log_printer(launched)
     with route(endpoint, upstream, federation, mode, identity) as link:
         say(f"router.{name}: {endpoint} leads to {upstream}")
-        probe_s = 0.0
-        while not stop.stopped():
-            if time.monotonic() >= probe_s and not link.links():
-                _refuse(tls.peer_fault(identity, upstream), upstream)
-                probe_s = time.monotonic() + PROBE_S
-            time.sleep(TICK_S)
+        links = RouterLinks(link, lambda text: say(f"router.{name}: {text}"))
+        with links.watch:
+            _route(link, links, stop, lambda: _refuse(tls.peer_fault(identity, upstream), upstream))
     say(f"router.{name}: left, {stop.reason()}")
     stop.exit_if_terminated()
+
+
+def _route(link: Session, links: RouterLinks, stop: StopChannel, check_upstream: Callable[[], None]) -> None:
+    """Let a router route until it is stopped."""
+    probe_s = 0.0
+    while not stop.stopped():
+        if time.monotonic() >= probe_s and not link.links():
+            check_upstream()
+            probe_s = time.monotonic() + PROBE_S
+        links.report()
+        time.sleep(TICK_S)
 
 
 def _refuse(fault: str | None, upstream: str) -> None:

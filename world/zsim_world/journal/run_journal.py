@@ -31,7 +31,7 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-VERSION = 1  # of the files
+VERSION = 2  # of the files, and of the states in them
 CHECKPOINT_NS = 5_000_000_000  # simulated time between two; the history that a replay refills reaches back as far
 CHECKPOINT_WALL_NS = 1_000_000_000  # wall time between two at least: a checkpoint of 1000 drones has 20 MB
 CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the one before it is younger than the history
