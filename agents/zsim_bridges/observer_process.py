@@ -20,6 +20,7 @@ class ObserverProcess:
         link: an open session.
         info: of the run.
         name: process name, role.thing.
+        serves: names of processes whose work it does; two that do the same are told of.
 
     Attributes:
         now_ns: simulated time of the newest clock received.
@@ -27,8 +28,9 @@ class ObserverProcess:
         end_reason: why the process has nothing left to do in this run; empty while it goes on.
     """
 
-    def __init__(self, link: Session, info: messages.Info, name: str) -> None:
+    def __init__(self, link: Session, info: messages.Info, name: str, serves: tuple[str, ...] = ()) -> None:
         self._link = link
+        self._serves = tuple(each for each in serves if each != name)
         self._info = info
         self._health_seq = 0
         self._join_seq = -1
@@ -55,7 +57,8 @@ class ObserverProcess:
     def _join(self) -> None:
         self._join_seq += 1
         host, run_id = self._link.host, self._info.run_id
-        join = join_of(self.name, host, run_id, self._incarnation, self._join_seq, self.now_ns)
+        when = self._join_seq, self.now_ns
+        join = join_of(self.name, host, run_id, self._incarnation, *when, serves=self._serves)
         self._link.put(keys.process(self.name, "join"), join)
 
     def update_clock(self, payload: bytes) -> run_messages.Clock | None:

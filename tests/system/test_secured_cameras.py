@@ -49,7 +49,7 @@ def test_a_camera_and_a_detector_do_their_work_with_no_more_than_their_rights(
 # (command, the certificate that it is given, what that may not read)
 OF_ANOTHER_ROLE = (
     ("camera", "detector.drone1", "drone/*/truth"),
-    ("detect", "camera.drone1", "drone/drone1/camera/*/info"),
+    ("detect", "camera.drone1", "drone/drone1/camera/front/info"),
 )
 
 

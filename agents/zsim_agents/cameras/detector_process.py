@@ -3,6 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from itertools import product
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
 from zsim.errors import DecodeError
 from zsim.math.frames import rotation_matrix
+from zsim.sensors.camera import CAMERAS
 from zsim.sensors.camera_model import CameraPose, Lens
 from zsim.sensors.jpeg_header import PictureError
 from zsim.transport.session import RawSample, Session
@@ -58,10 +60,10 @@ class DetectorProcess:
         self._bell = Bell(link, presence)
 
     def begin(self) -> None:
-        """Subscribe to pictures and to what their pixels mean."""
-        for drone in self._drones:
-            self._link.declare_subscriber(keys.camera_info(drone, "*"), self._on_info)
-            self._link.declare_subscriber(keys.camera(drone, "*"), self._on_picture)
+        """Subscribe to pictures and to what their pixels mean; of no other names, which anybody could make up."""
+        for drone, name in product(self._drones, CAMERAS):
+            self._link.declare_subscriber(keys.camera_info(drone, name), self._on_info)
+            self._link.declare_subscriber(keys.camera(drone, name), self._on_picture)
 
     def turn(self) -> None:
         """Wait for something, and look at the newest picture of each camera."""

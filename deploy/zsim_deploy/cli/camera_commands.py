@@ -9,6 +9,7 @@ import typer
 from zsim_deploy.arguments import WorldAccess, participant_options, positive, require
 
 if TYPE_CHECKING:
+    from zsim_deploy.roles.camera_roles import Drones as Chosen
     from zsim_deploy.roles.roles import Serve
 
 ROLES = "Roles, started by hand, on any machine, in any order"
@@ -32,7 +33,8 @@ def camera(
     require("camera", CAMERA_NEEDS)
     from zsim_deploy.roles import camera_roles
 
-    _serve("camera", partial(camera_roles.camera, names=drones or ()), reach, drones, name)
+    serve = partial(camera_roles.camera, names=drones or ())
+    _serve("camera", serve, camera_roles.of_camera, reach, drones, name)
 
 
 @app.command(rich_help_panel=ROLES)
@@ -52,16 +54,21 @@ def detect(
     require("detect", CAMERA_NEEDS)
     from zsim_deploy.roles import camera_roles
 
-    _serve("detector", partial(camera_roles.detector, names=drones or (), diameter_m=diameter), reach, drones, name)
+    serve = partial(camera_roles.detector, names=drones or (), diameter_m=diameter)
+    _serve("detector", serve, camera_roles.of_detector, reach, drones, name)
 
 
-def _serve(role: str, serve: "Serve", reach: WorldAccess, drones: Sequence[str] | None, name: str) -> None:
+def _serve(
+    role: str, serve: "Serve", chosen: "Chosen", reach: WorldAccess, drones: Sequence[str] | None, name: str
+) -> None:
     """Serve one run after the other with lower priority, as the process that the command means."""
+    from zsim_deploy.roles.camera_roles import stands_for
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import lower_priority, serve_runs
 
     lower_priority()
-    serve_runs(process_name(role, name, reach.who, _thing(drones)), serve, reach)
+    own_name = process_name(role, name, reach.who, _thing(drones))
+    serve_runs(own_name, serve, reach, partial(stands_for, role, chosen, drones or ()))
 
 
 def _thing(drones: Sequence[str] | None) -> str:

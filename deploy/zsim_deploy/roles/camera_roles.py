@@ -16,6 +16,7 @@ from zsim_bridges.observer_process import ObserverProcess
 
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
+Drones = Callable[[Info, Sequence[str]], list[str]]
 
 
 def camera(
@@ -26,11 +27,9 @@ def camera(
     Raises:
         RunError: no drone with a camera has such a name.
     """
-    scenario = scenario_file.from_text(info.scenario)
-    with_cameras = [drone.name for drone in scenario.drones if drone.sensors.cameras()]
-    drones = chosen("camera: drone with a camera", names or ["*"], with_cameras)
+    drones = of_camera(info, names)
     say(f"{presence.name}: draws for {', '.join(drones)}")
-    camera_process.serve(link, info, presence, stopped, scenario, drones)
+    camera_process.serve(link, info, presence, stopped, scenario_file.from_text(info.scenario), drones)
 
 
 def detector(
@@ -50,11 +49,37 @@ def detector(
     Raises:
         RunError: no drone has such a name.
     """
+    drones = of_detector(info, names)
+    say(f"{presence.name}: looks at the pictures of {', '.join(drones)}")
+    diameter_m = diameter_m or hat_diameter_m(scenario_file.from_text(info.scenario))
+    detector_process.serve(link, presence, stopped, say, drones, diameter_m)
+
+
+def of_camera(info: Info, names: Sequence[str]) -> list[str]:
+    """Return the drones of a camera process.
+
+    Raises:
+        RunError: no drone with a camera has such a name.
+    """
+    scenario = scenario_file.from_text(info.scenario)
+    with_cameras = [drone.name for drone in scenario.drones if drone.sensors.cameras()]
+    return chosen("camera: drone with a camera", names or ["*"], with_cameras)
+
+
+def of_detector(info: Info, names: Sequence[str]) -> list[str]:
+    """Return the drones of a detector process; their cameras need not be zsim's.
+
+    Raises:
+        RunError: no drone has such a name.
+    """
     scenario = scenario_file.from_text(info.scenario)
     everybody = [drone.name for drone in scenario.drones]
-    drones = chosen("detect: drone", names, everybody) if names else watched("", scenario) or everybody
-    say(f"{presence.name}: looks at the pictures of {', '.join(drones)}")
-    detector_process.serve(link, presence, stopped, say, drones, diameter_m or hat_diameter_m(scenario))
+    return chosen("detect: drone", names, everybody) if names else watched("", scenario) or everybody
+
+
+def stands_for(role: str, drones: Drones, names: Sequence[str], info: Info) -> tuple[str, ...]:
+    """Return the names of the processes, one for each drone, whose work a process for several does."""
+    return tuple(f"{role}.{drone}" for drone in drones(info, names))
 
 
 def hat_diameter_m(scenario: Scenario) -> float:

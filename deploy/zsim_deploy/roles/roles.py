@@ -44,6 +44,7 @@ PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
 Serve = Callable[[Session, Info, ObserverProcess, Stopped, Say], None]
+StandsFor = Callable[[Info], tuple[str, ...]]  # names of processes whose work a process does in a run
 """Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
 NICE = 5  # of processes for which no gate waits
 NICE_FOR_VIEWS = 10  # of those that only people look at: a picture may come later, a gate may not
@@ -185,13 +186,18 @@ def log_printer(launched: str | None) -> Callable[[str], None]:
     return say
 
 
-def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
+def _nobody(_: Info) -> tuple[str, ...]:
+    return ()
+
+
+def serve_runs(name: str, serve: Serve, reach: WorldAccess, stands_for: StandsFor = _nobody) -> None:
     """Serve one run after the other of the world on an endpoint, until it is stopped; launched, only one.
 
     Args:
         name: of the process; `role.*` for the first number that nobody has, kept until somebody takes it.
         serve: what it does in a run.
         reach: of the world.
+        stands_for: whose work it does in a run, beside its own.
 
     Raises:
         NoWorldError: there was no first world within `wait_s`.
@@ -210,7 +216,7 @@ def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
             ):
                 if info.run_id != served:
                     own_name = _free(link, own_name)
-                    presence = ObserverProcess(link, info, own_name)
+                    presence = ObserverProcess(link, info, own_name, stands_for(info))
                     _serve(serve, link, presence, info, stop, say)
                     served = info.run_id
                     if presence.superseded:

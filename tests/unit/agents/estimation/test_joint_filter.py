@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -45,13 +46,13 @@ def still(bank: EstimatorBank | ClusterBanks, gate: int, rng: np.random.Generato
             bank.receive(i, "flow", Flow(t_ns, 0, t_ns, tuple(rng.normal(0, 0.1, 3).tolist()), 1.0), t_ns * 1e-9)
 
 
-def sighted(observer: int, target: NDArray[np.float64], t_ns: int) -> Sightings:
+def sighted(observer: int, target: NDArray[np.float64], t_ns: int, source: str = "") -> Sightings:
     """Return what an observer sees of a hat at a place, without error."""
     R = np.array(matrix(NORTH))
     to_B = R.T @ (target + R @ HAT_B - PLACES[observer]) - CAMERA_B
     away = float(np.linalg.norm(to_B))
     seen = Seen(tuple((to_B / away).tolist()), away, 1e-3, 0.05)
-    return Sightings(t_ns=t_ns, seq=0, t_sample_ns=t_ns, camera="front", seen=(seen,))
+    return Sightings(t_ns=t_ns, seq=0, t_sample_ns=t_ns, source=source, camera="front", seen=(seen,))
 
 
 def settings() -> tuple[object, ...]:
@@ -88,6 +89,41 @@ def test_with_sightings_the_drones_are_where_they_are_to_each_other():
     assert max(miss(together, 1), miss(together, 2)) < 0.05 < max(miss(alone, 1), miss(alone, 2))
     assert together[1].sensors["sightings"][0] > 300
     assert together[0].sensors["sightings"] == (0, 0)
+
+
+LATE_GATES = 2  # by which the slower of two detectors is behind
+
+
+def flown_with_two_detectors(slower_first: bool, late_gates: int) -> list[StateEstimate]:
+    """Return the estimates after 30 s in which two detectors look at each picture of drone 2."""
+    bank, rng = JointBank(*settings()), np.random.default_rng(3)  # type: ignore[arg-type]
+    estimates: list[StateEstimate] = []
+    for gate in range(1500):
+        still(bank, gate, rng)
+        told = [("detector.a", gate), ("detector.b", gate - late_gates)]
+        for source, of_gate in reversed(told) if slower_first else told:
+            if of_gate >= 0 and of_gate % 3 == 0:
+                bank.receive(1, "sightings", sighted(1, PLACES[0], of_gate * GATE_NS, source), gate * GATE_S)
+        estimates = bank.estimate(gate * GATE_S)
+    return estimates
+
+
+@pytest.mark.parametrize("late_gates", [0, LATE_GATES])
+@pytest.mark.parametrize("slower_first", [False, True])
+def test_what_two_detectors_find_in_one_picture_counts_once(slower_first: bool, late_gates: int):
+    by_one = flown(JointBank(*settings()), 1500, {1: PLACES[0]})  # type: ignore[arg-type]
+    assert flown_with_two_detectors(slower_first, late_gates) == by_one
+
+
+def test_a_camera_that_the_drone_does_not_have_moves_nobody():
+    bank, calm = (JointBank(*settings()) for _ in range(2))  # type: ignore[arg-type]
+    rngs = np.random.default_rng(3), np.random.default_rng(3)
+    for gate in range(900):
+        for each, rng in zip((bank, calm), rngs, strict=True):
+            still(each, gate, rng)
+        message = msgspec.structs.replace(sighted(1, PLACES[0], gate * GATE_NS), camera="side")
+        bank.receive(1, "sightings", message, gate * GATE_S)
+        assert bank.estimate(gate * GATE_S) == calm.estimate(gate * GATE_S)
 
 
 def test_a_hat_where_nobody_is_moves_nobody():
@@ -172,6 +208,7 @@ def test_it_goes_on_from_a_snapshot_to_the_same_bits():
         rngs = np.random.default_rng(gate), np.random.default_rng(gate)
         for bank, own in zip((first, second), rngs, strict=True):
             still(bank, gate, own)
-            bank.receive(1, "sightings", sighted(1, PLACES[0], gate * GATE_NS), gate * GATE_S)
+            for source in ("detector.b", "detector.a")[: 1 + gate % 2]:
+                bank.receive(1, "sightings", sighted(1, PLACES[0], gate // 2 * 2 * GATE_NS, source), gate * GATE_S)
         (one,), (other,) = first.estimate(gate * GATE_S), second.estimate(gate * GATE_S)
         assert one == other

@@ -1,0 +1,84 @@
+"""Two detectors of one drone, a camera that stands still, one that nobody has: named, and the flight is untouched."""
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from federation import Federation
+from refused import has_terms
+from test_cameras import PAIR, PICTURES, SEEN, Flown
+
+FOREVER = ("--duration", "600", "--rate", "1")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Any:
+    """A flight with a second detector of drone1, whose camera is stopped for a while and goes on."""
+    alone: Path = tmp_path_factory.mktemp("alone")
+    with Federation(alone) as federation:
+        federation.run(PAIR, "--in-process").ends(with_code=0)
+        without = federation.record().sha256()
+    with Federation(tmp_path_factory.mktemp("amiss")) as federation:
+        run = federation.run(PAIR, "--cameras", "--detect", "--rate", "1")
+        client = federation.client()
+        pictures, seen, events = (client.subscribe(key) for key in (PICTURES, SEEN, "world/event"))
+        seen.until(lambda m: m["source"] == "detector.main")
+        federation.role("detect", "drone1", "--name", "detector.second")
+        seen.until(lambda m: m["source"] == "detector.second")
+        federation.kill("camera", signal.SIGSTOP)
+        events.until(lambda m: m["kind"] == "silent" and m["subject"] == "camera.main")
+        federation.kill("camera", signal.SIGCONT)
+        back_ns = events.until(lambda m: m["kind"] == "silent_end").message["t_ns"]
+        pictures.until(lambda m: m["t_sample_ns"] > back_ns)
+        run.ends(with_code=0)
+        yield Flown(federation.record(), without)
+
+
+def test_no_bit_of_the_truth_changes(flown: Flown) -> None:
+    assert flown.record.sha256() == flown.without
+
+
+def test_two_detectors_of_a_drone_are_named(flown: Flown) -> None:
+    (doubled,) = flown.record.events("doubled")
+    assert (doubled["subject"], doubled["data"]["other"]) == ("detector.second", "detector.main")
+    assert has_terms(doubled["text"], "detector.drone1")
+
+
+def test_each_of_two_detectors_says_whose_sightings_it_publishes(flown: Flown) -> None:
+    of_both = {name: {} for name in ("detector.main", "detector.second")}
+    for message in flown.record.all(SEEN):
+        of_both[message["source"]][message["t_sample_ns"]] = message["seen"]
+    both = of_both["detector.main"].keys() & of_both["detector.second"].keys()
+    assert both
+    assert all(of_both["detector.main"][t_ns] == of_both["detector.second"][t_ns] for t_ns in both)
+
+
+def test_a_camera_that_stands_still_is_named_and_leaves_out_what_is_too_old(flown: Flown) -> None:
+    silences = [event["subject"] for event in flown.record.events("silent", "silent_end")]
+    assert silences == ["camera.main"] * 2
+    assert flown.record.events("death", "drop", "overdue") == []
+    assert flown.record.all("process/camera.main/health")[-1]["dropped"] > 0
+    late = [m["t_ns"] - m["t_sample_ns"] for m in flown.record.all(PICTURES)]
+    assert max(late) <= 300_000_000
+
+
+ONE_SEES = PAIR.replace(", front_camera: {rate_hz: 10}", "").replace(
+    "{name: drone1,", "{name: drone1, sensors: {front_camera: {}},"
+)
+
+# name: (command, what its last line must show)
+UNKNOWN = {
+    "a camera of nobody": (("camera", "ghost"), ("'ghost'", "drone1")),
+    "a camera of one without": (("camera", "drone2"), ("'drone2'", "drone1")),
+    "a detector of nobody": (("detect", "ghost"), ("'ghost'", "drone1", "drone2")),
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_a_camera_that_is_none_is_a_line(federation: Federation, name: str) -> None:
+    command, terms = UNKNOWN[name]
+    federation.world(ONE_SEES, *FOREVER, "--expect", "nobody.yet")
+    role = federation.role(*command)
+    role.ends(with_code=2)
+    assert has_terms(role.text(), *terms)
