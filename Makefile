@@ -14,6 +14,7 @@ help:            ## list the commands
 run: setup       ## fly Test 1 of the paper as real processes and report it
 	$(BIN)/zsim run $(SCENARIO)
 
+test soak: export PYTHONDONTWRITEBYTECODE = # hundreds of processes import the same files
 test: $(VENV)/.dev ## run the tests
 	$(BIN)/pytest -n $(WORKERS) --dist loadgroup -m "not soak"
 
@@ -52,6 +53,7 @@ $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 	@touch $@ $(VENV)/.run
 
 define COMPILE
+	@$(BIN)/python -m compileall -q zsim agents world deploy
 	@echo "compiling what flies (once on this machine, about a minute)"
 	@folder=$$(mktemp -d) && $(BIN)/zsim run scenarios/step.yaml --in-process --duration 0.1 --no-report \
 		--out $$folder/run 2>/dev/null && rm -r $$folder
