@@ -26,6 +26,7 @@ SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 SIGHTED = ["sensors.front_camera={}", "sensors.sightings={}", "estimation.use_sightings=true"]
 SEEDS = range(1, 21)
 TAKEOFF_S, END_S, CONVERGED_S = 2.0, 45.0, 25.0
+ON_A_MAST = "environment.hats.position_m=[-0.03,0,0.25]"  # m; so high that no rotors hide a hat from a level camera
 EVERY = 25  # gates between two that are compared
 GATE_S = 0.02
 ACCEL_M_S2, IMU_S = 0.35, 0.005  # per sample; preset paper
@@ -50,8 +51,8 @@ class Relative(NamedTuple):
 
 
 @cache
-def flown() -> Relative:
-    parts = [fly(scenario_file.load(SCENARIO, SIGHTED, seed=seed)) for seed in SEEDS]
+def flown(*fields: str) -> Relative:
+    parts = [fly(scenario_file.load(SCENARIO, [*SIGHTED, *fields], seed=seed)) for seed in SEEDS]
     error, covariance = (np.array([part[k] for part in parts]) for k in (0, 1))
     return Relative(error, covariance, parts[0].places)
 
@@ -100,7 +101,8 @@ def test_the_errors_of_relative_positions_are_as_large_as_the_filter_says(i: int
 
 @pytest.mark.slow
 def test_the_relative_positions_are_as_good_as_they_can_be() -> None:
-    runs = flown()
+    """The bound has no errors to one side, as those of hats that are hidden in part."""
+    runs = flown(ON_A_MAST)
     rms = np.sqrt(np.mean(runs.error**2, axis=(0, 1)))  # (2, 3)
     best = bound(runs.places)
     horizontal = np.linalg.norm(rms[:, :2], axis=1) / np.linalg.norm(best[:, :2], axis=1)

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from sighting_tiers import Condition, Tiers, measured
+from pictures import HATS
+from sighting_tiers import FROM_BELOW, Condition, Tiers, measured
 
 RANGES_M = (2.0, 4.0), (4.0, 7.0), (7.0, 12.0)
 DAY, DULL, DUSK = 1.0, 0.4, 0.15  # of a clear day
@@ -63,3 +64,24 @@ def test_both_tiers_err_alike(ranges_m: tuple[float, float], light: float, rate_
 )
 def test_both_tiers_err_alike_in_many_pictures(condition: Condition) -> None:
     hold(measured(condition, pictures=400), LARGE)
+
+
+HIDDEN_RANGE, HIDDEN_SHARE, HIDDEN_MISSED = (
+    0.06,
+    0.12,
+    0.12,
+)  # differences: of the range, of a hat's diameter, of misses
+
+
+@pytest.mark.parametrize("ranges_m", RANGES_M[:2])
+def test_both_tiers_err_alike_where_a_drone_s_own_rotors_hide_a_part_of_its_hat(ranges_m: tuple[float, float]) -> None:
+    """Its range comes out too long and its middle too high, by as much as both say that they may err."""
+    rendered, geometric = measured(Condition(ranges_m, rise=FROM_BELOW), pictures=100)
+    (down, too_far), (down_too, too_far_too) = rendered.mean(), geometric.mean()
+    assert min(too_far, too_far_too) > 0.05
+    assert abs(too_far - too_far_too) < HIDDEN_RANGE
+    assert max(down, down_too) < 0
+    assert abs(down - down_too) < HIDDEN_SHARE * HATS.diameter_m / np.mean(ranges_m)
+    assert abs(rendered.missed - geometric.missed) < HIDDEN_MISSED
+    for tier in (rendered, geometric):
+        assert max(tier.normalised()) < 1.5

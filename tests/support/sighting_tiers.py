@@ -34,6 +34,7 @@ APART_RAD = 0.3  # rad between two hats, at least: no hull is before the other's
 ASSOCIATED_RAD = 0.04  # rad from a hat, within which a sighting is of it
 TILT_RAD = 0.06  # rad, standard deviation of roll and pitch
 FROM_ABOVE = (-0.35, -0.03)  # rise per metre from the camera to the hat: no hull is before its own drone's hat
+FROM_BELOW = (0.05, 0.25)  # 3 to 14 deg: its drone's rotors hide a part of it
 SCENARIO = """
 name: tiers
 seed: 5
@@ -56,11 +57,13 @@ class Condition(NamedTuple):
         ranges_m: of the hats, from and to.
         light: of a clear day.
         rate_deg_s: of the body that carries the camera, about any axis.
+        rise: per metre from the camera to a hat, from and to.
     """
 
     ranges_m: tuple[float, float]
     light: float = 1.0
     rate_deg_s: float = 0.0
+    rise: tuple[float, float] = FROM_ABOVE
 
 
 class Tier(NamedTuple):
@@ -86,6 +89,10 @@ class Tier(NamedTuple):
     def deviation(self) -> tuple[float, float]:
         """Return the standard deviations of bearing [rad], per axis, and range."""
         return float(self.errors[:, :2].std()), float(self.errors[:, 2].std())
+
+    def mean(self) -> Array:
+        """Return the mean errors, down [rad] and of the range."""
+        return self.errors[:, 1:].mean(axis=0)
 
     def bias(self) -> Array:
         """Return the mean errors in their own standard deviations, (3,)."""
@@ -175,7 +182,7 @@ def looks(condition: Condition, rng: np.random.Generator) -> list[Look]:
     attitudes = [[*rng.normal(0, TILT_RAD, 2), rng.uniform(-math.pi, math.pi)] for _ in range(1 + OTHERS)]
     R_WB, *R_WD = (rotation_matrix(quaternion_from_rpy(np.array(each))) for each in attitudes)
     p = np.array([*rng.uniform(-20, 20, 2), rng.uniform(6, 9)])
-    directions = _directions(R_WB, rng)
+    directions = _directions(R_WB, condition.rise, rng)
     near, far = (math.log(each) for each in condition.ranges_m)
     ranges = np.exp(rng.uniform(near, far, OTHERS)).tolist()
     hats_W = [p + R_WB @ (POSE.p_BK + away * d) for away, d in zip(ranges, directions, strict=True)]
@@ -187,14 +194,14 @@ def looks(condition: Condition, rng: np.random.Generator) -> list[Look]:
     return [Look(where, d, away) for d, away in zip(directions, ranges, strict=True)]
 
 
-def _directions(R_WB: Array, rng: np.random.Generator) -> list[Array]:
-    """Return directions in B to hats anywhere in the picture, as seen from above and apart from each other."""
+def _directions(R_WB: Array, rise: tuple[float, float], rng: np.random.Generator) -> list[Array]:
+    """Return directions in B to hats anywhere in the picture that rise so much, apart from each other."""
     found: list[Array] = []
     while len(found) < OTHERS:
         u, v = rng.uniform(0, LENS.width), rng.uniform(0, LENS.height)
         ray = np.array([*undistorted(LENS, u - 0.5, v - 0.5), 1.0])
         d = POSE.R_BK @ (ray / np.linalg.norm(ray))
-        is_above = FROM_ABOVE[0] < R_WB[2] @ d < FROM_ABOVE[1]
-        if is_above and all(np.linalg.norm(d - other) > APART_RAD for other in found):
+        rises = rise[0] < R_WB[2] @ d < rise[1]
+        if rises and all(np.linalg.norm(d - other) > APART_RAD for other in found):
             found.append(d)
     return found

@@ -1,7 +1,8 @@
 """Which hats a camera has in view, and where: of true poses, without pictures. Compiled, without time or chance.
 
-A hat is a ball. It is in view where all of it falls on the picture and nothing stands before its centre: no obstacle,
-and no hull, a flat body of revolution about its drone's z axis.
+A hat is a ball. It is in view where all of it falls on the picture, no obstacle stands before its centre, and no hull,
+a flat body of revolution about its drone's z axis, hides most of it: a detector takes what is left for the ball. From
+below it is the rim of the drone's own rotors that hides it from its lower edge on.
 """
 
 import math
@@ -24,6 +25,8 @@ VIEW = columns(  # of a hat in a camera
     (
         Field("seen", "1"),  # 0 or 1
         Field("direction_K", "1", 3),  # unit vector to its centre
+        Field("share", "1"),  # of its disc that no hull hides
+        Field("shift_K", "1", 3),  # from its centre to the middle of that share, over the distance
         Field("range", "m"),
         Field("angle", "rad"),  # its apparent diameter
         Field("scale", "px/rad"),  # of the picture where it is
@@ -32,6 +35,10 @@ VIEW = columns(  # of a hat in a camera
 )
 AHEAD_MIN = 0.05  # cosine to the axis; flatter rays never fall on a picture of 150 deg
 HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
+RIM_WIDE, RIM_HIGH = 1.15, 0.14  # radius and height of the rotors' rim, in radii of a hull; fitted to pictures
+POINTS = 32  # of a disc that are looked at
+GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))  # between two of them, Vogel's spiral: all at other heights
+SHARE_MIN = 0.4  # of a disc; with less in view a hat is not round enough for a ball
 SURFACE_M = 0.01  # m, nearer than which a ray has met an obstacle
 EDGE_PX = 3.0  # px, nearer than which to the picture's edge a detector takes a hat for cut; the blur of its rim
 STEPS_MAX = 64  # along a ray; each goes as far as the nearest surface
@@ -127,6 +134,53 @@ def _in_picture(lens: Lens, to_K: Vector, angle: float) -> bool:
     return edge <= u < lens.width - 1.0 - edge and edge <= v < lens.height - 1.0 - edge
 
 
+@inlined
+def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius: float) -> bool:
+    """Tell whether a ray to a drone's own hat comes up through the disc of its rotors."""
+    o, d = rotate_back(q_WB, subtract(eye, p_WB)), rotate_back(q_WB, ray)
+    rise = RIM_HIGH * radius - o[2]
+    if rise <= 0.0 or d[2] <= 0.0:
+        return False
+    x, y = o[0] + rise / d[2] * d[0], o[1] + rise / d[2] * d[1]
+    return x * x + y * y < RIM_WIDE * RIM_WIDE * radius * radius
+
+
+@inlined
+def _hulls_hide(eye: Vector, ray: Vector, away: float, own: int, m: int, poses: NDArray, hulls: NDArray) -> bool:
+    """Tell whether a hull stands on a ray to a ball, that of drone m or of none."""
+    for i in range(poses.shape[0]):
+        if i == own:
+            continue
+        p, q = _three(poses[i], POSE.p_WB), _four(poses[i], POSE.q_WB)
+        if (i == m and _rim_hides(eye, ray, p, q, hulls[i])) or (
+            i != m and _hull_hides(eye, ray, away, p, q, hulls[i])
+        ):
+            return True
+    return False
+
+
+@inlined
+def _write_share(
+    eye: Vector, ray: Vector, away: float, radius: float, own: int, m: int, poses: NDArray, hulls: NDArray, row: NDArray
+) -> None:
+    """Write which share of a ball's disc no hull hides, and how far its middle is from the ball's."""
+    e1 = (ray[1], -ray[0], 0.0) if abs(ray[2]) < 0.9 else (0.0, ray[2], -ray[1])
+    e1 = scaled(e1, 1.0 / norm(e1))
+    e2 = cross(ray, e1)
+    hidden, sum1, sum2 = 0, 0.0, 0.0
+    for k in range(POINTS):
+        r, turn = radius / away * math.sqrt((k + 0.5) / POINTS), k * GOLDEN_RAD
+        a, b = r * math.cos(turn), r * math.sin(turn)
+        to = axpy(axpy(ray, a, e1), b, e2)
+        if _hulls_hide(eye, scaled(to, 1.0 / norm(to)), away, own, m, poses, hulls):
+            hidden, sum1, sum2 = hidden + 1, sum1 + a, sum2 + b
+    left = max(POINTS - hidden, 1)
+    shift = axpy(scaled(e1, -sum1 / left), -sum2 / left, e2)
+    row[VIEW.share] = (POINTS - hidden) / POINTS
+    for k in range(3):
+        row[VIEW.shift_K + k] = shift[k]
+
+
 @kernel()
 def hats_in_view(
     camera: MountedCamera,
@@ -179,14 +233,9 @@ def hats_in_view(
         angle = 2.0 * math.asin(0.5 * diameter / away)
         if not _in_picture(camera.lens, to_K, angle):
             continue
-        ray, hidden = scaled(to_W, 1.0 / away), False
-        for i in range(drones):
-            if i != own and i != m:
-                p, q = _three(poses[i], POSE.p_WB), _four(poses[i], POSE.q_WB)
-                hidden = hidden or _hull_hides(eye, ray, away, p, q, hulls[i])
-            elif i == m:
-                q = _four(poses[i], POSE.q_WB)
-                hidden = hidden or _hull_hides(eye, ray, away, _three(poses[i], POSE.p_WB), q, hulls[i])
+        ray = scaled(to_W, 1.0 / away)
+        _write_share(eye, ray, away, 0.5 * diameter, own, m, poses, hulls, view[m])
+        hidden = view[m, VIEW.share] < SHARE_MIN
         for k in range(obstacles.shape[0]):
             hidden = hidden or _obstacle_hides(eye, ray, away, obstacles[k])
         if hidden:
@@ -194,8 +243,10 @@ def hats_in_view(
         across = axpy(subtract(velocity, v_eye), -dot(subtract(velocity, v_eye), ray), ray)
         moves = subtract(scaled(across, 1.0 / away), cross(w_W, ray))
         view[m, VIEW.seen] = 1.0
+        shift_K = rotate_back(camera.q_BK, rotate_back(q_WB, _three(view[m], VIEW.shift_K)))
         for k in range(3):
             view[m, VIEW.direction_K + k] = to_K[k] / away
+            view[m, VIEW.shift_K + k] = shift_K[k]
         view[m, VIEW.range] = away
         view[m, VIEW.angle] = angle
         view[m, VIEW.scale] = _scale(camera.lens, to_K[2] / away)

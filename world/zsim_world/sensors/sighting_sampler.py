@@ -25,6 +25,7 @@ from zsim_world.sensors.hats_in_view import VIEW, MountedCamera, hats_in_view, p
 from zsim_world.state.fleet_arrays import STATE
 
 NOISY_LIGHT = 0.4  # of a clear day, at which a picture's noise is half again of what it is by day; measured
+HIDDEN_CENTRE, HIDDEN_RANGE = 0.5, 1.2  # of diameter and range, per what hulls hide: sigmas of a detector; measured
 DRAWS = 4  # normal numbers for each hat of a picture: two for its centre, one for its diameter, one for a miss
 FALSE_DRAWS = 5  # uniform numbers for a false alarm: whether, where (2), how large, order
 
@@ -184,7 +185,7 @@ class _Watcher:
     def _is_missed(self, row: list[float], noise: list[float]) -> bool:
         """Tell whether a hat is missed by chance, or measured as too small."""
         model, (_, diameter_px) = self._model, self._sigmas_px(row)
-        measured_px = row[VIEW.angle] * row[VIEW.scale] + diameter_px * noise[2]
+        measured_px = math.sqrt(row[VIEW.share]) * row[VIEW.angle] * row[VIEW.scale] + diameter_px * noise[2]
         return measured_px < model.diameter_min_px or 0.5 * math.erfc(noise[3] / math.sqrt(2.0)) < model.miss
 
     def _sigmas_px(self, row: list[float]) -> tuple[float, float]:
@@ -197,15 +198,17 @@ class _Watcher:
     def _seen(self, row: list[float], noise: list[float]) -> Seen:
         centre_px, diameter_px = self._sigmas_px(row)
         scale, angle = row[VIEW.scale], row[VIEW.angle]
-        x, y, z = row[VIEW.direction_K : VIEW.direction_K + 3]
+        x, y, z = (row[VIEW.direction_K + k] + row[VIEW.shift_K + k] for k in range(3))
+        left = math.sqrt(row[VIEW.share])
         across = math.hypot(x, z)
         e1, e2 = (z / across, 0.0, -x / across), (-x * y / across, across, -y * z / across)
         a, b = centre_px / scale * noise[0], centre_px / scale * noise[1]
-        measured = max(angle + diameter_px / scale * noise[2], 0.1 * angle)
+        measured = max(left * angle + diameter_px / scale * noise[2], 0.1 * angle)
         range_m = self._radius_m / math.sin(0.5 * measured)
         direction = self._in_body(x + a * e1[0] + b * e2[0], y + a * e1[1] + b * e2[1], z + a * e1[2] + b * e2[2])
-        sigma = math.hypot(centre_px / scale, self._misaligned_rad)
-        return Seen(direction, range_m, sigma, range_m * diameter_px / (scale * measured))
+        sigma = math.hypot(centre_px / scale, self._misaligned_rad, HIDDEN_CENTRE * (1.0 - left) * angle)
+        sigma_m = range_m * math.hypot(diameter_px / (scale * measured), HIDDEN_RANGE * (1.0 - left))
+        return Seen(direction, range_m, sigma, sigma_m)
 
     def _in_body(self, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Return the unit vector in B along (x, y, z) in K."""

@@ -75,7 +75,7 @@ def test_a_covered_hat_is_not_seen_and_a_false_one_is():
     assert view[:, VIEW.seen].tolist() == [0.0, 0.0, 1.0]
 
 
-@pytest.mark.parametrize(("height_m", "seen"), [(0.0, 0), (0.1, 0), (0.5, 1), (-0.5, 1)])
+@pytest.mark.parametrize(("height_m", "seen"), [(0.03, 0), (0.1, 0), (0.5, 1), (-0.5, 1)])
 def test_a_hull_in_between_hides_it(height_m: float, seen: int):
     """The middle one stands in the line of sight, which rises by 0.1 m over 4 m, or over or under it."""
     view = look([pose(0, 0, 5), pose(4, 0, 5), pose(2, 0, 5 + height_m)], bare=[True, True, False])
@@ -85,6 +85,21 @@ def test_a_hull_in_between_hides_it(height_m: float, seen: int):
 def test_its_own_hull_hides_a_hat_from_below():
     view = look([pose(0, 0, 5, (0, -30, 0)), pose(0.8, 0, 6.5)])
     assert view[1, VIEW.seen] == 0.0
+
+
+RIM_M = 1.15 * HULL_M, 0.14 * HULL_M  # radius and height of the rotors' rim
+
+
+@pytest.mark.parametrize("below_deg", [-10.0, 0.0, 4.0, 8.0, 12.0])
+def test_its_own_rotors_hide_a_hat_from_its_lower_edge_on(below_deg: float):
+    """A straight edge hides it: a segment of a disc, by the height of the rim's near edge over the hat's lower one."""
+    slope = math.tan(math.radians(below_deg))
+    view = look([pose(-LENS_B[0], 0, 5 - LENS_B[2]), pose(4.0 - HAT_B[0], 0, 5 + 4.0 * slope - HAT_B[2])])
+    hidden_m = RIM_M[1] + (RIM_M[0] + HAT_B[0]) * slope - (HAT_B[2] - DIAMETER_M / 2)
+    cut = min(max(hidden_m / DIAMETER_M, 0.0), 1.0) if below_deg > 0 else 0.0
+    angle = math.acos(1 - 2 * cut)
+    assert view[1, VIEW.share] == pytest.approx(1 - (angle - math.sin(angle) * math.cos(angle)) / math.pi, abs=0.08)
+    assert (view[1, VIEW.shift_K + 1] < -1e-4) == (cut > 0.05)  # up in the picture
 
 
 OBSTACLES = [
