@@ -18,14 +18,14 @@ from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim_agents.cameras.detector import HatDetector
 from zsim_agents.cameras.jpeg import decoded
 from zsim_agents.cameras.rendering.renderer import Renderer
-from zsim_agents.cameras.rendering.scene import Bodies, Scene, default_look
+from zsim_agents.cameras.rendering.scene import DroneStates, Scene, default_look
 
 DRONES = 11  # one looks at ten
 REPEATS, CALLS = 30, 20  # the least of so many means: what other load adds is left out
 ROTOR_RAD_S = 400.0  # rad/s, about a hover
 
 
-def situation(moving: bool = False) -> Bodies:
+def situation(moving: bool = False) -> DroneStates:
     """Return ten drones before one, 3 to 15 m away."""
     rng = np.random.default_rng(3)
     ahead = np.array([0.0, *(3 + 1.2 * np.arange(1, DRONES))])
@@ -34,15 +34,15 @@ def situation(moving: bool = False) -> Bodies:
     rpy[0] = (0.05, 0.03, 0.0)
     rates = np.full((DRONES, 3), 0.4 if moving else 0.0)
     speeds = rng.normal(0, 0.7, (DRONES, 3)) if moving else np.zeros((DRONES, 3))
-    return Bodies(p, speeds, quaternion_from_rpy(rpy), rates, [[ROTOR_RAD_S] * 4] * DRONES)
+    return DroneStates(p, speeds, quaternion_from_rpy(rpy), rates, [[ROTOR_RAD_S] * 4] * DRONES)
 
 
-def formation() -> Bodies:
+def formation() -> DroneStates:
     """Return three drones in a triangle at 4 m, the first of which looks at the others."""
     p = np.array([(0.0, 0.0, 4.0), (3.0, 1.2, 4.0), (4.0, -1.3, 4.0)])
     rpy = np.array([(0.02, 0.03, 0.0), (0.05, 0.0, 2.6), (0.0, 0.04, -2.2)])
     still = np.zeros((3, 3))
-    return Bodies(p, still, quaternion_from_rpy(rpy), still, [[ROTOR_RAD_S] * 4] * 3)
+    return DroneStates(p, still, quaternion_from_rpy(rpy), still, [[ROTOR_RAD_S] * 4] * 3)
 
 
 def cpu_ms(call: Callable[[], object]) -> float:

@@ -11,7 +11,7 @@ from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.sensors.camera import BottomCamera, Camera, FrontCamera, Hats
 from zsim.sensors.camera_model import camera_pose, lens_of, pixel
 from zsim_agents.cameras.rendering.renderer import Renderer
-from zsim_agents.cameras.rendering.scene import Bodies, Scene, default_look
+from zsim_agents.cameras.rendering.scene import DroneStates, Scene, default_look
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -21,11 +21,11 @@ FRONT, BOTTOM = FrontCamera(), BottomCamera()
 ROTOR_RAD_S = 400.0
 
 
-def bodies(p_W: Any, rpy_rad: Any = None, v_W: Any = None, w_B: Any = None) -> Bodies:
+def bodies(p_W: Any, rpy_rad: Any = None, v_W: Any = None, w_B: Any = None) -> DroneStates:
     """Return drones at some places (N, 3); level, at rest and facing east where nothing else is given."""
     p = np.array(p_W, float)
     rpy, v, w = (np.zeros_like(p) if each is None else np.array(each, float) for each in (rpy_rad, v_W, w_B))
-    return Bodies(p, v, quaternion_from_rpy(rpy), w, [[ROTOR_RAD_S] * 4] * len(p))
+    return DroneStates(p, v, quaternion_from_rpy(rpy), w, [[ROTOR_RAD_S] * 4] * len(p))
 
 
 def scene(drones: int = 2, **fields: Any) -> Scene:
@@ -38,7 +38,7 @@ def renderer(camera: Camera = FRONT, of: Scene | None = None, seed: int = 1, **f
     return Renderer(camera, of or scene(), 0, seed, "drone1/front", **fields)
 
 
-def hat_K(camera: Camera, where: Bodies, drone: int = 1) -> Array:
+def hat_K(camera: Camera, where: DroneStates, drone: int = 1) -> Array:
     """Return where the hat of a drone is in the camera of the first [m; K]."""
     R_WB, R_WD = rotation_matrix(where.q_WB[0]), rotation_matrix(where.q_WB[drone])
     pose = camera_pose(camera)
@@ -46,7 +46,7 @@ def hat_K(camera: Camera, where: Bodies, drone: int = 1) -> Array:
     return pose.R_BK.T @ (hat_B - pose.p_BK)
 
 
-def hat_pixel(camera: Camera, where: Bodies, drone: int = 1) -> tuple[float, float]:
+def hat_pixel(camera: Camera, where: DroneStates, drone: int = 1) -> tuple[float, float]:
     """Return the pixel of a hat's centre."""
     x, y, z = hat_K(camera, where, drone).tolist()
     return pixel(lens_of(camera), x, y, z)
@@ -72,7 +72,7 @@ def has_magenta(picture: Picture) -> bool:
 class Look(NamedTuple):
     """A situation in which one drone sees the hat of the other: the drones, direction in B and distance of the hat."""
 
-    where: Bodies
+    where: DroneStates
     direction_B: Array
     range_m: float
 

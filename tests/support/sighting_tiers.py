@@ -22,7 +22,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
 from zsim_agents.cameras.detector import HatDetector
 from zsim_agents.cameras.jpeg import decoded
-from zsim_agents.cameras.rendering.scene import Bodies
+from zsim_agents.cameras.rendering.scene import DroneStates
 from zsim_world.sensors.sighting_sampler import SightingSampler
 
 Array = NDArray[np.float64]
@@ -163,7 +163,7 @@ def measured(condition: Condition, pictures: int, seed: int = 3) -> Tiers:
     return Tiers(rendered.tier(), geometric.tier())
 
 
-def state_of(where: Bodies) -> Array:
+def state_of(where: DroneStates) -> Array:
     """Return the rows that the world has of drones."""
     return np.hstack([where.p_WB, where.v_WB, where.q_WB, where.w_WB_B])
 

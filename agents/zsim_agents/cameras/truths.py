@@ -6,7 +6,7 @@ import numpy as np
 
 from zsim.contract.flight_messages import Truth
 from zsim.math.interpolation import pose_between
-from zsim_agents.cameras.rendering.scene import Bodies
+from zsim_agents.cameras.rendering.scene import DroneStates
 
 PENDING_MAX = 64  # gates of which the truth of a drone may be lacking
 
@@ -47,7 +47,7 @@ class TruthHistory:
         """Return the oldest gate that is kept; -1 if there is none."""
         return next(iter(self._whole), -1)
 
-    def bodies(self, t_ns: int) -> Bodies | None:
+    def bodies(self, t_ns: int) -> DroneStates | None:
         """Return all drones at an instant, or None where a gate beside it is lacking."""
         before_ns = t_ns // self._gate_ns * self._gate_ns
         before, after = self._whole.get(before_ns), self._whole.get(before_ns + self._gate_ns)
@@ -58,7 +58,7 @@ class TruthHistory:
         return None if after is None else _between((t_ns - before_ns) / 1e9, self._gate_ns / 1e9, before, after)
 
 
-def _between(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence[Truth]) -> Bodies:
+def _between(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence[Truth]) -> DroneStates:
     share = t_s / gate_s
     poses = [
         pose_between(
@@ -79,7 +79,7 @@ def _between(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence
     ]
     rotors = [_mean(a.rotor_rad_s, b.rotor_rad_s, share) for a, b in zip(before, after, strict=True)]
     p, v, q = (np.array([pose[k] for pose in poses]) for k in range(3))
-    return Bodies(p, v, q, np.array(rates), rotors)
+    return DroneStates(p, v, q, np.array(rates), rotors)
 
 
 def _mean(a: Sequence[float], b: Sequence[float], share: float) -> list[float]:

@@ -28,7 +28,7 @@ from zsim_world.physics.air import WIND
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import VALUE_COLUMNS, WHOSE, Sampled, Sampler, SensorSample
 from zsim_world.sensors.sensor_set import fleet_sensors
-from zsim_world.sensors.sighting_sampler import Sighting, SightingSampler
+from zsim_world.sensors.sighting_sampler import PictureSightings, SightingSampler
 from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, state_arrays
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY, SETPOINT
@@ -103,7 +103,7 @@ class Fleet:
         self._w = arrays(scenario, vehicles, self.sensors, self._noise)
         self._sampler = Sampler(scenario, self.sensors, self._w.senses)
         self._sightings = _sighting_sampler(scenario, self._w.bodies.vehicle[:, VEHICLE.hull_radius])
-        self.sightings: dict[int, Sighting] = {}
+        self.sightings: dict[int, PictureSightings] = {}
         self._held = kernel.hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
         self.impairment = Impairment(self._w, self.names, vehicles, self.sensors)
@@ -307,7 +307,7 @@ class Fleet:
         if self._sightings:
             self._add_sightings(self._sightings.due(self.bodies.state, self.t_ns))
 
-    def _add_sightings(self, sightings: list[Sighting]) -> None:
+    def _add_sightings(self, sightings: list[PictureSightings]) -> None:
         """Put sightings among the samples of the gate, behind those of the same drone and time."""
         self.sightings = {}
         if not sightings:

@@ -25,7 +25,7 @@ from zsim_world.fleet.kernel import hold
 from zsim_world.physics.rotors import charge_percent
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
-from zsim_world.sensors.sighting_sampler import Sighting
+from zsim_world.sensors.sighting_sampler import PictureSightings
 from zsim_world.state.fleet_arrays import STATE
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY
@@ -235,7 +235,7 @@ class UserMessages:
         return self._messages[s - STOCK_SENSORS](*stamps, *fields)
 
 
-def _sightings(stamps: tuple[int, int, int], sighting: Sighting) -> Sightings:
+def _sightings(stamps: tuple[int, int, int], sighting: PictureSightings) -> Sightings:
     t_ns, seq, t_sample_ns = stamps
     return Sightings(t_ns=t_ns, seq=seq, t_sample_ns=t_sample_ns, camera=sighting.camera, seen=sighting.seen)
 

@@ -30,7 +30,7 @@ DRAWS = 4  # normal numbers for each hat of a picture: two for its centre, one f
 FALSE_DRAWS = 5  # uniform numbers for a false alarm: whether, where (2), how large, order
 
 
-class Sighting(NamedTuple):
+class PictureSightings(NamedTuple):
     """What was seen in one picture.
 
     Attributes:
@@ -72,7 +72,7 @@ class SightingSampler:
         self._obstacles = np.array([row_of(each) for each in env.obstacles], dtype=float).reshape(-1, COLUMNS)
         x, y, z = hats.position_m
         self._hat_B, self._diameter_m = (float(x), float(y), float(z)), hats.diameter_m
-        self._later: list[Sighting] = []
+        self._later: list[PictureSightings] = []
         self._former: NDArray[np.float64] | None = None
         self._former_ns = 0
 
@@ -86,7 +86,7 @@ class SightingSampler:
     def restore(self, state: State) -> None:
         """Take over what `snapshot` returned."""
         self._later = [
-            Sighting(drone, t_ns, at_ns, camera, tuple(Seen(tuple(each[:3]), *each[3:]) for each in seen))
+            PictureSightings(drone, t_ns, at_ns, camera, tuple(Seen(tuple(each[:3]), *each[3:]) for each in seen))
             for drone, t_ns, at_ns, camera, seen in state["later"]
         ]
         self._former = state["former"].copy() if len(state["former"]) else None
@@ -94,7 +94,7 @@ class SightingSampler:
         for watcher, saved in zip(self._watchers, state["watchers"], strict=True):
             watcher.restore(saved)
 
-    def due(self, state: NDArray[np.float64], now_ns: int) -> list[Sighting]:
+    def due(self, state: NDArray[np.float64], now_ns: int) -> list[PictureSightings]:
         """Return what falls due by a gate, given the state of all drones there, (N, STATE.size or more)."""
         now = state[:, : STATE.size].copy()
         former, former_ns = (now, now_ns) if self._former is None else (self._former, self._former_ns)
@@ -165,7 +165,7 @@ class _Watcher:
         self._set_next()
         place(self._rng, state["stream"])
 
-    def look(self, view: NDArray[np.float64]) -> Sighting:
+    def look(self, view: NDArray[np.float64]) -> PictureSightings:
         """Return what the detector makes of what is in view."""
         at_ns, model = self.next_ns, self._model
         self._count += 1
@@ -180,7 +180,7 @@ class _Watcher:
             seen += self._false(self._rng.random(FALSE_DRAWS).tolist())
         if len(seen) > 1:
             seen.sort(key=_azimuth)
-        return Sighting(self.drone, at_ns + self._latency_ns, at_ns, self._name, tuple(seen))
+        return PictureSightings(self.drone, at_ns + self._latency_ns, at_ns, self._name, tuple(seen))
 
     def _is_missed(self, row: list[float], noise: list[float]) -> bool:
         """Tell whether a hat is missed by chance, or measured as too small."""

@@ -12,12 +12,12 @@ from zsim.scenario.obstacle import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
 from zsim_agents.cameras.rendering import film
+from zsim_agents.cameras.rendering.backdrop import Backdrop, Ground, colour_map, field
 from zsim_agents.cameras.rendering.balls import draw_ball
+from zsim_agents.cameras.rendering.drone_images import SEEN_M, DroneImager, DroneImages, balls
 from zsim_agents.cameras.rendering.drones import draw_drone
 from zsim_agents.cameras.rendering.faces import draw_obstacle
-from zsim_agents.cameras.rendering.fleet import SEEN_M, DroneImages, Fleet, balls
-from zsim_agents.cameras.rendering.ground import Backdrop, Ground, colour_map, field
-from zsim_agents.cameras.rendering.scene import SUN_W, Bodies, Scene
+from zsim_agents.cameras.rendering.scene import SUN_W, DroneStates, Scene
 from zsim_agents.cameras.rendering.view import CameraMotion, View, camera_motion
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ SWEPT_PX = 0.8  # px, from which on ground and sky are blurred by the motion
 WIDER_MAX = 2.0  # of the pinhole picture that a lens bends, over its own; rays beyond it repeat the edge
 
 
-class Seen(NamedTuple):
+class Drawable(NamedTuple):
     """What is to be drawn: its distance, and which it is of its kind."""
 
     distance_m: float
@@ -56,7 +56,7 @@ class Renderer:
         self._view = _view(lens_of(camera))
         self._brightness = scene.light * gain
         self._colours = colour_map(self._brightness)
-        self._fleet = Fleet(self._view, scene, carrier, self._exposure_s, self._brightness)
+        self._imager = DroneImager(self._view, scene, carrier, self._exposure_s, self._brightness)
         self._noise = None
         if camera.noise > 0:
             shape = self._view.lens.height, self._view.lens.width
@@ -67,7 +67,7 @@ class Renderer:
             flat, self._bend = _pinhole(self._view)
         self._backdrop = Backdrop(flat, ground or _field())
 
-    def picture(self, number: int, t_s: float, bodies: Bodies) -> Picture:
+    def picture(self, number: int, t_s: float, bodies: DroneStates) -> Picture:
         """Return the picture of an exposure as B, G, R, (height, width, 3).
 
         Args:
@@ -80,7 +80,7 @@ class Renderer:
         if self._bend is not None:
             grey = cv2.remap(grey, *self._bend, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         picture: Picture = cv2.applyColorMap(grey, self._colours)  # type: ignore[assignment]
-        images = self._fleet.images(motion, t_s, bodies)
+        images = self._imager.images(motion, t_s, bodies)
         for seen in sorted(self._order(motion, images), reverse=True):
             self._draw(picture, seen, motion, images)
         film.lens_blur(picture, self._camera.blur_px)
@@ -88,7 +88,7 @@ class Renderer:
             self._noise.add(picture, number)
         return picture
 
-    def jpeg(self, number: int, t_s: float, bodies: Bodies) -> bytes:
+    def jpeg(self, number: int, t_s: float, bodies: DroneStates) -> bytes:
         """Return the picture of an exposure as JPEG; see `picture`."""
         return film.jpeg(self.picture(number, t_s, bodies), self._camera.jpeg_quality)
 
@@ -102,16 +102,16 @@ class Renderer:
             return grey
         return cv2.filter2D(grey, -1, film.sweep_kernel(way_px), borderType=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
 
-    def _order(self, motion: CameraMotion, images: DroneImages) -> list[Seen]:
+    def _order(self, motion: CameraMotion, images: DroneImages) -> list[Drawable]:
         """Return what may be in view, in any order."""
-        seen = [Seen(images.distances_m[i], "drone", i) for i in images.in_view]
+        seen = [Drawable(images.distances_m[i], "drone", i) for i in images.in_view]
         for i, row in enumerate(self._scene.obstacles):
-            seen.append(Seen(_distance(row, motion.p_WK), "obstacle", i))
+            seen.append(Drawable(_distance(row, motion.p_WK), "obstacle", i))
         for i, place in enumerate(self._scene.hats.false_m):
-            seen.append(Seen(math.dist(place, motion.p_WK.tolist()), "hat", i))
+            seen.append(Drawable(math.dist(place, motion.p_WK.tolist()), "hat", i))
         return seen
 
-    def _draw(self, picture: Picture, seen: Seen, motion: CameraMotion, images: DroneImages) -> None:
+    def _draw(self, picture: Picture, seen: Drawable, motion: CameraMotion, images: DroneImages) -> None:
         if seen.kind == "obstacle":
             draw_obstacle(picture, self._view, self._scene.obstacles[seen.which], motion, self._brightness)
         elif seen.kind == "hat":

@@ -45,7 +45,7 @@ class Scene(NamedTuple):
     light: float = 1.0
 
 
-class Bodies(NamedTuple):
+class DroneStates(NamedTuple):
     """N drones at an instant: position [m; W], velocity [m/s; W], attitude B to W (N, 4), rate [rad/s; B], (N, 3) each.
 
     `rotors` has the speeds of each drone's rotors [rad/s].

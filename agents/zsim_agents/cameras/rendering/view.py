@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from zsim.math.frames import rotation_matrix
 from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix
-from zsim_agents.cameras.rendering.scene import Bodies
+from zsim_agents.cameras.rendering.scene import DroneStates
 
 Array = NDArray[np.float64]
 Rays = NDArray[np.float32]
@@ -40,7 +40,7 @@ def skew(a: Array) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def camera_motion(pose: CameraPose, bodies: Bodies, carrier: int) -> CameraMotion:
+def camera_motion(pose: CameraPose, bodies: DroneStates, carrier: int) -> CameraMotion:
     """Return where the camera is that one of the drones carries, and how it moves."""
     R_WB = rotation_matrix(bodies.q_WB[carrier])
     w_WB_B = bodies.w_WB_B[carrier]

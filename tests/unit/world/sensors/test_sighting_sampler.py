@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim_world.sensors.sighting_sampler import Sighting, SightingSampler
+from zsim_world.sensors.sighting_sampler import PictureSightings, SightingSampler
 
 GATE_NS = 20_000_000
 SCENARIO = """
@@ -41,7 +41,7 @@ def still() -> NDArray[np.float64]:
     return state
 
 
-def sampled(sampler: SightingSampler, gates: range, state: NDArray[np.float64] | None = None) -> list[Sighting]:
+def sampled(sampler: SightingSampler, gates: range, state: NDArray[np.float64] | None = None) -> list[PictureSightings]:
     state = still() if state is None else state
     return [sighting for gate in gates for sighting in sampler.due(state, gate * GATE_NS)]
 
@@ -50,7 +50,7 @@ def made(*fields: str) -> SightingSampler:
     return SightingSampler(scenario(*fields), np.full(3, 0.26))
 
 
-def of(sightings: list[Sighting], drone: int) -> list[Sighting]:
+def of(sightings: list[PictureSightings], drone: int) -> list[PictureSightings]:
     return [sighting for sighting in sightings if sighting.drone == drone]
 
 

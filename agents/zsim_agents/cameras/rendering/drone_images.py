@@ -10,7 +10,7 @@ from zsim.math.frames import rotation_matrix
 from zsim_agents.cameras.rendering.balls import NEAR_M, Ball
 from zsim_agents.cameras.rendering.drones import DroneImage, blade_points, drone_model
 from zsim_agents.cameras.rendering.faces import fixed
-from zsim_agents.cameras.rendering.scene import Bodies, Scene
+from zsim_agents.cameras.rendering.scene import DroneStates, Scene
 from zsim_agents.cameras.rendering.view import CameraMotion, View, skew
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ def balls(view: View, centres_K: Array, ways_K: Array, radius_m: float, brightne
     return [Ball(*row, radius_m, brightness * MAGENTA) for row in rows]
 
 
-class Fleet:
+class DroneImager:
     """The drones of a scene as one camera sees them.
 
     Args:
@@ -73,7 +73,7 @@ class Fleet:
         self._edges = max(lens.cx, lens.width - lens.cx) / lens.fx, max(lens.cy, lens.height - lens.cy) / lens.fy
         self._slack = 1.5 if view.distorts else 1.05
 
-    def images(self, motion: CameraMotion, t_s: float, bodies: Bodies) -> DroneImages:
+    def images(self, motion: CameraMotion, t_s: float, bodies: DroneStates) -> DroneImages:
         """Return the drones over an exposure about t_s [s]."""
         R_WB = rotation_matrix(bodies.q_WB)
         R_KB = motion.R_WK.T @ R_WB
@@ -122,7 +122,7 @@ class Fleet:
         ways: Array,
         cameras_B: Array,
         t_s: float,
-        bodies: Bodies,
+        bodies: DroneStates,
     ) -> None:
         """Add the images of the drones of one look."""
         look, model = self._looks[kind], self._models[kind]
