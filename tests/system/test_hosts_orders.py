@@ -16,6 +16,8 @@ from refused import has_terms
 from zsim.transport.tls import KEY
 from zsim_deploy.launch.end_signals import UNREAD
 
+IN_FLIGHT = r" [1-9][0-9]*\.[0-9] . 3600 s"  # a line of progress after the first second
+
 ROLES = {"world": "h1", "recorder": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2"]}
 SPARE = "h3"
 DRONES = 10  # their estimators, the world, the recorder and the link's own word are more than sshd's 10 channels
@@ -104,7 +106,7 @@ def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
 def test_a_pipe_that_nobody_reads_any_more_ends_the_run_and_fetches_its_record(lab: Lab) -> None:
     """As in `zsim up … 2>&1 | head`."""
     with closing(Deployment(lab, ROLES, secure=False)) as deployment:
-        piped = '"$@" 2>&1 | sed "/ real time/q"'
+        piped = '"$@" 2>&1 | sed -E "/' + IN_FLIGHT + '/q"'
         run = deployment.up("--rate", "4", "--duration", "3600", prefix=("sh", "-c", piped, "sh"))
         run.ends(with_code=0, within_s=START_S)
         deployment.nobody_left()
