@@ -4,14 +4,12 @@ Compiled. D = N n: the error states of N drones one behind the other, n each (fi
 none, J is (0, 0), and every drone's covariance stands for itself.
 """
 
-import math
-
 import numpy as np
 
 from zsim.math.compiled import portable
 from zsim_agents.estimation import strapdown
 from zsim_agents.estimation.filter_state import LAYOUT, SETTING, Rows
-from zsim_agents.estimation.kalman_update import within_gates
+from zsim_agents.estimation.kalman_update import cholesky, within_gates
 
 
 @portable
@@ -81,15 +79,8 @@ def add_innovation_covariance(HJ: np.ndarray, H: np.ndarray, first: int, S: np.n
 @portable
 def whiten(S: np.ndarray, HJ: np.ndarray, y: np.ndarray) -> None:
     """Replace HJ by W = L^-1 HJ and y by u = L^-1 y, with S = L L^T: then J^+ = J - W^T W, and x = W^T u."""
-    m = S.shape[0]
-    L = np.zeros((m, m))
-    for i in range(m):
-        for j in range(i + 1):
-            rest = S[i, j]
-            for k in range(j):
-                rest -= L[i, k] * L[j, k]
-            L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
-    for i in range(m):
+    L = cholesky(S)
+    for i in range(L.shape[0]):
         for k in range(i):
             y[i] -= L[i, k] * y[k]
             for d in range(HJ.shape[1]):

@@ -168,9 +168,9 @@ def innovation_covariance(P: np.ndarray, H: np.ndarray, variance: np.ndarray, PH
 
 
 @portable
-def gain(S: np.ndarray, PHt: np.ndarray) -> np.ndarray:
-    """Return K = P H^T S^-1, (n, m), by the Cholesky factor of S."""
-    n, m = PHt.shape
+def cholesky(S: np.ndarray) -> np.ndarray:
+    """Return the lower triangular L of S = L L^T, (m, m)."""
+    m = S.shape[0]
     L = np.zeros((m, m))
     for i in range(m):
         for j in range(i + 1):
@@ -178,6 +178,14 @@ def gain(S: np.ndarray, PHt: np.ndarray) -> np.ndarray:
             for k in range(j):
                 rest -= L[i, k] * L[j, k]
             L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
+    return L
+
+
+@portable
+def gain(S: np.ndarray, PHt: np.ndarray) -> np.ndarray:
+    """Return K = P H^T S^-1, (n, m), by the Cholesky factor of S."""
+    n, m = PHt.shape
+    L = cholesky(S)
     K = PHt.copy()
     for row in range(n):
         for i in range(m):
