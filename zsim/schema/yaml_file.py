@@ -78,6 +78,8 @@ def value(text: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml ends behind the last line
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        if "nesting depth" in problem:  # PyYAML from 6.0.4 on has a limit of its own
+            raise ValueError("is nested too deep") from None
         raise ValueError(f"{where}is not YAML ({problem[:100]})") from error
 
 
