@@ -26,7 +26,7 @@ from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.initial_state import arrays
 from zsim_world.physics.air import WIND
 from zsim_world.sensors.noise import NoiseTable
-from zsim_world.sensors.sampler import VALUE_COLUMNS, WHOSE, Sampled, Sampler, SensorSample
+from zsim_world.sensors.sampler import WHOSE, Sampled, Sampler, SensorSample, with_more
 from zsim_world.sensors.sensor_set import fleet_sensors
 from zsim_world.sensors.sighting_sampler import PictureSightings, SightingSampler
 from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, state_arrays
@@ -313,13 +313,11 @@ class Fleet:
         if not sightings:
             return
         number = len(self.sensors.names)
-        rows = [(number, each.drone, each.t_ns, each.t_sample_ns) for each in sightings]
-        whose = np.concatenate((self.sampled.whose, np.array(rows, dtype=np.int64).reshape(-1, WHOSE.size)))
-        values = np.concatenate((self.sampled.values, np.zeros((len(rows), VALUE_COLUMNS))))
-        order = np.lexsort((whose[:, WHOSE.sensor], whose[:, WHOSE.drone], whose[:, WHOSE.t]))
-        self.sampled = Sampled(whose[order], values[order])
-        first = len(whose) - len(rows)
-        self.sightings = {place: sightings[m - first] for place, m in enumerate(order.tolist()) if m >= first}
+        rows = sorted((each.t_ns, each.drone, number, each.t_sample_ns, m) for m, each in enumerate(sightings))
+        more = np.array(rows, dtype=np.int64)[:, [2, 1, 0, 3]]
+        whose, values, places = with_more(*self.sampled, more)
+        self.sampled = Sampled(whose, values)
+        self.sightings = {place: sightings[row[-1]] for place, row in zip(places.tolist(), rows, strict=True)}
 
     def _meet(self, least: float) -> None:
         self._began: list[tuple[int, int]] = []

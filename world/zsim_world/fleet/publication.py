@@ -195,15 +195,14 @@ class UserMessages:
             return NO_PAYLOADS
         sizes, payloads = np.zeros(len(whose), dtype=np.int64), []
         seq: dict[tuple[int, int], int] = {}
-        for m in places:
-            s, i, t_ns, t_sample_ns = whose[m].tolist()
+        for m, (s, i, t_ns, t_sample_ns) in zip(places, whose[places].tolist(), strict=True):
             number = seq.setdefault((i, s), int(counts[i, s + 2]))
             seq[i, s] += 1
             stamps = (t_ns, number, t_sample_ns)
             sighting = self._fleet.sightings.get(m)
             message = self._message(s, i, stamps, values[m]) if sighting is None else _sightings(stamps, sighting)
             payloads.append(messages.encode(message))
-            sizes[m] = len(payloads[-1])
+        sizes[places] = list(map(len, payloads))
         return UserPayloads(np.frombuffer(bytearray(b"".join(payloads)), dtype=np.uint8), np.cumsum(sizes))
 
     def _places(self, whose: NDArray[np.int64]) -> list[int]:

@@ -8,6 +8,7 @@ below it is the rim of the drone's own rotors that hides it from its lower edge 
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.columns import Field, columns
@@ -15,7 +16,8 @@ from zsim.math.compiled import inlined, kernel
 from zsim.math.interpolation import attitude_between, position_between
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
 from zsim.scenario import obstacle
-from zsim.sensors.camera_model import Lens, pixel
+from zsim.sensors.camera import Camera
+from zsim.sensors.camera_model import Lens, camera_pose, lens_of, pixel
 
 POSE = columns(  # of a drone at an instant
     "PoseColumns", (Field("p_WB", "m", 3), Field("v_WB", "m/s", 3), Field("q_WB", "1", 4), Field("w_WB_B", "rad/s", 3))
@@ -32,6 +34,9 @@ VIEW = columns(  # of a hat in a camera
         Field("scale", "px/rad"),  # of the picture where it is
         Field("rate", "rad/s"),  # at which it moves over the picture
     ),
+)
+CAMERA = columns(  # as mounted on a drone
+    "CameraColumns", (Field("lens", "1, px", 11), Field("p_BK", "m", 3), Field("q_BK", "1", 4))
 )
 AHEAD_MIN = 0.05  # cosine to the axis; flatter rays never fall on a picture of 150 deg
 HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
@@ -62,6 +67,21 @@ def _three(row: NDArray, at: int) -> Vector:
 @inlined
 def _four(row: NDArray, at: int) -> Quaternion:
     return (row[at], row[at + 1], row[at + 2], row[at + 3])
+
+
+def camera_row(camera: Camera) -> NDArray:
+    """Return the row of a camera, (CAMERA.size,)."""
+    pose = camera_pose(camera)
+    return np.array([*lens_of(camera), *pose.p_BK.tolist(), *pose.q_BK], dtype=float)
+
+
+@inlined
+def mounted(row: NDArray) -> MountedCamera:
+    """Return the camera of a row."""
+    lens = Lens(
+        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], int(row[9]), int(row[10])
+    )  # as Lens has them
+    return MountedCamera(lens, _three(row, CAMERA.p_BK), _four(row, CAMERA.q_BK))
 
 
 @kernel()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from zsim.contract.snapshot import State
 from zsim.math import geodetic
 from zsim.math.columns import Field, columns
-from zsim.math.compiled import kernel
+from zsim.math.compiled import inlined, kernel
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import SensorType
 from zsim_world.sensors import sensor_set
@@ -127,3 +127,33 @@ def stamped(
         for k in range(sensor_set.CHANNELS_MAX):
             values[m, first + k] = value[m, k]
     return index, values
+
+
+@inlined
+def _is_before(a: NDArray, b: NDArray) -> bool:
+    """Tell whether a measurement stands before or with another in the order of (t_ns, drone, sensor)."""
+    if a[WHOSE.t] != b[WHOSE.t]:
+        return a[WHOSE.t] < b[WHOSE.t]
+    if a[WHOSE.drone] != b[WHOSE.drone]:
+        return a[WHOSE.drone] < b[WHOSE.drone]
+    return a[WHOSE.sensor] <= b[WHOSE.sensor]
+
+
+@kernel()
+def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Return measurements with others among them that have no numbers, and the rows in which these stand.
+
+    Args:
+        whose, values: of Sampled, in its order.
+        more: in the same order, (K, WHOSE.size).
+    """
+    count, extra = whose.shape[0], more.shape[0]
+    index, numbers = np.empty((count + extra, WHOSE.size), np.int64), np.zeros((count + extra, VALUE_COLUMNS))
+    places, m = np.empty(extra, np.int64), 0
+    for k in range(extra + 1):
+        while m < count and (k == extra or _is_before(whose[m], more[k])):
+            index[m + k], numbers[m + k] = whose[m], values[m]
+            m += 1
+        if k < extra:
+            index[m + k], places[k] = more[k], m + k
+    return index, numbers, places

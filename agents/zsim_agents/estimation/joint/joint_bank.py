@@ -1,7 +1,6 @@
 """The estimators of the drones of a cluster with one covariance, which use what the drones see of each other."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,10 @@ from zsim_agents.estimation.joint_covariance import block, predict_jointly, put_
 SIGHTED_A_GATE = 1000  # more of one gate are a flood, and left out
 PICTURES_KEPT = 256  # the last that were used; of 12 drones at 15 Hz, those of 1.4 s
 
+NO_SIGHTINGS = np.empty((0, SIGHTING.size))
+
 Picture = tuple[int, str, int]  # whose, of which camera, exposed when [ns]
+_Row = tuple[float, ...]  # of SIGHTING
 
 
 class JointBank(EstimatorBank):
@@ -54,10 +56,11 @@ class JointBank(EstimatorBank):
         hats = environment.hats if isinstance(environment.hats, Hats) else Hats()
         x, y, z = hats.position_m
         self._hat_B: Vector = float(x), float(y), float(z)
-        self._cameras = [{name: camera_pose(c).p_BK for name, c in d.sensors.cameras().items()} for d in drones]
+        self._cameras = [{n: camera_pose(c).p_BK.tolist() for n, c in d.sensors.cameras().items()} for d in drones]
         self._drones = {keys.sensor(drone.name, keys.SIGHTINGS): i for i, drone in enumerate(drones)}
         self._places = PerPattern(self._sighting_places)
-        self._sighted: dict[Picture, tuple[str, list[list[float]]]] = {}  # of this gate: by whom, and what
+        self._sighted: dict[Picture, tuple[str, list[_Row]]] = {}  # of this gate: by whom, and what
+        self._hats = 0  # of this gate, those of pictures that another detector's replaced too
         self._used: dict[Picture, None] = {}
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
@@ -70,10 +73,12 @@ class JointBank(EstimatorBank):
         picture = (i, message.camera, message.t_sample_ns)
         if self._is_taken(picture, message.source):
             return
-        rows: list[list[float]] = []
-        for seen in message.seen[: SIGHTED_A_GATE - sum(len(rows) for _, rows in self._sighted.values())]:
-            row = (i, t_arrival_s, message.t_sample_ns * 1e-9, *p_BK.tolist(), *seen.direction_B, seen.range_m)
-            rows.append([*row, seen.sigma_direction_rad, seen.sigma_range_m])
+        camera = i, t_arrival_s, message.t_sample_ns * 1e-9, *p_BK
+        rows = [
+            (*camera, *seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
+            for seen in message.seen[: SIGHTED_A_GATE - self._hats]
+        ]
+        self._hats += len(rows)
         self._sighted[picture] = (message.source, rows)
 
     def _is_taken(self, picture: Picture, source: str) -> bool:
@@ -88,9 +93,11 @@ class JointBank(EstimatorBank):
         if not super().receive_gate(gate):
             return False
         for m, i, key in self._places.of(gate):
-            with suppress(DecodeError):
+            try:
                 message = messages.decode(key, gate.payload(m))
-                self.receive(i, keys.SIGHTINGS, message, message.t_ns * 1e-9)
+            except DecodeError:
+                continue
+            self.receive(i, keys.SIGHTINGS, message, message.t_ns * 1e-9)
         return True
 
     def _sighting_places(self, gate: GateMessages) -> list[tuple[int, int, str]]:
@@ -110,14 +117,18 @@ class JointBank(EstimatorBank):
         self._used = dict.fromkeys((i, camera, t_ns) for i, camera, t_ns in state["pictures"])
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        sighted, self._sighted = self._sighted, {}
-        self._used |= dict.fromkeys(sighted)
-        while len(self._used) > PICTURES_KEPT:
-            del self._used[next(iter(self._used))]
-        rows = sorted(row for _, of_picture in sighted.values() for row in of_picture)
-        sightings = np.array(rows, dtype=float).reshape(-1, SIGHTING.size)
+        sightings = self._taken() if self._sighted else NO_SIGHTINGS
         step_jointly(self.rows, t_s, readings, sightings, self._hat_B, self._estimates)
         return self._estimates
+
+    def _taken(self) -> NDArray[np.float64]:
+        """Return what is in the pictures of this gate, (M, SIGHTING.size), and forget it."""
+        rows = sorted(row for _, of_picture in self._sighted.values() for row in of_picture)
+        self._used |= dict.fromkeys(self._sighted)
+        while len(self._used) > PICTURES_KEPT:
+            del self._used[next(iter(self._used))]
+        self._sighted, self._hats = {}, 0
+        return np.array(rows) if rows else NO_SIGHTINGS
 
 
 @portable
