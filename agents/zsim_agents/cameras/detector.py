@@ -1,9 +1,9 @@
 """Finds magenta hats in a picture, from zsim or from a real camera: bearing and range of each, and how sure. Pure.
 
 How magenta a pixel is is a number that is linear where a hat mixes with grass, sky or hull, and nothing for orange:
-the share of a pixel that a hat covers is that number over the hat's own. Its direction is the middle of what it
-covers on the sphere of directions, its range follows from how much that is: a ball of radius r at a distance d covers
-2 pi (1 - cos a) with sin a = r / d, wherever in the picture it is.
+the share of a pixel that a hat covers is that number over the hat's own. Direction and range follow from the circle of
+its outline, of which rotors may hide a part: a ball of radius r at a distance d has an apparent radius a with
+sin a = r / d, wherever in the picture it is.
 """
 
 import math
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.camera_messages import Seen
 from zsim.sensors.camera_model import CameraPose, Lens
+from zsim_agents.cameras.hat_outline import WHOLE_CENTRE, Outline, outline
 from zsim_agents.cameras.rendering.view import View
 
 Picture = NDArray[np.uint8]
@@ -33,13 +34,12 @@ CORE_MIN_PX = 12  # of pixels that a hat covers wholly; with fewer its own colou
 BLUR_PX2 = 1.1  # px^2, variance of what lens, pixel, JPEG and a mean of nine make of a point; calibrated
 ROUND_MIN = 0.3  # of the smaller variance over the larger; less is no ball
 PIECE_GAP = 0.3  # of a ball's size, between two pieces of it; a guard before it is 0.2 wide
-LOST = 1.026  # of a covered area over what is measured of it: noise and shade are cut at the full share; calibrated
-ROUND = 0.92  # of one that nothing hides and no motion blurs; rounder ones are as good
-DIRECTION_PX = 0.075, 0.002  # standard deviation of a centre [px] of a small one, and per diameter; calibrated
-DIAMETER_PX = 0.12, 0.006, 0.8  # of a diameter [px]: at least, per diameter, and per 1/diameter; calibrated
+SHARE_OF_EDGE_MIN = 0.3  # visible; of less the circle is not known
 DIAMETER_MIN_PX = 4.0  # px; the range of smaller ones errs to one side, by more than its sigma says
-WHOLE = 0.93  # of the area of what is magenta over that of its convex hull, of one that nothing crosses
-OVAL = 0.25, 0.5  # of a diameter, per lack of roundness: of centre and diameter; calibrated
+# Standard deviations, calibrated: px per px by which edge points are off, and px^2 over the diameter. Of a centre the
+# second counts as far as a part is hidden, and px^3 over the diameter's square are added; of a diameter, px are.
+CENTRE = 1.9, 5.0, 6.0
+DIAMETER = 1.75, 4.4, 0.1
 
 _x = np.linspace(1e-3, 60, 6000)
 _PEAK = (1 - np.exp(-_x)) / _x  # of a blurred disc's middle over its own colour, times 1 / x, by x = r^2 / 2 s^2
@@ -68,13 +68,18 @@ class Box(NamedTuple):
 
 
 class Blob(NamedTuple):
-    """A hat in the picture: the sum of what it covers times rays (3,), solid angle [sr], and its figures in pixels."""
+    """A hat in the picture: its circle, its size [px], and pixels per radian there."""
 
-    ray_sum: Array
-    solid_angle_sr: float
-    sigma_centre_px: float
-    sigma_diameter_px: float
+    circle: Outline
     diameter_px: float
+    scale: float
+
+    def sigmas_px(self) -> tuple[float, float]:
+        """Return the standard deviations of the centre, per axis, and of the diameter."""
+        circle, size, rough = self.circle, self.diameter_px, self.circle.rough_px
+        hidden = max(0.0, circle.centre - WHOLE_CENTRE)
+        centre = math.hypot(CENTRE[0] * circle.centre * rough, CENTRE[1] * hidden / size, CENTRE[2] / size**2)
+        return centre, math.hypot(2 * circle.radius * math.hypot(DIAMETER[0] * rough, DIAMETER[1] / size), DIAMETER[2])
 
 
 class HatDetector:
@@ -89,8 +94,6 @@ class HatDetector:
     def __init__(self, lens: Lens, pose: CameraPose, diameter_m: float) -> None:
         self._lens, self._R_BK, self._radius_m = lens, pose.R_BK, diameter_m / 2
         self._rays = View(lens).rays
-        along = np.gradient(self._rays, axis=1), np.gradient(self._rays, axis=0)
-        self._solid = np.linalg.norm(np.cross(*along), axis=-1).astype(np.float32)  # sr, of each pixel
         self._half = max(1, lens.width // 2), max(1, lens.height // 2)
 
     def seen(self, picture: Picture) -> tuple[Seen, ...]:
@@ -126,20 +129,22 @@ class HatDetector:
             return None  # a part of a hat tells neither bearing nor range
         part = slice(max(v0, 0), v1), slice(max(u0, 0), u1)
         level = magenta(picture[part])
-        frame = np.concatenate([level[0], level[-1], level[1:-1, 0], level[1:-1, -1]])
-        behind = float(np.median(frame))
-        noise = 1.48 * float(np.median(np.abs(frame - behind)))  # of a normal distribution
+        sides = level[0], level[-1], level[1:-1, 0], level[1:-1, -1]
+        behind = float(np.median(np.concatenate(sides)))
+        noise = min(_deviation(side) for side in sides)  # of those that no hull crosses
         level -= np.float32(behind)
-        return _measured(level, noise, self._rays[part], self._solid[part], self._lens.fx)
+        return _outlined(level, noise, self._rays[part], self._lens.fx)
 
     def _sighting(self, blob: Blob) -> Seen:
-        direction_K = blob.ray_sum / np.linalg.norm(blob.ray_sum)
-        cosine = 1 - blob.solid_angle_sr / (2 * math.pi)
-        range_m = self._radius_m / math.sqrt(max(1 - cosine * cosine, 1e-12))
-        per_px = float(direction_K[2]) / self._lens.fx  # rad; between those across and along the way to the middle
-        x, y, z = (self._R_BK @ direction_K).tolist()
-        sigma_range_m = range_m * blob.sigma_diameter_px / blob.diameter_px
-        return Seen((x, y, z), range_m, blob.sigma_centre_px * per_px, sigma_range_m)
+        centre_px, diameter_px = blob.sigmas_px()
+        range_m = self._radius_m / math.sin(blob.circle.radius_rad)
+        x, y, z = (self._R_BK @ blob.circle.ray).tolist()
+        return Seen((x, y, z), range_m, centre_px / blob.scale, range_m * diameter_px / blob.diameter_px)
+
+
+def _deviation(values: Field) -> float:
+    """Return the standard deviation of normally distributed values, of which some are not."""
+    return 1.48 * float(np.median(np.abs(values - np.median(values))))
 
 
 def joined(boxes: list[Box]) -> list[Box]:
@@ -163,40 +168,26 @@ def magenta(picture: Picture) -> Field:
     return np.where(level > 0, np.maximum(level - lack, 0), level)
 
 
-def _measured(level: Field, noise: float, rays: Field, solid: Field, focal_px: float) -> Blob | None:
+def _outlined(level: Field, noise: float, rays: Field, focal_px: float) -> Blob | None:
     """Return the hat of which each pixel has a level over what is behind it, (h, w)."""
     mean = cv2.blur(level, (3, 3), borderType=cv2.BORDER_REPLICATE)
     v, u = divmod(int(np.argmax(mean)), level.shape[1])
     peak = float(mean[v, u])
     if peak < max(LEVEL_MIN / 2, 2 * noise / 3):  # the mean of nine has a third of the noise
         return None
+    cosine = float(rays[v, u, 2])
     core = (level > CORE * peak).astype(np.uint8)
     near = cv2.dilate(core, SQUARE_5).astype(np.uint8)
     covered = _shares(level, core, near, peak)
-    weights = (covered * solid).astype(np.float64)
-    solid_angle = LOST * float(weights.sum())
-    area = float(covered.sum())
-    if not 0 < solid_angle < math.pi or area < 1:
+    oblique = cosine * cosine  # variance of a round one in the plane of the picture: cos^2 off the axis
+    if _roundness(covered) / oblique < ROUND_MIN:
         return None
-    oblique = float(rays[v, u, 2]) ** 2  # variance of a round one in the plane of the picture: cos^2 off the axis
-    roundness = min(1.0, _roundness(covered, area) / oblique)
-    if roundness < ROUND_MIN:
+    scale = focal_px / (cosine * math.sqrt(cosine))  # between those along and across the way to the middle
+    circle = outline(covered, noise / peak, rays, scale)
+    if not circle.share >= SHARE_OF_EDGE_MIN:
         return None
-    lack = max(0.0, ROUND - roundness) + max(0.0, WHOLE - _wholeness(core))
-    diameter = 2 * math.sqrt(area / math.pi)
-    if diameter < DIAMETER_MIN_PX:
-        return None
-    count = float(near.sum())
-    of_noise = noise * math.sqrt(count) / (peak * area)  # of the covered area, relative
-    ray_sum = np.tensordot(weights, rays, axes=((0, 1), (0, 1)))
-    centre_px = math.hypot(
-        DIRECTION_PX[0], DIRECTION_PX[1] * diameter, of_noise * math.sqrt(count / 6), OVAL[0] * lack * diameter
-    )
-    floor, share, small = DIAMETER_PX
-    diameter_px = math.hypot(
-        floor, share * diameter, small / diameter, of_noise * diameter / 2, OVAL[1] * lack * diameter
-    )
-    return Blob(ray_sum, solid_angle, centre_px, diameter_px, diameter)
+    diameter_px = 2 * circle.radius_rad * scale
+    return Blob(circle, diameter_px, scale) if diameter_px >= DIAMETER_MIN_PX else None
 
 
 SQUARE_3, SQUARE_5 = (np.ones((side, side), np.uint8) for side in (3, 5))
@@ -219,16 +210,12 @@ def _shares(level: Field, core: Picture, near: Picture, peak: float) -> Field:
     return np.clip(level / own, 0, 1) * near
 
 
-def _roundness(covered: Field, area: float) -> float:
-    """Return the smaller variance of what is covered over the larger."""
+def _roundness(covered: Field) -> float:
+    """Return the smaller variance of what is covered over the larger; 0 for nothing."""
     moments = cv2.moments(covered)
+    area = moments["m00"]
+    if area < 1:
+        return 0.0
     uu, vv, uv = moments["mu20"] / area, moments["mu02"] / area, moments["mu11"] / area
     middle, half = (uu + vv) / 2, math.hypot((uu - vv) / 2, uv)
     return (middle - half) / max(middle + half, 1e-9)
-
-
-def _wholeness(core: Picture) -> float:
-    """Return the area of a blob over that of its convex hull."""
-    hull = cv2.convexHull(cv2.findNonZero(core))
-    area = cv2.contourArea(hull) + cv2.arcLength(hull, True) / 2 + 1  # through the middles of the outermost pixels
-    return float(core.sum()) / area
