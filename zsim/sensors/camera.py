@@ -63,11 +63,11 @@ class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
     latency_ms: LatencyMs = 0.0
     """Of the detector, after the camera's."""
-    centre_px: NonNegative = 0.07  # px, fitted to the detector on rendered pictures, as the next three
+    centre_px: NonNegative = 0.035  # px, fitted to the detector on rendered pictures, as the next three
     """Error of a large hat's centre, standard deviation per axis."""
-    diameter_px: NonNegative = 0.17
+    diameter_px: NonNegative = 0.11
     """Error of its apparent diameter, standard deviation."""
-    noise_px2: NonNegative = 0.45
+    noise_px2: NonNegative = 0.65
     """Over the apparent diameter, added to both in quadrature; that of a clear day, more in low light."""
     blur_share: NonNegative = 0.018
     """Of the way that a hat moves over the picture during the exposure, added to both in quadrature."""

@@ -38,8 +38,8 @@ SHARE_OF_EDGE_MIN = 0.3  # visible; of less the circle is not known
 DIAMETER_MIN_PX = 4.0  # px; the range of smaller ones errs to one side, by more than its sigma says
 # Standard deviations, calibrated: px per px by which edge points are off, and px^2 over the diameter. Of a centre the
 # second counts as far as a part is hidden, and px^3 over the diameter's square are added; of a diameter, px are.
-CENTRE = 1.9, 5.0, 6.0
-DIAMETER = 1.75, 4.4, 0.1
+CENTRE = 2.0, 6.5, 8.0
+DIAMETER = 2.0, 4.6, 0.1
 
 _x = np.linspace(1e-3, 60, 6000)
 _PEAK = (1 - np.exp(-_x)) / _x  # of a blurred disc's middle over its own colour, times 1 / x, by x = r^2 / 2 s^2

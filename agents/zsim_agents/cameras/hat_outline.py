@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math.circle import spread
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import portable
 from zsim.math.rotation import Vector, add, cross, dot, norm, scaled
@@ -211,14 +212,13 @@ def _choose(points: NDArray, noise: float) -> bool:
 @portable
 def _spread(points: NDArray, x: float, y: float, r: float) -> tuple[float, float, float]:
     """Return the standard deviations of centre and radius over that of an edge point, and the roughness [px]."""
-    C, rough = np.zeros((3, 3)), 0.0
+    n, sx, sy, sxx, sxy, syy, rough = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(points)):
         if points[k, EDGE_POINT.on] != 0.0:
-            row = (points[k, 0] - x) / r, (points[k, 1] - y) / r, 1.0
-            rough += (math.hypot(points[k, 0] - x, points[k, 1] - y) - r) ** 2
-            for i in range(3):
-                for j in range(3):
-                    C[i, j] += row[i] * row[j]
-    V = np.linalg.inv(C + SINGULAR * np.eye(3))
-    count = points[:, EDGE_POINT.on].sum()
-    return math.sqrt((V[0, 0] + V[1, 1]) / 2.0), math.sqrt(V[2, 2]), math.sqrt(rough / count)
+            dx, dy = points[k, EDGE_POINT.x] - x, points[k, EDGE_POINT.y] - y
+            rough += (math.hypot(dx, dy) - r) ** 2
+            dx, dy = dx / r, dy / r
+            n, sx, sy = n + 1.0, sx + dx, sy + dy
+            sxx, sxy, syy = sxx + dx * dx, sxy + dx * dy, syy + dy * dy
+    centre, radius = spread(n, sx, sy, sxx, sxy, syy)
+    return centre, radius, math.sqrt(rough / n)

@@ -1,8 +1,8 @@
 """Which hats a camera has in view, and where: of true poses, without pictures. Compiled, without time or chance.
 
-A hat is a ball. It is in view where all of it falls on the picture, no obstacle stands before its centre, and no hull,
-a flat body of revolution about its drone's z axis, hides most of it: a detector takes what is left for the ball. From
-below it is the rim of the drone's own rotors that hides it from its lower edge on.
+A hat is a ball. It is in view where all of it falls on the picture and enough of its edge is visible: a detector knows
+its circle from that, the better the more it is. What hides are obstacles, hulls, flat bodies of revolution about their
+drones' z axis, and from below the rim of the drone's own rotors.
 """
 
 import math
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math.circle import spread
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined, kernel
 from zsim.math.interpolation import attitude_between, position_between
@@ -27,8 +28,9 @@ VIEW = columns(  # of a hat in a camera
     (
         Field("seen", "1"),  # 0 or 1
         Field("direction_K", "1", 3),  # unit vector to its centre
-        Field("share", "1"),  # of its disc that no hull hides
-        Field("shift_K", "1", 3),  # from its centre to the middle of that share, over the distance
+        Field("share", "1"),  # of its edge, that is visible
+        Field("centre", "1"),  # errors of the centre of a circle through what is visible, over those of a whole one
+        Field("radius", "1"),  # likewise of its radius
         Field("range", "m"),
         Field("angle", "rad"),  # its apparent diameter
         Field("scale", "px/rad"),  # of the picture where it is
@@ -41,9 +43,10 @@ CAMERA = columns(  # as mounted on a drone
 AHEAD_MIN = 0.05  # cosine to the axis; flatter rays never fall on a picture of 150 deg
 HULL_FLATNESS = 0.25  # height over width of a hull, the AR.Drone's rounded: 0.13 m of 0.52 m
 RIM_WIDE, RIM_HIGH = 1.15, 0.14  # radius and height of the rotors' rim, in radii of a hull; fitted to pictures
-POINTS = 32  # of a disc that are looked at
-GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))  # between two of them, Vogel's spiral: all at other heights
-SHARE_MIN = 0.4  # of a disc; with less in view a hat is not round enough for a ball
+POINTS = 32  # of its edge, that are looked at
+COSINES, SINES = (np.array([f(2.0 * math.pi * k / POINTS) for k in range(POINTS)]) for f in (math.cos, math.sin))
+LEVEL_COSINE = 0.9  # of a ray that is not nearly upright
+SHARE_MIN = 0.3  # of its edge; of a ball with less in view a detector does not know the circle
 SURFACE_M = 0.01  # m, nearer than which a ray has met an obstacle
 EDGE_PX = 3.0  # px, nearer than which to the picture's edge a detector takes a hat for cut; the blur of its rim
 STEPS_MAX = 64  # along a ray; each goes as far as the nearest surface
@@ -123,18 +126,45 @@ def _hull_hides(eye: Vector, ray: Vector, far: float, p_WB: Vector, q_WB: Quater
 
 
 @inlined
-def _obstacle_hides(eye: Vector, ray: Vector, far: float, row: NDArray) -> bool:
-    """Tell whether an obstacle stands on a ray nearer than `far` [m]: a walk along it by the distance that is free."""
+def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius: float) -> bool:
+    """Tell whether a ray to a drone's own hat comes up through the disc of its rotors."""
+    o, d = rotate_back(q_WB, subtract(eye, p_WB)), rotate_back(q_WB, ray)
+    rise = RIM_HIGH * radius - o[2]
+    if rise <= 0.0 or d[2] <= 0.0:
+        return False
+    x, y = o[0] + rise / d[2] * d[0], o[1] + rise / d[2] * d[1]
+    return x * x + y * y < RIM_WIDE * RIM_WIDE * radius * radius
+
+
+@inlined
+def _obstacle_hides(eye: Vector, ray: Vector, far: float, clearance: float, row: NDArray) -> bool:
+    """Tell whether a ray comes nearer to an obstacle than a clearance [m] before `far` [m], by steps that are free."""
     at = 0.0
     for _ in range(STEPS_MAX):
         p = axpy(eye, at, ray)
-        free = nearest(row, p[0], p[1], p[2])[0]
-        if free < SURFACE_M:
+        free = nearest(row, p[0], p[1], p[2])[0] - clearance
+        if free < 0.0:
             return True
-        at += free
+        at += max(free, SURFACE_M)
         if at >= far:
             return False
     return False
+
+
+@inlined
+def _drone_hides(eye: Vector, ray: Vector, away: float, i: int, m: int, pose: NDArray, radius: float) -> bool:
+    """Tell whether drone i stands on a ray to a ball, that of drone m or of none."""
+    p, q = _three(pose, POSE.p_WB), _four(pose, POSE.q_WB)
+    return _rim_hides(eye, ray, p, q, radius) if i == m else _hull_hides(eye, ray, away, p, q, radius)
+
+
+@inlined
+def _passes(eye: Vector, ray: Vector, away: float, p: Vector, radius: float) -> bool:
+    """Tell whether a sphere is beside or beyond all rays to a ball."""
+    to = subtract(p, eye)
+    along = min(max(dot(to, ray), 0.0), away)
+    off = axpy(to, -along, ray)
+    return dot(off, off) > radius * radius
 
 
 @inlined
@@ -155,50 +185,57 @@ def _in_picture(lens: Lens, to_K: Vector, angle: float) -> bool:
 
 
 @inlined
-def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius: float) -> bool:
-    """Tell whether a ray to a drone's own hat comes up through the disc of its rotors."""
-    o, d = rotate_back(q_WB, subtract(eye, p_WB)), rotate_back(q_WB, ray)
-    rise = RIM_HIGH * radius - o[2]
-    if rise <= 0.0 or d[2] <= 0.0:
-        return False
-    x, y = o[0] + rise / d[2] * d[0], o[1] + rise / d[2] * d[1]
-    return x * x + y * y < RIM_WIDE * RIM_WIDE * radius * radius
-
-
-@inlined
-def _hulls_hide(eye: Vector, ray: Vector, away: float, own: int, m: int, poses: NDArray, hulls: NDArray) -> bool:
-    """Tell whether a hull stands on a ray to a ball, that of drone m or of none."""
-    for i in range(poses.shape[0]):
-        if i == own:
-            continue
-        p, q = _three(poses[i], POSE.p_WB), _four(poses[i], POSE.q_WB)
-        if (i == m and _rim_hides(eye, ray, p, q, hulls[i])) or (
-            i != m and _hull_hides(eye, ray, away, p, q, hulls[i])
-        ):
-            return True
-    return False
-
-
-@inlined
-def _write_share(
-    eye: Vector, ray: Vector, away: float, radius: float, own: int, m: int, poses: NDArray, hulls: NDArray, row: NDArray
-) -> None:
-    """Write which share of a ball's disc no hull hides, and how far its middle is from the ball's."""
-    e1 = (ray[1], -ray[0], 0.0) if abs(ray[2]) < 0.9 else (0.0, ray[2], -ray[1])
+def _hidden(
+    eye: Vector,
+    ray: Vector,
+    away: float,
+    ball: float,
+    own: int,
+    m: int,
+    poses: NDArray,
+    hulls: NDArray,
+    obstacles: NDArray,
+) -> int:
+    """Return which points of a ball's edge are hidden, one bit each."""
+    e1 = (ray[1], -ray[0], 0.0) if abs(ray[2]) < LEVEL_COSINE else (0.0, ray[2], -ray[1])
     e1 = scaled(e1, 1.0 / norm(e1))
     e2 = cross(ray, e1)
-    hidden, sum1, sum2 = 0, 0.0, 0.0
+    hidden = 0
+    for i in range(poses.shape[0] + obstacles.shape[0]):
+        k = i - poses.shape[0]
+        if k < 0 and (i == own or (_passes(eye, ray, away, _three(poses[i], POSE.p_WB), RIM_WIDE * hulls[i] + ball))):
+            continue
+        if k >= 0 and not _obstacle_hides(eye, ray, away, ball, obstacles[k]):
+            continue
+        for point in range(POINTS):
+            a, b = ball / away * COSINES[point], ball / away * SINES[point]
+            to = axpy(axpy(ray, a, e1), b, e2)
+            to = scaled(to, 1.0 / norm(to))
+            if (
+                _drone_hides(eye, to, away, i, m, poses[i], hulls[i])
+                if k < 0
+                else _obstacle_hides(eye, to, away, SURFACE_M, obstacles[k])
+            ):
+                hidden |= 1 << point
+    return hidden
+
+
+@inlined
+def _write_outline(hidden: int, row: NDArray) -> None:
+    """Write what the points of its edge that are visible tell of a ball."""
+    row[VIEW.share], row[VIEW.centre], row[VIEW.radius] = 1.0, 1.0, 1.0
+    if hidden == 0:
+        return
+    around = POINTS - 1  # a detector leaves out the points beside those that are hidden
+    hidden |= hidden << 1 | hidden >> 1 | hidden << around | hidden >> around
+    n, x, y, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(POINTS):
-        r, turn = radius / away * math.sqrt((k + 0.5) / POINTS), k * GOLDEN_RAD
-        a, b = r * math.cos(turn), r * math.sin(turn)
-        to = axpy(axpy(ray, a, e1), b, e2)
-        if _hulls_hide(eye, scaled(to, 1.0 / norm(to)), away, own, m, poses, hulls):
-            hidden, sum1, sum2 = hidden + 1, sum1 + a, sum2 + b
-    left = max(POINTS - hidden, 1)
-    shift = axpy(scaled(e1, -sum1 / left), -sum2 / left, e2)
-    row[VIEW.share] = (POINTS - hidden) / POINTS
-    for k in range(3):
-        row[VIEW.shift_K + k] = shift[k]
+        if not hidden >> k & 1:
+            a, b = COSINES[k], SINES[k]
+            n, x, y, xx, xy, yy = n + 1.0, x + a, y + b, xx + a * a, xy + a * b, yy + b * b
+    centre, radius = spread(n, x, y, xx, xy, yy)
+    row[VIEW.share] = n / POINTS
+    row[VIEW.centre], row[VIEW.radius] = centre * math.sqrt(POINTS / 2), radius * math.sqrt(POINTS)
 
 
 @kernel()
@@ -254,19 +291,14 @@ def hats_in_view(
         if not _in_picture(camera.lens, to_K, angle):
             continue
         ray = scaled(to_W, 1.0 / away)
-        _write_share(eye, ray, away, 0.5 * diameter, own, m, poses, hulls, view[m])
-        hidden = view[m, VIEW.share] < SHARE_MIN
-        for k in range(obstacles.shape[0]):
-            hidden = hidden or _obstacle_hides(eye, ray, away, obstacles[k])
-        if hidden:
+        _write_outline(_hidden(eye, ray, away, 0.5 * diameter, own, m, poses, hulls, obstacles), view[m])
+        if view[m, VIEW.share] < SHARE_MIN:
             continue
         across = axpy(subtract(velocity, v_eye), -dot(subtract(velocity, v_eye), ray), ray)
         moves = subtract(scaled(across, 1.0 / away), cross(w_W, ray))
         view[m, VIEW.seen] = 1.0
-        shift_K = rotate_back(camera.q_BK, rotate_back(q_WB, _three(view[m], VIEW.shift_K)))
         for k in range(3):
             view[m, VIEW.direction_K + k] = to_K[k] / away
-            view[m, VIEW.shift_K + k] = shift_K[k]
         view[m, VIEW.range] = away
         view[m, VIEW.angle] = angle
         view[m, VIEW.scale] = _scale(camera.lens, to_K[2] / away)

@@ -43,9 +43,9 @@ SEEN = columns(  # a sighting
         Field("sigma_range", "m"),
     ),
 )
-HIDDEN_CENTRE, HIDDEN_RANGE = 0.5, 1.2  # of diameter and range, per what hulls hide: sigmas of a detector; measured
 DRAWS = 4  # normal numbers for each hat of a picture: two for its centre, one for its diameter, one for a miss
 FALSE_DRAWS = 4  # likewise for a false alarm: whether, where (2), how large
+DIAMETER_NOISE, DIAMETER_BLUR = 1.4, 2.8  # what noise and blur make of a diameter over that of a centre; measured
 SMALLEST = 0.1  # of a hat's apparent diameter, the least that is measured
 
 
@@ -59,9 +59,11 @@ def _unit(normal: float) -> float:
 def _sigmas_px(model: NDArray, row: NDArray) -> tuple[float, float]:
     """Return the standard deviations of a hat's centre and apparent diameter."""
     scale = row[VIEW.scale]
+    noise = model[DETECTOR.noise] / (row[VIEW.angle] * scale)
     blur = model[DETECTOR.blur_share] * row[VIEW.rate] * model[DETECTOR.exposure] * scale
-    extra = math.hypot(model[DETECTOR.noise] / (row[VIEW.angle] * scale), blur)
-    return math.hypot(model[DETECTOR.centre], extra), math.hypot(model[DETECTOR.diameter], extra)
+    centre = row[VIEW.centre] * math.hypot(noise, blur)
+    diameter = row[VIEW.radius] * math.hypot(DIAMETER_NOISE * noise, DIAMETER_BLUR * blur)
+    return math.hypot(model[DETECTOR.centre], centre), math.hypot(model[DETECTOR.diameter], diameter)
 
 
 @inlined
@@ -85,19 +87,18 @@ def _range_m(model: NDArray, angle: float) -> float:
 def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
     """Write what is seen of a hat in view; False if it is missed by chance, or measured as too small."""
     centre_px, diameter_px = _sigmas_px(model, row)
-    scale, angle, left = row[VIEW.scale], row[VIEW.angle], math.sqrt(row[VIEW.share])
-    measured = left * angle + diameter_px / scale * noise[2]
+    scale, angle = row[VIEW.scale], row[VIEW.angle]
+    measured = angle + diameter_px / scale * noise[2]
     if measured * scale < model[DETECTOR.diameter_min] or _unit(noise[3]) < model[DETECTOR.miss]:
         return False
     measured = max(measured, SMALLEST * angle)
-    x, y = row[VIEW.direction_K] + row[VIEW.shift_K], row[VIEW.direction_K + 1] + row[VIEW.shift_K + 1]
-    z = row[VIEW.direction_K + 2] + row[VIEW.shift_K + 2]
+    x, y, z = row[VIEW.direction_K], row[VIEW.direction_K + 1], row[VIEW.direction_K + 2]
     across = math.hypot(x, z)
     a, b = centre_px / scale * noise[0], centre_px / scale * noise[1]
     to_K = (x + a * z / across - b * x * y / across, y + b * across, z - a * x / across - b * y * z / across)
-    sigma = math.hypot(centre_px / scale, math.hypot(model[DETECTOR.misaligned], HIDDEN_CENTRE * (1.0 - left) * angle))
     range_m = _range_m(model, measured)
-    sigma_m = range_m * math.hypot(diameter_px / (scale * measured), HIDDEN_RANGE * (1.0 - left))
+    sigma = math.hypot(centre_px / scale, model[DETECTOR.misaligned])
+    sigma_m = range_m * diameter_px / (scale * measured)
     _put(model, to_K, range_m, sigma, sigma_m, out)
     return True
 
