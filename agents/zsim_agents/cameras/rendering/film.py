@@ -76,7 +76,8 @@ def lens_blur(picture: Picture, sigma_px: float) -> None:
     if sigma_px < 0.2:
         return  # less than a pixel's own width
     side = 3 if sigma_px <= 0.7 else 2 * math.ceil(2.5 * sigma_px) + 1
-    cv2.GaussianBlur(picture, (side, side), sigma_px, dst=picture, borderType=cv2.BORDER_REPLICATE)
+    kernel = cv2.getGaussianKernel(side, sigma_px)
+    cv2.sepFilter2D(picture, -1, kernel, kernel, dst=picture, borderType=cv2.BORDER_REPLICATE)
 
 
 def jpeg(picture: Picture, quality: int) -> bytes:
