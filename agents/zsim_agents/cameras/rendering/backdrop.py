@@ -146,6 +146,12 @@ class Backdrop:
                 self._lay(self._ground.levels[i], to_ground, down, limits[i + 1], limits[i])
         return self.grey
 
+    def ground_rows(self, motion: CameraMotion, room: int) -> slice:
+        """Return the rows that have ground, and so many on either side of them."""
+        down = (-motion.R_WK[2] @ self._K_inv).tolist()
+        first, end = _rows(half_plane(self._size, down, 0.0), self._size) or (0, 0)
+        return slice(max(0, first - room), min(self._size[1], end + room)) if first < end else slice(0, 0)
+
     def _reach(self, level: Level, height_m: float) -> float:
         """Return how far a level is drawn [m]: a pixel is s^2 / (f h) deep on the ground at a distance s."""
         return min(math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m), 0.7 * level.reach_m)

@@ -22,7 +22,7 @@ from zsim_agents.cameras.rendering.view import CameraMotion, View, camera_motion
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
-SWEPT_PX = 0.8  # px, from which on ground and sky are blurred by the motion
+SWEPT_PX = 0.8  # px, from which on the ground is blurred by the motion
 WIDER_MAX = 2.0  # of the pinhole picture that a lens bends, over its own; rays beyond it repeat the edge
 
 
@@ -76,7 +76,8 @@ class Renderer:
             bodies: all drones then, in the scene's order.
         """
         motion = camera_motion(self._pose, bodies, self._carrier)
-        grey = self._swept(self._backdrop.draw(motion), motion)
+        grey = self._backdrop.draw(motion)
+        self._sweep(grey, motion)
         if self._bend is not None:
             grey = cv2.remap(grey, *self._bend, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         picture: Picture = cv2.applyColorMap(grey, self._colours)  # type: ignore[assignment]
@@ -92,15 +93,21 @@ class Renderer:
         """Return the picture of an exposure as JPEG; see `picture`."""
         return film.jpeg(self.picture(number, t_s, bodies), self._camera.jpeg_quality)
 
-    def _swept(self, grey: Picture, motion: CameraMotion) -> Picture:
-        """Return ground and sky blurred by the motion of the middle of the picture's lower half over the exposure."""
+    def _sweep(self, grey: Picture, motion: CameraMotion) -> None:
+        """Blur the ground by the motion of the middle of the picture's lower half over the exposure.
+
+        The sky is smooth: its rows are left out, but for those that the horizon is blurred into.
+        """
         ray_K = np.array([0.0, self._view.lens.height / 4 / self._view.lens.fy, 1.0])
         down = -float(motion.R_WK[2] @ ray_K)
         point_K = ray_K * (max(float(motion.p_WK[2]), 0.1) / down if down > 1e-3 else SEEN_M)
         way_px = self._view.flow_px(point_K, motion.rates_K(point_K, np.zeros(3))) * self._exposure_s
         if np.hypot(*way_px) < SWEPT_PX:
-            return grey
-        return cv2.filter2D(grey, -1, film.sweep_kernel(way_px), borderType=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
+            return
+        kernel = film.sweep_kernels(way_px[None])[0]
+        part = grey[self._backdrop.ground_rows(motion, len(kernel))]
+        if len(part):
+            cv2.filter2D(part, -1, kernel, dst=part, borderType=cv2.BORDER_REPLICATE)
 
     def _order(self, motion: CameraMotion, images: DroneImages) -> list[Drawable]:
         """Return what may be in view, in any order."""
