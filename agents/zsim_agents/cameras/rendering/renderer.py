@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math.frames import rotation_matrix
 from zsim.scenario.obstacle import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
 from zsim_agents.cameras.rendering import film
 from zsim_agents.cameras.rendering.backdrop import Backdrop, Ground, colour_map, field
-from zsim_agents.cameras.rendering.balls import draw_ball
-from zsim_agents.cameras.rendering.drone_images import SEEN_M, DroneImager, DroneImages, balls
+from zsim_agents.cameras.rendering.drone_images import SEEN_M, DroneImager, DroneImages, hat_images
 from zsim_agents.cameras.rendering.drones import draw_drone
 from zsim_agents.cameras.rendering.faces import draw_obstacle
 from zsim_agents.cameras.rendering.scene import SUN_W, DroneStates, Scene
@@ -75,13 +75,14 @@ class Renderer:
             t_s: the middle of the exposure [s].
             bodies: all drones then, in the scene's order.
         """
-        motion = camera_motion(self._pose, bodies, self._carrier)
+        R_WB = rotation_matrix(bodies.q_WB)
+        motion = camera_motion(self._pose, bodies, R_WB[self._carrier], self._carrier)
         grey = self._backdrop.draw(motion)
         self._sweep(grey, motion)
         if self._bend is not None:
             grey = cv2.remap(grey, *self._bend, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         picture: Picture = cv2.applyColorMap(grey, self._colours)  # type: ignore[assignment]
-        images = self._imager.images(motion, t_s, bodies)
+        images = self._imager.images(motion, t_s, bodies, R_WB)
         for seen in sorted(self._order(motion, images), reverse=True):
             self._draw(picture, seen, motion, images)
         film.lens_blur(picture, self._camera.blur_px)
@@ -124,25 +125,26 @@ class Renderer:
         elif seen.kind == "hat":
             self._false_hat(picture, np.array([self._scene.hats.false_m[seen.which]]), motion)
         else:
-            self._drone(picture, seen.which, SUN_W @ motion.R_WK, images)
+            self._drone(picture, seen.which, images)
 
     def _false_hat(self, picture: Picture, place_W: Array, motion: CameraMotion) -> None:
         centre_K = motion.points_K(place_W)
         if centre_K[0, 2] > 0:
             way_K = motion.rates_K(centre_K, np.zeros(3)) * self._exposure_s
-            for ball in balls(self._view, centre_K, way_K, self._scene.hats.diameter_m / 2, self._brightness):
-                draw_ball(picture, self._view, ball, SUN_W @ motion.R_WK)
+            radius_m, sun_K = self._scene.hats.diameter_m / 2, SUN_W @ motion.R_WK
+            for image in hat_images(self._view, centre_K, way_K, radius_m, self._brightness, sun_K).values():
+                image.lay(picture)
 
-    def _drone(self, picture: Picture, i: int, sun_K: Array, images: DroneImages) -> None:
+    def _drone(self, picture: Picture, i: int, images: DroneImages) -> None:
         """Draw a drone and its hat: which of them is before the other depends on where the camera is."""
         image, hat, hats = images.drones.get(i), images.hats.get(i), self._scene.hats
         above = images.cameras_B[i, 2] > hats.position_m[2] - hats.diameter_m / 2
         if hat is not None and not above:
-            draw_ball(picture, self._view, hat, sun_K)
+            hat.lay(picture)
         if image is not None:
-            draw_drone(picture, self._view, image)
+            draw_drone(picture, image)
         if hat is not None and above:
-            draw_ball(picture, self._view, hat, sun_K)
+            hat.lay(picture)
 
 
 def _distance(row: tuple[float, ...], p_WK: Array) -> float:
