@@ -142,7 +142,7 @@ class DroneImage(NamedTuple):
 
 
 def draw_drone(picture: Picture, drone: DroneImage) -> None:
-    """Draw a drone but its hat."""
+    """Draw a drone but its hat; if it moves, its light and what it covers are blurred apart from what is behind."""
     u0, v0, u1, v1 = drone.box
     part = picture[v0:v1, u0:u1]
     pixels = drone.pixels - np.array([u0, v0], np.int32) * (1 << SHIFT)
