@@ -5,6 +5,7 @@ in levels that each average several pixels of the one before: far away the coars
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -15,6 +16,7 @@ from zsim_agents.cameras.rendering.view import CameraMotion, View
 
 Grey = NDArray[np.uint8]
 Array = NDArray[np.float64]
+Points = list[tuple[float, float]]
 
 TEXEL_M = 0.02  # m, of the finest level, chosen: a blade of grass is not seen, a line of 6 cm is
 TILE = 1000  # texels of a side: 20 m, so that lines every metre go on over the seam
@@ -25,6 +27,7 @@ HEIGHT_MIN_M = 0.03  # m, of a camera over the ground
 DARKEST, LIGHTEST, HAZE = 0, 150, 176  # greys
 SHADOW = 34  # greys darker, chosen
 ZENITH = 0.6  # sine of the elevation from which on the sky is the bluest; chosen
+SKY_SLOPE = (255 - HAZE) / ZENITH  # greys of the sky for a sine of 1
 COLOURS = {  # B, G, R by grey; chosen: dry grass, white lines, a hazy blue sky
     0: (24, 36, 30),
     60: (52, 104, 92),
@@ -36,11 +39,19 @@ COLOURS = {  # B, G, R by grey; chosen: dry grass, white lines, a hazy blue sky
 
 
 class Level(NamedTuple):
-    """A level of the ground: its window, the size of a texel [m], and how far it is drawn at most [m]."""
+    """A level of the ground.
+
+    Attributes:
+        texels: of its window.
+        texel_m: the size of one [m].
+        reach_m: how far it is drawn at most [m].
+        place: from (x, y, 1) of W [m] to texels, whose whole numbers are their middles, (3, 3).
+    """
 
     texels: Grey
     texel_m: float
     reach_m: float
+    place: Array
 
 
 class Ground:
@@ -61,7 +72,9 @@ class Ground:
         mean = tile.reshape(side, factor, side, factor).mean(axis=(1, 3))
         repeats = max(3, 2 * (window // side // 2) + 1)  # odd: W's origin stays in the middle
         texels = np.tile(np.rint(mean).astype(np.uint8), (repeats, repeats))
-        return Level(texels, texel_m * factor, self.tile_m * (repeats - 1) / 2)
+        scale, middle = 1 / (texel_m * factor), len(texels) / 2 - 0.5  # W's origin is in the middle of the window
+        place = np.array([[scale, 0, middle], [0, -scale, middle], [0, 0, 1.0]])
+        return Level(texels, texel_m * factor, self.tile_m * (repeats - 1) / 2, place)
 
 
 def field(seed: int = 1) -> Ground:
@@ -93,12 +106,6 @@ def colour_map(brightness: float) -> Grey:
     return np.rint(brightness * np.stack(channels, axis=-1)).astype(np.uint8)[:, None, :]
 
 
-RAMP_STEPS = 128  # greys of the sky for a sine of 1
-RAMP_END = 16  # beyond any w of a ray with z = 1 in K, of a lens of 150 deg at most, rolled in any way
-_HEIGHTS = np.arange(-RAMP_END * RAMP_STEPS, RAMP_END * RAMP_STEPS) / (ZENITH * RAMP_STEPS)
-SKY_RAMP = np.tile(np.rint(HAZE + (255 - HAZE) * np.clip(_HEIGHTS, 0, 1)).astype(np.uint8), (4, 1))
-
-
 class Backdrop:
     """Draws ground and sky as a pinhole sees them.
 
@@ -115,7 +122,8 @@ class Backdrop:
         self._K_inv = np.array(
             [[1 / lens.fx, 0, -lens.cx / lens.fx], [0, 1 / lens.fy, -lens.cy / lens.fy], [0, 0, 1.0]]
         )
-        self._corners = np.array([(u, v, 1.0) for u, v in _rectangle(*self._size)])
+        self._columns = np.arange(lens.width, dtype=np.float32)
+        self._row_numbers = np.arange(lens.height, dtype=np.float32)[:, None]
         self.grey: Grey = np.empty((lens.height, lens.width), np.uint8)
         self._scratch = np.empty_like(self.grey)
         self._mask = np.empty_like(self.grey)
@@ -124,60 +132,63 @@ class Backdrop:
         """Return the picture, owned by this object."""
         height_m = max(float(motion.p_WK[2]), HEIGHT_MIN_M)
         to_W = motion.R_WK @ self._K_inv  # a pixel (u, v, 1) to its ray in W
-        down = -to_W[2]  # how far it goes down, of a ray with z = 1 in K
-        at_corners = self._corners @ down
-        reaches = [self._reach(level, height_m) for level in self._ground.levels]
-        least = float(at_corners.min())
-        first = next((i for i, reach in enumerate(reaches) if least >= height_m / reach), None)
+        down = (-to_W[2]).tolist()  # how far it goes down, of a ray with z = 1 in K
+        limits = [math.inf, *(height_m / self._reach(level, height_m) for level in self._ground.levels)]
+        least, most = _extremes(self._size, down)
+        first = next((i for i, limit in enumerate(limits[1:]) if least >= limit), None)
         if first is None:
             self._sky(down)
             self._fill(down, 0.0, self._ground.mean)
-            first = len(reaches) - 1
-        limits = [math.inf, *(height_m / reach for reach in reaches)]  # of `down`, of each level and the one before
-        for i in range(first, -1, -1):
-            if at_corners.max() > limits[i + 1]:
-                self._lay(self._ground.levels[i], to_W, motion.p_WK, height_m, limits[i + 1], limits[i])
+            first = len(self._ground.levels) - 1
+        to_ground = self._to_ground(to_W, motion.p_WK, height_m)
+        for i in range(first, -1, -1):  # limits[i + 1] and limits[i] are of `down`, of a level and the finer one
+            if most > limits[i + 1]:
+                self._lay(self._ground.levels[i], to_ground, down, limits[i + 1], limits[i])
         return self.grey
+
+    def ground_rows(self, motion: CameraMotion, room: int) -> slice:
+        """Return the rows that have ground, and so many on either side of them."""
+        down = (-motion.R_WK[2] @ self._K_inv).tolist()
+        first, end = _rows(half_plane(self._size, down, 0.0), self._size) or (0, 0)
+        return slice(max(0, first - room), min(self._size[1], end + room)) if first < end else slice(0, 0)
 
     def _reach(self, level: Level, height_m: float) -> float:
         """Return how far a level is drawn [m]: a pixel is s^2 / (f h) deep on the ground at a distance s."""
         return min(math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m), 0.7 * level.reach_m)
 
-    def _sky(self, down: Array) -> None:
+    def _sky(self, down: Sequence[float]) -> None:
         """Draw the sky, bluer the higher; only the rows that have some."""
-        rows = _rows(half_plane(self._size, -down, 0.0), self._size)
-        if rows is None:
-            return
-        a, b, c = -down * RAMP_STEPS
-        warp = np.array([[a, b, c + b * rows[0] + RAMP_END * RAMP_STEPS], [0.0, 0.0, 1.0]])
-        flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        out = self.grey[rows[0] : rows[1]]
-        cv2.warpAffine(SKY_RAMP, warp, (out.shape[1], out.shape[0]), out, flags, cv2.BORDER_CONSTANT, 255)
+        a, b, c = (-SKY_SLOPE * each for each in down)
+        rows = _rows(half_plane(self._size, (a, b, c), 0.0), self._size)
+        if rows is not None:
+            upwards = np.float32(b) * self._row_numbers[slice(*rows)] + np.float32(c + HAZE)
+            cv2.convertScaleAbs(upwards + np.float32(a) * self._columns, dst=self.grey[slice(*rows)])
 
-    def _fill(self, down: Array, least: float, grey: int) -> None:
+    def _fill(self, down: Sequence[float], least: float, grey: int) -> None:
         part = half_plane(self._size, down, least)
         if len(part) >= 3:
             cv2.fillConvexPoly(self.grey, _fixed(part), grey, cv2.LINE_AA, SHIFT)
 
-    def _lay(self, level: Level, to_W: Array, p_WK: Array, height_m: float, least: float, most: float) -> None:
+    def _lay(self, level: Level, to_ground: Array, down: Sequence[float], least: float, most: float) -> None:
         """Draw a level in the rows where the ground is near enough for it, and not all near enough for a finer one."""
-        part = half_plane(self._size, -to_W[2], least)
+        part = half_plane(self._size, down, least)
         rows = _rows(part, self._size)
-        coarse = _rows(half_plane(self._size, to_W[2], -most), self._size) if most < math.inf else rows
+        coarse = _rows(half_plane(self._size, [-each for each in down], -most), self._size) if most < math.inf else rows
         if rows is None or coarse is None:
             return
         v0, v1 = max(rows[0], coarse[0]), min(rows[1], coarse[1])
         if v1 - v0 < 1:
             return
-        warp = self._to_texels(level, to_W, p_WK, height_m) @ np.array([[1.0, 0, 0], [0, 1.0, v0], [0, 0, 1.0]])
+        warp = level.place @ to_ground
+        warp[:, 2] += v0 * warp[:, 1]
         out = self.grey[v0:v1]
-        if (self._corners[:, :2] @ -to_W[2, :2]).min() - to_W[2, 2] >= least:  # all of the picture
+        if _extremes(self._size, down)[0] >= least:  # all of the picture
             self._warp(level, warp, out)
             return
         drawn, mask = self._scratch[v0:v1], self._mask[v0:v1]
         self._warp(level, warp, drawn)
         mask.fill(0)
-        cv2.fillConvexPoly(mask, _fixed(part - (0, v0)), 255, cv2.LINE_8, SHIFT)
+        cv2.fillConvexPoly(mask, _fixed([(u, v - v0) for u, v in part]), 255, cv2.LINE_8, SHIFT)
         cv2.copyTo(drawn, mask, out)
 
     def _warp(self, level: Level, warp: Array, out: Grey) -> None:
@@ -186,42 +197,49 @@ class Backdrop:
         value = self._ground.mean
         cv2.warpPerspective(level.texels, warp, size, out, flags, cv2.BORDER_CONSTANT, value)
 
-    def _to_texels(self, level: Level, to_W: Array, p_WK: Array, height_m: float) -> Array:
-        """Return the homography from pixels to texels of a level; of the repeated tiles the nearest are taken."""
-        x, y = (float(p) - self._ground.tile_m * round(float(p) / self._ground.tile_m) for p in p_WK[:2])
-        to_ground = np.array([[height_m, 0, -x], [0, height_m, -y], [0, 0, -1.0]])  # d of W to (x, y, 1) times -d_z
-        middle = len(level.texels) / 2 - 0.5  # of the window, where W's origin is, in OpenCV's whole middles of texels
-        place = np.array([[1 / level.texel_m, 0, middle], [0, -1 / level.texel_m, middle], [0, 0, 1.0]])
-        return place @ to_ground @ to_W
+    def _to_ground(self, to_W: Array, p_WK: Array, height_m: float) -> Array:
+        """Return the homography from pixels to (x, y, 1) on the ground [m]; of the repeated tiles the nearest."""
+        x, y = (p - self._ground.tile_m * round(p / self._ground.tile_m) for p in p_WK[:2].tolist())
+        return np.array([[height_m, 0, -x], [0, height_m, -y], [0, 0, -1.0]]) @ to_W
 
 
 SHIFT = 4  # fractional bits of OpenCV's coordinates: sixteenths of a pixel
 
 
-def _fixed(points: Array) -> NDArray[np.int32]:
-    return np.rint(points * (1 << SHIFT)).astype(np.int32)
+def _fixed(points: Points) -> NDArray[np.int32]:
+    return np.rint(np.array(points) * (1 << SHIFT)).astype(np.int32)
 
 
-def _rows(part: Array, size: tuple[int, int]) -> tuple[int, int] | None:
+def _rows(part: Points, size: tuple[int, int]) -> tuple[int, int] | None:
     """Return the first row that a part of the picture has, and the first that it does not have any more."""
     if len(part) < 3:
         return None
-    return max(0, math.floor(part[:, 1].min())), min(size[1], math.ceil(part[:, 1].max()) + 1)
+    heights = [v for _, v in part]
+    return max(0, math.floor(min(heights))), min(size[1], math.ceil(max(heights)) + 1)
 
 
-def _rectangle(width: int, height: int) -> Array:
-    return np.array([(-0.5, -0.5), (width - 0.5, -0.5), (width - 0.5, height - 0.5), (-0.5, height - 0.5)])
+def _rectangle(width: int, height: int) -> Points:
+    return [(-0.5, -0.5), (width - 0.5, -0.5), (width - 0.5, height - 0.5), (-0.5, height - 0.5)]
 
 
-def half_plane(size: tuple[int, int], linear: Array, least: float) -> Array:
-    """Return the part of a picture where a u + b v + c >= least, as a polygon (M, 2); fewer than three are none."""
+def _extremes(size: tuple[int, int], linear: Sequence[float]) -> tuple[float, float]:
+    """Return the least and the greatest a u + b v + c of a picture."""
+    a, b, c = linear
+    at_corners = [a * u + b * v + c for u, v in _rectangle(*size)]
+    return min(at_corners), max(at_corners)
+
+
+def half_plane(size: tuple[int, int], linear: Sequence[float], least: float) -> Points:
+    """Return the part of a picture where a u + b v + c >= least, as a polygon; fewer than three points are none."""
+    a, b, c = linear
     corners = _rectangle(*size)
-    over = corners @ linear[:2] + (linear[2] - least)
-    points: list[Array] = []
+    over = [a * u + b * v + c - least for u, v in corners]
+    points: Points = []
     for i in range(4):
-        j = (i + 1) % 4
-        if over[i] >= 0:
-            points.append(corners[i])
-        if (over[i] >= 0) != (over[j] >= 0):
-            points.append(corners[i] + (corners[j] - corners[i]) * (over[i] / (over[i] - over[j])))
-    return np.array(points).reshape(-1, 2)
+        (u, v), (u1, v1), here, there = corners[i], corners[i - 3], over[i], over[i - 3]
+        if here >= 0:
+            points.append((u, v))
+        if (here >= 0) != (there >= 0):
+            share = here / (here - there)
+            points.append((u + (u1 - u) * share, v + (v1 - v) * share))
+    return points

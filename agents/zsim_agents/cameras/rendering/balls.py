@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim_agents.cameras.rendering.view import View
+from zsim_agents.cameras.rendering.view import View, has_pixels
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -19,6 +19,7 @@ AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the s
 STEPS_MAX = 6  # instants of an exposure that are drawn of what moves over the picture
 STEP_PX = 0.8  # px between two of them
 HALF = np.float32(0.5)
+AXIS = np.array([0.0, 0.0, 1.0])
 NEAR_M = 0.05  # nothing nearer is drawn
 
 
@@ -42,64 +43,126 @@ class Ball(NamedTuple):
     colour: Array
 
 
+class Balls(NamedTuple):
+    """M balls of one size and colour, as of `Ball`: (M, 3), (M, 3), (M, 2), (M,)."""
+
+    centres_K: Array
+    ways_K: Array
+    pixels: Array
+    ways_px: Array
+    radius_m: float
+    colour: Array
+
+
+class BallImage(NamedTuple):
+    """What a ball makes of a part of the picture.
+
+    Attributes:
+        box: the part, u0, v0, u1, v1.
+        light: what comes from the ball, and a half, by which it is rounded, (h, w, 3).
+        passes: the share that comes from behind it, (h, w, 1).
+    """
+
+    box: list[int]
+    light: Field
+    passes: Field
+
+    def lay(self, picture: Picture) -> None:
+        """Draw it."""
+        u0, v0, u1, v1 = self.box
+        part = picture[v0:v1, u0:u1]
+        part[:] = part * self.passes + self.light
+
+
 def draw_ball(picture: Picture, view: View, ball: Ball, sun_K: Array) -> None:
     """Draw a ball as it is seen over an exposure."""
-    x, y, z = ball.centre_K.tolist()
-    radius = ball.radius_m
-    if z < radius + NEAR_M:
-        return
-    wide_px = view.lens.fx * radius / (z - radius) * (1 + math.hypot(x, y) / z)
-    box = view.box(ball.pixel, 1.5 + ball.way_px / 2 + wide_px)
-    if box is None:
-        return
-    u0, v0, u1, v1 = box
-    covered, shade = _cover(view, view.rays[v0:v1, u0:u1], ball, sun_K)
-    part = picture[v0:v1, u0:u1]
-    colour = shade[..., None] * ball.colour.astype(np.float32)
-    colour -= part
-    colour *= covered[..., None]
-    colour += part
-    part[:] = colour + HALF  # rounded
+    way_px = np.array([ball.way_px])
+    one = Balls(ball.centre_K[None], ball.way_K[None], ball.pixel[None], way_px, ball.radius_m, ball.colour)
+    for image in ball_images(view, one, sun_K).values():
+        image.lay(picture)
 
 
-def exposures(steps: int) -> Array:
-    """Return the instants of an exposure that are drawn, as shares of it from its middle."""
-    return (np.arange(steps) + 0.5) / steps - 0.5
+def ball_images(view: View, balls: Balls, sun_K: Array) -> dict[int, BallImage]:
+    """Return what balls make of the picture over an exposure, by their numbers; of those that are in it.
+
+    All pixels that may be a ball's are computed in one row, at the instants of the ball that moves most, since the
+    balls are many and small.
+    """
+    boxes = _boxes(view, balls)
+    if not boxes:
+        return {}
+    shown, radius = list(boxes), balls.radius_m
+    centres, ways = balls.centres_K[shown], balls.ways_K[shown]
+    pixels = _pixels(view, [*boxes.values()], centres, ways, sun_K)
+    steps = min(STEPS_MAX, max(1, math.ceil(balls.ways_px[shown].max() / STEP_PX)))
+    covered = _covered(pixels, centres, ways, radius, view.lens.fx, steps)
+    shade = _shade(pixels, centres, radius, sun_K)
+    light = (covered * shade)[:, None] * balls.colour.astype(np.float32) + HALF
+    return _split(boxes, light, (1 - covered)[:, None])
 
 
-def steps_of(way_px: float, step_px: float) -> int:
-    """Return at how many instants of the exposure something is drawn that goes so far over the picture."""
-    return min(STEPS_MAX, max(1, math.ceil(way_px / step_px)))
+class _Pixels(NamedTuple):
+    """The rays of the pixels of some balls, one ball after the other, by their parts along four vectors, (P,) each."""
+
+    along: Field
+    to_way: Field
+    to_sun: Field
+    to_axis: Field
+    counts: list[int]
+
+    def of_ball(self, values: Array) -> Field:
+        """Return values of the balls (..., M) for each pixel, (..., P)."""
+        return np.repeat(values.astype(np.float32), self.counts, axis=-1)
 
 
-def _cover(view: View, rays: Field, ball: Ball, sun_K: Array) -> tuple[Field, Field]:
-    """Return the share of each pixel that is covered, and how bright the ball is there (1: under the sun), (h, w)."""
-    centre, radius = ball.centre_K, np.float32(ball.radius_m)
-    away2 = float(centre @ centre)
-    products = rays @ np.stack([centre, sun_K], axis=-1).astype(np.float32)
-    along, to_sun = products[..., 0], products[..., 1]
-    inside: Field = (along * along + (ball.radius_m**2 - away2)).astype(
-        np.float32, copy=False
-    )  # of half the chord, squared
-    per_pixel = np.float32(view.lens.fx / math.sqrt(away2)) / (
-        rays[..., 2] * np.sqrt(rays[..., 2])
-    )  # px/m, mean of both
-    steps = steps_of(ball.way_px, STEP_PX)
-    if steps == 1:
-        covered = _edge(radius, inside, per_pixel)
-    else:
-        covered = np.zeros_like(per_pixel)
-        for share in exposures(steps):
-            moved = centre + share * ball.way_K
-            nearer = rays @ moved.astype(np.float32)
-            covered += _edge(radius, np.float32(ball.radius_m**2 - moved @ moved) + nearer * nearer, per_pixel)
-        covered /= np.float32(steps)
-    meets = along - np.sqrt(np.maximum(inside, 0))
-    cosine = (meets * to_sun - np.float32(centre @ sun_K)) * np.float32(DIFFUSE / ball.radius_m)
-    return covered, np.float32(AMBIENT) + np.minimum(np.maximum(cosine, 0), np.float32(DIFFUSE))
+def _pixels(view: View, boxes: list[list[int]], centres: Array, ways: Array, sun_K: Array) -> _Pixels:
+    vectors = np.empty((len(boxes), 3, 4), np.float32)
+    vectors[..., 0], vectors[..., 1], vectors[..., 2], vectors[..., 3] = centres, ways, sun_K, AXIS
+    parts = [
+        view.rays[v0:v1, u0:u1].reshape(-1, 3) @ each for (u0, v0, u1, v1), each in zip(boxes, vectors, strict=True)
+    ]
+    along, to_way, to_sun, to_axis = np.concatenate(parts).T
+    return _Pixels(along, to_way, to_sun, to_axis, [len(part) for part in parts])
 
 
-def _edge(radius: np.float32, inside: Field, per_pixel: Field) -> Field:
-    """Return the share of each pixel that is covered: by how far its ray passes within the radius."""
-    beside = np.sqrt(np.maximum(radius * radius - inside, 0))
-    return np.minimum(np.maximum(HALF + (radius - beside) * per_pixel, 0), 1)
+def _boxes(view: View, balls: Balls) -> dict[int, list[int]]:
+    """Return the parts of the picture in which the balls are that it has, by their numbers."""
+    x, y, z = balls.centres_K.T
+    radius = balls.radius_m
+    before = z >= radius + NEAR_M
+    wide_px = view.lens.fx * radius / np.where(before, z - radius, np.inf) * (1 + np.hypot(x, y) / z)
+    reach = (1.5 + balls.ways_px / 2 + wide_px)[:, None]
+    boxes = view.boxes(balls.pixels - reach, balls.pixels + reach)
+    return {i: box for i, box in enumerate(boxes) if before[i] and has_pixels(box)}
+
+
+def _split(boxes: dict[int, list[int]], light: Field, passes: Field) -> dict[int, BallImage]:
+    images: dict[int, BallImage] = {}
+    start = 0
+    for i, box in boxes.items():
+        wide, high = box[2] - box[0], box[3] - box[1]
+        end = start + wide * high
+        images[i] = BallImage(box, light[start:end].reshape(high, wide, 3), passes[start:end].reshape(high, wide, 1))
+        start = end
+    return images
+
+
+def _covered(pixels: _Pixels, centres: Array, ways: Array, radius: float, focal_px: float, steps: int) -> Field:
+    """Return the share of each pixel that is covered: by how far its ray passes within the radius, as a mean."""
+    shares = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None]  # of the exposure, from its middle
+    moved = centres + shares[..., None] * ways
+    away2 = (moved * moved).sum(axis=-1)
+    along = pixels.along + shares.astype(np.float32) * pixels.to_way
+    beside2 = pixels.of_ball(away2) - along * along
+    px_per_m = pixels.of_ball(focal_px / np.sqrt((centres * centres).sum(axis=-1)))
+    px_per_m /= pixels.to_axis * np.sqrt(pixels.to_axis)  # mean of both directions
+    within = (np.float32(radius) - np.sqrt(np.maximum(beside2, 0))) * px_per_m
+    return np.minimum(np.maximum(within + HALF, 0), 1).mean(axis=0)
+
+
+def _shade(pixels: _Pixels, centres: Array, radius: float, sun_K: Array) -> Field:
+    """Return how bright the ball is at each pixel; 1: under the sun."""
+    rest = pixels.of_ball(radius**2 - (centres * centres).sum(axis=-1))
+    meets = pixels.along - np.sqrt(np.maximum(pixels.along * pixels.along + rest, 0))
+    cosine = (meets * pixels.to_sun - pixels.of_ball(centres @ sun_K)) * np.float32(DIFFUSE / radius)
+    return np.float32(AMBIENT) + np.minimum(np.maximum(cosine, 0), np.float32(DIFFUSE))

@@ -10,14 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim_agents.cameras.rendering.balls import exposures, steps_of
-from zsim_agents.cameras.rendering.faces import SHIFT, bgr, fixed
+from zsim_agents.cameras.rendering.faces import SHIFT, bgr
 from zsim_agents.cameras.rendering.scene import ARM_M, DroneLook
-from zsim_agents.cameras.rendering.view import View
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Fixed = NDArray[np.int32]
+Colour = tuple[float, float, float, float]  # B, G, R, and all of the light
 
 CROSS, HULL, HULL_LOW, NOSE, ROTOR = (  # B, G, R; as the console has them, the hull's lower side in its own shade
     np.array([48.0, 44.0, 42.0]),
@@ -36,18 +35,28 @@ MOTOR_WIDE_M = 0.034  # m
 REACH_M = 0.36  # m, farthest point of the AR.Drone from its middle, rotors and hull
 SECTOR = 5  # points of a blade's sweep along the circle
 BLADES = 2
-STEP_PX = 2.0  # px between two instants that are drawn; hulls need not be as exact as hats
 DETAIL_PX = 14.0  # across; of smaller ones neither rings nor rotors are told apart
 THICKNESS_MAX_PX = 80
 
 
+class Colours(NamedTuple):
+    """The colours of a drone in the light of the day."""
+
+    cross: Colour
+    hull: Colour
+    hull_low: Colour
+    nose: Colour
+    rotor: Colour
+
+
 class DroneModel(NamedTuple):
-    """The points of a drone (P, 3) [m; B], part by part, and how much larger it is than the AR.Drone."""
+    """A drone: points (P, 3) [m; B], part by part, how much larger it is than the AR.Drone, and its colours."""
 
     points: Array
     parts: dict[str, slice]
     rotors: int
     size: float
+    colours: Colours
 
 
 def _ellipsoid(middle: float, length: float, width: float, height: float, points: int) -> Array:
@@ -64,8 +73,8 @@ _BLADES = math.pi * np.arange(BLADES)  # rad, of each over the first
 _SWEEP = np.linspace(-0.5, 0.5, SECTOR)
 
 
-def drone_model(look: DroneLook) -> DroneModel:
-    """Return the points of a drone."""
+def drone_model(look: DroneLook, brightness: float) -> DroneModel:
+    """Return a drone in light of a brightness."""
     size = float(np.hypot(*look.hubs_B.T).max()) / ARM_M
     angles = 2 * math.pi * np.arange(RING_POINTS) / RING_POINTS
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(RING_POINTS)], axis=-1)
@@ -83,7 +92,8 @@ def drone_model(look: DroneLook) -> DroneModel:
     }
     ends = np.cumsum([len(part) for part in points.values()]).tolist()
     parts = {name: slice(end - len(points[name]), end) for name, end in zip(points, ends, strict=True)}
-    return DroneModel(np.concatenate([*points.values()]), parts, len(hubs), size)
+    colours = Colours(*((*bgr(brightness * each), 255.0) for each in (CROSS, HULL, HULL_LOW, NOSE, ROTOR)))
+    return DroneModel(np.concatenate([*points.values()]), parts, len(hubs), size, colours)
 
 
 def blade_points(look: DroneLook, size: float, t_s: float, exposure_s: float, speeds: Array) -> Array:
@@ -109,92 +119,83 @@ class DroneImage(NamedTuple):
     """A drone as it is to be drawn.
 
     Attributes:
-        model: its points.
+        model: what it looks like.
+        box: the part of the picture that it is in, u0, v0, u1, v1.
         pixels: of the model's points, then of its blades' sweeps, in sixteenths, (P + R BLADES (SECTOR + 1), 2).
-        middle_px: pixel of its centre, (2,).
-        depth_m: of its centre in K.
-        way_px: its way over the picture during the exposure, (2,).
+        scale: px/m of the AR.Drone.
+        sweep: kernel of its motion during the exposure; None if it does not move.
         from_above: whether the camera is above its rotors.
         shows_lens: whether the camera is before it.
-        brightness: of the light.
         opacity: of what a blade sweeps over.
+        whole_turns: whether the blades of each rotor leave nothing of its circle out.
     """
 
     model: DroneModel
+    box: list[int]
     pixels: Fixed
-    middle_px: Array
-    depth_m: float
-    way_px: Array
+    scale: float
+    sweep: NDArray[np.float32] | None
     from_above: bool
     shows_lens: bool
-    brightness: float
     opacity: float
+    whole_turns: bool
 
 
-def draw_drone(picture: Picture, view: View, drone: DroneImage) -> None:
-    """Draw a drone but its hat; one that moves over the picture at several instants of the exposure, and their mean."""
-    scale = view.lens.fx * drone.model.size / drone.depth_m  # px/m of the AR.Drone
-    box = view.box(drone.middle_px, 2.0 + 1.5 * REACH_M * scale + float(np.hypot(*drone.way_px)) / 2)
-    if box is None:
-        return
-    u0, v0, u1, v1 = box
+def draw_drone(picture: Picture, drone: DroneImage) -> None:
+    """Draw a drone but its hat; if it moves, its light and what it covers are blurred apart from what is behind."""
+    u0, v0, u1, v1 = drone.box
     part = picture[v0:v1, u0:u1]
-    corner = np.array([u0, v0])
-    steps = steps_of(math.hypot(*drone.way_px), STEP_PX)
-    if steps == 1:
-        _draw(part, drone, scale, drone.pixels - fixed(corner))
+    pixels = drone.pixels - np.array([u0, v0], np.int32) * (1 << SHIFT)
+    if drone.sweep is None:
+        _draw(part, drone, pixels)
         return
-    total = np.zeros(part.shape, np.float32)
-    for share in exposures(steps):
-        one = part.copy()
-        _draw(one, drone, scale, drone.pixels + fixed(drone.way_px * share - corner))
-        cv2.accumulate(one, total)
-    part[:] = np.rint(total / steps).astype(np.uint8)
+    layer = np.zeros((*part.shape[:2], 4), np.uint8)
+    _draw(layer, drone, pixels)
+    cv2.filter2D(layer, -1, drone.sweep, dst=layer, borderType=cv2.BORDER_REPLICATE)
+    passes = cv2.bitwise_not(cv2.extractChannel(layer, 3))
+    cv2.multiply(part, cv2.merge([passes] * 3), dst=part, scale=1 / 255)
+    cv2.add(part, cv2.cvtColor(layer, cv2.COLOR_BGRA2BGR), dst=part)
 
 
-def _draw(picture: Picture, drone: DroneImage, scale: float, pixels: Fixed) -> None:
-    model, parts = drone.model, drone.model.parts
-    hull, cross = (drone.brightness * colour for colour in (HULL if drone.from_above else HULL_LOW, CROSS))
+def _draw(picture: Picture, drone: DroneImage, pixels: Fixed) -> None:
+    """Draw a drone over a picture, or into an empty layer of four channels, the last of which is what it covers."""
+    scale, parts, colours = drone.scale, drone.model.parts, drone.model.colours
+    hull = colours.hull if drone.from_above else colours.hull_low
     detailed = 2 * REACH_M * scale > DETAIL_PX
-    turning = pixels[len(model.points) :].reshape(-1, SECTOR + 1, 2)
     if detailed and not drone.from_above:
-        _rotors(picture, drone, turning)
-    _lines(picture, pixels[parts["rings"]].reshape(model.rotors, RING_POINTS, 2), True, hull, 0.6 * RING_HIGH_M * scale)
-    _lines(picture, pixels[parts["arms"]].reshape(-1, 2, 2), False, cross, ARM_WIDE_M * scale)
+        _rotors(picture, drone, pixels)
+    _lines(picture, pixels[parts["rings"]].reshape(-1, RING_POINTS, 2), True, hull, 0.6 * RING_HIGH_M * scale)
+    _lines(picture, pixels[parts["arms"]].reshape(-1, 2, 2), False, colours.cross, ARM_WIDE_M * scale)
     if detailed:
-        _lines(picture, pixels[parts["motors"]].reshape(-1, 2, 2), False, cross, MOTOR_WIDE_M * scale)
+        _lines(picture, pixels[parts["motors"]].reshape(-1, 2, 2), False, colours.cross, MOTOR_WIDE_M * scale)
     _hull(picture, pixels[parts["body"]], hull)
     if drone.shows_lens:
-        _hull(picture, pixels[parts["nose"]], drone.brightness * NOSE)
+        _hull(picture, pixels[parts["nose"]], colours.nose)
         if detailed:
-            _dot(picture, pixels[parts["lens"]][0], LENS_M * scale, cross)
+            _dot(picture, pixels[parts["lens"]][0], LENS_M * scale, colours.cross)
     if detailed and drone.from_above:
-        _rotors(picture, drone, turning)
+        _rotors(picture, drone, pixels)
 
 
-def _lines(picture: Picture, lines: Fixed, closed: bool, colour: Array, wide_px: float) -> None:
+def _lines(picture: Picture, lines: Fixed, closed: bool, colour: Colour, wide_px: float) -> None:
     thickness = min(max(1, round(wide_px)), THICKNESS_MAX_PX)
-    cv2.polylines(picture, [*lines], closed, bgr(colour), thickness, cv2.LINE_AA, SHIFT)
+    cv2.polylines(picture, [*lines], closed, colour, thickness, cv2.LINE_AA, SHIFT)
 
 
-def _hull(picture: Picture, pixels: Fixed, colour: Array) -> None:
-    cv2.fillConvexPoly(picture, cv2.convexHull(pixels), bgr(colour), cv2.LINE_AA, SHIFT)
+def _hull(picture: Picture, pixels: Fixed, colour: Colour) -> None:
+    cv2.fillConvexPoly(picture, cv2.convexHull(pixels), colour, cv2.LINE_AA, SHIFT)
 
 
-def _dot(picture: Picture, pixel: Fixed, radius_px: float, colour: Array) -> None:
+def _dot(picture: Picture, pixel: Fixed, radius_px: float, colour: Colour) -> None:
     u, v = pixel.tolist()
-    cv2.circle(picture, (u, v), round(max(radius_px, 0.5) * (1 << SHIFT)), bgr(colour), cv2.FILLED, cv2.LINE_AA, SHIFT)
+    cv2.circle(picture, (u, v), round(max(radius_px, 0.5) * (1 << SHIFT)), colour, cv2.FILLED, cv2.LINE_AA, SHIFT)
 
 
-def _rotors(picture: Picture, drone: DroneImage, sweeps: Fixed) -> None:
+def _rotors(picture: Picture, drone: DroneImage, pixels: Fixed) -> None:
     """Darken what the blades sweep over."""
-    mask = np.zeros(picture.shape[:2], np.uint8)
-    level = round(255 * drone.opacity)
-    for sweep in sweeps:
-        cv2.fillConvexPoly(mask, sweep, level, cv2.LINE_AA, SHIFT)
-    u, v, wide, high = cv2.boundingRect(mask)
-    if wide == 0:
-        return
-    part = picture[v : v + high, u : u + wide]
-    share = mask[v : v + high, u : u + wide, None] * np.float32(1 / 255)
-    part[:] = part + share * ((drone.brightness * ROTOR).astype(np.float32) - part)
+    swept = picture.copy()
+    sectors = pixels[len(drone.model.points) :].reshape(-1, SECTOR + 1, 2)
+    circles = sectors[:, 1:].reshape(-1, BLADES * SECTOR, 2)
+    for sweep in circles if drone.whole_turns else sectors:
+        cv2.fillConvexPoly(swept, sweep, drone.model.colours.rotor, cv2.LINE_AA, SHIFT)
+    cv2.addWeighted(swept, drone.opacity, picture, 1 - drone.opacity, 0.0, dst=picture)

@@ -24,21 +24,18 @@ def gain(light: float) -> float:
     return 1.0 / math.sqrt(light)
 
 
-def sweep_kernel(way_px: Array) -> NDArray[np.float32]:
-    """Return the kernel of a motion by a way [px] over the picture: how long each pixel has had the light."""
-    length = float(np.hypot(*way_px))
-    way = way_px * min(1.0, SWEEP_MAX_PX / max(length, 1e-9))
-    half = math.ceil(float(np.abs(way).max()) / 2) + 1
-    count = max(2, math.ceil(min(length, SWEEP_MAX_PX) * SAMPLES_PER_PX))
-    at = half + ((np.arange(count) + 0.5) / count - 0.5)[:, None] * way
-    low = np.floor(at).astype(int)
-    f = at - low
-    kernel = np.zeros((2 * half + 1, 2 * half + 1))
-    for du in (0, 1):
-        for dv in (0, 1):
-            weight = np.abs(1 - du - f[:, 0]) * np.abs(1 - dv - f[:, 1])
-            np.add.at(kernel, (low[:, 1] + dv, low[:, 0] + du), weight)
-    return (kernel / count).astype(np.float32)
+def sweep_kernels(ways_px: Array) -> list[NDArray[np.float32]]:
+    """Return the kernels of motions by ways (N, 2) [px] over the picture: how long each pixel has had the light."""
+    lengths = np.hypot(*ways_px.T)
+    ways = ways_px * np.minimum(1.0, SWEEP_MAX_PX / np.maximum(lengths, 1e-9))[:, None]
+    count = max(2, math.ceil(min(lengths.max(), SWEEP_MAX_PX) * SAMPLES_PER_PX))
+    at = ways[:, :, None] * ((np.arange(count) + 0.5) / count - 0.5)  # (N, 2, count)
+    halves = [math.ceil(way / 2) + 1 for way in np.abs(ways).max(axis=1).tolist()]
+    most = max(halves)
+    shares = np.maximum(1 - np.abs(np.arange(-most, most + 1) - at[..., None]), 0)  # of a point, in a column or row
+    kernels = (shares[:, 1].transpose(0, 2, 1) @ shares[:, 0] / count).astype(np.float32)
+    inner = [slice(most - half, most + half + 1) for half in halves]
+    return [kernel[part, part] for kernel, part in zip(kernels, inner, strict=True)]
 
 
 class Noise:
@@ -76,7 +73,8 @@ def lens_blur(picture: Picture, sigma_px: float) -> None:
     if sigma_px < 0.2:
         return  # less than a pixel's own width
     side = 3 if sigma_px <= 0.7 else 2 * math.ceil(2.5 * sigma_px) + 1
-    cv2.GaussianBlur(picture, (side, side), sigma_px, dst=picture, borderType=cv2.BORDER_REPLICATE)
+    kernel = cv2.getGaussianKernel(side, sigma_px)
+    cv2.sepFilter2D(picture, -1, kernel, kernel, dst=picture, borderType=cv2.BORDER_REPLICATE)
 
 
 def jpeg(picture: Picture, quality: int) -> bytes:

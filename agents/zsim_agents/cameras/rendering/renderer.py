@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math.frames import rotation_matrix
 from zsim.scenario.obstacle import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
 from zsim_agents.cameras.rendering import film
 from zsim_agents.cameras.rendering.backdrop import Backdrop, Ground, colour_map, field
-from zsim_agents.cameras.rendering.balls import draw_ball
-from zsim_agents.cameras.rendering.drone_images import SEEN_M, DroneImager, DroneImages, balls
+from zsim_agents.cameras.rendering.drone_images import SEEN_M, DroneImager, DroneImages, hat_images
 from zsim_agents.cameras.rendering.drones import draw_drone
 from zsim_agents.cameras.rendering.faces import draw_obstacle
 from zsim_agents.cameras.rendering.scene import SUN_W, DroneStates, Scene
@@ -22,7 +22,7 @@ from zsim_agents.cameras.rendering.view import CameraMotion, View, camera_motion
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
-SWEPT_PX = 0.8  # px, from which on ground and sky are blurred by the motion
+SWEPT_PX = 0.8  # px, from which on the ground is blurred by the motion
 WIDER_MAX = 2.0  # of the pinhole picture that a lens bends, over its own; rays beyond it repeat the edge
 
 
@@ -75,12 +75,14 @@ class Renderer:
             t_s: the middle of the exposure [s].
             bodies: all drones then, in the scene's order.
         """
-        motion = camera_motion(self._pose, bodies, self._carrier)
-        grey = self._swept(self._backdrop.draw(motion), motion)
+        R_WB = rotation_matrix(bodies.q_WB)
+        motion = camera_motion(self._pose, bodies, R_WB[self._carrier], self._carrier)
+        grey = self._backdrop.draw(motion)
+        self._sweep(grey, motion)
         if self._bend is not None:
             grey = cv2.remap(grey, *self._bend, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         picture: Picture = cv2.applyColorMap(grey, self._colours)  # type: ignore[assignment]
-        images = self._imager.images(motion, t_s, bodies)
+        images = self._imager.images(motion, t_s, bodies, R_WB)
         for seen in sorted(self._order(motion, images), reverse=True):
             self._draw(picture, seen, motion, images)
         film.lens_blur(picture, self._camera.blur_px)
@@ -92,15 +94,21 @@ class Renderer:
         """Return the picture of an exposure as JPEG; see `picture`."""
         return film.jpeg(self.picture(number, t_s, bodies), self._camera.jpeg_quality)
 
-    def _swept(self, grey: Picture, motion: CameraMotion) -> Picture:
-        """Return ground and sky blurred by the motion of the middle of the picture's lower half over the exposure."""
+    def _sweep(self, grey: Picture, motion: CameraMotion) -> None:
+        """Blur the ground by the motion of the middle of the picture's lower half over the exposure.
+
+        The sky is smooth: its rows are left out, but for those that the horizon is blurred into.
+        """
         ray_K = np.array([0.0, self._view.lens.height / 4 / self._view.lens.fy, 1.0])
         down = -float(motion.R_WK[2] @ ray_K)
         point_K = ray_K * (max(float(motion.p_WK[2]), 0.1) / down if down > 1e-3 else SEEN_M)
         way_px = self._view.flow_px(point_K, motion.rates_K(point_K, np.zeros(3))) * self._exposure_s
         if np.hypot(*way_px) < SWEPT_PX:
-            return grey
-        return cv2.filter2D(grey, -1, film.sweep_kernel(way_px), borderType=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
+            return
+        kernel = film.sweep_kernels(way_px[None])[0]
+        part = grey[self._backdrop.ground_rows(motion, len(kernel))]
+        if len(part):
+            cv2.filter2D(part, -1, kernel, dst=part, borderType=cv2.BORDER_REPLICATE)
 
     def _order(self, motion: CameraMotion, images: DroneImages) -> list[Drawable]:
         """Return what may be in view, in any order."""
@@ -117,25 +125,26 @@ class Renderer:
         elif seen.kind == "hat":
             self._false_hat(picture, np.array([self._scene.hats.false_m[seen.which]]), motion)
         else:
-            self._drone(picture, seen.which, SUN_W @ motion.R_WK, images)
+            self._drone(picture, seen.which, images)
 
     def _false_hat(self, picture: Picture, place_W: Array, motion: CameraMotion) -> None:
         centre_K = motion.points_K(place_W)
         if centre_K[0, 2] > 0:
             way_K = motion.rates_K(centre_K, np.zeros(3)) * self._exposure_s
-            for ball in balls(self._view, centre_K, way_K, self._scene.hats.diameter_m / 2, self._brightness):
-                draw_ball(picture, self._view, ball, SUN_W @ motion.R_WK)
+            radius_m, sun_K = self._scene.hats.diameter_m / 2, SUN_W @ motion.R_WK
+            for image in hat_images(self._view, centre_K, way_K, radius_m, self._brightness, sun_K).values():
+                image.lay(picture)
 
-    def _drone(self, picture: Picture, i: int, sun_K: Array, images: DroneImages) -> None:
+    def _drone(self, picture: Picture, i: int, images: DroneImages) -> None:
         """Draw a drone and its hat: which of them is before the other depends on where the camera is."""
         image, hat, hats = images.drones.get(i), images.hats.get(i), self._scene.hats
         above = images.cameras_B[i, 2] > hats.position_m[2] - hats.diameter_m / 2
         if hat is not None and not above:
-            draw_ball(picture, self._view, hat, sun_K)
+            hat.lay(picture)
         if image is not None:
-            draw_drone(picture, self._view, image)
+            draw_drone(picture, image)
         if hat is not None and above:
-            draw_ball(picture, self._view, hat, sun_K)
+            hat.lay(picture)
 
 
 def _distance(row: tuple[float, ...], p_WK: Array) -> float:

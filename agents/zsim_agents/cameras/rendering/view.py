@@ -1,13 +1,11 @@
 """A camera's view: points of K to pixels, the rays of its pixels, and how points move in K. Pure."""
 
-import math
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.frames import rotation_matrix
 from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix
 from zsim_agents.cameras.rendering.scene import DroneStates
 
@@ -40,12 +38,11 @@ def skew(a: Array) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def camera_motion(pose: CameraPose, bodies: DroneStates, carrier: int) -> CameraMotion:
-    """Return where the camera is that one of the drones carries, and how it moves."""
-    R_WB = rotation_matrix(bodies.q_WB[carrier])
+def camera_motion(pose: CameraPose, bodies: DroneStates, R_WB: Array, carrier: int) -> CameraMotion:
+    """Return where the camera is that one of the drones carries, whose attitude is R_WB (3, 3), and how it moves."""
     w_WB_B = bodies.w_WB_B[carrier]
     p_WK = bodies.p_WB[carrier] + R_WB @ pose.p_BK
-    v_WK = bodies.v_WB[carrier] + R_WB @ np.cross(w_WB_B, pose.p_BK)
+    v_WK = bodies.v_WB[carrier] - R_WB @ (w_WB_B @ skew(pose.p_BK).T)
     return CameraMotion(p_WK, v_WK, pose.R_BK.T @ w_WB_B, R_WB @ pose.R_BK)
 
 
@@ -86,7 +83,8 @@ class View:
         """Return the pixels (..., 2) of points (..., 3) in front of the camera."""
         lens = self.lens
         if not self.distorts:
-            return points_K[..., :2] / points_K[..., 2:] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+            x, y, z = np.moveaxis(points_K, -1, 0)
+            return np.stack([x / z * lens.fx + lens.cx, y / z * lens.fy + lens.cy], axis=-1)
         flat, _ = cv2.projectPoints(points_K.reshape(-1, 1, 3), ORIGIN, ORIGIN, self._K, self._D)
         return np.asarray(flat, float).reshape(*points_K.shape[:-1], 2)
 
@@ -95,9 +93,13 @@ class View:
         z = points_K[..., 2:]
         return self.lens.fx * (rates_K[..., :2] - points_K[..., :2] / z * rates_K[..., 2:]) / z
 
-    def box(self, centre_px: Array, radius_px: float) -> tuple[int, int, int, int] | None:
-        """Return the part u0, v0, u1, v1 of the picture about a pixel; None if it is outside."""
-        u, v = centre_px
-        u0, u1 = max(0, math.floor(u - radius_px)), min(self.lens.width, math.ceil(u + radius_px) + 1)
-        v0, v1 = max(0, math.floor(v - radius_px)), min(self.lens.height, math.ceil(v + radius_px) + 1)
-        return (u0, v0, u1, v1) if u0 < u1 and v0 < v1 else None
+    def boxes(self, lowest_px: Array, highest_px: Array) -> list[list[int]]:
+        """Return the parts u0, v0, u1, v1 of the picture that hold rectangles, given by their corners (M, 2)."""
+        size = self.lens.width, self.lens.height
+        ends = np.concatenate([np.floor(lowest_px), np.ceil(highest_px) + 1], axis=1)
+        return np.clip(ends, 0, size * 2).astype(int).tolist()
+
+
+def has_pixels(box: list[int]) -> bool:
+    """Tell whether a part of the picture has any."""
+    return box[0] < box[2] and box[1] < box[3]
