@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from pictures import HATS
 from sighting_tiers import FROM_BELOW, Condition, Tiers, measured
 
 RANGES_M = (2.0, 4.0), (4.0, 7.0), (7.0, 12.0)
@@ -35,8 +34,9 @@ class Band(NamedTuple):
     normalised: tuple[float, float]
 
 
-SMALL = Band((0.45, 1.9), 1.0, 0.07, 0.02, (0.45, 1.8))  # of 100 hats
-LARGE = Band((0.5, 1.6), 0.9, 0.04, 0.005, (0.5, 1.65))  # of 800
+SMALL = Band((0.45, 2.0), 1.0, 0.07, 0.04, (0.45, 1.9))  # of 100 hats
+LARGE = Band((0.5, 1.7), 0.9, 0.04, 0.005, (0.5, 1.65))  # of 800
+FROM_BELOW_LARGE = LARGE._replace(bias=1.2)  # the detector takes the rotors' blurred rim for the edge of small hats
 
 
 def hold(tiers: Tiers, band: Band) -> None:
@@ -66,22 +66,17 @@ def test_both_tiers_err_alike_in_many_pictures(condition: Condition) -> None:
     hold(measured(condition, pictures=400), LARGE)
 
 
-HIDDEN_RANGE, HIDDEN_SHARE, HIDDEN_MISSED = (
-    0.06,
-    0.12,
-    0.12,
-)  # differences: of the range, of a hat's diameter, of misses
-
-
+@pytest.mark.parametrize("rate_deg_s", [0.0, 75.0])
 @pytest.mark.parametrize("ranges_m", RANGES_M[:2])
-def test_both_tiers_err_alike_where_a_drone_s_own_rotors_hide_a_part_of_its_hat(ranges_m: tuple[float, float]) -> None:
-    """Its range comes out too long and its middle too high, by as much as both say that they may err."""
-    rendered, geometric = measured(Condition(ranges_m, rise=FROM_BELOW), pictures=100)
-    (down, too_far), (down_too, too_far_too) = rendered.mean(), geometric.mean()
-    assert min(too_far, too_far_too) > 0.05
-    assert abs(too_far - too_far_too) < HIDDEN_RANGE
-    assert max(down, down_too) < 0
-    assert abs(down - down_too) < HIDDEN_SHARE * HATS.diameter_m / np.mean(ranges_m)
-    assert abs(rendered.missed - geometric.missed) < HIDDEN_MISSED
-    for tier in (rendered, geometric):
-        assert max(tier.normalised()) < 1.5
+def test_both_tiers_err_alike_where_a_drone_s_own_rotors_hide_a_part_of_its_hat(
+    ranges_m: tuple[float, float], rate_deg_s: float
+) -> None:
+    hold(measured(Condition(ranges_m, rate_deg_s=rate_deg_s, rise=FROM_BELOW), pictures=100), SMALL)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    "condition", [Condition(*each, FROM_BELOW) for each in product(RANGES_M[:2], (DAY, DULL, DUSK), (0.0, 35.0))]
+)
+def test_both_tiers_err_alike_in_many_pictures_from_below(condition: Condition) -> None:
+    hold(measured(condition, pictures=400), FROM_BELOW_LARGE)

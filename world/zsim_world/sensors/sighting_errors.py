@@ -62,7 +62,8 @@ def _sigmas_px(model: NDArray, row: NDArray) -> tuple[float, float]:
     noise = model[DETECTOR.noise] / (row[VIEW.angle] * scale)
     blur = model[DETECTOR.blur_share] * row[VIEW.rate] * model[DETECTOR.exposure] * scale
     centre = row[VIEW.centre] * math.hypot(noise, blur)
-    diameter = row[VIEW.radius] * math.hypot(DIAMETER_NOISE * noise, DIAMETER_BLUR * blur)
+    hidden = 0.5 * (row[VIEW.radius] - 1.0)
+    diameter = math.hypot(row[VIEW.radius] * DIAMETER_NOISE * noise, (1.0 + hidden) * DIAMETER_BLUR * blur)
     return math.hypot(model[DETECTOR.centre], centre), math.hypot(model[DETECTOR.diameter], diameter)
 
 

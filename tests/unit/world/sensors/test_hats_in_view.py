@@ -11,7 +11,7 @@ from zsim.scenario.obstacle import COLUMNS, row_of
 from zsim.scenario.scenario import Obstacle
 from zsim.sensors.camera import FrontCamera
 from zsim.sensors.camera_model import camera_pose, lens_of
-from zsim_world.sensors.hats_in_view import POSE, VIEW, MountedCamera, hats_in_view
+from zsim_world.sensors.hats_in_view import POINTS, POSE, VIEW, MountedCamera, hats_in_view
 
 HAT_B, DIAMETER_M, HULL_M = (-0.03, 0.0, 0.11), 0.14, 0.26
 LENS_B = (0.162, 0.0, 0.012)  # of the front camera
@@ -92,14 +92,29 @@ RIM_M = 1.15 * HULL_M, 0.14 * HULL_M  # radius and height of the rotors' rim
 
 @pytest.mark.parametrize("below_deg", [-10.0, 0.0, 4.0, 8.0, 12.0])
 def test_its_own_rotors_hide_a_hat_from_its_lower_edge_on(below_deg: float):
-    """A straight edge hides it: a segment of a disc, by the height of the rim's near edge over the hat's lower one."""
+    """A straight edge hides an arc of its edge, by the height of the rim's near edge over the hat's lower one."""
     slope = math.tan(math.radians(below_deg))
     view = look([pose(-LENS_B[0], 0, 5 - LENS_B[2]), pose(4.0 - HAT_B[0], 0, 5 + 4.0 * slope - HAT_B[2])])
     hidden_m = RIM_M[1] + (RIM_M[0] + HAT_B[0]) * slope - (HAT_B[2] - DIAMETER_M / 2)
     cut = min(max(hidden_m / DIAMETER_M, 0.0), 1.0) if below_deg > 0 else 0.0
-    angle = math.acos(1 - 2 * cut)
-    assert view[1, VIEW.share] == pytest.approx(1 - (angle - math.sin(angle) * math.cos(angle)) / math.pi, abs=0.08)
-    assert (view[1, VIEW.shift_K + 1] < -1e-4) == (cut > 0.05)  # up in the picture
+    arc = 1 - math.acos(1 - 2 * cut) / math.pi
+    beside = 2 / POINTS if cut else 0.0  # the points beside it are left out
+    row = view[1]
+    assert row[VIEW.share] == pytest.approx(arc - beside, abs=2 / POINTS)
+    assert (row[VIEW.centre] > 1.0, row[VIEW.radius] > 1.0) == (cut > 0, cut > 0)
+
+
+def test_an_edge_that_is_visible_to_a_half_tells_the_circle_as_least_squares_do():
+    """A wall hides the right half; of a circle through 15 points of 32 the errors are those of (A^T A)^-1."""
+    wall = Obstacle(name="wall", shape="box", position_m=(2, -1.0101, 0), size_m=(0.01, 2, 20))
+    view = look([pose(0, 0, 5), pose(4, 0, 5)], obstacles=[wall])[1]
+    count = round(view[VIEW.share] * POINTS)
+    turns = 2 * math.pi * (np.arange(count) - (count - 1) / 2) / POINTS
+    A = np.column_stack([np.cos(turns), np.sin(turns), np.ones(count)])
+    of_part = np.diag(np.linalg.inv(A.T @ A))
+    assert count in (13, 14, 15)
+    assert view[VIEW.centre] == pytest.approx(math.sqrt((of_part[0] + of_part[1]) / 2 / (2 / POINTS)), rel=1e-6)
+    assert view[VIEW.radius] == pytest.approx(math.sqrt(of_part[2] * POINTS), rel=1e-6)
 
 
 OBSTACLES = [
