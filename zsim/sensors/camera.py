@@ -12,9 +12,11 @@ from zsim.sensors.sensor import LatencyMs, Mount
 
 CAMERAS = ("front", "bottom")
 CameraName = Literal["front", "bottom"]
+NearM = Annotated[float, Meta(ge=-2, le=2)]
 DroneName = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
 WidthPx = Annotated[int, Meta(ge=32, le=1920)]
 HeightPx = Annotated[int, Meta(ge=24, le=1080)]
+ErrorPx = Annotated[float, Meta(ge=0, le=100)]
 CameraRateHz = Annotated[float, Meta(ge=0.1, le=60)]
 
 
@@ -63,9 +65,9 @@ class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
     latency_ms: LatencyMs = 0.0
     """Of the detector, after the camera's."""
-    centre_px: NonNegative = 0.035  # px, fitted to the detector on rendered pictures, as the next three
+    centre_px: ErrorPx = 0.035  # px, fitted to the detector on rendered pictures, as the next three
     """Error of a large hat's centre, standard deviation per axis."""
-    diameter_px: NonNegative = 0.11
+    diameter_px: ErrorPx = 0.11
     """Error of its apparent diameter, standard deviation."""
     noise_px2: NonNegative = 0.65
     """Over the apparent diameter, added to both in quadrature; that of a clear day, more in low light."""
@@ -73,11 +75,11 @@ class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Of the way that a hat moves over the picture during the exposure, added to both in quadrature."""
     diameter_min_px: Positive = 4.0
     """What is measured as smaller is not seen."""
-    misalignment_deg: NonNegative = 0.0
+    misalignment_deg: Annotated[float, Meta(ge=0, le=30)] = 0.0
     """Constant over a run, of the camera's mount, standard deviation per axis."""
     miss: Fraction = 0.02
     """Probability that a hat in view is not seen in a picture."""
-    false_hz: NonNegative = 0.0
+    false_hz: Annotated[float, Meta(ge=0, le=60)] = 0.0
     """Rate of sightings of nothing, anywhere in the picture."""
 
 
@@ -85,7 +87,7 @@ class Hats(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The magenta markers by which drones see each other: a ball on every drone, and what only looks like one."""
 
     diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # chosen: a tennis cap's crown, on the AR.Drone's hull
-    position_m: Vector3 = (-0.03, 0.0, 0.11)  # in B, chosen: on top of the hull, behind the middle
+    position_m: tuple[NearM, NearM, NearM] = (-0.03, 0.0, 0.11)  # in B, chosen: on top of the hull, behind the middle
     covered: Annotated[list[DroneName], Meta(max_length=1000)] = []
     """Drones whose hat cannot be seen."""
     false_m: Annotated[list[Vector3], Meta(max_length=100)] = []

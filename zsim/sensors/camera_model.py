@@ -5,7 +5,7 @@ corner, whole numbers in the middle of a pixel, as OpenCV has them (calib3d, "De
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,10 @@ from zsim.math.rotation import matrix_from_rpy
 from zsim.sensors.camera import Camera
 
 Array = NDArray[np.float64]
+Number = TypeVar("Number", float, NDArray[np.float64])  # or many of them
 R_SK = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # K's axes in the mount's: x right is -y, …
-UNDISTORT_STEPS = 8  # of a fixed point; enough for 1e-6 px within the field of view of any lens allowed here
+UNDISTORT_STEPS = 12  # of Newton's method; enough for 1e-6 px in any picture that does not fold
+FOLD_GRID, FOLD_PX = 25, 1e-3  # points along each side, and of the way to each; by which one may be missed
 
 
 class Lens(NamedTuple):
@@ -68,7 +70,7 @@ def camera_matrix(lens: Lens) -> Array:
 
 
 @portable
-def distorted(lens: Lens, x: float, y: float) -> tuple[float, float]:
+def distorted(lens: Lens, x: Number, y: Number) -> tuple[Number, Number]:
     """Return where a ray (x, y, 1) of K falls on the picture plane after the lens, in focal lengths."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
@@ -79,14 +81,39 @@ def distorted(lens: Lens, x: float, y: float) -> tuple[float, float]:
 
 
 @portable
-def undistorted(lens: Lens, u: float, v: float) -> tuple[float, float]:
-    """Return the ray (x, y, 1) of K that falls on a pixel, by a fixed point."""
+def undistorted(lens: Lens, u: Number, v: Number) -> tuple[Number, Number]:
+    """Return the ray (x, y, 1) of K that falls on a pixel, by Newton's method."""
     a, b = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
     x, y = a, b
     for _ in range(UNDISTORT_STEPS):
         at_x, at_y = distorted(lens, x, y)
-        x, y = x + a - at_x, y + b - at_y
+        xx, xy, yy = distortion_slopes(lens, x, y)
+        miss_x, miss_y, determinant = a - at_x, b - at_y, xx * yy - xy * xy
+        x, y = x + (yy * miss_x - xy * miss_y) / determinant, y + (xx * miss_y - xy * miss_x) / determinant
     return x, y
+
+
+@portable
+def distortion_slopes(lens: Lens, x: Number, y: Number) -> tuple[Number, Number, Number]:
+    """Return the derivatives of `distorted`, which are symmetric: of x by x, of either by the other, of y by y."""
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+    slope = 2.0 * (lens.k1 + r2 * (2.0 * lens.k2 + 3.0 * r2 * lens.k3))
+    xx = radial + slope * x * x + 2.0 * lens.p1 * y + 6.0 * lens.p2 * x
+    yy = radial + slope * y * y + 6.0 * lens.p1 * y + 2.0 * lens.p2 * x
+    return xx, slope * x * y + 2.0 * lens.p1 * x + 2.0 * lens.p2 * y, yy
+
+
+def folds(lens: Lens) -> bool:
+    """Tell whether some pixel of the picture has no ray of its own: the distortion turns back on the way to it."""
+    u, v = np.meshgrid(*(np.linspace(0.0, side - 1.0, FOLD_GRID) for side in (lens.width, lens.height)))
+    with np.errstate(all="ignore"):
+        x, y = undistorted(lens, u.ravel(), v.ravel())
+        share = np.linspace(0.0, 1.0, FOLD_GRID)[:, None]
+        xx, xy, yy = distortion_slopes(lens, share * x, share * y)
+        at_x, at_y = distorted(lens, x, y)
+        off_px = np.hypot(lens.fx * at_x + lens.cx - u.ravel(), lens.fy * at_y + lens.cy - v.ravel())
+    return not (np.all(off_px < FOLD_PX) and np.all(xx * yy - xy * xy > 0.0) and np.all(xx > 0.0))
 
 
 @portable

@@ -12,7 +12,7 @@ from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
 from zsim.errors import DecodeError
 from zsim.math.frames import rotation_matrix
 from zsim.sensors.camera import CAMERAS
-from zsim.sensors.camera_model import CameraPose, Lens
+from zsim.sensors.camera_model import CameraPose, Lens, folds
 from zsim.sensors.jpeg_header import PictureError
 from zsim.transport.session import RawSample, Session
 from zsim_agents.cameras.detector import HatDetector
@@ -160,5 +160,7 @@ def detector_of(info: CameraInfo, diameter_m: float) -> HatDetector:
     if fx <= 0 or fy <= 0 or skew:
         raise PictureError(f"K has focal lengths {fx:g} and {fy:g}, and skew {skew:g}; must be > 0, > 0, and 0")
     lens = Lens(fx, fy, cx, cy, *info.D, info.width, info.height)
+    if folds(lens):
+        raise PictureError(f"D is {list(info.D)}, which folds the picture; must give every pixel a ray of its own")
     R_BK = rotation_matrix(np.array(info.orientation_wxyz))
     return HatDetector(lens, CameraPose(np.array(info.position_m), R_BK), diameter_m)

@@ -6,13 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix
+from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix, undistorted
 from zsim_agents.cameras.rendering.scene import DroneStates
 
 Array = NDArray[np.float64]
 Rays = NDArray[np.float32]
 ORIGIN = np.zeros(3)
-UNDISTORT_STEPS = 20  # of a fixed point, as in zsim.sensors.camera_model; once for each lens
 
 
 class CameraMotion(NamedTuple):
@@ -69,15 +68,7 @@ class View:
         """Return where the rays of the pixels meet the plane z = 1 of K, (height, width, 2)."""
         lens = self.lens
         u, v = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
-        pixels = np.stack([u, v], axis=-1)
-        if not self.distorts:
-            return (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
-        ahead = np.ones((lens.height, lens.width, 1))
-        plane = wanted = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
-        for _ in range(UNDISTORT_STEPS):
-            falls = (self.pixels(np.concatenate([plane, ahead], axis=-1)) - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
-            plane = plane + wanted - falls
-        return plane
+        return np.stack(undistorted(lens, u, v), axis=-1)
 
     def pixels(self, points_K: Array) -> Array:
         """Return the pixels (..., 2) of points (..., 3) in front of the camera."""
