@@ -42,6 +42,7 @@ class Agent(ABC):
         reads: key expressions it subscribes to.
         gate_keys: keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status.
         counted: drones of which it reads all sensors, so that what their status counts is waited for.
+        uncounted: keys whose messages belong to no gate: one that comes late is handed over with the next.
         writes: keys that it publishes at every gate and that others of its process may read.
         serves: names of processes for which it stands beside its own.
         takes_gates: whether `receive_gate` is to have the world's messages of a gate as columns and one buffer.
@@ -53,6 +54,7 @@ class Agent(ABC):
     reads: tuple[str, ...]
     gate_keys: tuple[str, ...]
     counted: tuple[str, ...] = ()
+    uncounted: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
     serves: tuple[str, ...] = ()
     takes_gates: bool = False

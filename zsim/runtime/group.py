@@ -43,6 +43,7 @@ class AgentGroup(Agent):
         self.reads = tuple(key for key in _joined(member.reads for member in members) if key not in inner)
         self.gate_keys = tuple(key for key in _joined(member.gate_keys for member in members) if key not in inner)
         self.counted = _joined(member.counted for member in members)
+        self.uncounted = _joined(member.uncounted for member in members)
         self.repeats = _joined(member.repeats for member in members)
         self._waiting: list[list[Input]] = [[] for _ in members]
         self._routes = RoutingTable([member.reads for member in members])

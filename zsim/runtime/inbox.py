@@ -27,13 +27,21 @@ class Inbox:
         counted: drones of which all `sensor/*` keys are read.
         keep_late: hand out what comes after its gate was taken, once, with the next gate: in realtime an old input
             is better than none.
+        uncounted: keys of which everything that comes late is handed out with the next gate in any case: it belongs to
+            no gate, as what a detector finds in a picture.
 
     Attributes:
         duplicates: messages that came again before their gate was taken.
         late: messages that came when their gate had been taken.
     """
 
-    def __init__(self, gate_keys: Sequence[str], counted: Sequence[str] = (), keep_late: bool = False) -> None:
+    def __init__(
+        self,
+        gate_keys: Sequence[str],
+        counted: Sequence[str] = (),
+        keep_late: bool = False,
+        uncounted: Sequence[str] = (),
+    ) -> None:
         self._closing = dict.fromkeys(gate_keys)
         self._beside = dict.fromkeys(key for key in gate_keys if not keys.is_status(key))  # not closed by GateMessages
         self._meters = {keys.status(drone): _Meter() for drone in counted}
@@ -48,6 +56,7 @@ class Inbox:
         self._last_beat: tuple[int, int] | None = None
         self._taken_ns = -1
         self._keep_late = keep_late
+        self._uncounted = frozenset(uncounted)
         self._belated: dict[tuple[str, int], tuple[str, Any]] = {}
         self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
         self.duplicates = 0
@@ -78,8 +87,9 @@ class Inbox:
         return True
 
     def _put_late(self, key: str, message: Any) -> bool:
-        """Keep a late message unless a newer one of its key, or itself, has been handed out."""
-        if not self._keep_late or message.t_ns <= self._newest.get(key, ALWAYS_NS):
+        """Keep a late message, of a counted key unless a newer one of it, or itself, has been handed out."""
+        is_old = not self._keep_late or message.t_ns <= self._newest.get(key, ALWAYS_NS)
+        if is_old and key not in self._uncounted:
             return False
         self._belated[key, message.seq] = (key, message)
         return True
@@ -169,7 +179,7 @@ class Inbox:
         for stamp in _cut(self._stamps, t_ns):
             stamped = self._waiting.pop(stamp)
             ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
-        if self._keep_late:
+        if self._keep_late or self._belated:
             ready = self._with_belated(ready)
         for gate_ns in _cut(self._gates, t_ns):
             del self._lacking[gate_ns]

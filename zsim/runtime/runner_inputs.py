@@ -38,7 +38,7 @@ class RunnerInputs:
         self._agent = agent
         self._health = health
         self._say = say
-        self.inbox = Inbox(agent.gate_keys, agent.counted, keep_late=info.mode == "realtime")
+        self.inbox = Inbox(agent.gate_keys, agent.counted, info.mode == "realtime", agent.uncounted)
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}

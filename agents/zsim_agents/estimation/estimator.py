@@ -55,7 +55,8 @@ class Estimator(Agent):
         beside = [*(sensor.name for sensor in info.own_sensors), *([keys.SIGHTINGS] * (info.sightings is True))]
         self.reads = tuple(keys.sensors(drone) for drone in read) if make else _reads(read, beside)
         if banks:
-            self.reads += tuple(keys.detections(drone) for drone in read if not has_own_sightings(scenario, drone))
+            self.uncounted = tuple(keys.detections(drone) for drone in read if not has_own_sightings(scenario, drone))
+            self.reads += self.uncounted
         self._last: list[flight_messages.Estimate] = []
         self._view_key = keys.estimates_view(self.name)
         self.takes_gates = COMPILES and not make

@@ -199,6 +199,7 @@ def initial_rows(
         walk=walk,
         limits=innovation_limits(estimation.gate_probability),
         joint=np.zeros((0, 0)),
+        sighted=np.zeros((0, 0)),
     )
     return rows, np.zeros((count, ESTIMATE.size))
 

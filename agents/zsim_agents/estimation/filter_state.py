@@ -150,6 +150,7 @@ class Rows(NamedTuple):
     walk: NDArray[np.float64]  # (N, n), unit^2/s
     limits: NDArray[np.float64]  # (7,), of the innovation gates by number of rows
     joint: NDArray[np.float64]  # (N n, N n), covariance of all of them together; (0, 0) where each stands for itself
+    sighted: NDArray[np.float64]  # (N, N), when a sighting of one drone by another was used last [s]; (0, 0) likewise
 
 
 STATES = (
@@ -159,6 +160,7 @@ STATES = (
     "bias",
     "history",
     "joint",
+    "sighted",
 )  # rows that change; others are settings
 
 

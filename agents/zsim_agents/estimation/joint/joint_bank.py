@@ -1,5 +1,6 @@
 """The estimators of the drones of a cluster with one covariance, which use what the drones see of each other."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -52,7 +53,7 @@ class JointBank(EstimatorBank):
         joint = np.zeros((count * n, count * n))
         for i in range(count):
             put_block(joint, i, self.rows.covariance[i])
-        self.rows = self.rows._replace(joint=joint)
+        self.rows = self.rows._replace(joint=joint, sighted=np.full((count, count), -math.inf))
         hats = environment.hats if isinstance(environment.hats, Hats) else Hats()
         x, y, z = hats.position_m
         self._hat_B: Vector = float(x), float(y), float(z)

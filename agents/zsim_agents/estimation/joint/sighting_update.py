@@ -215,4 +215,5 @@ def use_sightings(rows: Rows, sightings: np.ndarray, hat_B: Vector) -> None:
             continue
         taken[j] = True
         rows.counts[i, COUNT.sightings_used] += 1
+        rows.sighted[i, j] = sighting[SIGHTING.t_sample]
         correct_all(rows, HJ, S, y)

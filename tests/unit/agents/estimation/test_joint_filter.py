@@ -29,8 +29,10 @@ CAMERA_B, HAT_B = np.array([0.162, 0.0, 0.012]), np.array([-0.03, 0.0, 0.11])
 FIELD_B = np.array([17.8, 2.8, 14.0])  # of the scenario, seen by who looks north
 
 
-def still(bank: EstimatorBank | ClusterBanks, gate: int, rng: np.random.Generator) -> None:
-    """Hand over what drones sense that stand still in the air, looking north."""
+def still(
+    bank: EstimatorBank | ClusterBanks, gate: int, rng: np.random.Generator, baro_off_m: tuple[float, ...] = (0, 0, 0)
+) -> None:
+    """Hand over what drones sense that stand still in the air, looking north; by how much their barometers lie."""
     t_ns = gate * GATE_NS
     for i, place in enumerate(PLACES):
         for k in (3, 2, 1, 0) if gate else ():
@@ -41,7 +43,12 @@ def still(bank: EstimatorBank | ClusterBanks, gate: int, rng: np.random.Generato
             bank.receive(i, "gps", Gps(t_ns, 0, t_ns, 0, 0, 0, (x, y, z), (0.0, 0.0, 0.0), 2.0, 3, 9), t_ns * 1e-9)
         if gate % 2 == 0:
             bank.receive(i, "mag", Mag(t_ns, 0, t_ns, tuple(FIELD_B.tolist())), t_ns * 1e-9)
-            bank.receive(i, "baro", Baro(t_ns, 0, t_ns, 101_000.0, float(place[2] + rng.normal(0, 0.1))), t_ns * 1e-9)
+            bank.receive(
+                i,
+                "baro",
+                Baro(t_ns, 0, t_ns, 101_000.0, float(place[2] + baro_off_m[i] + rng.normal(0, 0.1))),
+                t_ns * 1e-9,
+            )
         if gate % 3 == 0:
             bank.receive(i, "flow", Flow(t_ns, 0, t_ns, tuple(rng.normal(0, 0.1, 3).tolist()), 1.0), t_ns * 1e-9)
 
@@ -89,6 +96,22 @@ def test_with_sightings_the_drones_are_where_they_are_to_each_other():
     assert max(miss(together, 1), miss(together, 2)) < 0.05 < max(miss(alone, 1), miss(alone, 2))
     assert together[1].sensors["sightings"][0] > 300
     assert together[0].sensors["sightings"] == (0, 0)
+
+
+@pytest.mark.parametrize(("seen", "height_off_m"), [({1: PLACES[0], 2: PLACES[0]}, 0.0), ({}, 5.0)])
+def test_a_barometer_that_lies_is_not_trusted_while_others_whom_the_drone_sees_know_better(
+    seen: dict[int, NDArray[np.float64]], height_off_m: float
+):
+    """A drone that nobody sees trusts its barometer again, when that has been refused for long."""
+    bank, rng = JointBank(*settings()), np.random.default_rng(3)  # type: ignore[arg-type]
+    estimates: list[StateEstimate] = []
+    for gate in range(1500):
+        still(bank, gate, rng, (5.0 if gate > 700 else 0.0, 0.0, 0.0))
+        for observer, target in seen.items() if gate % 3 == 0 else ():
+            bank.receive(observer, "sightings", sighted(observer, target, gate * GATE_NS), gate * GATE_S)
+        estimates = bank.estimate(gate * GATE_S)
+    assert estimates[0].position_m[2] == pytest.approx(PLACES[0, 2] + height_off_m, abs=0.3)
+    assert (estimates[0].sensors["baro"][1] > 300) == bool(seen)
 
 
 LATE_GATES = 2  # by which the slower of two detectors is behind

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsim.contract import keys, messages
+from zsim.contract.camera_messages import Sightings
 from zsim.contract.flight_messages import Estimate, Status
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import Baro, Imu
@@ -307,6 +308,18 @@ def test_in_lockstep_a_late_message_is_refused():
     inbox.take(GATE_NS)
     assert not inbox.put(STATUS, status(GATE_NS, 1, 1))
     assert inbox.take(2 * GATE_NS) == []
+
+
+def test_in_lockstep_what_belongs_to_no_gate_comes_with_the_next_if_it_is_late():
+    found = keys.detections("d1")
+    inbox = Inbox([STATUS], uncounted=[found])
+    for gate in (1, 2, 3):
+        inbox.put(STATUS, status(gate * GATE_NS, gate, 1))
+    inbox.take(2 * GATE_NS)
+    late = [Sightings(t_ns=gate * GATE_NS, seq=gate, t_sample_ns=0, camera="front") for gate in (2, 1)]
+    assert all(inbox.put(found, each) for each in late)
+    assert [(key, message.seq) for key, message in inbox.take(3 * GATE_NS)] == [(found, 1), (found, 2), (STATUS, 3)]
+    assert inbox.take(4 * GATE_NS) == []
 
 
 def test_what_a_replay_brings_of_a_gate_that_came_whole_is_left_out():
