@@ -1,4 +1,4 @@
-"""A process of a run that shows and commands but never gates: its join, health and bye."""
+"""A process of a run that shows and commands and answers no gate: its join, health and bye."""
 
 import os
 import secrets
@@ -21,6 +21,7 @@ class ObserverProcess:
         info: of the run.
         name: process name, role.thing.
         serves: names of processes whose work it does; two that do the same are told of.
+        slack_ns: by how much the world may be ahead of its dones; 0 for any.
 
     Attributes:
         now_ns: simulated time of the newest clock received.
@@ -28,11 +29,14 @@ class ObserverProcess:
         end_reason: why the process has nothing left to do in this run; empty while it goes on.
     """
 
-    def __init__(self, link: Session, info: messages.Info, name: str, serves: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, link: Session, info: messages.Info, name: str, serves: tuple[str, ...] = (), slack_ns: int = 0
+    ) -> None:
         self._link = link
         self._serves = tuple(each for each in serves if each != name)
         self._info = info
-        self._health_seq = 0
+        self._slack_ns = slack_ns
+        self._health_seq = self._done_seq = 0
         self._join_seq = -1
         self.name = name
         self.now_ns = 0
@@ -58,7 +62,7 @@ class ObserverProcess:
         self._join_seq += 1
         host, run_id = self._link.host, self._info.run_id
         when = self._join_seq, self.now_ns
-        join = join_of(self.name, host, run_id, self._incarnation, *when, serves=self._serves)
+        join = join_of(self.name, host, run_id, self._incarnation, *when, serves=self._serves, slack_ns=self._slack_ns)
         self._link.put(keys.process(self.name, "join"), join)
 
     def update_clock(self, payload: bytes) -> run_messages.Clock | None:
@@ -85,6 +89,13 @@ class ObserverProcess:
             health = self.health.message(self.now_ns, self._health_seq)
             self._health_seq += 1
             self._link.put(keys.process(self.name, "health"), health)
+
+    def done(self, t_ns: int) -> None:
+        """Publish that all up to a gate is done, if the world waits for it."""
+        if self._slack_ns:
+            done = run_messages.Done(t_ns, self._done_seq, self._info.run_id, self._incarnation, t_ns, 0)
+            self._done_seq += 1
+            self._link.put(keys.process(self.name, "done"), done)
 
     @property
     def superseded(self) -> bool:

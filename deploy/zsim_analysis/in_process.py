@@ -10,6 +10,7 @@ from msgspec import Struct
 
 from zsim.contract import flight_messages, keys, run_messages
 from zsim.contract.framing import GateMessages
+from zsim.errors import RunError
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
@@ -51,6 +52,11 @@ class InProcessFlight:
     """
 
     def __init__(self, scenario: Scenario, run_id: str | None = None) -> None:
+        if scenario.gates("camera"):
+            raise RunError(
+                "processes.gating is [camera]; must be left out in one process, which has no cameras: "
+                "fly it as processes, or with --set processes.gating=[]"
+            )
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id)
         self._agents = agents(self.world)
 

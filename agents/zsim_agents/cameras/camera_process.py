@@ -1,6 +1,6 @@
 """The cameras of one or several drones as a process: draws what they see, from the truth, and publishes it.
 
-It takes part in no gate. When it is too slow it leaves pictures out, and counts them.
+When it is too slow it leaves pictures out, and counts them; where the scenario lets cameras gate, the run waits.
 """
 
 import time
@@ -85,6 +85,7 @@ class CameraProcess:
         self._arrived: deque[RawSample] = deque()
         self._info_seq = 0
         self._begun = False
+        self._done_ns = -1
         self._bell = Bell(link, presence)
 
     def _eye(self, drone: str, name: str, camera: Camera, scene: Scene) -> Eye:
@@ -105,9 +106,13 @@ class CameraProcess:
             self._bell.is_back = False
             self._publish_infos()
         self._take_in()
+        newest_ns = self._truths.newest_ns
         for eye, number in self._due():
             self._take_in()
             self._expose(eye, number)
+        if newest_ns > self._done_ns:
+            self._done_ns = newest_ns
+            self._presence.done(newest_ns)
 
     # What arrives
 

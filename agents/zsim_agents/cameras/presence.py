@@ -1,4 +1,4 @@
-"""What a process of cameras needs of its place in a run: it never gates."""
+"""What a process of cameras needs of its place in a run."""
 
 import threading
 from typing import Protocol
@@ -20,6 +20,7 @@ class Presence(Protocol):
 
     def update_clock(self, payload: bytes) -> object: ...
     def tick(self) -> None: ...
+    def done(self, t_ns: int) -> None: ...
 
 
 class Bell:

@@ -62,13 +62,13 @@ def _serve(
     role: str, serve: "Serve", chosen: "Chosen", reach: WorldAccess, drones: Sequence[str] | None, name: str
 ) -> None:
     """Serve one run after the other with lower priority, as the process that the command means."""
-    from zsim_deploy.roles.camera_roles import stands_for
+    from zsim_deploy.roles.camera_roles import slack_ns, stands_for
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import lower_priority, serve_runs
 
     lower_priority()
     own_name = process_name(role, name, reach.who, _thing(drones))
-    serve_runs(own_name, serve, reach, partial(stands_for, role, chosen, drones or ()))
+    serve_runs(own_name, serve, reach, partial(stands_for, role, chosen, drones or ()), partial(slack_ns, role))
 
 
 def _thing(drones: Sequence[str] | None) -> str:

@@ -14,6 +14,7 @@ from zsim_agents.cameras import camera_process, detector_process
 from zsim_agents.hosting import chosen
 from zsim_bridges.observer_process import ObserverProcess
 
+SLACK_GATES = 3  # a picture between two gates needs the second; one more, and the world and the cameras work at once
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
 Drones = Callable[[Info, Sequence[str]], list[str]]
@@ -80,6 +81,11 @@ def of_detector(info: Info, names: Sequence[str]) -> list[str]:
 def stands_for(role: str, drones: Drones, names: Sequence[str], info: Info) -> tuple[str, ...]:
     """Return the names of the processes, one for each drone, whose work a process for several does."""
     return tuple(f"{role}.{drone}" for drone in drones(info, names))
+
+
+def slack_ns(role: str, info: Info) -> int:
+    """Return by how much the world may be ahead of a role; 0 for any, where the scenario does not let it gate."""
+    return SLACK_GATES * info.gate_ns if scenario_file.from_text(info.scenario).gates(role) else 0
 
 
 def hat_diameter_m(scenario: Scenario) -> float:

@@ -45,6 +45,7 @@ Stopped = Callable[[], bool]
 Say = Callable[[str], None]
 Serve = Callable[[Session, Info, ObserverProcess, Stopped, Say], None]
 StandsFor = Callable[[Info], tuple[str, ...]]  # names of processes whose work a process does in a run
+SlackNs = Callable[[Info], int]
 """Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
 NICE = 5  # of processes for which no gate waits
 NICE_FOR_VIEWS = 10  # of those that only people look at: a picture may come later, a gate may not
@@ -190,7 +191,13 @@ def _nobody(_: Info) -> tuple[str, ...]:
     return ()
 
 
-def serve_runs(name: str, serve: Serve, reach: WorldAccess, stands_for: StandsFor = _nobody) -> None:
+def _any(_: Info) -> int:
+    return 0
+
+
+def serve_runs(
+    name: str, serve: Serve, reach: WorldAccess, stands_for: StandsFor = _nobody, slack_ns: SlackNs = _any
+) -> None:
     """Serve one run after the other of the world on an endpoint, until it is stopped; launched, only one.
 
     Args:
@@ -198,6 +205,7 @@ def serve_runs(name: str, serve: Serve, reach: WorldAccess, stands_for: StandsFo
         serve: what it does in a run.
         reach: of the world.
         stands_for: whose work it does in a run, beside its own.
+        slack_ns: by how much the world of a run may be ahead of it; 0 for any.
 
     Raises:
         NoWorldError: there was no first world within `wait_s`.
@@ -216,7 +224,7 @@ def serve_runs(name: str, serve: Serve, reach: WorldAccess, stands_for: StandsFo
             ):
                 if info.run_id != served:
                     own_name = _free(link, own_name)
-                    presence = ObserverProcess(link, info, own_name, stands_for(info))
+                    presence = ObserverProcess(link, info, own_name, stands_for(info), slack_ns(info))
                     _serve(serve, link, presence, info, stop, say)
                     served = info.run_id
                     if presence.superseded:
