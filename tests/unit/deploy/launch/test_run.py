@@ -103,6 +103,51 @@ def test_no_name_is_taken_for_an_option(tmp_path: Path):
     assert line[-2:] == ["--", "-._"]
 
 
+EYES = "sensors={preset: paper, front_camera: {}}"
+
+# name: (overrides, --cameras, --detect; process: drones, none for all with cameras)
+CAMERAS = {
+    "none": ([EYES], False, False, {}),
+    "all": ([EYES], True, True, {"camera.main": [], "detector.main": []}),
+    "one": ([EYES, "processes.expect=[camera.drone1]"], False, False, {"camera.drone1": ["drone1"]}),
+    "the others too": (
+        [EYES, "processes.expect=[camera.drone2]"],
+        True,
+        False,
+        {"camera.drone2": ["drone2"], "camera.main": ["drone1", "drone3"]},
+    ),
+    "no others": (
+        [EYES, "processes.expect=[detector.drone1, detector.drone2, detector.drone3]"],
+        False,
+        True,
+        {f"detector.drone{i}": [f"drone{i}"] for i in (1, 2, 3)},
+    ),
+    "main": (
+        [EYES, "processes.expect=[camera.main, detector.main]"],
+        False,
+        False,
+        {"camera.main": [], "detector.main": []},
+    ),
+    "names of one's own": ([EYES, "processes.expect=[camera.left, detector.left]"], False, False, {}),
+    "somebody's own cameras": (
+        ["processes.expect=[camera.drone1, camera.main, detector.drone1]"],
+        False,
+        False,
+        {"detector.drone1": ["drone1"]},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_which_cameras_are_started(tmp_path: Path, name: str):
+    overrides, cameras, detect, started = CAMERAS[name]
+    made = options(tmp_path, *overrides, cameras=cameras, detect=detect)
+    children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
+    lines = {child.name: child._arguments for child in children if child.role in ("camera", "detector")}
+    assert {name: line[line.index("--") + 1 :] for name, line in lines.items()} == started
+    assert all(line[line.index("--name") + 1] == name for name, line in lines.items())
+
+
 @pytest.mark.parametrize(
     "endpoint", ["bogus", "tcp/127.0.0.1", "tcp/127.0.0.1:", "tcp/127.0.0.1:0", "tls/127.0.0.1:7000", ""]
 )
