@@ -209,6 +209,8 @@ def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
     if not options.continued:
         _write_scenario(options, in_process=False)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
+    if options.camera_children() and not options.rate:
+        screen.say("as fast as it goes, a lockstep run is faster than its cameras; --rate 1 leaves them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
         if listen:
             return _run_on(options, listen, screen, launcher, signals)

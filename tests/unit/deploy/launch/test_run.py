@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from refused import refused
+from refused import has_terms, refused
 from synthetic_record import SCENARIOS
 
 from zsim.errors import RunError, SessionError
@@ -18,9 +18,13 @@ TAKEN = "the world died: exit code 2: cannot listen on tcp/127.0.0.1:{port} (Add
 
 
 class Say:
-    """A screen that keeps nothing."""
+    """A screen that keeps what is said."""
 
-    def say(self, text: str) -> None: ...
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.lines.append(text)
 
     def hang_up(self) -> None: ...
 
@@ -146,6 +150,16 @@ def test_which_cameras_are_started(tmp_path: Path, name: str):
     lines = {child.name: child._arguments for child in children if child.role in ("camera", "detector")}
     assert {name: line[line.index("--") + 1 :] for name, line in lines.items()} == started
     assert all(line[line.index("--name") + 1] == name for name, line in lines.items())
+
+
+@pytest.mark.parametrize(("cameras", "rate", "says"), [(True, 0.0, True), (True, 1.0, False), (False, 0.0, False)])
+def test_a_run_that_leaves_its_cameras_no_time_says_so(
+    watched: type[FakeSupervisor], tmp_path: Path, cameras: bool, rate: float, says: bool
+):
+    watched.outcomes = ["ended"]
+    screen = Say()
+    run.run_processes(options(tmp_path, EYES, cameras=cameras, rate=rate), screen)  # type: ignore[arg-type]
+    assert any(has_terms(line, "cameras", "--rate 1") for line in screen.lines) == says
 
 
 @pytest.mark.parametrize(
