@@ -145,7 +145,7 @@ class DetectorProcess:
         self._presence.health.refused += 1
         if self._reported < REPORTS_MAX:
             self._reported += 1
-            self._say(f"{self._presence.name}: {key}: {error}")
+            self._say(f"{self._presence.name}: {key}: {messages.fault_at(key, error)}")
 
 
 def detector_of(info: CameraInfo, diameter_m: float) -> HatDetector:

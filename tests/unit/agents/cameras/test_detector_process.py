@@ -98,6 +98,7 @@ def test_pictures_that_are_none_are_told_of_a_few_times_only() -> None:
     [
         ({"width": ABSURD_PX, "height": ABSURD_PX}, (str(ABSURD_PX), str(PIXELS_MAX))),
         ({"K": (0.0,) * 9}, ("0", "> 0")),
+        ({"width": 10**9}, ("width", str(10**9))),
     ],
 )
 def test_what_its_pixels_cannot_mean_is_refused_before_memory_is_taken(
@@ -108,6 +109,7 @@ def test_what_its_pixels_cannot_mean_is_refused_before_memory_is_taken(
     detecting.take((FRONT_INFO, replace(info(), **fields)))
     assert detecting.counted() == (0, 1, 0)
     assert has_terms(detecting.said[0], FRONT_INFO, *terms)
+    assert detecting.said[0].count(FRONT_INFO) == 1
 
 
 def test_of_many_pictures_only_the_newest_is_held() -> None:
