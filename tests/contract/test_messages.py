@@ -600,3 +600,13 @@ def test_a_malformed_request_is_refused(plain: Any, terms: tuple[str, ...]):
 def test_a_random_request_is_a_request_or_refused(payload: bytes):
     request = decoded_or_refused(run_messages.ControlRequest, payload, "world/control")
     assert request is None or isinstance(request, run_messages.ControlRequest)
+
+
+@pytest.mark.parametrize("drone", ["d1", "d" * 100], ids=["short", "cut short"])
+def test_a_refusal_can_be_said_without_its_key(drone: str):
+    key = f"drone/{drone}/camera/front/info"
+    with pytest.raises(DecodeError) as caught:
+        messages.decode(key, b"\xc0")
+    assert str(caught.value).endswith(f": {messages.fault_at(key, caught.value)}")
+    assert "drone/" not in messages.fault_at(key, caught.value)
+    assert messages.fault_at(key, ValueError("of another kind")) == "of another kind"

@@ -11,7 +11,8 @@ import pytest
 from chromium import needs_browser
 from federation import PAIR, Federation
 from gateway_process import GatewayProcess
-from picture_pump import SIZE, image, pumping, shaded
+from meanwhile import meanwhile
+from picture_pump import PERIOD_S, SIZE, calibration, image, pumping, shaded
 from refused import has_terms
 from wire import PATIENCE_S, Client
 
@@ -160,6 +161,24 @@ def test_junk_on_a_camera_s_key_is_counted_and_touches_nothing(gateway: GatewayP
             number, data = stream.next()
         assert data == shaded(number)
     assert healths.until(lambda health: health["refused"]).message["refused"] == len(JUNK)
+
+
+def test_an_info_that_is_none_is_not_shown_and_the_one_before_stays(gateway: GatewayProcess, camera: Client) -> None:
+    path = f"/json/{FRONT}/info"
+    healths = camera.subscribe("process/gateway.main/health")
+    before = healths.until(lambda health: True).message["refused"]
+    with gateway.events(path) as events:
+        with meanwhile(lambda: camera.put(f"{FRONT}/info", **calibration()), PERIOD_S):
+            _, first = next(events)  # the gateway's subscription has reached whoever publishes
+        absurd = {**calibration(), "seq": 1, "source": "evil.cam", "width": 10**9, "K": [0.0] * 9}
+        camera.put_raw(f"{FRONT}/info", Client.pack(absurd))
+        healths.until(lambda health: health["refused"] > before)
+        assert gateway.http("GET", path).json()["source"] == "camera.tester"
+        camera.put(f"{FRONT}/info", **{**calibration(), "rate_hz": 7.0})
+        shown = first["value"]
+        while shown["rate_hz"] != 7.0:
+            assert shown["source"] == "camera.tester"
+            shown = next(events)[1]["value"]
 
 
 def test_a_client_of_the_gateway_may_be_a_camera(gateway: GatewayProcess) -> None:

@@ -220,6 +220,18 @@ def decode_as(kind: type[Struct], payload: bytes, where: str) -> Any:
         raise _refusal(kind, payload, where, error) from error
 
 
+def fault_at(key: str, error: Exception) -> str:
+    """Return the text of a refusal without the key with which it opens, for who names that anyway."""
+    text = str(error)
+    return next(
+        (text.removeprefix(where) for where in (f"{key}: ", f"{_shown(key)}: ") if text.startswith(where)), text
+    )
+
+
+def _shown(where: str) -> str:
+    return where if len(where) <= 80 else f"{where[:77]}..."
+
+
 _Reader = Callable[[bytes], Any]
 
 
@@ -253,7 +265,7 @@ def _too_long(payload: bytes) -> NoReturn:
 
 def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -> DecodeError:
     """Return the refusal in the contract's words: key, field, what was found, what is allowed."""
-    where = where if len(where) <= 80 else f"{where[:77]}..."
+    where = _shown(where)
     if not isinstance(error, msgspec.MsgspecError):
         return DecodeError(f"{where}: {str(error) or type(error).__name__}")
     try:

@@ -19,6 +19,7 @@ class Role(NamedTuple):
         about: what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent.
         agent: `package.module:Class` of the agent, made of world/info, scenario and name.
         joint: one agent may do the work of many, made of all their names.
+        on_overdue: what follows where it does not come back and the scenario does not say; `drop` if it gates nothing.
     """
 
     extra: str
@@ -26,6 +27,7 @@ class Role(NamedTuple):
     about: Literal["drone", "cluster"] | None = None
     agent: str = ""
     joint: bool = False
+    on_overdue: OnOverdue = "end"
 
 
 ROLES = {
@@ -33,8 +35,12 @@ ROLES = {
     "recorder": Role("record", "restart"),
     "estimator": Role("agents", "restart", "drone", "zsim_agents.estimation.estimator:Estimator", joint=True),
     "controller": Role("agents", "restart", "cluster", "zsim_agents.formation.controller:Controller"),
-    "camera": Role("cameras", "restart"),
-    "detector": Role("cameras", "restart"),
+    "camera": Role("cameras", "restart", on_overdue="drop"),
+    "detector": Role("cameras", "restart", on_overdue="drop"),
+    "console": Role("console", "drop", on_overdue="drop"),
+    "gateway": Role("gateway", "drop", on_overdue="drop"),
+    "ros1": Role("ros1", "drop", on_overdue="drop"),
+    "ros2": Role("ros2", "drop", on_overdue="drop"),
     "router": Role("", "restart"),
 }
 AGENTS = {name: role for name, role in ROLES.items() if role.about}
@@ -65,4 +71,12 @@ def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None)
 
 def on_overdue(actions: Mapping[str, OnOverdue], name: str, role: str | None = None) -> OnOverdue:
     """Return what is to be done when a process has not come back in its time; arguments as of `on_death`."""
-    return actions.get(name) or actions.get(role or name.partition(".")[0]) or "end"
+    role = role or name.partition(".")[0]
+    default = ROLES[role].on_overdue if role in ROLES else "end"
+    return actions.get(name) or actions.get(role) or default
+
+
+def is_needed(name: str) -> bool:
+    """Tell whether a run cannot go on without a process, by its role, unless the scenario says so."""
+    role = ROLES.get(name.partition(".")[0])
+    return role is not None and role.on_overdue == "end"

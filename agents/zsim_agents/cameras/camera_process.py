@@ -6,6 +6,7 @@ When it is too slow it leaves pictures out, and counts them; where the scenario 
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import count
 
 from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo
@@ -47,6 +48,7 @@ class Eye:
         self.latency_ns = round(camera.latency_ms * 1e6)
         self.next = 0
         self.seq = 0
+        self.last = -1  # its last picture, by its number among those of all cameras
 
     def exposure_ns(self, number: int) -> int:
         """Return the middle of the exposure of a picture: number / rate."""
@@ -83,6 +85,7 @@ class CameraProcess:
         longest_ns = max((eye.latency_ns for eye in self._eyes), default=0)
         self._truths = TruthHistory(len(info.drones), info.gate_ns, longest_ns + 2 * BEHIND_MAX * info.gate_ns)
         self._arrived: deque[RawSample] = deque()
+        self._numbers_drawn = count()
         self._info_seq = 0
         self._begun = False
         self._done_ns = -1
@@ -144,20 +147,24 @@ class CameraProcess:
     # What goes out
 
     def _due(self) -> list[tuple[Eye, int]]:
-        """Return the pictures that are due, the oldest first; those that it is too late for are counted."""
+        """Return the pictures that are due, one of each camera after the other; those that are too old are counted.
+
+        Of the cameras, the one whose last picture is longest ago is first: a process that is too slow for all of them
+        leaves out some of each.
+        """
         newest_ns = self._truths.newest_ns
         if newest_ns < 0:
             return []
-        due: list[tuple[int, Eye, int]] = []
+        due: list[tuple[int, int, Eye]] = []
         for eye in self._eyes:
             last = eye.last_due(newest_ns)
             first = max(eye.next, eye.last_due(newest_ns - BEHIND_MAX * self._info.gate_ns) + 1)
             if self._begun:
                 self._presence.health.dropped += max(0, first - eye.next)
-            due += [(eye.exposure_ns(number), eye, number) for number in range(first, last + 1)]
+            due += [(turn, number, eye) for turn, number in enumerate(range(first, last + 1))]
             eye.next = max(eye.next, last + 1)
         self._begun = True
-        return [(eye, number) for _, eye, number in sorted(due, key=lambda each: each[0])]
+        return [(eye, number) for _, number, eye in sorted(due, key=lambda each: (each[0], each[2].last))]
 
     def _expose(self, eye: Eye, number: int) -> None:
         """Draw and publish a picture, if it is not too late for it by now."""
@@ -179,6 +186,7 @@ class CameraProcess:
             data=eye.renderer.jpeg(number, t_sample_ns / 1e9, bodies),
         )
         eye.seq += 1
+        eye.last = next(self._numbers_drawn)
         self._link.put(eye.key, image)
         health.step(time.perf_counter_ns() - start_ns)
 

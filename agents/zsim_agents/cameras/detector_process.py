@@ -1,7 +1,7 @@
 """A detector of hats as a process: reads the pictures of some drones' cameras, publishes what it finds in them."""
 
 import time
-from collections import defaultdict
+from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Sequence
 from itertools import product
 
@@ -50,7 +50,7 @@ class DetectorProcess:
     ) -> None:
         self._link, self._presence, self._say = link, presence, say
         self._drones, self._diameter_m = drones, diameter_m
-        self._pictures: dict[str, RawSample] = {}  # the newest of each camera
+        self._pictures: OrderedDict[str, RawSample] = OrderedDict()  # the newest of each camera, by who waits longest
         self._infos: dict[str, RawSample] = {}
         self._detectors: dict[str, HatDetector] = {}  # by the key of the camera
         self._known: dict[str, CameraInfo] = {}
@@ -66,12 +66,12 @@ class DetectorProcess:
             self._link.declare_subscriber(keys.camera(drone, name), self._on_picture)
 
     def turn(self) -> None:
-        """Wait for something, and look at the newest picture of each camera."""
+        """Wait for something, and look at the newest picture of each camera, of the one that waits longest first."""
         self._bell.wait()
         while self._infos:
             self._learn(self._infos.popitem()[1])
-        while self._pictures:
-            self._look(self._pictures.popitem()[1])
+        for _ in range(len(self._pictures)):
+            self._look(self._pictures.popitem(last=False)[1])
 
     # What arrives, in threads of Zenoh's
 
@@ -145,7 +145,7 @@ class DetectorProcess:
         self._presence.health.refused += 1
         if self._reported < REPORTS_MAX:
             self._reported += 1
-            self._say(f"{self._presence.name}: {key}: {error}")
+            self._say(f"{self._presence.name}: {key}: {messages.fault_at(key, error)}")
 
 
 def detector_of(info: CameraInfo, diameter_m: float) -> HatDetector:

@@ -166,11 +166,20 @@ def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
         key: on which it was published.
         payload: as published.
         encoding: Zenoh's, where it is known.
+
+    Raises:
+        DecodeError: it is not the message that the contract puts on its key.
     """
+    known = messages.type_of(key) is not None
+    return _to_json(messages.decode(key, payload) if known else decode_foreign(payload, encoding))
+
+
+def is_sound(key: str, payload: bytes) -> bool:
+    """Tell whether a payload is the message that the contract puts on its key; on other keys anything is."""
     try:
-        return _to_json(messages.decode(key, payload))
+        return messages.type_of(key) is None or messages.decode(key, payload) is not None
     except DecodeError:
-        return _to_json(decode_foreign(payload, encoding))
+        return False
 
 
 def decode_foreign(payload: bytes, encoding: str) -> Any:
@@ -255,6 +264,9 @@ def json_entry(key: str, payload: bytes, encoding: str = "") -> dict[str, Any]:
 
 @lru_cache(maxsize=CACHED_VALUES)
 def value_line(sample: RawSample) -> bytes:
-    """Return the line of a value for a client; null for a key that was deleted."""
-    value = payload_to_json(sample.key, sample.payload, sample.encoding) if sample.payload else b"null"
+    """Return the line of a value for a client; null for a key that was deleted, nothing for what is no message."""
+    try:
+        value = payload_to_json(sample.key, sample.payload, sample.encoding) if sample.payload else b"null"
+    except DecodeError:
+        return b""
     return b'{"op":"value","key":%b,"value":%b}\n' % (_to_json(sample.key), value)

@@ -33,7 +33,7 @@ _SOCKET_OPTIONS = (
 
 Half = Coroutine[Any, Any, None]
 EventOf = Callable[[RawSample], bytes]
-"""Makes the event of a publication."""
+"""Makes the event of a publication; an empty one is not sent."""
 
 
 class Outbox:
@@ -261,9 +261,12 @@ async def stream_events(
         TooManyError: the limit of streams is reached.
     """
     outbox = Outbox(_cutter(request), _lost_comment)
-    unsubscribe = subscriptions.subscribe_stream(
-        expression, lambda sample: outbox.put(event_of(sample), droppable=True)
-    )
+
+    def put(sample: RawSample) -> None:
+        if event := event_of(sample):
+            outbox.put(event, droppable=True)
+
+    unsubscribe = subscriptions.subscribe_stream(expression, put)
     headers = {"Content-Type": "text/event-stream", "Cache-Control": "no-cache", "Access-Control-Allow-Origin": "*"}
     response = web.StreamResponse(headers=headers)
     try:

@@ -121,7 +121,7 @@ class JsonTree:
         """Answer with the last values, or with every value from now on."""
         expression = _checked_key(request)
         if _first_accepted(request) == EVENT_STREAM:
-            return await stream_events(request, self._subscriptions, expression, _value_event)
+            return await stream_events(request, self._subscriptions, expression, value_event)
         last = self._run().values
         entries = [json_entry(key, payload, last.encoding(key)) for key, payload in last.matching(expression)]
         if "*" in expression:
@@ -278,9 +278,13 @@ def _sample_event(sample: RawSample) -> bytes:
 
 
 @lru_cache(maxsize=CACHED_VALUES)
-def _value_event(sample: RawSample) -> bytes:
+def value_event(sample: RawSample) -> bytes:
+    """Return a publication as an event; nothing for what is no message."""
     deleted = {"key": sample.key, "value": None}
-    value = json_entry(sample.key, sample.payload, sample.encoding) if sample.payload else deleted
+    try:
+        value = json_entry(sample.key, sample.payload, sample.encoding) if sample.payload else deleted
+    except DecodeError:
+        return b""
     return event_bytes(sample.kind, _encode(value))
 
 

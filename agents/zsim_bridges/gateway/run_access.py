@@ -13,7 +13,7 @@ from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
 from zsim.sensors.camera import CAMERAS
-from zsim.transport.session import RawSample, Session, check_expression
+from zsim.transport.session import RawSample, ReceivedSample, Session, check_expression
 from zsim.transport.traffic import Passed, Traffic
 from zsim_bridges.gateway.client_messages import (
     ForbiddenError,
@@ -23,6 +23,7 @@ from zsim_bridges.gateway.client_messages import (
     check_not_reserved,
     is_client_key,
     is_control_key,
+    is_sound,
     json_to_payload,
 )
 from zsim_bridges.gateway.publications import LastValues
@@ -74,10 +75,10 @@ class RunAccess:
         """Subscribe to what passes the world, and read the last values of before."""
         self._traffic = Traffic(self.link, run_key_table(self.info), self.count_refused)
         # Views do not pass the world.
-        self.link.declare_subscriber("view/**", lambda sample: self.values.add(sample.key, sample.payload))
+        self.link.declare_subscriber("view/**", lambda sample: self._keep(self.values.add, sample))
         for expression in rights.LAST_VALUES:
             for sample in self.link.get(expression):
-                self.values.add(sample.key, sample.payload)
+                self._keep(self.values.add, sample)
                 if sample.key == keys.CLOCK:
                     self._observer.update_clock(sample.payload)
 
@@ -101,9 +102,16 @@ class RunAccess:
             if isinstance(entry, GateMessages):
                 self.values.add_gate(entry)
                 continue
-            self.values.add_passed(entry.key, entry.payload)
+            self._keep(self.values.add_passed, entry)
             if entry.key == keys.CLOCK:
                 self._observer.update_clock(entry.payload)
+
+    def _keep(self, add: Callable[[str, bytes], None], sample: RawSample | ReceivedSample) -> None:
+        """Keep a last value; of what is no message, which anybody may publish, the one before stays."""
+        if is_sound(sample.key, sample.payload):
+            add(sample.key, sample.payload)
+        else:
+            self.count_refused()
 
     def close(self) -> None:
         """Give up requests that wait."""

@@ -220,7 +220,8 @@ class Client:
         self.send({"op": "subscribe", "key": request.key}, request)
 
     def _on_value(self, sample: RawSample) -> None:
-        self._outbox.put(value_line(sample), droppable=True)
+        if line := value_line(sample):
+            self._outbox.put(line, droppable=True)
 
     def _unsubscribe(self, request: stream_requests.UnsubscribeRequest) -> None:
         if request.key not in self._subscriptions:

@@ -163,7 +163,7 @@ class SourceSubscriptions:
                 try:
                     yield key, messages.decode(key, payload)
                 except DecodeError as error:
-                    self._refuse(key, str(error))
+                    self._refuse(key, messages.fault_at(key, error))
 
     def _publish(self, publication: BridgedTopic, key: str, message: Any) -> None:
         try:

@@ -23,6 +23,9 @@ TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everyb
 DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID that ROS 2 takes
 
 CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}  # modules by extra
+GATEWAY_NEEDS = {"gateway": ("aiohttp",)}
+ROS1_NEEDS = {"ros1": ("rosbags",)}
+ROS2_NEEDS = {"ros2": ("rosbags", "xxhash")}
 
 app = typer.Typer()
 
@@ -78,6 +81,7 @@ def gateway(
     name: Annotated[str, typer.Option(help="Process name (default gateway.main, or the certificate's).")] = "",
 ) -> None:
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
+    require("gateway", GATEWAY_NEEDS)
     from zsim.transport.connection import find_world
     from zsim.transport.open_files import SERVER_FILES, allow_files, require_files
     from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
@@ -128,6 +132,7 @@ def ros1(
     name: Annotated[str, typer.Option(help="Process name (default ros1.main, or the certificate's).")] = "",
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
+    require("ros1", ROS1_NEEDS)
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import lower_priority, serve_runs
@@ -155,6 +160,7 @@ def ros2(
     ] = None,
 ) -> None:
     """Show the drones to ROS 2 (RMW_IMPLEMENTATION=rmw_zenoh_cpp) as topics and services, without ROS here."""
+    require("ros2", ROS2_NEEDS)
     if write_package is not None:
         _write_package(write_package / "zsim_msgs")
         return

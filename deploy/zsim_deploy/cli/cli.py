@@ -99,8 +99,6 @@ def run(
         _refuse_with_others(flight, listen, hosted, console, cameras, detect)
     if console:
         require("console", bridge_commands.CONSOLE_NEEDS)
-    if cameras or detect:
-        require("run", camera_commands.CAMERA_NEEDS)
     if continue_:
         _refuse_to_change(flight, out, in_process, listen, insecure, hosted)
         options, in_process = options_of(flight.path)
@@ -113,6 +111,8 @@ def run(
         scenario = with_cameras(flight.scenario()) if cameras else flight.scenario()
         options = RunOptions(scenario, Path(), *pace, listen, insecure, hosted, first, console, cameras, detect)
     if not in_process:
+        if options.camera_children():
+            require("run", camera_commands.CAMERA_NEEDS)
         check_open_files(options)
     if not continue_:
         options.out = make_directory(out, options.scenario, force)

@@ -22,6 +22,7 @@ from zsim_agents.hosting import agents_of
 from zsim_deploy.arguments import CONSOLE_PORT, load_scenario, pace_options
 from zsim_deploy.inventory.processes import COMMANDS
 from zsim_deploy.launch import interrupted_run
+from zsim_deploy.launch.camera_children import CameraChild, camera_children
 from zsim_deploy.launch.child_process import ChildProcess
 from zsim_deploy.launch.end_signals import EndSignals
 from zsim_deploy.launch.interrupted_run import JOURNAL, Launch
@@ -59,6 +60,10 @@ class RunOptions:
     run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
     continued: bool = False
 
+    def camera_children(self) -> list[CameraChild]:
+        """Return the cameras and detectors that are started."""
+        return camera_children(self.scenario, self.cameras, self.detect)
+
 
 def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launcher: RoleLauncher) -> list[ChildProcess]:
     """Return the processes of a run, not started."""
@@ -88,8 +93,9 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
     if options.console:
         show = ["console", "--name", CONSOLE, "--port", str(_page_port()), *reach]
         children.append(ChildProcess(CONSOLE, show, logs, launcher, supervisor.handle_line))
-    for role in (["camera"] * options.cameras) + (["detector"] * options.detect):
-        children.append(ChildProcess(f"{role}.main", [COMMANDS.get(role, role), *reach], logs, launcher))
+    for role, name, drones in options.camera_children():
+        draw = [COMMANDS.get(role, role), "--name", name, *reach, "--", *drones]
+        children.append(ChildProcess(name, draw, logs, launcher))
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 
@@ -124,9 +130,10 @@ def check_open_files(options: RunOptions) -> None:
     Raises:
         SessionError: with how many files there must be.
     """
+    cameras = {child.name for child in options.camera_children()}
     expected = {*options.scenario.expected(), RECORDER}
-    agents = 1 if options.hosted else len(expected) - 1
-    count = 2 + agents + options.console + options.cameras + options.detect
+    agents = 1 if options.hosted else len(expected - cameras) - 1
+    count = 2 + agents + options.console + len(cameras)
     require_files(launcher_files(count, len(expected)), f"{count} processes")
 
 
@@ -202,6 +209,8 @@ def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
     if not options.continued:
         _write_scenario(options, in_process=False)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
+    if options.camera_children() and not options.rate:
+        screen.say("as fast as it goes, a lockstep run is faster than its cameras; --rate 1 leaves them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
         if listen:
             return _run_on(options, listen, screen, launcher, signals)

@@ -5,7 +5,6 @@ Where a process runs, on this machine (`ChildProcess`) or on another one (`Remot
 
 import json
 import time
-from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -15,8 +14,8 @@ from typing import Any, Protocol
 
 from zsim.errors import RunError
 from zsim.runtime.progress import ProgressSink
-from zsim.scenario.role_table import on_death, on_overdue
 from zsim.scenario.scenario import Processes
+from zsim_deploy.launch.death_policy import SUPERSEDED, USER_FAULT, DeathPolicy
 from zsim_deploy.launch.world_watch import WorldWatch
 from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
@@ -26,10 +25,6 @@ WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for e
 INTERRUPT_S = 2.0  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
 SILENT_S = 10.0  # after which a world that has printed nothing is named; it takes 1 s, and compiles with a notice
 TAKE_OVER_S = 60.0  # how long a process may stay once another was started in its place; a slow one starts in half
-RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
-RESTART_WINDOW_S = 20.0
-USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run at all
-SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
 
 
 class RunProcess(Protocol):
@@ -74,7 +69,7 @@ class Supervisor:
 
     def __init__(self, processes: Processes, show: ProgressSink) -> None:
         self.members: list[RunProcess] = []
-        self._processes = processes
+        self._deaths = DeathPolicy(processes)
         self._show = show
         self._reason = ""
         self._failed = False
@@ -83,7 +78,6 @@ class Supervisor:
         self._until_s: float | None = None
         self._silent_s: float | None = None  # when a world without a line of its own is to be named (monotonic)
         self._dead: set[str] = set()
-        self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
         self._gone: list[RunProcess] = []  # nobody waits for them any more
         self._world_watch = WorldWatch()
@@ -194,10 +188,10 @@ class Supervisor:
         flew = code is not None and code not in (0, USER_FAULT) and (self._flies or code < 0)
         if not flew or self._reason or self._interrupted:
             return False
-        policy = on_death(self._processes.on_death, world.name)
-        if policy != "restart" or self._too_often(world):
+        action, why = self._deaths.decide(world.name, code, flies=True)
+        if action != "restart":
             return False
-        self._show.say(f"{world.name} (pid {world.pid}) ended: {world.outcome()}; on_death: {policy}")
+        self._show.say(f"{world.name} (pid {world.pid}) ended: {world.outcome()}; {why}")
         world.restarts += 1
         world.start()
         return True
@@ -266,18 +260,14 @@ class Supervisor:
             if child.code == SUPERSEDED:
                 self._show.say(child.last_log_line())
             return
-        policy = on_death(self._processes.on_death, child.name)
-        if child.code == USER_FAULT:
-            policy = "end"
-        elif policy == "restart" and self._too_often(child):
-            policy = on_overdue(self._processes.on_overdue or {}, child.name)
-        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {policy}")
-        if policy == "restart":
+        action, why = self._deaths.decide(child.name, child.code, self._flies)
+        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {why}")
+        if action == "restart":
             child.restarts += 1
             child.start()
             return
         self._dead.add(child.name)
-        if policy == "end":
+        if action == "end":
             self._fail(f"{child.name} ended: {child.outcome()}")
             world.request_stop(self._reason)
 
@@ -296,12 +286,6 @@ class Supervisor:
             self._silent_s = None
             last = world.last_log_line() or "its log is empty"
             self._show.say(f"the world (pid {world.pid}) has not begun after {SILENT_S:g} s: {last}; the others wait")
-
-    def _too_often(self, child: RunProcess) -> bool:
-        """Count a death; return whether there were too many in a row for another restart."""
-        deaths = self._deaths[child.name]
-        deaths.append(time.monotonic())
-        return len(deaths) > RESTARTS_MAX and deaths[-1] - deaths[0] < RESTART_WINDOW_S
 
     def _fail(self, reason: str) -> None:
         self._reason, self._failed = self._reason or reason, True

@@ -24,7 +24,7 @@ from zsim_deploy.inventory.processes import (
     processes,
     used_hosts,
 )
-from zsim_deploy.launch.supervisor import RESTARTS_MAX
+from zsim_deploy.launch.death_policy import RESTARTS_MAX
 from zsim_deploy.render.rendered_files import (
     ACCESS,
     CACHE,

@@ -27,8 +27,8 @@ from zsim_deploy.inventory.processes import (
     processes,
     used_hosts,
 )
+from zsim_deploy.launch.death_policy import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_FAULT
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
-from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_FAULT
 
 TARGET = "zsim.target"
 STATE = "/var/lib/zsim"  # StateDirectory=zsim

@@ -24,7 +24,8 @@ from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.run_clock import number, refused_argument
 from zsim_world.flight.run_outbox import Refusal
-from zsim_world.playback.recorded_gates import Gate, PlaybackViews, RecordedGates, author, is_played, without_kills
+from zsim_world.playback.live_processes import LiveProcesses
+from zsim_world.playback.recorded_gates import Gate, PlaybackViews, RecordedGates, is_played, without_kills
 
 RECORD_OVER = "the record is over"  # why a replay of the whole record ended
 
@@ -51,7 +52,8 @@ class PlaybackRange(NamedTuple):
 class Playback(Coordinator):
     """Plays a record.
 
-    What a process that takes part publishes in place of one on record (by its name: `estimator.drone1`) is not played.
+    What a process that takes part publishes in place of one on record (by its name: `estimator.drone1`; pictures and
+    what is seen in them: by their drone) is not played.
 
     Args:
         reader: of the record; it stays open.
@@ -179,9 +181,8 @@ class Playback(Coordinator):
 
     # What is played
 
-    def _live(self) -> set[str]:
-        """Return the names of the processes whose work the participants do."""
-        return {name for p in self.barrier.participants.values() for name in p.served_names}
+    def _live(self) -> LiveProcesses:
+        return LiveProcesses(self.scenario, self.barrier.participants.values())
 
     def _play(self, gate: Gate, wall_ns: int) -> None:
         live = self._live()
@@ -197,7 +198,7 @@ class Playback(Coordinator):
         self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
         infos, self._pending_infos = self._pending_infos, []
         for recorded in (m for m in (*infos, *gate.messages) if m.key not in self._place and m.key != keys.FAULTS):
-            if not (live and author(recorded) in live):
+            if not live.replace(recorded):
                 self._publish(recorded)
 
     def _publish(self, recorded: Recorded) -> None:
@@ -231,7 +232,7 @@ class Playback(Coordinator):
         return GateMessages.of(t_ns, t_ns // self.clock.gate_ns, self._table, pairs, stamps, first)
 
     def views(self, seq: int) -> Sequence[Output]:
-        live = self._live()
+        live = self._live().names
         views = self._views.views(self._last, self.now_ns, seq)
         return [output for output in views if not _is_of(output.key, live)]
 
@@ -252,7 +253,7 @@ class Playback(Coordinator):
         return ControlAnswer(False, NOT_FLYABLE) if request.op in FLIGHT_OPS else super()._perform(request)
 
     def refusal_at(self, key: str) -> str | None:
-        return None if f"controller.{keys.thing(key)}" in self._live() else NOT_FLYABLE
+        return None if f"controller.{keys.thing(key)}" in self._live().names else NOT_FLYABLE
 
     def _after_bye(self, participant: Participant, reason: str) -> None:
         """Go on: the record is there already."""

@@ -236,7 +236,7 @@ class MessageIntake:
                 raise DecodeError(f"{key}: only the world publishes here")
         except DecodeError as error:
             self.history.add_foreign(key, sample.payload)
-            self._refuse("somebody", key[:80], error)
+            self._refuse("somebody", key, error)
             self._count_refused(sample)
 
     def _hand_over(self, key: str, payload: bytes, wall_ns: int) -> None:
@@ -251,9 +251,9 @@ class MessageIntake:
             self.liveliness.health_received(keys.thing(key))
             self.progress("health", message, keys.thing(key))
 
-    def _refuse(self, source: str, subject: str, error: DecodeError) -> None:
+    def _refuse(self, source: str, key: str, error: DecodeError) -> None:
         self.health.refused += 1
-        self.world.outbox.refuse(source, subject, str(error))
+        self.world.outbox.refuse(source, key[:80], messages.fault_at(key, error))
 
     def _count_refused(self, sample: ReceivedSample) -> None:
         """Count an output that was refused, so that its sender's done is not taken to be short of it."""

@@ -1,5 +1,6 @@
 """The process of a detector: what arrives on a camera's keys that is none of its pictures is counted, and held nowhere."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -24,13 +25,13 @@ ABSURD_PX = 16_384  # as many as the contract lets a side have
 
 
 class Detecting:
-    """A detector of drone d1, whatever it says, and what it publishes."""
+    """A detector of drone d1, or of others, whatever it says, and what it publishes."""
 
-    def __init__(self) -> None:
+    def __init__(self, drones: Sequence[str] = ("d1",)) -> None:
         self.link, self.said = FakeLink(), []
         link: Any = self.link
         self.presence = ObserverProcess(link, INFO, "detector.d1")
-        self._process = DetectorProcess(link, self.presence, self.said.append, ["d1"], HATS.diameter_m)
+        self._process = DetectorProcess(link, self.presence, self.said.append, drones, HATS.diameter_m)
         self._process.begin()
 
     def take(self, *arrived: tuple[str, Any]) -> None:
@@ -97,6 +98,7 @@ def test_pictures_that_are_none_are_told_of_a_few_times_only() -> None:
     [
         ({"width": ABSURD_PX, "height": ABSURD_PX}, (str(ABSURD_PX), str(PIXELS_MAX))),
         ({"K": (0.0,) * 9}, ("0", "> 0")),
+        ({"width": 10**9}, ("width", str(10**9))),
     ],
 )
 def test_what_its_pixels_cannot_mean_is_refused_before_memory_is_taken(
@@ -107,6 +109,7 @@ def test_what_its_pixels_cannot_mean_is_refused_before_memory_is_taken(
     detecting.take((FRONT_INFO, replace(info(), **fields)))
     assert detecting.counted() == (0, 1, 0)
     assert has_terms(detecting.said[0], FRONT_INFO, *terms)
+    assert detecting.said[0].count(FRONT_INFO) == 1
 
 
 def test_of_many_pictures_only_the_newest_is_held() -> None:
@@ -114,6 +117,23 @@ def test_of_many_pictures_only_the_newest_is_held() -> None:
     detecting.take((FRONT_INFO, info()), *((FRONT, image(number * 1_000_000)) for number in range(100)))
     assert detecting.counted() == (1, 0, 99)
     assert [seen.t_ns for seen in detecting.sightings()] == [99_000_000]
+
+
+def test_of_too_many_pictures_as_many_are_looked_at_of_each_camera() -> None:
+    """Whenever it has looked at one there are new ones of all."""
+    drones = ["d1", "d2", "d3"]
+    detecting = Detecting(drones)
+
+    def all_expose(key: str = "", _: object = None) -> None:
+        for drone in drones if not key or key.endswith("/sightings") else ():
+            detecting.link.deliver(keys.camera(drone, "front"), image(0))
+
+    detecting.take(*((keys.camera_info(drone, "front"), info()) for drone in drones))
+    all_expose()
+    detecting.link.on_publish = all_expose
+    for _ in range(4):
+        detecting.take()
+    assert [len(detecting.link.published_on(keys.detections(drone))) for drone in drones] == [4, 4, 4]
 
 
 def test_a_camera_that_no_drone_has_is_not_looked_at() -> None:

@@ -26,6 +26,7 @@ from zsim_bridges.gateway.client_messages import (
     TooManyError,
     is_control_key,
     is_reserved,
+    is_sound,
     json_to_payload,
     json_value,
     payload_to_json,
@@ -33,7 +34,7 @@ from zsim_bridges.gateway.client_messages import (
 )
 from zsim_bridges.gateway.client_streams import Outbox
 from zsim_bridges.gateway.http_routes import description
-from zsim_bridges.gateway.http_trees import described_sample, methods_of
+from zsim_bridges.gateway.http_trees import described_sample, methods_of, value_event
 from zsim_bridges.gateway.lockstep_session import LockstepSession, gate_keys_of
 from zsim_bridges.gateway.publications import EchoFilter, LastValues
 from zsim_bridges.gateway.stream_client import Client
@@ -87,6 +88,16 @@ def test_whole_numbers_may_come_as_doubles_but_not_as_fractions():
 )
 def test_what_the_contract_does_not_know_is_shown_as_well_as_json_can(payload: bytes, text: Any):
     assert json.loads(payload_to_json("my/key", payload)) == text
+
+
+@pytest.mark.parametrize("payload", [b"\xc0", msgspec.msgpack.encode({"t_ns": 1}), b"\xc1 no msgpack", b""])
+def test_what_is_no_message_of_its_key_is_not_shown(payload: bytes):
+    assert not is_sound(VELOCITY, payload)
+    with pytest.raises(DecodeError):
+        payload_to_json(VELOCITY, payload)
+    sent = RawSample("PUT", VELOCITY, payload or b"\xc0", "zenoh/bytes", None)
+    assert (value_line(sent), value_event(sent)) == (b"", b"")
+    assert is_sound("my/key", payload)
 
 
 def test_results_that_json_cannot_say_are_base64():

@@ -1,5 +1,7 @@
-"""What `zsim ros2` does beside bridging: the ROS package of our own messages, and options that do not go together."""
+"""What the commands of bridges do beside bridging: the ROS package of our own messages, and what they refuse."""
 
+from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import RunError
 from zsim_bridges.ros2.ros_types import MESSAGES, RosTypes
-from zsim_deploy.cli.bridge_commands import ros2
+from zsim_deploy.cli.bridge_commands import console, gateway, ros1, ros2
 
 
 def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -35,3 +37,20 @@ def test_a_folder_that_cannot_be_written_is_a_line(tmp_path: Path) -> None:
 def test_a_secured_world_needs_a_router_for_ros(tmp_path: Path) -> None:
     with refused(typer.BadParameter, "--tls", "--router"):
         ros2(tls=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("command", "module", "extra"),
+    [
+        (console, "viser", "console"),
+        (gateway, "aiohttp", "gateway"),
+        (ros1, "rosbags", "ros1"),
+        (ros2, "xxhash", "ros2"),
+    ],
+)
+def test_a_bridge_without_its_extra_is_a_line(
+    monkeypatch: pytest.MonkeyPatch, command: Callable[[], None], module: str, extra: str
+) -> None:
+    monkeypatch.setattr("zsim_deploy.arguments.find_spec", lambda name: None if name == module else find_spec(name))
+    with refused(RunError, extra, module, f"pip install 'zsim[{extra}]'"):
+        command()

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from refused import refused
+from refused import has_terms, refused
 from synthetic_record import SCENARIOS
 
 from zsim.errors import RunError, SessionError
@@ -18,9 +18,13 @@ TAKEN = "the world died: exit code 2: cannot listen on tcp/127.0.0.1:{port} (Add
 
 
 class Say:
-    """A screen that keeps nothing."""
+    """A screen that keeps what is said."""
 
-    def say(self, text: str) -> None: ...
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.lines.append(text)
 
     def hang_up(self) -> None: ...
 
@@ -101,6 +105,61 @@ def test_no_name_is_taken_for_an_option(tmp_path: Path):
     (line,) = (line for line in lines if "-._" in line)
     assert line[0] == "estimator"
     assert line[-2:] == ["--", "-._"]
+
+
+EYES = "sensors={preset: paper, front_camera: {}}"
+
+# name: (overrides, --cameras, --detect; process: drones, none for all with cameras)
+CAMERAS = {
+    "none": ([EYES], False, False, {}),
+    "all": ([EYES], True, True, {"camera.main": [], "detector.main": []}),
+    "one": ([EYES, "processes.expect=[camera.drone1]"], False, False, {"camera.drone1": ["drone1"]}),
+    "the others too": (
+        [EYES, "processes.expect=[camera.drone2]"],
+        True,
+        False,
+        {"camera.drone2": ["drone2"], "camera.main": ["drone1", "drone3"]},
+    ),
+    "no others": (
+        [EYES, "processes.expect=[detector.drone1, detector.drone2, detector.drone3]"],
+        False,
+        True,
+        {f"detector.drone{i}": [f"drone{i}"] for i in (1, 2, 3)},
+    ),
+    "main": (
+        [EYES, "processes.expect=[camera.main, detector.main]"],
+        False,
+        False,
+        {"camera.main": [], "detector.main": []},
+    ),
+    "names of one's own": ([EYES, "processes.expect=[camera.left, detector.left]"], False, False, {}),
+    "somebody's own cameras": (
+        ["processes.expect=[camera.drone1, camera.main, detector.drone1]"],
+        False,
+        False,
+        {"detector.drone1": ["drone1"]},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_which_cameras_are_started(tmp_path: Path, name: str):
+    overrides, cameras, detect, started = CAMERAS[name]
+    made = options(tmp_path, *overrides, cameras=cameras, detect=detect)
+    children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
+    lines = {child.name: child._arguments for child in children if child.role in ("camera", "detector")}
+    assert {name: line[line.index("--") + 1 :] for name, line in lines.items()} == started
+    assert all(line[line.index("--name") + 1] == name for name, line in lines.items())
+
+
+@pytest.mark.parametrize(("cameras", "rate", "says"), [(True, 0.0, True), (True, 1.0, False), (False, 0.0, False)])
+def test_a_run_that_leaves_its_cameras_no_time_says_so(
+    watched: type[FakeSupervisor], tmp_path: Path, cameras: bool, rate: float, says: bool
+):
+    watched.outcomes = ["ended"]
+    screen = Say()
+    run.run_processes(options(tmp_path, EYES, cameras=cameras, rate=rate), screen)  # type: ignore[arg-type]
+    assert any(has_terms(line, "cameras", "--rate 1") for line in screen.lines) == says
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ from refused import has_terms
 
 from zsim.errors import RunError
 from zsim.scenario.scenario import Processes
-from zsim_deploy.launch.supervisor import RESTARTS_MAX, SILENT_S, SUPERSEDED, USER_FAULT, Supervisor
+from zsim_deploy.launch.death_policy import RESTARTS_MAX, SUPERSEDED, USER_FAULT
+from zsim_deploy.launch.supervisor import SILENT_S, Supervisor
 
 
 class Show:
@@ -147,6 +148,27 @@ def test_or_it_is_left_to_the_world_to_go_on_without_it():
     assert team.others[0].restarts == RESTARTS_MAX
 
 
+@pytest.mark.parametrize("name", ["camera.main", "camera.drone1", "detector.main"])
+def test_one_for_which_no_gate_waits_is_given_up_and_named(name: str):
+    team = Team(Member(name, *[1] * 20), looks=100)
+    assert not team.go().failed
+    assert team.others[0].restarts == RESTARTS_MAX
+    assert has_terms(team.show.lines[-1], name, "exit code 1", f"{RESTARTS_MAX} restarts", "given up")
+
+
+def test_or_the_run_ends_where_the_scenario_says_so():
+    team = Team(Member("camera.main", *[1] * 20), looks=100, return_s=1, on_overdue={"camera": "end"})
+    assert team.go().reason.startswith("camera.main ended")
+
+
+@pytest.mark.parametrize(("flies", "fails"), [(False, True), (True, False)])
+def test_a_run_that_cannot_begin_without_a_camera_ends(flies: bool, fails: bool):
+    team = Team(Member("camera.d1", *[1] * 20), looks=100, expect=["camera.d1"])
+    if flies:
+        team.watch.handle_line('{"clock": {"state": "running"}}')
+    assert team.go().failed == fails
+
+
 @pytest.mark.parametrize(("action", "fails"), [("drop", False), ("end", True)])
 def test_who_does_not_come_back_in_its_time(action: str, fails: bool):
     team = Team(Member("estimator.d1"))
@@ -169,6 +191,10 @@ def test_deaths_far_apart_do_not_add_up(monkeypatch):
     [
         ("estimator.d1", USER_FAULT, {}, True),
         ("recorder2", 1, {}, False),
+        ("camera.main", USER_FAULT, {}, False),
+        ("camera.main", 1, {"camera": "end"}, True),
+        ("camera.main", USER_FAULT, {"camera": "end"}, True),
+        ("console.run", USER_FAULT, {}, False),
         ("estimator.d1", 1, {"estimator": "drop"}, False),
         ("estimator.d1", 1, {"estimator.d1": "end", "estimator": "drop"}, True),
         ("estimator.d1", SUPERSEDED, {"estimator": "end"}, False),

@@ -72,6 +72,16 @@ def test_or_goes_on_without_it(whose: str) -> None:
     assert made.may_advance()
 
 
+@pytest.mark.parametrize("name", ["camera.main", "detector.d1"])
+def test_one_for_which_no_gate_waits_ends_nothing_by_staying_away(name: str) -> None:
+    made = world("return_s: 2")
+    made.handle(keys.process(name, "join"), Join(0, 0, "run1", 2, name.split(".")[0], "h", 8, 0), 0)
+    made.losses.died(name, 1)
+    made.losses.expired(name)
+    assert events(made)[-3:] == [("death", name), ("overdue", name), ("drop", name)]
+    assert made.ended is None
+
+
 @pytest.mark.parametrize(("on_death", "ends"), [("wait", True), ("restart", True), ("end", True), ("drop", False)])
 def test_one_that_is_stopped_is_overdue_too_and_on_death_says_what_it_means(on_death: str, ends: bool) -> None:
     made = world(f"return_s: 2, on_death: {{estimator: {on_death}}}")

@@ -18,6 +18,7 @@ from zsim.errors import RecordError
 from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
+from zsim.sensors.camera import FrontCamera
 from zsim_world.flight.world import World
 from zsim_world.playback.playback import NOT_FLYABLE, RECORD_OVER, Playback, PlaybackRange
 from zsim_world.playback.recorded_gates import RecordedGates
@@ -267,8 +268,9 @@ def test_views_are_made_of_what_was_played(flight: RecordReader):
 # Who takes part
 
 
-def join(made: Playback, name: str, period_ns: int = GATE_NS) -> None:
-    made.handle(keys.process(name, "join"), Join(0, 0, "replay", 5, name.split(".")[0], "h", 1, period_ns), 0)
+def join(made: Playback, name: str, period_ns: int = GATE_NS, serves: tuple[str, ...] = ()) -> None:
+    role = name.split(".")[0]
+    made.handle(keys.process(name, "join"), Join(0, 0, "replay", 5, role, "h", 1, period_ns, serves=serves), 0)
 
 
 def test_who_takes_part_is_waited_for_and_replaces_its_record(flight: RecordReader):
@@ -467,3 +469,51 @@ def test_a_camera_that_takes_part_renders_in_place_of_the_record(filmed: RecordR
     published = played(made)
     assert (on(FRONT, published), on(FRONT_INFO, published)) == ([], [])
     assert len(on(DETECTIONS, published)) == 6  # its detector's does not
+
+
+@pytest.fixture
+def filmed_by_one(tmp_path: Path) -> Iterator[RecordReader]:
+    """A gate, pictures of both drones, and what was seen in them, by one camera and one detector for both."""
+    recorded: list[KeyedMessage] = [(keys.INFO, INFO), *gate(0)]
+    for name in ("d1", "d2"):
+        recorded += [(keys.camera_info(name, "front"), info(0, source="camera.main"))]
+        recorded += [(keys.camera(name, "front"), image(0, source="camera.main"))]
+        recorded += [(keys.detections(name), sightings(0, source="detector.main"))]
+    with write(tmp_path, recorded) as reader:
+        yield reader
+
+
+# name: (process, what it declares to do, the drones whose pictures are played, those whose sightings are)
+ANEW = {
+    "one of them": ("camera.d2", (), ["d1"], ["d1", "d2"]),
+    "one of them, in the name of both": ("camera.main", ("camera.d2",), ["d1"], ["d1", "d2"]),
+    "both": ("camera.main", ("camera.d1", "camera.d2"), [], ["d1", "d2"]),
+    "a detector": ("detector.d1", (), ["d1", "d2"], ["d2"]),
+    "a name alone": ("camera.main", (), [], ["d1", "d2"]),
+    "another name alone": ("camera.other", (), ["d1", "d2"], ["d1", "d2"]),
+}
+
+
+@pytest.mark.parametrize("name", ANEW)
+def test_a_camera_replaces_the_record_of_the_drones_that_it_draws(filmed_by_one: RecordReader, name: str):
+    process, serves, pictures, seen = ANEW[name]
+    made = playback(filmed_by_one)
+    join(made, process, 0, serves)
+    published = [key for key, _ in played(made)]
+    assert [d for d in ("d1", "d2") if keys.camera(d, "front") in published] == pictures
+    assert [d for d in ("d1", "d2") if keys.camera_info(d, "front") in published] == pictures
+    assert [d for d in ("d1", "d2") if keys.detections(d) in published] == seen
+
+
+def test_a_camera_that_the_scenario_does_not_have_is_not_replaced(tmp_path: Path):
+    bottom = keys.camera("d1", "bottom")
+    first, second = SCENARIO.drones
+    sensors = msgspec.structs.replace(first.sensors, front_camera=FrontCamera())
+    scenario = msgspec.structs.replace(SCENARIO, drones=[msgspec.structs.replace(first, sensors=sensors), second])
+    with write(
+        tmp_path, [(keys.INFO, INFO), *gate(0), (FRONT, image(0)), (bottom, image(0, source="own.eye"))]
+    ) as reader:
+        made = Playback(reader, scenario, INFO, PlaybackRange(), 0.0, lambda: 0, "replay")
+        join(made, "camera.d1", 0)
+        published = played(made)
+    assert (len(on(FRONT, published)), len(on(bottom, published))) == (0, 1)

@@ -1,0 +1,63 @@
+"""What a launcher does when one of its processes ends while the run goes on."""
+
+import time
+from collections import defaultdict, deque
+from typing import NamedTuple
+
+from zsim.scenario.role_table import OnDeath, is_needed, on_death, on_overdue
+from zsim.scenario.scenario import Processes
+
+RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
+RESTART_WINDOW_S = 20.0
+USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run at all
+SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
+
+
+class Decision(NamedTuple):
+    """What is to be done, and why, for people."""
+
+    action: OnDeath
+    why: str
+
+
+class DeathPolicy:
+    """Decides by what the scenario says of deaths, and by how often a process has died.
+
+    Args:
+        processes: of the scenario.
+    """
+
+    def __init__(self, processes: Processes) -> None:
+        self._processes = processes
+        self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
+
+    def decide(self, name: str, code: int | None, flies: bool) -> Decision:
+        """Take the death of a process; return what is to be done.
+
+        Args:
+            name: of the process.
+            code: with which it ended.
+            flies: whether the run has begun.
+        """
+        action = on_death(self._processes.on_death, name)
+        if action == "end":
+            return Decision("end", "on_death: end")
+        if code == USER_FAULT:
+            return self._without(name, flies, "a restart would not help", is_needed(name))
+        if action == "restart" and self._dies_too_often(name):
+            return self._without(name, flies, f"more than {RESTARTS_MAX} restarts within {RESTART_WINDOW_S:g} s")
+        return Decision(action, f"on_death: {action}")
+
+    def _without(self, name: str, flies: bool, why: str, ends: bool = False) -> Decision:
+        """Return whether the run goes on without a process that no restart brings back."""
+        ends = ends or on_overdue(self._processes.on_overdue or {}, name) == "end"
+        is_awaited = not flies and not is_needed(name) and name in (self._processes.expect or ())
+        if ends or is_awaited:  # a run that has not begun would wait for it for ever
+            return Decision("end", f"{why}; the run ends")
+        return Decision("drop", f"{why}; it is given up, and the run goes on without it")
+
+    def _dies_too_often(self, name: str) -> bool:
+        """Count a death; return whether there were too many in a row for another restart."""
+        deaths = self._deaths[name]
+        deaths.append(time.monotonic())
+        return len(deaths) > RESTARTS_MAX and deaths[-1] - deaths[0] < RESTART_WINDOW_S
