@@ -90,9 +90,14 @@ class ObserverProcess:
             self._health_seq += 1
             self._link.put(keys.process(self.name, "health"), health)
 
+    @property
+    def gates(self) -> bool:
+        """Whether the world waits for it; it is then to announce itself when it has subscribed to all that it needs."""
+        return self._slack_ns > 0
+
     def done(self, t_ns: int) -> None:
         """Publish that all up to a gate is done, if the world waits for it."""
-        if self._slack_ns:
+        if self.gates:
             done = run_messages.Done(t_ns, self._done_seq, self._info.run_id, self._incarnation, t_ns, 0)
             self._done_seq += 1
             self._link.put(keys.process(self.name, "done"), done)

@@ -21,7 +21,9 @@ from zsim_agents.cameras.rendering.renderer import Renderer
 from zsim_agents.cameras.rendering.scene import Scene, scene_of
 from zsim_agents.cameras.truths import TruthHistory
 
-BEHIND_MAX = 5  # gates that it may be behind before it leaves pictures out: what arrives in a heap is no reason yet
+# gates that it may be behind the world, which may be ahead of everybody by the command delay, before it leaves pictures
+# out: what arrives in a heap is no reason yet, and more than the slack of cameras that gate
+BEHIND_MAX = 5
 
 
 def serve(
@@ -35,8 +37,12 @@ def serve(
     """Publish the pictures of some drones' cameras until the run is over or the process is stopped."""
     process = CameraProcess(link, info, presence, scenario, drones)
     process.begin()
+    if presence.gates:
+        presence.announce()
     while not (presence.end_reason or stopped()):
         process.turn()
+    if not stopped():
+        process.draw()
 
 
 class Eye:
@@ -83,7 +89,8 @@ class CameraProcess:
         cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
         self._eyes = [self._eye(drone, name, each, scene) for drone in drones for name, each in cameras[drone].items()]
         longest_ns = max((eye.latency_ns for eye in self._eyes), default=0)
-        self._truths = TruthHistory(len(info.drones), info.gate_ns, longest_ns + 2 * BEHIND_MAX * info.gate_ns)
+        self._behind_ns = BEHIND_MAX * info.gate_ns + info.command_delay_ns
+        self._truths = TruthHistory(len(info.drones), info.gate_ns, longest_ns + 2 * self._behind_ns)
         self._arrived: deque[RawSample] = deque()
         self._numbers_drawn = count()
         self._info_seq = 0
@@ -108,6 +115,10 @@ class CameraProcess:
         if self._bell.is_back:
             self._bell.is_back = False
             self._publish_infos()
+        self.draw()
+
+    def draw(self) -> None:
+        """Publish the pictures that are due by what has arrived."""
         self._take_in()
         newest_ns = self._truths.newest_ns
         for eye, number in self._due():
@@ -158,7 +169,7 @@ class CameraProcess:
         due: list[tuple[int, int, Eye]] = []
         for eye in self._eyes:
             last = eye.last_due(newest_ns)
-            first = max(eye.next, eye.last_due(newest_ns - BEHIND_MAX * self._info.gate_ns) + 1)
+            first = max(eye.next, eye.last_due(newest_ns - self._behind_ns) + 1)
             if self._begun:
                 self._presence.health.dropped += max(0, first - eye.next)
             due += [(turn, number, eye) for turn, number in enumerate(range(first, last + 1))]
@@ -173,7 +184,7 @@ class CameraProcess:
         health = self._presence.health
         health.lag_ns = max(0, self._truths.newest_ns - t_sample_ns - eye.latency_ns)
         bodies = self._truths.bodies(t_sample_ns)
-        if bodies is None or health.lag_ns > 2 * BEHIND_MAX * self._info.gate_ns:
+        if bodies is None or health.lag_ns > 2 * self._behind_ns:
             health.dropped += 1
             return
         image = CameraImage(

@@ -262,7 +262,8 @@ def _next(name: str, presence: ObserverProcess) -> str:
 
 
 def _serve(serve: Serve, link: Session, presence: ObserverProcess, info: Info, stop: StopChannel, say: Say) -> None:
-    presence.announce()
+    if not presence.gates:
+        presence.announce()
     say(f"{presence.name}: in run {info.run_id}")
     serve(link, info, presence, stop.stopped, say)
     reason = presence.end_reason or stop.reason() or "stopped"
