@@ -129,6 +129,9 @@ class SceneNodes:
         arms_m: centre to rotor, of each.
         robots: how many drones are in formations, and so have a ghost.
         clusters: how many formations there are.
+
+    Attributes:
+        radii_m: (N,), how far each drone reaches from its centre.
     """
 
     def __init__(
@@ -149,6 +152,7 @@ class SceneNodes:
         server.scene.set_up_direction("+z")
         self._ground()
         looks = [airframe.shape_of(*each) for each in zip(drones, arms_m, strict=True)]
+        self.radii_m: Array = np.array([look.reach_m for look in looks])
         self._airframes = _AirframeNodes(self._scene, looks)
         self._rotors = _RotorNodes(drones, looks, self._batch)
         ghost = airframe.whole(looks[0])
@@ -186,10 +190,16 @@ class SceneNodes:
         for label, p_W in zip(self._names, drones.p_W, strict=False):
             label.position = p_W + LABEL_B
 
-    def on_click(self, act: Callable[[Any], None]) -> None:
-        """Call back with viser's event of each click on a drone."""
-        for _, node in self._airframes.nodes:
-            node.on_click(act)
+    def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
+        """Call back with viser's event of each click into the scene.
+
+        Not of the drones' nodes: a page of viser 1.1.1 fails on opening where a batched mesh is clickable already.
+        """
+        self._scene.on_click()(act)
+
+    def close(self) -> None:
+        """Call back no more; the nodes stay."""
+        self._scene.remove_click_callback("all")
 
     def wind(self, drones: DronePoses) -> None:
         """Set the arrow of the wind, above the drones."""

@@ -196,17 +196,21 @@ def test_a_click_on_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, 
     ("direction", "drone"),
     [
         ((0.0, 0.0, -1.0), "near"),
-        ((5.0, 0.1, -10.0), "far"),  # passes by it at 0.1 m
-        ((0.0, 0.0, 1.0), "near"),  # behind: the nearest to where the ray begins
+        ((5.0, 0.2, -10.0), "far"),  # passes by it at 0.2 m
+        ((5.0, 0.4, -10.0), None),
+        ((0.1, 0.0, -5.0), "near"),  # hits the one behind it, too, further from its centre
+        ((0.0, 50.5, -10.0), "distant"),  # passes by it at 0.5 m, 0.01 rad
+        ((0.0, 0.0, 1.0), None),  # all are behind
         ((0.0, 0.0, 0.0), None),
     ],
 )
-def test_a_click_is_on_the_drone_that_is_nearest_to_its_ray(direction: tuple[float, ...], drone: str | None):
-    p_W = np.array([(0.0, 0.0, 5.0), (5.0, 0.0, 0.0), (math.nan,) * 3])
-    poses = DronePoses(0, ("near", "far", "gone"), p_W, np.tile(LEVEL, (3, 1)), np.zeros((3, 4)), np.zeros(3))
-    assert drone_on_ray(poses, (0.0, 0.0, 10.0), direction) == drone
+def test_a_click_is_on_the_drone_that_its_ray_hits(direction: tuple[float, ...], drone: str | None):
+    p_W = np.array([(0.0, 0.0, 5.0), (0.0, 0.0, 4.0), (5.0, 0.0, 0.0), (0.0, 50.0, 0.0), (math.nan,) * 3])
+    names = ("near", "behind", "far", "distant", "gone")
+    poses = DronePoses(0, names, p_W, np.tile(LEVEL, (5, 1)), np.zeros((5, 4)), np.zeros(3))
+    assert drone_on_ray(poses, np.full(5, 0.3), (0.0, 0.0, 10.0), direction) == drone
 
 
 def test_without_drones_a_click_is_on_none():
     poses = DronePoses(0, ("gone",), np.full((1, 3), math.nan), LEVEL[None], np.zeros((1, 4)), np.zeros(3))
-    assert drone_on_ray(poses, (0.0, 0.0, 10.0), (0.0, 0.0, -1.0)) is None
+    assert drone_on_ray(poses, np.ones(1), (0.0, 0.0, 10.0), (0.0, 0.0, -1.0)) is None
