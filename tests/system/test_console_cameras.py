@@ -19,7 +19,7 @@ from synthetic_camera import NUMBER_BITS, SETTINGS
 from wire import PATIENCE_S, Client
 
 from zsim.contract import keys, messages
-from zsim_bridges.console.page.scene_nodes import OFFSET_M
+from zsim_bridges.console.page.page_camera import OFFSET_M
 
 LOW = {"width": 1000, "height": 480}
 LAPTOP, DESK = {"width": 1280, "height": 720}, {"width": 1600, "height": 1000}

@@ -38,7 +38,7 @@ from zsim_bridges.console.http_proxy import (
     ViserBackend,
 )
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
-from zsim_bridges.console.page.scene_nodes import CameraFollow
+from zsim_bridges.console.page.page_camera import CameraFollow
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.observer_process import ObserverProcess
 

@@ -28,6 +28,7 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows, console_state
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.console_page import ConsolePage
+from zsim_bridges.console.page.page_camera import CameraFollow
 from zsim_bridges.console.page.picture import (
     CanvasTrails,
     DronePoses,
@@ -38,7 +39,7 @@ from zsim_bridges.console.page.picture import (
     formation_shape,
     ghosts,
 )
-from zsim_bridges.console.page.scene_nodes import CameraFollow, SceneNodes
+from zsim_bridges.console.page.scene_nodes import SceneNodes
 from zsim_bridges.console.view_buffer import TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ import synthetic_camera
 
 from zsim.math import frames
 from zsim_bridges.console.page.camera_frustums import CameraFrustums, drone_index, frustum_pose
+from zsim_bridges.console.page.page_camera import OFFSET_M
 from zsim_bridges.console.page.picture import DronePoses, drone_on_ray
 
 FRONT, BOTTOM = synthetic_camera.info_of("front"), synthetic_camera.info_of("bottom")
@@ -48,10 +50,15 @@ def test_only_a_drone_in_the_view_has_a_place(camera: str, index: int | None):
 
 
 class Page:
-    """A page of viser's that notes its frusta."""
+    """A page of viser's that notes its frusta; its camera looks north from 6 m south of the origin, 2 m above it."""
 
     def __init__(self, client_id: int) -> None:
         self.client_id = client_id
+        self.camera = SimpleNamespace(
+            position=np.array([0.0, -6.0, 2.0]), look_at=np.array([0.0, 0.0, 2.0]),
+            up_direction=np.array([0.0, 0.0, 1.0]), fov=math.radians(75), aspect=1.5,
+        )  # fmt: skip
+        self.atomic = nullcontext
         self.html = ""
         self.nodes: list[Any] = []
         self.gui = SimpleNamespace(add_html=self._add_html)
@@ -128,6 +135,23 @@ def test_a_page_shows_the_frustum_that_was_clicked_on_it_and_the_others_do_not(
     assert pages[0].nodes == [node]
     assert node.position[0] == pytest.approx(6.162)
     assert node._image_data == b"JPEG 2"
+
+
+def test_a_frustum_that_is_in_view_leaves_its_page_s_camera_alone(frustums: CameraFrustums, pages: list[Page]):
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(1.0), shown)
+    assert pages[0].camera.position.tolist() == [0.0, -6.0, 2.0]
+
+
+def test_a_frustum_that_appears_out_of_view_is_brought_into_it_once(frustums: CameraFrustums, pages: list[Page]):
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(50.0), shown)
+    camera = pages[0].camera
+    assert camera.look_at == pytest.approx((50.162, 0.0, 2.012))
+    assert camera.position[1] == pytest.approx(-np.linalg.norm(OFFSET_M))
+    assert pages[1].camera.look_at.tolist() == [0.0, 0.0, 2.0]
+    frustums.draw(drones(90.0), lambda name: shown(name, 2))
+    assert camera.look_at[0] == pytest.approx(50.162)
 
 
 def test_another_click_hides_it(frustums: CameraFrustums, pages: list[Page]):
