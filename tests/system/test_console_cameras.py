@@ -19,8 +19,9 @@ from synthetic_camera import NUMBER_BITS, SETTINGS
 from wire import PATIENCE_S, Client
 
 from zsim.contract import keys, messages
-from zsim_bridges.console.page.scene_nodes import OFFSET_M
+from zsim_bridges.console.page.page_camera import OFFSET_M
 
+LOW = {"width": 1000, "height": 480}
 LAPTOP, DESK = {"width": 1280, "height": 720}, {"width": 1600, "height": 1000}
 SCREENS = (LAPTOP, DESK)
 TRIAD = """
@@ -37,6 +38,12 @@ clusters:
 """
 THREE = ("drone1", "drone2", "drone3")
 SIX = [f"{drone}/{name}" for drone in THREE for name in SETTINGS]
+ALONE = """
+name: alone
+duration_s: 3600
+drones: [{name: drone1, position_m: [4, 4, 0]}]
+processes: {expect: []}
+"""
 TWELVE = "\n".join(
     [
         "name: twelve\nduration_s: 3600\ndrones:",
@@ -46,6 +53,7 @@ TWELVE = "\n".join(
 EMERGENCY = "EMERGENCY – all rotors stop"
 SKY = np.array(synthetic_camera.SKY[::-1])  # red, green, blue; nothing else in the scene has it
 SKY_PIXELS = 60  # of a frustum's picture, at least
+HAT_PIXELS = 20  # of a drone's hat, at least
 FIELD_DEG = 75.0  # of viser's camera, from top to bottom
 NEAR = 12  # levels of 255: JPEG, and the scene's light
 
@@ -128,12 +136,32 @@ def is_stacked(places: list[dict[str, float]], screen: dict[str, int]) -> bool:
     )
 
 
-def sky_pixels(page: BrowserPage) -> int:
-    """Return how many pixels of the scene have the colour of the pictures' sky."""
+def scene_pixels(page: BrowserPage) -> np.ndarray:
+    """Return the scene as it stands on the page: rows of pixels (red, green, blue)."""
     image = pytest.importorskip("PIL.Image")
     box: Any = page.page.locator("canvas[data-engine]").bounding_box()
-    screen = np.array(image.open(io.BytesIO(page.page.screenshot(clip=box, timeout=PATIENCE_MS))).convert("RGB"), int)
-    return int(np.count_nonzero(np.abs(screen - SKY).max(axis=2) < NEAR))
+    return np.array(image.open(io.BytesIO(page.page.screenshot(clip=box, timeout=PATIENCE_MS))).convert("RGB"), int)
+
+
+def sky_pixels(page: BrowserPage) -> int:
+    """Return how many pixels of the scene have the colour of the pictures' sky."""
+    return int(np.count_nonzero(np.abs(scene_pixels(page) - SKY).max(axis=2) < NEAR))
+
+
+def wait_for_pictures_and_drones(page: BrowserPage, cameras: list[str]) -> None:
+    """Wait until a page shows the pictures, and in its scene the hats of drones, as long as it has no error."""
+    page.page.locator(".mantine-Notification-closeButton").click()  # "software WebGL", of this browser alone
+
+    def look() -> tuple[bool, int]:
+        assert page.faults == []
+        if not page.page.locator("canvas[data-engine]").count():
+            return False, 0
+        red, green, blue = np.moveaxis(scene_pixels(page), 2, 0)
+        shown = numbers(page)
+        complete = list(shown) == cameras and None not in shown.values()
+        return complete, int(np.count_nonzero((red > 2 * green) & (blue > 2 * green) & (red > 100)))
+
+    until(page, look, lambda seen: seen[0] and seen[1] > HAT_PIXELS)
 
 
 def place_of(page: BrowserPage, p_W: tuple[float, float, float]) -> tuple[float, float]:
@@ -161,6 +189,25 @@ def watched(page: BrowserPage) -> list[str]:
 def repeated(client: Client, key: str, payload: bytes) -> AbstractContextManager[None]:
     """Publish the same bytes again and again meanwhile."""
     return meanwhile(lambda: client.put_raw(key, payload), 0.01)
+
+
+@needs_browser
+@pytest.mark.slow
+def test_pictures_and_drones_are_shown_on_a_reloaded_page_and_on_a_second_one(
+    federation: Federation, opened: Callable[..., BrowserPage]
+) -> None:
+    pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+    federation.world(ALONE, "--duration", "600", "--rate", "1")
+    role, links = console(federation)
+    role.line("console.1: in run")
+    cameras = [f"drone1/{name}" for name in SETTINGS]
+    with synthetic_camera.published(federation.client(), ["drone1"], rate_hz=5.0):
+        page = opened(links["steer"], LOW)
+        until(page, lambda: numbers(page), lambda seen: list(seen) == cameras and None not in seen.values())
+        page.page.reload()
+        wait_for_pictures_and_drones(page, cameras)
+        page.page.close()
+        wait_for_pictures_and_drones(opened(links["look"], LOW), cameras)
 
 
 @needs_browser

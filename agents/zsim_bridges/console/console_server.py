@@ -11,7 +11,7 @@ import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import viser
@@ -38,7 +38,7 @@ from zsim_bridges.console.http_proxy import (
     ViserBackend,
 )
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
-from zsim_bridges.console.page.scene_nodes import CameraFollow
+from zsim_bridges.console.page.page_camera import CameraFollow
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.observer_process import ObserverProcess
 
@@ -151,19 +151,17 @@ class ControlUpdate(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unk
     updates: Updates
 
 
-class DroneClick(Struct, tag_field="type", tag="SceneNodeClickMessage"):
-    """A page sends this when somebody clicks a drone in the scene; nothing but the ray is looked at."""
+class SceneClick(Struct, tag_field="type", tag="ScenePointerMessage"):
+    """A page sends this when somebody clicks into the scene; nothing but the ray is looked at."""
 
-    name: Annotated[str, Meta(pattern=r"^/drones(/[0-9]{1,4})?\Z")]
-    instance_index: int | None
+    event_type: Literal["click"]
     ray_origin: message.Vector3
     ray_direction: message.Vector3
-    screen_pos: tuple[message.Number, message.Number]
+    screen_pos: tuple[tuple[message.Number, message.Number]]
     modifier: Annotated[str, Meta(max_length=NAME_MAX)] | None = None
-    owner: Annotated[str, Meta(max_length=NAME_MAX)] = ""
 
 
-_DECODER = msgspec.msgpack.Decoder(ViewerCamera | ControlUpdate | DroneClick)
+_DECODER = msgspec.msgpack.Decoder(ViewerCamera | ControlUpdate | SceneClick)
 """All other messages are refused, such as to show the page on the Internet, or to upload files."""
 
 

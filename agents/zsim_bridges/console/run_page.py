@@ -28,6 +28,7 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows, console_state
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.console_page import ConsolePage
+from zsim_bridges.console.page.page_camera import CameraFollow
 from zsim_bridges.console.page.picture import (
     CanvasTrails,
     DronePoses,
@@ -38,7 +39,7 @@ from zsim_bridges.console.page.picture import (
     formation_shape,
     ghosts,
 )
-from zsim_bridges.console.page.scene_nodes import CameraFollow, SceneNodes
+from zsim_bridges.console.page.scene_nodes import SceneNodes
 from zsim_bridges.console.view_buffer import TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
@@ -135,6 +136,7 @@ class RunPage:
         self._client.close()
         self.cameras.close()
         self._frustums.clear()
+        self._scene.close()
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Draw pictures until the run is over or `stopped` returns true."""
@@ -185,9 +187,10 @@ class RunPage:
             self._has_clicks = True
             self._scene.on_click(self._on_click)
 
-    def _on_click(self, event: Any) -> None:
-        drones = self._drones
-        drone = None if drones is None else drone_on_ray(drones, event.ray_origin, event.ray_direction)
+    def _on_click(self, event: viser.SceneClickEvent) -> None:
+        if self._drones is None:
+            return
+        drone = drone_on_ray(self._drones, self._scene.radii_m, event.ray_origin, event.ray_direction)
         if drone is not None:
             self._frustums.click(event.client_id, drone)
 

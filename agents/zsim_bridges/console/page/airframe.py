@@ -50,6 +50,11 @@ class DroneShape(NamedTuple):
         """Return how much larger it is than the AR.Drone, by the longest arm."""
         return max(math.hypot(x, y) for x, y in self.hubs_B) / ARM_M
 
+    @property
+    def reach_m(self) -> float:
+        """Return how far its hull reaches from the centre [m]."""
+        return self.size * ARM_M + RING * self.radius_m
+
 
 def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
     """Return what a drone looks like; one whose rotors are not named has four, in a cross of this arm [m]."""

@@ -10,6 +10,7 @@ import viser
 from zsim.contract.camera_messages import CameraImage, CameraInfo
 from zsim.math import frames, rotation
 from zsim_bridges.console.page.camera_marks import field_of_view
+from zsim_bridges.console.page.page_camera import bring_into_view
 from zsim_bridges.console.page.picture import Array, DronePoses
 
 NODE = "/camera_frustum"
@@ -46,7 +47,7 @@ def frustum_pose(info: CameraInfo, p_WB: Array, q_WB: Array) -> tuple[Array, Arr
 
 
 class CameraFrustums:
-    """The frusta of all pages.
+    """The frusta of all pages; one that appears out of its page's view is brought into it.
 
     Args:
         server: viser's. Each page is told a key of its own, by which it says here which frustum it shows.
@@ -107,8 +108,11 @@ class CameraFrustums:
         if what is None or drones is None or index is None:
             return
         info, picture = what
+        p_W, q_WK = frustum_pose(info, drones.p_W[index], drones.q_WB[index])
+        if node is None:
+            bring_into_view(client, p_W, p_W + frames.rotate(q_WK, (0.0, 0.0, SCALE)))
         node = self._nodes[key] = node or _Frustum(client, camera, info)
-        node.move(*frustum_pose(info, drones.p_W[index], drones.q_WB[index]))
+        node.move(p_W, q_WK)
         node.show(picture.number, picture.image)
 
     def _on_connect(self, client: viser.ClientHandle) -> None:

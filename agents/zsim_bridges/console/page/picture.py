@@ -27,6 +27,7 @@ SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which 
 CORNER_SHARE = (
     0.25  # of the way from a corner to the opposite side; there its angle is written, clear of names and sides
 )
+CLICK_RAD = 0.012  # half the angle in which a click on a small, far drone is one on it; chosen: about five pixels
 SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at their ends; docs/conventions.md
 
 
@@ -86,16 +87,25 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
     return DronePoses(view.t_ns, tuple(names), p_W, q_WB, rotor, wind)
 
 
-def drone_on_ray(drones: DronePoses, origin_W: Sequence[float], direction_W: Sequence[float]) -> str | None:
-    """Return the drone that is nearest to a ray, None where none is in the view, or the ray has no direction."""
+def drone_on_ray(
+    drones: DronePoses, radii_m: Array, origin_W: Sequence[float], direction_W: Sequence[float]
+) -> str | None:
+    """Return the drone that a ray hits, of several that whose centre is nearest to it; None where it hits none.
+
+    Args:
+        drones: N of them.
+        radii_m: (N,), of the balls around them that count as hit; of one far away, its ball is not below CLICK_RAD.
+        origin_W, direction_W: of the ray [m; W]; a direction without length hits nothing.
+    """
     direction = np.array(direction_W)
     length = float(np.linalg.norm(direction))
-    if not drones.present.any() or not 0.0 < length < math.inf:
+    if not 0.0 < length < math.inf:
         return None
     away = drones.p_W - np.array(origin_W)
-    ahead = np.maximum(away @ (direction / length), 0.0)
-    distances_m = np.linalg.norm(away - ahead[:, None] * (direction / length), axis=1)
-    return drones.names[int(np.nanargmin(distances_m))]
+    ahead_m = away @ (direction / length)
+    distances_m = np.linalg.norm(away - ahead_m[:, None] * (direction / length), axis=1)
+    hit = (ahead_m > 0.0) & (distances_m <= np.maximum(radii_m, CLICK_RAD * ahead_m))
+    return drones.names[int(np.argmin(np.where(hit, distances_m, math.inf)))] if hit.any() else None
 
 
 def rotor_angles(angles: Array, speeds: Array, turns: Array, dt_s: float) -> Array:

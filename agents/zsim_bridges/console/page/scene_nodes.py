@@ -1,7 +1,6 @@
-"""The scene of the page: viser's nodes and cameras; only what has changed is sent."""
+"""The scene of the page: viser's nodes; only what has changed is sent."""
 
 import math
-import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,94 +13,6 @@ from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console.page import airframe
 from zsim_bridges.console.page.picture import Array, DronePoses, Ellipsoids, FormationShape, rotor_angles, rotor_poses
-
-OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a camera, from what it looks at, where that is not larger than EXTENT_M
-EXTENT_M = 2.0  # from its centre
-DEADBAND_M = 0.25  # a shorter move does not move the camera: pictures then need not be drawn anew
-
-
-class CameraFollow:
-    """Cameras of all pages: where they begin, and which follow the formation, as each page chooses.
-
-    Args:
-        server: viser's.
-
-    Attributes:
-        switches: ids of the controls by which each page chooses for itself.
-    """
-
-    def __init__(self, server: viser.ViserServer) -> None:
-        self.switches: set[str] = set()
-        self._server = server
-        self._lock = threading.Lock()
-        self._switches: dict[int, tuple[viser.ClientHandle, Any]] = {}
-        self._targets: dict[int, Array] = {}
-        self._centre: Array = np.zeros(3)
-        self._offset: Array = OFFSET_M
-        self._aimed = False
-        server.on_client_connect(self._on_connect)
-        server.on_client_disconnect(self._on_disconnect)
-
-    def restart(self) -> None:
-        """Aim all cameras anew at the first picture: another run may fly elsewhere."""
-        self._aimed = False
-
-    def set_target(self, p_W: Array) -> None:
-        """Aim the cameras of later pages at positions (n, 3) [m], unless there are none."""
-        if not len(p_W):
-            return
-        self._centre = p_W.mean(axis=0)
-        extent_m = float(np.linalg.norm(p_W - self._centre, axis=1).max())
-        self._offset = OFFSET_M * max(1.0, extent_m / EXTENT_M)
-
-    def follow(self, p_W: Array) -> None:
-        """Move the cameras that follow the positions (n, 3) [m]."""
-        self.set_target(p_W)
-        centre = self._centre
-        with self._lock:
-            switches = list(self._switches.items())
-        if not self._aimed and len(p_W):
-            self._aimed = True
-            for _, (client, _) in switches:
-                _aim(client, centre, self._offset)
-        for number, (client, switch) in switches:
-            if self._moves(number, switch.value, centre):
-                _aim(client, centre, client.camera.position - client.camera.look_at)
-
-    def _moves(self, number: int, follows: bool, centre: Array) -> bool:
-        """Return whether a page's camera has to move, and store where to."""
-        with self._lock:
-            if not follows:
-                self._targets.pop(number, None)
-            near = np.linalg.norm(centre - self._targets.get(number, np.full(3, np.inf))) <= DEADBAND_M
-            if not follows or near or number not in self._switches:
-                return False
-            self._targets[number] = centre
-            return True
-
-    def _on_connect(self, client: viser.ClientHandle) -> None:
-        with client.atomic():
-            _aim(client, self._centre, self._offset)
-        switch = client.gui.add_checkbox("Camera follows the formation", False, order=-1.0)
-        with self._lock:
-            self._switches[client.client_id] = (client, switch)
-            self.switches.add(switch._impl.uuid)
-        if client.client_id not in self._server.get_clients():
-            self._on_disconnect(client)  # it has disconnected meanwhile
-
-    def _on_disconnect(self, client: viser.ClientHandle) -> None:
-        with self._lock:
-            _, switch = self._switches.pop(client.client_id, (None, None))
-            self._targets.pop(client.client_id, None)
-            if switch is not None:
-                self.switches.discard(switch._impl.uuid)
-
-
-def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
-    with client.atomic():
-        client.camera.position = centre + offset
-        client.camera.look_at = centre
-
 
 NAMED_MAX = 12  # drones with their names beside them; more would hide each other
 TRAIL_COLOURS = np.array(
@@ -129,6 +40,9 @@ class SceneNodes:
         arms_m: centre to rotor, of each.
         robots: how many drones are in formations, and so have a ghost.
         clusters: how many formations there are.
+
+    Attributes:
+        radii_m: (N,), how far each drone reaches from its centre.
     """
 
     def __init__(
@@ -149,6 +63,7 @@ class SceneNodes:
         server.scene.set_up_direction("+z")
         self._ground()
         looks = [airframe.shape_of(*each) for each in zip(drones, arms_m, strict=True)]
+        self.radii_m: Array = np.array([look.reach_m for look in looks])
         self._airframes = _AirframeNodes(self._scene, looks)
         self._rotors = _RotorNodes(drones, looks, self._batch)
         ghost = airframe.whole(looks[0])
@@ -186,10 +101,16 @@ class SceneNodes:
         for label, p_W in zip(self._names, drones.p_W, strict=False):
             label.position = p_W + LABEL_B
 
-    def on_click(self, act: Callable[[Any], None]) -> None:
-        """Call back with viser's event of each click on a drone."""
-        for _, node in self._airframes.nodes:
-            node.on_click(act)
+    def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
+        """Call back with viser's event of each click into the scene.
+
+        Not of the drones' nodes: a page of viser 1.1.1 fails on opening where a batched mesh is clickable already.
+        """
+        self._scene.on_click()(act)
+
+    def close(self) -> None:
+        """Call back no more; the nodes stay."""
+        self._scene.remove_click_callback("all")
 
     def wind(self, drones: DronePoses) -> None:
         """Set the arrow of the wind, above the drones."""

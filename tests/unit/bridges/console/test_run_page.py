@@ -20,8 +20,8 @@ from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_server import PrivateViser
 from zsim_bridges.console.page import scene_nodes as stages
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
+from zsim_bridges.console.page.page_camera import CameraFollow
 from zsim_bridges.console.page.picture import drone_poses
-from zsim_bridges.console.page.scene_nodes import CameraFollow
 from zsim_bridges.console.run_page import RunPage, picture_rate_hz
 from zsim_bridges.console.view_buffer import TimeMonitor
 

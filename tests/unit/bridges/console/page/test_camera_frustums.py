@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ import synthetic_camera
 
 from zsim.math import frames
 from zsim_bridges.console.page.camera_frustums import CameraFrustums, drone_index, frustum_pose
+from zsim_bridges.console.page.page_camera import OFFSET_M
 from zsim_bridges.console.page.picture import DronePoses, drone_on_ray
 
 FRONT, BOTTOM = synthetic_camera.info_of("front"), synthetic_camera.info_of("bottom")
@@ -48,10 +50,15 @@ def test_only_a_drone_in_the_view_has_a_place(camera: str, index: int | None):
 
 
 class Page:
-    """A page of viser's that notes its frusta."""
+    """A page of viser's that notes its frusta; its camera looks north from 6 m south of the origin, 2 m above it."""
 
     def __init__(self, client_id: int) -> None:
         self.client_id = client_id
+        self.camera = SimpleNamespace(
+            position=np.array([0.0, -6.0, 2.0]), look_at=np.array([0.0, 0.0, 2.0]),
+            up_direction=np.array([0.0, 0.0, 1.0]), fov=math.radians(75), aspect=1.5,
+        )  # fmt: skip
+        self.atomic = nullcontext
         self.html = ""
         self.nodes: list[Any] = []
         self.gui = SimpleNamespace(add_html=self._add_html)
@@ -130,6 +137,23 @@ def test_a_page_shows_the_frustum_that_was_clicked_on_it_and_the_others_do_not(
     assert node._image_data == b"JPEG 2"
 
 
+def test_a_frustum_that_is_in_view_leaves_its_page_s_camera_alone(frustums: CameraFrustums, pages: list[Page]):
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(1.0), shown)
+    assert pages[0].camera.position.tolist() == [0.0, -6.0, 2.0]
+
+
+def test_a_frustum_that_appears_out_of_view_is_brought_into_it_once(frustums: CameraFrustums, pages: list[Page]):
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(50.0), shown)
+    camera = pages[0].camera
+    assert camera.look_at == pytest.approx((50.162, 0.0, 2.012))
+    assert camera.position[1] == pytest.approx(-np.linalg.norm(OFFSET_M))
+    assert pages[1].camera.look_at.tolist() == [0.0, 0.0, 2.0]
+    frustums.draw(drones(90.0), lambda name: shown(name, 2))
+    assert camera.look_at[0] == pytest.approx(50.162)
+
+
 def test_another_click_hides_it(frustums: CameraFrustums, pages: list[Page]):
     frustums.choose(pages[0].key, "drone1/front")
     frustums.draw(drones(), shown)
@@ -196,17 +220,21 @@ def test_a_click_on_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, 
     ("direction", "drone"),
     [
         ((0.0, 0.0, -1.0), "near"),
-        ((5.0, 0.1, -10.0), "far"),  # passes by it at 0.1 m
-        ((0.0, 0.0, 1.0), "near"),  # behind: the nearest to where the ray begins
+        ((5.0, 0.2, -10.0), "far"),  # passes by it at 0.2 m
+        ((5.0, 0.4, -10.0), None),
+        ((0.1, 0.0, -5.0), "near"),  # hits the one behind it, too, further from its centre
+        ((0.0, 50.5, -10.0), "distant"),  # passes by it at 0.5 m, 0.01 rad
+        ((0.0, 0.0, 1.0), None),  # all are behind
         ((0.0, 0.0, 0.0), None),
     ],
 )
-def test_a_click_is_on_the_drone_that_is_nearest_to_its_ray(direction: tuple[float, ...], drone: str | None):
-    p_W = np.array([(0.0, 0.0, 5.0), (5.0, 0.0, 0.0), (math.nan,) * 3])
-    poses = DronePoses(0, ("near", "far", "gone"), p_W, np.tile(LEVEL, (3, 1)), np.zeros((3, 4)), np.zeros(3))
-    assert drone_on_ray(poses, (0.0, 0.0, 10.0), direction) == drone
+def test_a_click_is_on_the_drone_that_its_ray_hits(direction: tuple[float, ...], drone: str | None):
+    p_W = np.array([(0.0, 0.0, 5.0), (0.0, 0.0, 4.0), (5.0, 0.0, 0.0), (0.0, 50.0, 0.0), (math.nan,) * 3])
+    names = ("near", "behind", "far", "distant", "gone")
+    poses = DronePoses(0, names, p_W, np.tile(LEVEL, (5, 1)), np.zeros((5, 4)), np.zeros(3))
+    assert drone_on_ray(poses, np.full(5, 0.3), (0.0, 0.0, 10.0), direction) == drone
 
 
 def test_without_drones_a_click_is_on_none():
     poses = DronePoses(0, ("gone",), np.full((1, 3), math.nan), LEVEL[None], np.zeros((1, 4)), np.zeros(3))
-    assert drone_on_ray(poses, (0.0, 0.0, 10.0), (0.0, 0.0, -1.0)) is None
+    assert drone_on_ray(poses, np.ones(1), (0.0, 0.0, 10.0), (0.0, 0.0, -1.0)) is None
