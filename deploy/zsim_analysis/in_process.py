@@ -21,6 +21,9 @@ from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World
 
 
+GC_ALLOCATIONS = 50_000  # between two searches for cycles, of which a flight makes none; a gate allocates hundreds
+
+
 class FlightObserver(Protocol):
     """Receives every message of a flight, as a record writer does."""
 
@@ -86,12 +89,15 @@ class InProcessFlight:
         bus.join()
         gc.collect()
         gc.freeze()  # what lives as long as the flight is not searched again and again
+        thresholds = gc.get_threshold()
+        gc.set_threshold(GC_ALLOCATIONS, *thresholds[1:])
         try:
             while bus.turn():
                 if reason := stop_reason():
                     self.world.clock.stop(reason)
             bus.end()
         finally:
+            gc.set_threshold(*thresholds)
             gc.unfreeze()
 
 

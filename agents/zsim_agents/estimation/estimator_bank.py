@@ -108,13 +108,14 @@ class EstimatorBank:
             self._count = count
         return count >= 0
 
-    def estimate(self, t_s: float) -> list[StateEstimate]:
-        """Use what has come since the last gate and return the estimates for `t_s`."""
+    def estimate(self, t_s: float, wanted: Sequence[int] | None = None) -> list[StateEstimate]:
+        """Use what has come since the last gate and return the estimates for `t_s`, those of some drones, or of all."""
         count, self._count = self._count, 0
         self.use(t_s, self._readings[:count])
         counts = self.rows.counts[:, COUNT.used :].tolist()
-        rows = zip(self._estimates.tolist(), counts, strict=True)
-        return [_estimate(row, count, self.counted) for row, count in rows]
+        rows = self._estimates.tolist()
+        places = range(len(rows)) if wanted is None else wanted
+        return [_estimate(rows[i], counts[i], self.counted) for i in places]
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Use readings (M, READING.size) and return the estimates for `t_s`, (N, ESTIMATE.size)."""

@@ -313,11 +313,11 @@ class Fleet:
         if not sightings:
             return
         number = len(self.sensors.names)
-        rows = sorted((each.t_ns, each.drone, number, each.t_sample_ns, m) for m, each in enumerate(sightings))
-        more = np.array(rows, dtype=np.int64)[:, [2, 1, 0, 3]]
+        sightings.sort(key=_order)
+        more = np.array([(number, *each[:3]) for each in sightings], dtype=np.int64)
         whose, values, places = with_more(*self.sampled, more)
         self.sampled = Sampled(whose, values)
-        self.sightings = {place: sightings[row[-1]] for place, row in zip(places.tolist(), rows, strict=True)}
+        self.sightings = dict(zip(places.tolist(), sightings, strict=True))
 
     def _meet(self, least: float) -> None:
         self._began: list[tuple[int, int]] = []
@@ -327,6 +327,10 @@ class Fleet:
         if least < 2.0 * self._hull_m:
             self._began = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
             self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
+
+
+def _order(sightings: PictureSightings) -> tuple[int, int]:
+    return sightings.t_ns, sightings.drone
 
 
 def _sighting_sampler(scenario: Scenario, hulls: NDArray[np.float64]) -> SightingSampler | None:

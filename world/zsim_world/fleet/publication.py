@@ -179,6 +179,7 @@ class UserMessages:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
+        self._seen = len(fleet.sensors.names)  # number of the sightings, behind all sensors
         self._fields = [field_types(kind.message) for kind in fleet.sensors.types[STOCK_SENSORS:]]
         kinds = zip(fleet.sensors.types[STOCK_SENSORS:], self._fields, strict=True)
         self._messages = [message_type(kind.message.__name__, fields) for kind, fields in kinds]
@@ -189,29 +190,26 @@ class UserMessages:
         Args:
             counts: (N, kinds), messages that each key has had.
         """
-        whose, values = self._fleet.sampled
-        places = self._places(whose)
-        if not places:
+        sightings = self._fleet.sightings
+        if not (sightings or self._messages):
             return NO_PAYLOADS
-        sizes, payloads = np.zeros(len(whose), dtype=np.int64), []
+        whose, values = self._fleet.sampled
+        places = [*sightings]
+        if self._messages:
+            places = np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist()
+        sizes, data = np.zeros(len(whose), dtype=np.int64), bytearray()
         seq: dict[tuple[int, int], int] = {}
-        for m, (s, i, t_ns, t_sample_ns) in zip(places, whose[places].tolist(), strict=True):
-            number = seq.setdefault((i, s), int(counts[i, s + 2]))
-            seq[i, s] += 1
+        for m in places:
+            sighting = sightings.get(m)
+            s, i, t_ns, t_sample_ns = whose[m].tolist() if sighting is None else (self._seen, *sighting[:3])
+            number = seq.get((i, s), counts.item(i, s + 2))
+            seq[i, s] = number + 1
             stamps = (t_ns, number, t_sample_ns)
-            sighting = self._fleet.sightings.get(m)
             message = self._message(s, i, stamps, values[m]) if sighting is None else _sightings(stamps, sighting)
-            payloads.append(messages.encode(message))
-        sizes[places] = list(map(len, payloads))
-        return UserPayloads(np.frombuffer(bytearray(b"".join(payloads)), dtype=np.uint8), np.cumsum(sizes))
-
-    def _places(self, whose: NDArray[np.int64]) -> list[int]:
-        """Return which samples are not of stock sensors."""
-        return (
-            np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist()
-            if self._messages
-            else [*self._fleet.sightings]
-        )
+            payload = messages.encode(message)
+            sizes[m] = len(payload)
+            data += payload
+        return UserPayloads(np.frombuffer(data, dtype=np.uint8), sizes.cumsum())
 
     def _message(self, s: int, i: int, stamps: tuple[int, int, int], values: NDArray[np.float64]) -> Sample:
         """Return the message of a reading.

@@ -5,10 +5,11 @@ Each camera has a random stream. All that falls due in a gate is computed in one
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
+from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
 from zsim.contract.camera_messages import Seen
@@ -98,7 +99,7 @@ class SightingSampler:
             for (_, _, camera, model), rng in zip(watching, generators, strict=True)
         ]
         x, y, z = hats.position_m
-        self._surroundings = Surroundings(
+        surroundings = Surroundings(
             np.array([i for i, *_ in watching], dtype=np.int64),
             np.array([camera_row(camera) for *_, camera, _ in watching]).reshape(-1, CAMERA.size),
             np.array(detectors).reshape(-1, DETECTOR.size),
@@ -109,6 +110,8 @@ class SightingSampler:
             np.array([drone.name not in hats.covered for drone in scenario.drones]),
             np.array([row_of(each) for each in env.obstacles], dtype=float).reshape(-1, COLUMNS),
         )
+        self._held: Any = List()  # numba takes a list as one thing, and each array apart
+        self._held.append(surroundings)
         self._streams = np.array([words(rng) for rng in generators], dtype=np.uint64).reshape(-1, WORDS.size)
         self._counts = [0] * len(watching)
         self._next_ns = 0  # the soonest picture of all
@@ -125,7 +128,8 @@ class SightingSampler:
     def restore(self, state: State) -> None:
         """Take over what `snapshot` returned."""
         self._later = [
-            PictureSightings(i, t_ns, at_ns, name, _seen(seen)) for i, t_ns, at_ns, name, seen in state["later"]
+            PictureSightings(i, t_ns, at_ns, name, tuple(map(_sighting, seen)))
+            for i, t_ns, at_ns, name, seen in state["later"]
         ]
         self._former, self._former_ns = state["former"].copy(), state["former_ns"]
         self._counts, self._next_ns = [*state["counts"]], state["next_ns"]
@@ -133,10 +137,13 @@ class SightingSampler:
 
     def due(self, state: Array, now_ns: int) -> list[PictureSightings]:
         """Return what falls due by a gate, given the state of all drones there, (N, STATE.size or more)."""
-        now = state[:, : STATE.size].copy()
         if self._next_ns <= now_ns:
-            self._later += self._looked(now, now_ns)
-        self._former, self._former_ns = now, now_ns
+            self._later += self._looked(state[:, : STATE.size].copy(), now_ns)
+        if (
+            not now_ns or self._next_ns <= 2 * now_ns - self._former_ns
+        ):  # a picture before the next gate needs this state
+            self._former = state[:, : STATE.size].copy()
+        self._former_ns = now_ns
         if not self._later:
             return []
         due = [sighting for sighting in self._later if sighting.t_ns <= now_ns]
@@ -149,13 +156,12 @@ class SightingSampler:
         first = not len(self._former)
         former, former_ns = (now, now_ns) if first else (self._former, self._former_ns)
         which = np.array(pictures, dtype=np.int64)
-        rows = look(which, former, former_ns, now, now_ns, self._surroundings, self._streams).tolist()
-        seen: list[list[list[float]]] = [[] for _ in pictures]
-        for number, *row in rows:
-            seen[int(number)].append(row)
+        seen: list[list[Seen]] = [[] for _ in pictures]
+        for row in look(which, former, former_ns, now, now_ns, self._held, self._streams).tolist():
+            seen[int(row[SEEN.picture])].append(_sighting(row))
         exposed = ((at_ns, self._exposures[w]) for at_ns, w in pictures)
         return [
-            PictureSightings(each.drone, at_ns + each.latency_ns, at_ns, each.name, _seen(of_picture))
+            PictureSightings(each.drone, at_ns + each.latency_ns, at_ns, each.name, tuple(of_picture))
             for (at_ns, each), of_picture in zip(exposed, seen, strict=True)
         ]
 
@@ -194,12 +200,15 @@ def _detector(camera: Camera, model: SightingModel, hats: Hats, light: float, rn
     return row
 
 
-def _seen(rows: list[list[float]]) -> tuple[Seen, ...]:
-    return tuple(Seen((x, y, z), range_m, sigma, sigma_m) for x, y, z, range_m, sigma, sigma_m in rows)
+def _sighting(row: list[float]) -> Seen:
+    """Return what a row of SEEN says."""
+    _, x, y, z, range_m, sigma, sigma_m = row
+    return Seen((x, y, z), range_m, sigma, sigma_m)
 
 
 def _plain(seen: Seen) -> list[float]:
-    return [*seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m]
+    """Return a sighting as a row of SEEN."""
+    return [0.0, *seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m]
 
 
 def _turned(r: Array) -> Array:
@@ -217,7 +226,7 @@ def look(
     former_ns: int,
     now: NDArray,
     now_ns: int,
-    scene: Surroundings,
+    held: List,
     streams: NDArray,
 ) -> NDArray:
     """Return what is seen in some pictures, (M, SEEN.size).
@@ -225,9 +234,10 @@ def look(
     Args:
         pictures: instant [ns] and camera of each, by instant, (P, 2).
         former, now: states of all drones at two gates, (N, STATE.size).
-        scene: what the cameras look at.
+        held: Surroundings, in a list of one.
         streams: words of the cameras' random streams, (W, WORDS.size); moved on.
     """
+    scene = held[0]
     hats = len(now) + len(scene.balls)
     view, out = np.empty((hats, VIEW.size)), np.empty((len(pictures) * (hats + 1), SEEN.size))
     poses, end = now, 0

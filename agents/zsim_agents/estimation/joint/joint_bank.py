@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract import keys, messages
+from zsim.contract.camera_messages import Sightings
 from zsim.contract.flight_messages import Estimate
 from zsim.contract.framing import GateMessages, PerPattern
 from zsim.contract.snapshot import State
@@ -65,11 +66,14 @@ class JointBank(EstimatorBank):
         self._used: dict[Picture, None] = {}
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
-        if sensor != keys.SIGHTINGS:
+        if sensor == keys.SIGHTINGS:
+            self._receive_sightings(i, message, t_arrival_s)
+        else:
             super().receive(i, sensor, message, t_arrival_s)
-            return
+
+    def _receive_sightings(self, i: int, message: Sightings, t_arrival_s: float) -> None:
         p_BK = self._cameras[i].get(message.camera)
-        if p_BK is None:
+        if p_BK is None or not message.seen:
             return
         picture = (i, message.camera, message.t_sample_ns)
         if self._is_taken(picture, message.source):
@@ -98,7 +102,7 @@ class JointBank(EstimatorBank):
                 message = messages.decode(key, gate.payload(m))
             except DecodeError:
                 continue
-            self.receive(i, keys.SIGHTINGS, message, message.t_ns * 1e-9)
+            self._receive_sightings(i, message, message.t_ns * 1e-9)
         return True
 
     def _sighting_places(self, gate: GateMessages) -> list[tuple[int, int, str]]:

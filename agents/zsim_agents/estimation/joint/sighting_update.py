@@ -159,27 +159,30 @@ def owner(
     count, i = rows.nominal.shape[0], int(sighting[SIGHTING.drone])
     places, seen = np.zeros((count, 3)), place_of(sighting)
     best, second, found = math.inf, math.inf, NOBODY
+    trial_HJ, trial_S = np.zeros_like(HJ), np.zeros_like(S)
+    toward = across((1.0, 0.0, 0.0))
     for j in range(count):
         if j == i:
             continue
         if not rows.counts[j, COUNT.heading_known]:
             return NOBODY  # it could be anywhere
-        r, axes = predict_sighting(rows, sighting, j, hat_B, HJ, S)
+        r, axes = predict_sighting(rows, sighting, j, hat_B, trial_HJ, trial_S)
         places[j, 0], places[j, 1], places[j, 2] = r[0], r[1], r[2]
-        distance = distance_squared(rows, S, innovation(axes, seen, r))
+        trial_y = innovation(axes, seen, r)
+        distance = distance_squared(rows, trial_S, trial_y)
         if distance < best:
-            best, second, found = distance, best, j
+            best, second, found, toward = distance, best, j, axes
+            HJ[:], S[:], y[:] = trial_HJ, trial_S, trial_y
         elif distance < second:
             second = distance
     if found == NOBODY or best > rows.limits[3] or second - best < AMBIGUITY or taken[found]:
         return NOBODY
-    r, axes = predict_sighting(rows, sighting, found, hat_B, HJ, S)
+    r = (places[found, 0], places[found, 1], places[found, 2])
     for j in range(count):
         if j not in (i, found):
             other = (places[j, 0], places[j, 1], places[j, 2])
-            if distance_squared(rows, S, innovation(axes, other, r)) < APART * APART:
+            if distance_squared(rows, S, innovation(toward, other, r)) < APART * APART:
                 return NOBODY
-    y[:] = innovation(axes, seen, r)
     return found
 
 
