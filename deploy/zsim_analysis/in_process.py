@@ -20,7 +20,6 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World
 
-
 GC_ALLOCATIONS = 50_000  # between two searches for cycles, of which a flight makes none; a gate allocates hundreds
 
 

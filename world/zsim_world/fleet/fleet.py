@@ -313,8 +313,9 @@ class Fleet:
         if not sightings:
             return
         number = len(self.sensors.names)
-        sightings.sort(key=_order)
-        more = np.array([(number, *each[:3]) for each in sightings], dtype=np.int64)
+        sightings.sort()
+        rows = [(number, each.drone, each.t_ns, each.t_sample_ns) for each in sightings]
+        more = np.array(rows, dtype=np.int64)
         whose, values, places = with_more(*self.sampled, more)
         self.sampled = Sampled(whose, values)
         self.sightings = dict(zip(places.tolist(), sightings, strict=True))
@@ -327,10 +328,6 @@ class Fleet:
         if least < 2.0 * self._hull_m:
             self._began = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
             self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
-
-
-def _order(sightings: PictureSightings) -> tuple[int, int]:
-    return sightings.t_ns, sightings.drone
 
 
 def _sighting_sampler(scenario: Scenario, hulls: NDArray[np.float64]) -> SightingSampler | None:

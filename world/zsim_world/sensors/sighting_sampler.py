@@ -35,15 +35,15 @@ class PictureSightings(NamedTuple):
     """What was seen in one picture.
 
     Attributes:
-        drone: whose camera.
         t_ns: when it is published.
+        drone: whose camera.
         t_sample_ns: the middle of the exposure.
         camera: its name.
         seen: in no order that tells whose hats they are.
     """
 
-    drone: int
     t_ns: int
+    drone: int
     t_sample_ns: int
     camera: str
     seen: tuple[Seen, ...]
@@ -74,6 +74,10 @@ class _Exposures(NamedTuple):
     def at_ns(self, count: int) -> int:
         """Return the instant of a picture."""
         return round(count * 1e9 / self.rate_hz)
+
+    def publish(self, at_ns: int, seen: tuple[Seen, ...]) -> PictureSightings:
+        """Return what was seen in a picture of an instant."""
+        return PictureSightings(at_ns + self.latency_ns, self.drone, at_ns, self.name, seen)
 
 
 class SightingSampler:
@@ -114,7 +118,8 @@ class SightingSampler:
         self._held.append(surroundings)
         self._streams = np.array([words(rng) for rng in generators], dtype=np.uint64).reshape(-1, WORDS.size)
         self._counts = [0] * len(watching)
-        self._next_ns = 0  # the soonest picture of all
+        self._due_ns = [0] * len(watching)  # the next picture of each
+        self._next_ns = 0  # the soonest of all
         self._later: list[PictureSightings] = []
         self._former = np.empty((0, STATE.size))  # states of the last gate
         self._former_ns = 0
@@ -122,17 +127,19 @@ class SightingSampler:
     def snapshot(self) -> State:
         """Return what is on its way, the poses of the last gate, and the random streams."""
         later = [[*each[:4], [_plain(seen) for seen in each.seen]] for each in self._later]
-        watch = {"counts": [*self._counts], "next_ns": self._next_ns, "streams": self._streams}
+        watch = {"counts": [*self._counts], "streams": self._streams}
         return {"later": later, "former": self._former, "former_ns": self._former_ns, **watch}
 
     def restore(self, state: State) -> None:
         """Take over what `snapshot` returned."""
         self._later = [
-            PictureSightings(i, t_ns, at_ns, name, tuple(map(_sighting, seen)))
-            for i, t_ns, at_ns, name, seen in state["later"]
+            PictureSightings(t_ns, i, at_ns, name, tuple(map(_sighting, seen)))
+            for t_ns, i, at_ns, name, seen in state["later"]
         ]
         self._former, self._former_ns = state["former"].copy(), state["former_ns"]
-        self._counts, self._next_ns = [*state["counts"]], state["next_ns"]
+        self._counts = [*state["counts"]]
+        self._due_ns = [each.at_ns(count) for each, count in zip(self._exposures, self._counts, strict=True)]
+        self._next_ns = min(self._due_ns)
         self._streams[:] = state["streams"]
 
     def due(self, state: Array, now_ns: int) -> list[PictureSightings]:
@@ -153,26 +160,23 @@ class SightingSampler:
     def _looked(self, now: Array, now_ns: int) -> list[PictureSightings]:
         """Return what is seen in all pictures up to a gate."""
         pictures = sorted(self._taken(now_ns))
+        self._next_ns = min(self._due_ns)
         first = not len(self._former)
         former, former_ns = (now, now_ns) if first else (self._former, self._former_ns)
         which = np.array(pictures, dtype=np.int64)
         seen: list[list[Seen]] = [[] for _ in pictures]
         for row in look(which, former, former_ns, now, now_ns, self._held, self._streams).tolist():
             seen[int(row[SEEN.picture])].append(_sighting(row))
-        exposed = ((at_ns, self._exposures[w]) for at_ns, w in pictures)
-        return [
-            PictureSightings(each.drone, at_ns + each.latency_ns, at_ns, each.name, tuple(of_picture))
-            for (at_ns, each), of_picture in zip(exposed, seen, strict=True)
-        ]
+        return [self._exposures[w].publish(at_ns, tuple(of)) for (at_ns, w), of in zip(pictures, seen, strict=True)]
 
     def _taken(self, now_ns: int) -> Iterator[tuple[int, int]]:
         """Yield instant and camera of every picture up to a gate, and count it."""
-        self._next_ns = 2**63 - 1
+        due_ns, counts = self._due_ns, self._counts
         for w, exposures in enumerate(self._exposures):
-            while (at_ns := exposures.at_ns(self._counts[w])) <= now_ns:
-                self._counts[w] += 1
-                yield at_ns, w
-            self._next_ns = min(self._next_ns, at_ns)
+            while due_ns[w] <= now_ns:
+                yield due_ns[w], w
+                counts[w] += 1
+                due_ns[w] = exposures.at_ns(counts[w])
 
 
 def _watching(scenario: Scenario) -> Iterator[tuple[int, str, Camera, SightingModel]]:
