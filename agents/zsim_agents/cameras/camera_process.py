@@ -24,6 +24,8 @@ from zsim_agents.cameras.truths import TruthHistory
 # gates that it may be behind the world, which may be ahead of everybody by the command delay, before it leaves pictures
 # out: what arrives in a heap is no reason yet, and more than the slack of cameras that gate
 BEHIND_MAX = 5
+OVERTAKING_S = 0.1  # wall; a bye of higher priority would pass the last pictures, and a recorder close before them
+DRAIN_S = 1.0  # wall; how long the last truths of a run are waited for
 
 
 def serve(
@@ -42,7 +44,7 @@ def serve(
     while not (presence.end_reason or stopped()):
         process.turn()
     if not stopped():
-        process.draw()
+        process.finish()
 
 
 class Eye:
@@ -116,6 +118,15 @@ class CameraProcess:
             self._bell.is_back = False
             self._publish_infos()
         self.draw()
+
+    def finish(self) -> None:
+        """Publish the pictures that are due by the end of the run, of which the truth may still be on its way."""
+        end_s = time.monotonic() + DRAIN_S
+        self.draw()
+        while self._truths.newest_ns < self._presence.now_ns and time.monotonic() < end_s:
+            self._bell.wait()
+            self.draw()
+        time.sleep(OVERTAKING_S)
 
     def draw(self) -> None:
         """Publish the pictures that are due by what has arrived."""
