@@ -1,4 +1,4 @@
-"""A process of a run that shows and commands and answers no gate: its join, health and bye."""
+"""A process of a run that shows and commands, and gates only if it is to: its join, health and bye."""
 
 import os
 import secrets
@@ -46,6 +46,7 @@ class ObserverProcess:
         self._incarnation = secrets.randbits(62)
         self._admitted = self._superseded = False
         self._must_join = self._was_link_lost = False
+        self._done_ns = -1
 
     def announce(self) -> None:
         """Join the run."""
@@ -64,6 +65,8 @@ class ObserverProcess:
         when = self._join_seq, self.now_ns
         join = join_of(self.name, host, run_id, self._incarnation, *when, serves=self._serves, slack_ns=self._slack_ns)
         self._link.put(keys.process(self.name, "join"), join)
+        if self._done_ns >= 0:  # the last one may have been lost, or was of another incarnation
+            self.done(self._done_ns)
 
     def update_clock(self, payload: bytes) -> run_messages.Clock | None:
         """Follow the run by a message on `clock`; return it, None where it cannot be decoded."""
@@ -98,6 +101,7 @@ class ObserverProcess:
     def done(self, t_ns: int) -> None:
         """Publish that all up to a gate is done, if the world waits for it."""
         if self.gates:
+            self._done_ns = t_ns
             done = run_messages.Done(t_ns, self._done_seq, self._info.run_id, self._incarnation, t_ns, 0)
             self._done_seq += 1
             self._link.put(keys.process(self.name, "done"), done)

@@ -99,7 +99,7 @@ class Bus:
         self._wall_ns = wall_ns
         self._sink = sink
         self._gate_sink = gate_sink or self._sink_each
-        self._agents = [(agent, Inbox(agent.gate_keys, agent.counted)) for agent in agents]
+        self._agents = [(agent, Inbox(agent.gate_keys, agent.counted, uncounted=agent.uncounted)) for agent in agents]
         self._readers = RoutingTable([agent.reads for agent in agents])
         self._routes: dict[str, _Route] = {}
         self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and who reads of it

@@ -146,7 +146,8 @@ def _about_cluster(thing: str, scenario: Scenario, role: str) -> Rights:
 def _camera(drone: str) -> Rights:
     """Return what a camera of a drone may do: it sees all drones."""
     info = (keys.camera_info(drone, "*"),)
-    return Rights(reads=(keys.truth("*"),), writes=(keys.camera(drone, "*"), *info), answers=info)
+    truth = (keys.truth("*"),)
+    return Rights(reads=truth, writes=(keys.camera(drone, "*"), *info), answers=info, asks=truth)
 
 
 def _detector(drone: str) -> Rights:

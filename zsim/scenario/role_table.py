@@ -3,7 +3,7 @@
 Launchers, the world and access control read it; what a role may do on the keys is in `rights`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Literal, NamedTuple
 
 OnDeath = Literal["wait", "restart", "drop", "end"]
@@ -19,7 +19,7 @@ class Role(NamedTuple):
         about: what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent.
         agent: `package.module:Class` of the agent, made of world/info, scenario and name.
         joint: one agent may do the work of many, made of all their names.
-        on_overdue: what follows where it does not come back and the scenario does not say; `drop` if it gates nothing.
+        on_overdue: what follows where it does not come back and the scenario does not say; `drop` where nothing waits
     """
 
     extra: str
@@ -69,10 +69,17 @@ def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None)
     return actions.get(name) or actions.get(role) or default
 
 
-def on_overdue(actions: Mapping[str, OnOverdue], name: str, role: str | None = None) -> OnOverdue:
-    """Return what is to be done when a process has not come back in its time; arguments as of `on_death`."""
+def on_overdue(
+    actions: Mapping[str, OnOverdue], name: str, role: str | None = None, gating: Collection[str] = ()
+) -> OnOverdue:
+    """Return what is to be done when a process has not come back in its time.
+
+    Args:
+        actions, name, role: as of `on_death`.
+        gating: roles for which the run waits beside the agents.
+    """
     role = role or name.partition(".")[0]
-    default = ROLES[role].on_overdue if role in ROLES else "end"
+    default = ROLES[role].on_overdue if role in ROLES and role not in gating else "end"
     return actions.get(name) or actions.get(role) or default
 
 

@@ -222,9 +222,13 @@ class Processes(Spec, frozen=True, kw_only=True):
     on_death: Annotated[dict[str, OnDeath], Meta(max_length=PROCESSES_MAX)] = {}
     return_s: Positive | None = None  # wall; how long one that is to come back may stay away
     on_overdue: Annotated[dict[str, OnOverdue], Meta(max_length=PROCESSES_MAX)] | UnsetType = UNSET  # then; unset: end
+    snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s for who goes on
     gating: Annotated[list[Literal["camera"]], Meta(max_length=1)] | UnsetType = UNSET
     """Roles for which the run waits beside the agents; unset: none."""
-    snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s for who goes on
+
+    def gates(self, role: str) -> bool:
+        """Tell whether the run waits for the processes of a role that is no agent's."""
+        return self.gating is not UNSET and role in self.gating
 
 
 class TimeSteps(Spec, frozen=True, kw_only=True):
@@ -277,7 +281,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
 
     def gates(self, role: str) -> bool:
         """Tell whether the run waits for the processes of a role that is no agent's."""
-        return self.processes.gating is not UNSET and role in self.processes.gating
+        return self.processes.gates(role)
 
 
 class Document(Scenario, frozen=True, kw_only=True):

@@ -11,11 +11,12 @@ from itertools import count
 from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo
 from zsim.contract.messages import Info
+from zsim.contract.run_messages import RUN_ENDED
 from zsim.errors import DecodeError
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import camera_matrix, camera_pose, lens_of
-from zsim.transport.session import Query, RawSample, Session
+from zsim.transport.session import Query, RawSample, ReceivedSample, Session
 from zsim_agents.cameras.presence import Bell, Presence
 from zsim_agents.cameras.rendering.renderer import Renderer
 from zsim_agents.cameras.rendering.scene import Scene, scene_of
@@ -24,6 +25,7 @@ from zsim_agents.cameras.truths import TruthHistory
 # gates that it may be behind the world, which may be ahead of everybody by the command delay, before it leaves pictures
 # out: what arrives in a heap is no reason yet, and more than the slack of cameras that gate
 BEHIND_MAX = 5
+ASK_S = 0.5  # wall; the world answers in milliseconds
 OVERTAKING_S = 0.1  # wall; a bye of higher priority would pass the last pictures, and a recorder close before them
 DRAIN_S = 1.0  # wall; how long the last truths of a run are waited for
 
@@ -41,9 +43,10 @@ def serve(
     process.begin()
     if presence.gates:
         presence.announce()
+        process.catch_up()
     while not (presence.end_reason or stopped()):
         process.turn()
-    if not stopped():
+    if presence.end_reason == RUN_ENDED:
         process.finish()
 
 
@@ -93,7 +96,7 @@ class CameraProcess:
         longest_ns = max((eye.latency_ns for eye in self._eyes), default=0)
         self._behind_ns = BEHIND_MAX * info.gate_ns + info.command_delay_ns
         self._truths = TruthHistory(len(info.drones), info.gate_ns, longest_ns + 2 * self._behind_ns)
-        self._arrived: deque[RawSample] = deque()
+        self._arrived: deque[RawSample | ReceivedSample] = deque()
         self._numbers_drawn = count()
         self._info_seq = 0
         self._begun = False
@@ -117,7 +120,14 @@ class CameraProcess:
         if self._bell.is_back:
             self._bell.is_back = False
             self._publish_infos()
+            self.catch_up()
         self.draw()
+
+    def catch_up(self) -> None:
+        """Ask for the newest truth where the world waits for this process: what it is to be done with has passed."""
+        if self._presence.gates:
+            self._arrived.extend(self._link.get(keys.truth("*"), timeout_s=ASK_S))
+            self._bell.ring()
 
     def finish(self) -> None:
         """Publish the pictures that are due by the end of the run, of which the truth may still be on its way."""

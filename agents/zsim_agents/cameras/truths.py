@@ -43,10 +43,6 @@ class TruthHistory:
         elif len(self._pending) > PENDING_MAX:
             del self._pending[min(self._pending)]
 
-    def oldest_ns(self) -> int:
-        """Return the oldest gate that is kept; -1 if there is none."""
-        return next(iter(self._whole), -1)
-
     def bodies(self, t_ns: int) -> DroneStates | None:
         """Return all drones at an instant, or None where a gate beside it is lacking."""
         before_ns = t_ns // self._gate_ns * self._gate_ns

@@ -52,7 +52,7 @@ VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would
 SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
 HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which turns the attitude to it
 SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
-CONFIRMED_S = 2.0  # s, by which two drones have seen each other; they do not drift apart by an error meanwhile
+DENIED_S = 2.0  # s since two drones saw each other, chosen: errors grow little meanwhile
 HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
 
 
@@ -158,12 +158,12 @@ def with_biases(rows: Rows, i: int, kind: int, H: np.ndarray, at: int, out: np.n
 
 
 @portable
-def is_confirmed(rows: Rows, i: int, kind: int) -> bool:
-    """Tell whether who sees a drone, or is seen by it, agrees with it and trusts its own sensor: this one's lies."""
+def is_denied(rows: Rows, i: int, kind: int) -> bool:
+    """Tell whether who sees a drone, or is seen by it, trusts its own sensor of a kind, so that this one's is wrong."""
     for j in range(rows.sighted.shape[0]):
         last_s = max(rows.sighted[i, j], rows.sighted[j, i])
         trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0
-        if j != i and trusted and rows.nominal[i, NOMINAL.t] - last_s < CONFIRMED_S:
+        if j != i and trusted and rows.nominal[i, NOMINAL.t] - last_s < DENIED_S:
             return True
     return False
 
@@ -328,7 +328,7 @@ def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, af
         stack(rows, i, reading, H, z, expected, m, past)
         write_variance(reading, setting, variance, m)
         patience_s = setting[SETTING.sensors + kind * SENSOR.size + SENSOR.patience]
-        if row[NOMINAL.t] - row[NOMINAL.refused_since + kind] > patience_s and not is_confirmed(rows, i, kind):
+        if row[NOMINAL.t] - row[NOMINAL.refused_since + kind] > patience_s and not is_denied(rows, i, kind):
             inflate(row, P, kind, z, expected, m)
         blocks[b, 0], blocks[b, 1], kinds[b] = m, size, kind
         m, b = m + size, b + 1

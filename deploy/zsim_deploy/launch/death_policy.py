@@ -49,8 +49,9 @@ class DeathPolicy:
         return Decision(action, f"on_death: {action}")
 
     def _without(self, name: str, flies: bool, why: str, ends: bool = False) -> Decision:
-        """Return whether the run goes on without a process that no restart brings back."""
-        ends = ends or on_overdue(self._processes.on_overdue or {}, name) == "end"
+        """Return what is to be done where no restart brings a process back."""
+        overdue = on_overdue(self._processes.on_overdue or {}, name, gating=self._processes.gating or ())
+        ends = ends or overdue == "end" or self._processes.gates(name.partition(".")[0])
         is_awaited = not flies and not is_needed(name) and name in (self._processes.expect or ())
         if ends or is_awaited:  # a run that has not begun would wait for it for ever
             return Decision("end", f"{why}; the run ends")

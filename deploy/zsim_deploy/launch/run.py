@@ -62,7 +62,7 @@ class RunOptions:
 
     def camera_children(self) -> list[CameraChild]:
         """Return the cameras and detectors that are started."""
-        return camera_children(self.scenario, self.cameras, self.detect)
+        return camera_children(self.scenario, self.cameras or self.scenario.gates("camera"), self.detect)
 
 
 def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launcher: RoleLauncher) -> list[ChildProcess]:
@@ -209,7 +209,7 @@ def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
     if not options.continued:
         _write_scenario(options, in_process=False)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    if options.camera_children() and not options.rate:
+    if options.camera_children() and not options.rate and not scenario.gates("camera"):
         screen.say("as fast as it goes, a lockstep run is faster than its cameras; --rate 1 leaves them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
         if listen:

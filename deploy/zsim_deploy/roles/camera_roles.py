@@ -84,8 +84,9 @@ def stands_for(role: str, drones: Drones, names: Sequence[str], info: Info) -> t
 
 
 def slack_ns(role: str, info: Info) -> int:
-    """Return by how much the world may be ahead of a role; 0 for any, where the scenario does not let it gate."""
-    return SLACK_GATES * info.gate_ns if scenario_file.from_text(info.scenario).gates(role) else 0
+    """Return by how much the world may be ahead of a role; 0 for any, where nothing waits for it, as in a replay."""
+    gates = not info.replay_of and scenario_file.from_text(info.scenario).gates(role)
+    return SLACK_GATES * info.gate_ns if gates else 0
 
 
 def hat_diameter_m(scenario: Scenario) -> float:

@@ -44,9 +44,9 @@ PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
 Serve = Callable[[Session, Info, ObserverProcess, Stopped, Say], None]
-StandsFor = Callable[[Info], tuple[str, ...]]  # names of processes whose work a process does in a run
-SlackNs = Callable[[Info], int]
 """Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
+StandsFor = Callable[[Info], tuple[str, ...]]  # names of processes whose work a process does in a run
+SlackNs = Callable[[Info], int]  # by how much the world of a run may be ahead of a process; 0 for any
 NICE = 5  # of processes for which no gate waits
 NICE_FOR_VIEWS = 10  # of those that only people look at: a picture may come later, a gate may not
 AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
@@ -191,12 +191,12 @@ def _nobody(_: Info) -> tuple[str, ...]:
     return ()
 
 
-def _any(_: Info) -> int:
+def _no_slack(_: Info) -> int:
     return 0
 
 
 def serve_runs(
-    name: str, serve: Serve, reach: WorldAccess, stands_for: StandsFor = _nobody, slack_ns: SlackNs = _any
+    name: str, serve: Serve, reach: WorldAccess, stands_for: StandsFor = _nobody, slack_ns: SlackNs = _no_slack
 ) -> None:
     """Serve one run after the other of the world on an endpoint, until it is stopped; launched, only one.
 

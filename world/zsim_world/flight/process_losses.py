@@ -102,7 +102,8 @@ class ProcessLosses:
         action = self._run.on_death(participant)
         if action in ("drop", "end"):  # of one that is silent, as after its death
             return action
-        return on_overdue(self._run.scenario.processes.on_overdue or {}, participant.name, participant.join.role)
+        processes, role = self._run.scenario.processes, participant.join.role
+        return on_overdue(processes.on_overdue or {}, participant.name, role, processes.gating or ())
 
     def silence_changed(self, name: str, since_wall_ns: int | None) -> None:
         """Take it that a process publishes its health no longer, since its last; or does again (None)."""

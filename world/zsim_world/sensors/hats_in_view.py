@@ -137,8 +137,11 @@ def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius:
 
 
 @inlined
-def _obstacle_hides(eye: Vector, ray: Vector, far: float, clearance: float, row: NDArray) -> bool:
-    """Tell whether a ray comes nearer to an obstacle than a clearance [m] before `far` [m], by steps that are free."""
+def _obstacle_hides(eye: Vector, ray: Vector, far: float, clearance: float, row: NDArray, unsure: bool) -> bool:
+    """Tell whether a ray comes nearer to an obstacle than a clearance [m] before `far` [m], by steps that are free.
+
+    `unsure` is the answer where all steps are used up beside it.
+    """
     at = 0.0
     for _ in range(STEPS_MAX):
         p = axpy(eye, at, ray)
@@ -148,7 +151,7 @@ def _obstacle_hides(eye: Vector, ray: Vector, far: float, clearance: float, row:
         at += max(free, SURFACE_M)
         if at >= far:
             return False
-    return False
+    return unsure
 
 
 @inlined
@@ -205,7 +208,7 @@ def _hidden(
         k = i - poses.shape[0]
         if k < 0 and (i == own or (_passes(eye, ray, away, _three(poses[i], POSE.p_WB), RIM_WIDE * hulls[i] + ball))):
             continue
-        if k >= 0 and not _obstacle_hides(eye, ray, away, ball, obstacles[k]):
+        if k >= 0 and not _obstacle_hides(eye, ray, away, ball, obstacles[k], True):
             continue
         for point in range(POINTS):
             a, b = ball / away * COSINES[point], ball / away * SINES[point]
@@ -214,7 +217,7 @@ def _hidden(
             if (
                 _drone_hides(eye, to, away, i, m, poses[i], hulls[i])
                 if k < 0
-                else _obstacle_hides(eye, to, away, SURFACE_M, obstacles[k])
+                else _obstacle_hides(eye, to, away, SURFACE_M, obstacles[k], False)
             ):
                 hidden |= 1 << point
     return hidden

@@ -46,6 +46,7 @@ SEEN = columns(  # a sighting
 DRAWS = 4  # normal numbers for each hat of a picture: two for its centre, one for its diameter, one for a miss
 FALSE_DRAWS = 4  # likewise for a false alarm: whether, where (2), how large
 DIAMETER_NOISE, DIAMETER_BLUR = 1.4, 2.8  # what noise and blur make of a diameter over that of a centre; measured
+ANGLE_MAX = 3.0  # rad, of an apparent diameter; pi is that of a ball that touches the lens
 SMALLEST = 0.1  # of a hat's apparent diameter, the least that is measured
 
 
@@ -81,7 +82,7 @@ def _put(model: NDArray, to_K: Vector, range_m: float, sigma: float, sigma_m: fl
 @inlined
 def _range_m(model: NDArray, angle: float) -> float:
     """Return how far a hat of an apparent diameter [rad] is."""
-    return model[DETECTOR.radius] / math.sin(0.5 * angle)
+    return model[DETECTOR.radius] / math.sin(0.5 * min(angle, ANGLE_MAX))
 
 
 @inlined

@@ -121,7 +121,8 @@ class SightingSampler:
         self._due_ns = [0] * len(watching)  # the next picture of each
         self._next_ns = 0  # the soonest of all
         self._later: list[PictureSightings] = []
-        self._former = np.empty((0, STATE.size))  # states of the last gate
+        self._gate_ns = round(scenario.time.gate_ms * 1e6)
+        self._former = np.empty((0, STATE.size))  # states of the last gate before a picture
         self._former_ns = 0
 
     def snapshot(self) -> State:
@@ -146,11 +147,8 @@ class SightingSampler:
         """Return what falls due by a gate, given the state of all drones there, (N, STATE.size or more)."""
         if self._next_ns <= now_ns:
             self._later += self._looked(state[:, : STATE.size].copy(), now_ns)
-        if (
-            not now_ns or self._next_ns <= 2 * now_ns - self._former_ns
-        ):  # a picture before the next gate needs this state
-            self._former = state[:, : STATE.size].copy()
-        self._former_ns = now_ns
+        if self._next_ns <= now_ns + self._gate_ns:  # a picture before the next gate needs this state
+            self._former, self._former_ns = state[:, : STATE.size].copy(), now_ns
         if not self._later:
             return []
         due = [sighting for sighting in self._later if sighting.t_ns <= now_ns]

@@ -112,6 +112,7 @@ EYES = "sensors={preset: paper, front_camera: {}}"
 # name: (overrides, --cameras, --detect; process: drones, none for all with cameras)
 CAMERAS = {
     "none": ([EYES], False, False, {}),
+    "gating": ([EYES, "processes.gating=[camera]"], False, False, {"camera.main": []}),
     "all": ([EYES], True, True, {"camera.main": [], "detector.main": []}),
     "one": ([EYES, "processes.expect=[camera.drone1]"], False, False, {"camera.drone1": ["drone1"]}),
     "the others too": (

@@ -11,7 +11,7 @@ from refused import has_terms
 
 from zsim.errors import RunError
 from zsim.scenario.scenario import Processes
-from zsim_deploy.launch.death_policy import RESTARTS_MAX, SUPERSEDED, USER_FAULT
+from zsim_deploy.launch.death_policy import RESTARTS_MAX, SUPERSEDED, USER_FAULT, DeathPolicy
 from zsim_deploy.launch.supervisor import SILENT_S, Supervisor
 
 
@@ -204,6 +204,15 @@ def test_deaths_far_apart_do_not_add_up(monkeypatch):
 def test_what_a_death_means(name, code, on_death, fails):
     team = Team(Member(name, code), on_death=on_death)
     assert team.go().failed == fails
+
+
+@pytest.mark.parametrize("name", ["camera.main", "camera.drone1"])
+def test_a_camera_that_gates_ends_the_run_where_no_restart_helps(name: str):
+    policy = DeathPolicy(Processes(gating=["camera"]))
+    decisions = [policy.decide(name, 1, flies=True).action for _ in range(RESTARTS_MAX + 1)]
+    assert decisions == ["restart"] * RESTARTS_MAX + ["end"]
+    assert DeathPolicy(Processes(gating=["camera"])).decide(name, USER_FAULT, flies=True).action == "end"
+    assert DeathPolicy(Processes()).decide(name, USER_FAULT, flies=True).action == "drop"
 
 
 def test_a_dead_world_fails_the_run_and_stops_the_rest():
