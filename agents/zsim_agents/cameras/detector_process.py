@@ -15,6 +15,7 @@ from zsim.sensors.camera import CAMERAS
 from zsim.sensors.camera_model import CameraPose, Lens, folds
 from zsim.sensors.jpeg_header import PictureError
 from zsim.transport.session import RawSample, Session
+from zsim_agents.cameras import hat_outline
 from zsim_agents.cameras.detector import HatDetector
 from zsim_agents.cameras.jpeg import PIXELS_MAX, decoded
 from zsim_agents.cameras.presence import Bell, Presence
@@ -61,6 +62,7 @@ class DetectorProcess:
 
     def begin(self) -> None:
         """Subscribe to pictures and to what their pixels mean; of no other names, which anybody could make up."""
+        hat_outline.rehearse()
         for drone, name in product(self._drones, CAMERAS):
             self._link.declare_subscriber(keys.camera_info(drone, name), self._on_info)
             self._link.declare_subscriber(keys.camera(drone, name), self._on_picture)

@@ -55,6 +55,11 @@ NONE = Outline((0.0, 0.0, 1.0), math.nan, 0.0, 0.0, 0.0, 0.0)
 Circle = tuple[float, float, float]  # middle and radius [px]
 
 
+def rehearse() -> None:
+    """Load or compile what is needed of it, with a picture of nothing: the first hat is not to wait for it."""
+    outline(np.zeros((3, 3), np.float32), 0.0, np.ones((3, 3, 3), np.float32), 1.0)
+
+
 @portable
 def outline(covered: NDArray, noise: float, rays: NDArray, scale: float) -> Outline:
     """Return the circle of a ball.

@@ -1,6 +1,7 @@
 """The estimator of one drone, or of several, as an agent: sensors in, an estimate of each drone out at every gate."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, cast
 
 from msgspec import UNSET, Struct
@@ -48,7 +49,11 @@ class Estimator(Agent):
         sighted = scenario.estimation.use_sightings is True and not make
         banks = ClusterBanks(scenario, names, info.gate_ns / 1e9) if sighted else None
         self._estimators = banks or (EstimatorSet(make, *settings) if make else EstimatorBank(*settings))
-        self._settings = None if make or sighted else settings
+        self._fresh: Callable[[], EstimatorBank | ClusterBanks] | None = (
+            None if make else partial(EstimatorBank, *settings)
+        )
+        if sighted:
+            self._fresh = partial(ClusterBanks, scenario, names, info.gate_ns / 1e9)
         read = tuple(banks.drones) if banks else names
         self.gate_keys = tuple(keys.status(drone) for drone in read)
         self.counted = read
@@ -94,9 +99,9 @@ class Estimator(Agent):
         return [Output(self._view_key, ViewEstimates(t_ns, self.next_seq(self._view_key), shown))]
 
     def rehearse(self) -> None:
-        if self._settings is None:
+        if self._fresh is None:
             return
-        bank, drone, t_ns, still = EstimatorBank(*self._settings), self._names[0], 1_000_000, (0.0, 0.0, 0.0)
+        bank, drone, t_ns, still = self._fresh(), self._names[0], 1_000_000, (0.0, 0.0, 0.0)
         readings: dict[str, Struct] = {
             "imu": messages.Imu(t_ns, 0, t_ns, (0.0, 0.0, 9.8), still),
             "gps": messages.Gps(t_ns, 0, t_ns, 0.0, 0.0, 0.0, still, still, 1.0, 3, 9),

@@ -22,6 +22,7 @@ ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "posit
 NESTED = ("groups", 2, 3)  # name, groups, drones of each
 WITH_WORLD = {"world", "sweep", "all", "dev"}  # extras that bring it …
 WITH_AGENTS = WITH_WORLD | {"agents"}  # … and them; pyproject.toml
+WITH_CAMERAS = {"cameras"}
 APART_M = 4.0  # on circles, so that no formation stands in a line
 
 
@@ -33,6 +34,8 @@ def main(extras: Collection[str]) -> None:
         _build_world()
     if WITH_AGENTS & {*extras}:
         _rehearse_agents()
+    if WITH_CAMERAS & {*extras}:
+        _rehearse_detector()
 
 
 def _build_world() -> None:
@@ -46,6 +49,12 @@ def _rehearse_agents() -> None:
 
     scenario = scenario_file.resolve(formations())
     hosted(_info(scenario), scenario, ["*"]).rehearse()
+
+
+def _rehearse_detector() -> None:
+    from zsim_agents.cameras import hat_outline
+
+    hat_outline.rehearse()
 
 
 def _info(scenario: Scenario) -> Info:
