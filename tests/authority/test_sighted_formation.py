@@ -30,6 +30,7 @@ AMISS = {
     "covered_hat": "environment.hats.covered=[drone2]",
     "false_hat": "environment.hats.false_m=[[5, -5, 0.07]]",
 }
+RARELY = ("none", "gps_of_one")  # what the others fly, too
 SIGHTED = [
     "sensors.front_camera={}",
     "sensors.sightings={}",
@@ -55,7 +56,9 @@ def flown(folder: Path, scenario: str, fields: list[str], seed: int, window_s: t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("amiss", AMISS)
+@pytest.mark.parametrize(
+    "amiss", [pytest.param(each, marks=pytest.mark.soak) if each in RARELY else each for each in AMISS]
+)
 def test_the_formation_keeps_its_shape(amiss: str, tmp_path: Path) -> None:
     track = flown(tmp_path, "eyes.yaml", ["duration_s=200", AMISS[amiss]], 1, WINDOW_S)
     sides = np.linalg.norm(track[:, 1:] - track[:, :1], axis=2)  # p and q

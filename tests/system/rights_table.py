@@ -43,7 +43,7 @@ drone/drone1/sensor/baro          r       -       r       r       -       -
 drone/drone1/sensor/sonar         r       -       r       r       -       -
 drone/drone1/sensor/flow          r       -       r       r       -       -
 drone/drone1/sensor/status        rg      rg      rg      rg      -       -
-drone/drone1/truth                -       -       rg      rg      r       -
+drone/drone1/truth                -       -       rg      rg      rg      -
 drone/drone1/cmd/velocity         -       p       r       rp      -       -
 drone/drone1/cmd/ardrone          -       p       r       rp      -       -
 drone/drone1/cmd/attitude         -       p       r       rp      -       -
@@ -57,7 +57,7 @@ drone/drone1/sightings            -       -       r       r       -       p
 drone/drone2/sensor/imu           -       -       r       r       -       -
 drone/drone2/sensor/gps           -       -       r       r       -       -
 drone/drone2/sensor/status        -       rg      rg      rg      -       -
-drone/drone2/truth                -       -       rg      rg      r       -
+drone/drone2/truth                -       -       rg      rg      rg      -
 drone/drone2/cmd/velocity         -       p       r       rp      -       -
 drone/drone2/cmd/mode             -       p       r       rp      -       -
 drone/drone2/estimate             -       rg      rg      rg      -       -
@@ -66,7 +66,7 @@ drone/drone2/camera/front/info    -       -       rg      rg      -       -
 drone/drone2/sightings            -       -       r       r       -       -
 drone/drone3/sensor/imu           -       -       r       r       -       -
 drone/drone3/sensor/status        -       -       rg      rg      -       -
-drone/drone3/truth                -       -       rg      rg      r       -
+drone/drone3/truth                -       -       rg      rg      rg      -
 drone/drone3/cmd/velocity         -       -       r       rp      -       -
 drone/drone3/cmd/mode             -       -       r       rp      -       -
 drone/drone3/estimate             -       -       rg      rg      -       -
