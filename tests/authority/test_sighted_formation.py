@@ -30,7 +30,7 @@ AMISS = {
     "covered_hat": "environment.hats.covered=[drone2]",
     "false_hat": "environment.hats.false_m=[[5, -5, 0.07]]",
 }
-RARELY = ("none", "gps_of_one")  # what the others fly, too
+RARELY = ("none", "gps_of_one", "covered_hat")  # what the others fly, too
 SIGHTED = [
     "sensors.front_camera={}",
     "sensors.sightings={}",
