@@ -13,7 +13,7 @@ USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run a
 SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
 
 
-class Decision(NamedTuple):
+class DeathDecision(NamedTuple):
     """What is to be done, and why, for people."""
 
     action: OnDeath
@@ -31,7 +31,7 @@ class DeathPolicy:
         self._processes = processes
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
 
-    def decide(self, name: str, code: int | None, flies: bool) -> Decision:
+    def decide(self, name: str, code: int | None, flies: bool) -> DeathDecision:
         """Take the death of a process; return what is to be done.
 
         Args:
@@ -41,21 +41,21 @@ class DeathPolicy:
         """
         action = on_death(self._processes.on_death, name)
         if action == "end":
-            return Decision("end", "on_death: end")
+            return DeathDecision("end", "on_death: end")
         if code == USER_FAULT:
             return self._without(name, flies, "a restart would not help", is_needed(name))
         if action == "restart" and self._dies_too_often(name):
             return self._without(name, flies, f"more than {RESTARTS_MAX} restarts within {RESTART_WINDOW_S:g} s")
-        return Decision(action, f"on_death: {action}")
+        return DeathDecision(action, f"on_death: {action}")
 
-    def _without(self, name: str, flies: bool, why: str, ends: bool = False) -> Decision:
+    def _without(self, name: str, flies: bool, why: str, ends: bool = False) -> DeathDecision:
         """Return what is to be done where no restart brings a process back."""
         overdue = on_overdue(self._processes.on_overdue or {}, name, gating=self._processes.gating or ())
         ends = ends or overdue == "end" or self._processes.gates(name.partition(".")[0])
         is_awaited = not flies and not is_needed(name) and name in (self._processes.expect or ())
         if ends or is_awaited:  # a run that has not begun would wait for it for ever
-            return Decision("end", f"{why}; the run ends")
-        return Decision("drop", f"{why}; it is given up, and the run goes on without it")
+            return DeathDecision("end", f"{why}; the run ends")
+        return DeathDecision("drop", f"{why}; it is given up, and the run goes on without it")
 
     def _dies_too_often(self, name: str) -> bool:
         """Count a death; return whether there were too many in a row for another restart."""
