@@ -1,7 +1,6 @@
 """Two detectors of one drone, a camera that stands still, one that nobody has: named, and the flight is untouched."""
 
 import signal
-from pathlib import Path
 from typing import Any
 
 import pytest
