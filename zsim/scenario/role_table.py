@@ -41,6 +41,9 @@ ROLES = {
     "gateway": Role("gateway", "drop", on_overdue="drop"),
     "ros1": Role("ros1", "drop", on_overdue="drop"),
     "ros2": Role("ros2", "drop", on_overdue="drop"),
+    "mavlink": Role("", "drop", on_overdue="drop"),
+    "ardrone": Role("", "drop", on_overdue="drop"),
+    "driver": Role("", "restart", on_overdue="drop"),
     "router": Role("", "restart"),
 }
 AGENTS = {name: role for name, role in ROLES.items() if role.about}

@@ -9,13 +9,15 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from zsim.contract import flight_messages, keys, messages
+from zsim.contract import flight_messages, messages
 from zsim.scenario.scenario import Drone
 from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.camera_topics import CameraTopics
 from zsim_bridges.ros1.connections import PublishedTopic
-from zsim_bridges.ros1.driver_messages import DriverFrames, OnboardState
+from zsim_bridges.ros1.driver_messages import DriverFrames
 from zsim_bridges.ros1.node import Ros1Node
+from zsim_bridges.vehicle_links.command_sender import CommandSender, ModeName
+from zsim_bridges.vehicle_links.onboard_state import OnboardState
 
 NEARLY_ZERO = 1e-6  # of a component of cmd_vel, _EPS of the driver
 REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
@@ -43,10 +45,7 @@ class DriverCommands:
     """
 
     def __init__(self, drone: str, source: str, put: Callable[[str, Any], None]) -> None:
-        self._source = source
-        self._put = put
-        self._tilt_key, self._mode_key = keys.command(drone, "ardrone"), keys.command(drone, "mode")
-        self._seq = {self._tilt_key: 0, self._mode_key: 0}
+        self._sender = CommandSender(drone, source, put)
         self._tilt: TiltCommand | None = None
         self._sent_ns: int | None = None
         self._status: flight_messages.Status | None = None
@@ -86,16 +85,10 @@ class DriverCommands:
         late = self._sent_ns is None or status.t_ns - self._sent_ns >= REPEAT_NS
         if self._tilt is not None and late and status.state in AIRBORNE:
             self._sent_ns = status.t_ns
-            seq = self._next_seq(self._tilt_key)
-            self._put(self._tilt_key, flight_messages.Ardrone(status.t_ns, seq, self._source, *self._tilt))
+            self._sender.tilt(status.t_ns, *self._tilt)
 
-    def _send_mode(self, mode: Any) -> None:
-        t_ns = self._status.t_ns if self._status else 0
-        self._put(self._mode_key, flight_messages.Mode(t_ns, self._next_seq(self._mode_key), self._source, mode))
-
-    def _next_seq(self, key: str) -> int:
-        self._seq[key] += 1
-        return self._seq[key] - 1
+    def _send_mode(self, mode: ModeName) -> None:
+        self._sender.mode(self._status.t_ns if self._status else 0, mode)
 
 
 def ros1_name(name: str) -> str:

@@ -2,27 +2,23 @@
 
 import asyncio
 import contextlib
-import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo
-from zsim.contract.framing import run_key_table
 from zsim.contract.messages import Info
-from zsim.errors import DecodeError, RunError, SessionError
-from zsim.runtime.health import HealthMeter
+from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file
-from zsim.transport.session import ReceivedSample, Session
-from zsim.transport.traffic import Passed, Traffic, samples
+from zsim.transport.session import Session
+from zsim_bridges.message_intake import MessageIntake
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics, ros1_name
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.picture_intake import PictureIntake
+from zsim_bridges.vehicle_links import onboard_state
 
-BACKLOG = 250  # times that something arrived, some seconds of realtime
 POLL_S = 0.1  # how often a stop is looked for
 REPORTED_MAX = 1000  # texts remembered, so that each is printed once
 Say = Callable[[str], None]
@@ -30,59 +26,6 @@ Say = Callable[[str], None]
 
 class NodeShutdownError(RunError):
     """A ROS node, or the master, has asked this node to stop."""
-
-
-class Intake:
-    """Messages in the order in which they passed the world; a reader that is too slow loses the oldest gates.
-
-    Args:
-        link: an open session.
-        info: of the run.
-        health: counts what is lost or refused.
-        loop: of the reader.
-
-    Attributes:
-        news: set when there is something to read.
-    """
-
-    def __init__(self, link: Session, info: Info, health: HealthMeter, loop: asyncio.AbstractEventLoop) -> None:
-        self._traffic = Traffic(link, run_key_table(info), self._count_refused)
-        self._health = health
-        self._loop = loop
-        self._backlog: deque[Sequence[Passed]] = deque(maxlen=BACKLOG)
-        self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
-        self.news = asyncio.Event()
-        for sample in link.get(keys.CLOCK):  # a world that stands, or has ended, publishes it no more
-            self._backlog.append([sample])
-        self.news.set()
-        self._thread.start()
-
-    def close(self) -> None:
-        """Take in no more."""
-        self._traffic.close()
-        self._thread.join(1.0)
-
-    def arrivals(self) -> Iterator[list[ReceivedSample]]:
-        """Yield what has come until now, in the parts in which it came."""
-        self.news.clear()
-        for _ in range(len(self._backlog)):
-            yield list(samples(self._backlog.popleft()))
-
-    def _run(self) -> None:
-        while True:
-            try:
-                passed = self._traffic.receive()
-            except SessionError:
-                return
-            if passed:
-                self._health.dropped += len(self._backlog) == BACKLOG
-                self._health.received += 1
-                self._backlog.append(passed)
-                with contextlib.suppress(RuntimeError):  # the reader is gone
-                    self._loop.call_soon_threadsafe(self.news.set)
-
-    def _count_refused(self) -> None:
-        self._health.refused += 1
 
 
 def serve(
@@ -109,7 +52,7 @@ def serve(
         NodeShutdownError: ROS asked this node to stop.
         RunError: two drones have the same name in ROS.
     """
-    driver_messages.warm_up()
+    onboard_state.warm_up()
     node = Ros1Node(f"/{ros1_name(info.federation)}", master_uri, host, say)
     asyncio.run(Ros1Bridge(link, info, observer, node, say).run(stopped))
     if node.shutdown_reason:
@@ -138,7 +81,7 @@ class Ros1Bridge:
         for sample in self._link.get(keys.camera_info("*", "*")):
             self.forward(sample.key, sample.payload)
         pictures = PictureIntake(self._link, asyncio.get_running_loop(), self.forward)
-        intake = Intake(self._link, self._info, self._observer.health, asyncio.get_running_loop())
+        intake = MessageIntake(self._link, self._info, self._observer.health, asyncio.get_running_loop())
         try:
             async with self._node.running():
                 while not (stopped() or self._observer.end_reason or self._node.shutdown_reason):
@@ -156,7 +99,7 @@ class Ros1Bridge:
         for name, drone in self._drones.items():
             yield from (keys.camera(name, camera) for camera in drone.cameras.wanted())
 
-    async def _forward_all(self, intake: Intake) -> None:
+    async def _forward_all(self, intake: MessageIntake) -> None:
         for arrived in intake.arrivals():
             for key, payload in arrived:
                 self.forward(key, payload)

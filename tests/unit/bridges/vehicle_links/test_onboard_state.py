@@ -8,7 +8,7 @@ import pytest
 from zsim.contract import flight_messages, messages
 from zsim.math.frames import heading, rpy_from_quaternion
 from zsim.sensors.sensor import Mount
-from zsim_bridges.ros1.driver_messages import OnboardState
+from zsim_bridges.vehicle_links.onboard_state import OnboardState
 
 S = 1_000_000_000
 REST = (0.0, 0.0, 9.80665)
