@@ -1,0 +1,287 @@
+"""The driver as a process: an aircraft at the other end of a wire is one drone of a run.
+
+The wire's session, the failsafe and what becomes of readings are pure and stand in files of their own; here are
+sockets, keys, and the event loop.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+from zsim.contract import flight_messages, keys, messages
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import RUN_ENDED, ControlAnswer
+from zsim.errors import DecodeError, RunError
+from zsim.scenario import scenario_file
+from zsim.transport.session import Query, RawSample, Session
+from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.vehicle_links.clock_offset import ClockOffset
+from zsim_bridges.vehicle_links.external_drone import ExternalDrone
+from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe
+from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+from zsim_bridges.vehicle_links.vehicle_session import Channel, LinkFigures, VehicleSession
+from zsim_bridges.vehicle_links.vehicle_state import AIRBORNE
+
+TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
+REPORT_S = 1.0  # s, wall; of the link's figures
+LANDING_S = 30.0  # s, wall; how long it waits for the aircraft to be down before it leaves
+Say = Callable[[str], None]
+
+
+class DriverClock:
+    """The clock of the driver, which goes as fast as the run's, and what the run's shows.
+
+    Args:
+        rate: simulated per wall seconds.
+        wall_ns: monotonic wall time.
+    """
+
+    def __init__(self, rate: float, wall_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._rate, self._wall_ns = rate, wall_ns
+        self._offset = ClockOffset()
+
+    def now_ns(self) -> int:
+        return round(self._wall_ns() * self._rate)
+
+    def on_gate(self, t_ns: int) -> None:
+        """A clock of the run has just arrived."""
+        self._offset.add(t_ns, self.now_ns())
+
+    def to_simulated(self, now_ns: int) -> int:
+        """Return simulated time at a time of this clock."""
+        return self._offset.to_remote(now_ns)
+
+
+class DriverProcess:
+    """One aircraft in one run.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        observer: of this process in it.
+        drone: which drone of the run the aircraft is.
+        make_session: makes the session with the aircraft, at a time of the driver's clock.
+        limits: that hold whatever is commanded.
+        armed: whether it begins armed.
+        say: prints a line.
+
+    Raises:
+        RunError: the drone is not external, or the run does not keep the pace of the wall clock.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        info: Info,
+        observer: ObserverProcess,
+        drone: str,
+        make_session: Callable[[int], VehicleSession],
+        limits: FlightLimits,
+        armed: bool,
+        say: Say,
+    ) -> None:
+        check_external(info, drone)
+        self._link, self._observer, self._drone, self._say = link, observer, drone, say
+        self._clock = DriverClock(info.rate or 1.0)
+        self._session = make_session(self._clock.now_ns())
+        self._failsafe = Failsafe(scenario_file.from_text(info.scenario).silence, limits, armed)
+        self._external = ExternalDrone(drone, self._clock.to_simulated)
+        self._sockets: list[asyncio.DatagramTransport] = []
+        self._reported_s, self._reported = 0.0, ("", "", "")
+        self._report_seq = self._ignored = 0
+
+    async def run(self, stopped: Callable[[], bool]) -> None:
+        """Carry messages both ways until the run is over or a stop is requested; then land."""
+        loop = asyncio.get_running_loop()
+        await self._open(loop)
+        try:
+            self._subscribe(loop)
+            self._observer.announce()
+            while not (stopped() or self._observer.end_reason):
+                self._tick()
+                await asyncio.sleep(TICK_S)
+            await self._land_and_leave(stopped())
+        finally:
+            for transport in self._sockets:
+                transport.close()
+
+    async def _open(self, loop: asyncio.AbstractEventLoop) -> None:
+        for number, channel in enumerate(self._session.channels):
+            try:
+                transport, _ = await loop.create_datagram_endpoint(
+                    lambda number=number: ChannelSocket(number, self._receive),
+                    remote_addr=(channel.host, channel.port),
+                    local_addr=_local(channel),
+                )
+            except OSError as error:
+                raise RunError(f"{channel.host}:{channel.port} cannot be reached: {error.strerror or error}") from error
+            self._sockets.append(transport)
+
+    def _subscribe(self, loop: asyncio.AbstractEventLoop) -> None:
+        def in_loop(handle: Callable[[str, bytes], None]) -> Callable[[RawSample], None]:
+            def take(sample: RawSample) -> None:
+                with contextlib.suppress(RuntimeError):  # the loop is closed
+                    loop.call_soon_threadsafe(handle, sample.key, sample.payload)
+
+            return take
+
+        self._link.declare_subscriber(keys.CLOCK, in_loop(self._on_clock))
+        self._link.declare_subscriber(keys.accepted(self._drone, "*"), in_loop(self._on_accepted))
+
+        def on_query(query: Query) -> None:
+            with contextlib.suppress(RuntimeError):
+                loop.call_soon_threadsafe(self._on_request, query)
+
+        self._link.declare_queryable(keys.driver(self._drone), on_query)
+
+    # What arrives
+
+    def _receive(self, channel: int, datagram: bytes) -> None:
+        self._session.receive(channel, datagram, self._clock.now_ns())
+        self._external.add(self._session.take_readings())
+
+    def _on_clock(self, _: str, payload: bytes) -> None:
+        """Publish the gate that the world has reached."""
+        clock = self._observer.update_clock(payload)
+        if clock is None or clock.state != "running":
+            return
+        now_ns = self._clock.now_ns()
+        self._clock.on_gate(clock.t_ns)
+        self._failsafe.on_clock(now_ns)
+        vehicle = self._session.state
+        if vehicle.received_ns is not None and now_ns - vehicle.received_ns < LINK_LOST_S * 1e9:
+            for key, message in self._external.gate(clock.t_ns, vehicle, self._failsafe.commander):
+                self._link.put(key, message)
+
+    def _on_accepted(self, key: str, payload: bytes) -> None:
+        """Hand a command on at once."""
+        try:
+            command = messages.decode(key, payload)
+        except DecodeError:
+            self._observer.health.refused += 1
+            return
+        refusal = self._failsafe.on_command(command, self._clock.now_ns(), self._session.state)
+        if refusal is None:
+            self._send()
+            return
+        self._observer.health.refused += 1
+        self._ignored += 1
+        if self._ignored == 1 or isinstance(command, flight_messages.Mode):
+            self._say(f"{self._observer.name}: {keys.leaf(key)} of {command.source} is not obeyed: {refusal}")
+
+    def _on_request(self, query: Query) -> None:
+        """Answer an operator."""
+        request, now_ns, vehicle = query.request(), self._clock.now_ns(), self._session.state
+        match request.op:
+            case "arm":
+                error = self._failsafe.arm(now_ns, vehicle)
+            case "disarm":
+                error = self._failsafe.disarm(vehicle)
+            case "kill":
+                self._failsafe.kill(now_ns)
+                error = None
+            case _:
+                error = f"op is {request.op!r}; must be one of arm, disarm, kill"
+        query.answer(ControlAnswer(error is None, error or ""))
+        self._say(f"{self._observer.name}: {request.source or 'somebody'} asks {request.op}: {error or 'done'}")
+        self._send()
+        self._report(now_ns)
+
+    # What goes out
+
+    def _tick(self) -> None:
+        self._send()
+        self._observer.tick()
+        for text in self._session.texts:
+            self._say(f"{self._observer.name}: {text}")
+        self._session.texts.clear()
+        if time.monotonic() - self._reported_s > REPORT_S or self._reported != self._reported_now():
+            self._report(self._clock.now_ns())
+
+    def _send(self) -> None:
+        """Send the aircraft what is due."""
+        now_ns = self._clock.now_ns()
+        demand = self._failsafe.demand(now_ns, self._session.state)
+        for channel, datagram in self._session.advance(now_ns, demand):
+            self._sockets[channel].sendto(datagram)
+
+    def _reported_now(self) -> tuple[str, str, str]:
+        return self._link_state(self._clock.now_ns()), self._failsafe.phase, self._failsafe.reason
+
+    def _link_state(self, now_ns: int) -> str:
+        received_ns = self._session.state.received_ns
+        if received_ns is None:
+            return "waiting"
+        if now_ns - received_ns > LINK_LOST_S * 1e9:
+            return "lost"
+        return "armed" if self._failsafe.armed else "connected"
+
+    def _report(self, now_ns: int) -> None:
+        """Publish the state of the link; print its changes."""
+        state, phase, reason = now = self._reported_now()
+        if now != self._reported:
+            self._say(f"{self._observer.name}: link {state}, {phase}{f' ({reason})' if reason else ''}")
+        self._reported, self._reported_s = now, time.monotonic()
+        figures: LinkFigures = self._session.figures(now_ns)
+        received_ns, channel = self._session.state.received_ns, self._session.channels[0]
+        message = flight_messages.LinkState(
+            t_ns=self._observer.now_ns,
+            seq=self._report_seq,
+            source=self._observer.name,
+            peer=f"{channel.host}:{channel.port}",
+            state=state,
+            age_ms=0.0 if received_ns is None else (now_ns - received_ns) / 1e6,
+            loss_percent=figures.loss_percent,
+            round_trip_ms=figures.round_trip_ms,
+            clock_offset_ms=figures.clock_offset_ms,
+            refused=figures.refused,
+        )
+        self._report_seq += 1
+        self._link.put(keys.link(self._drone), message)
+
+    async def _land_and_leave(self, interrupted: bool) -> None:
+        """Land what still flies for this driver, and wait for it."""
+        reason = "its driver is stopped" if interrupted else self._observer.end_reason or RUN_ENDED
+        self._failsafe.land(reason, self._clock.now_ns())
+        until_s = time.monotonic() + LANDING_S
+        if self._failsafe.phase == "landing":
+            self._say(f"{self._observer.name}: {reason}; it lands")
+        while self._failsafe.phase == "landing" and time.monotonic() < until_s:
+            self._send()
+            await asyncio.sleep(TICK_S)
+        if self._session.state.state in AIRBORNE and self._failsafe.armed:
+            self._say(f"{self._observer.name}: it is still in the air; take it over by hand")
+
+
+class ChannelSocket(asyncio.DatagramProtocol):
+    """Hands datagrams on, with the number of their channel."""
+
+    def __init__(self, number: int, receive: Callable[[int, bytes], None]) -> None:
+        self._number, self._receive = number, receive
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        self._receive(self._number, data)
+
+    def error_received(self, exc: Exception) -> None:
+        """Nobody listens there yet; what is due is sent again."""
+
+
+def check_external(info: Info, drone: str) -> None:
+    """Refuse a drone that has no driver, and a run at another pace than the wall clock's.
+
+    Raises:
+        RunError: with the reason.
+    """
+    bodies = {each.name: each.body for each in info.drones}
+    if drone not in bodies:
+        raise RunError(f"drone is {drone!r}; must be one of {', '.join(bodies)}")
+    if bodies[drone] != "external":
+        raise RunError(f"{drone} is simulated; a driver needs `body: external` of it in the scenario")
+    if info.mode != "realtime":
+        raise RunError("the run is in lockstep; a driver needs one that is started with --realtime")
+
+
+def _local(channel: Channel) -> tuple[str, int] | None:
+    return ("0.0.0.0", channel.local_port) if channel.local_port else None

@@ -1,0 +1,196 @@
+"""What a driver asks of its aircraft: the accepted commands, while everybody is there; else hold, then land. Pure.
+
+The rules, for the clock of the run:
+
+- Nothing before an operator has armed the driver on purpose.
+- No setpoint for `silence.hover_s`: it holds. For `silence.land_s` more: it lands.
+- The world silent for as long, whoever flies: it lands.
+- Outside the fence: it lands. Killed: its motors stop, until it is armed again.
+"""
+
+from math import cos, sin
+from typing import Literal, NamedTuple
+
+from zsim.contract import flight_messages
+from zsim.math.frames import heading
+from zsim.math.rotation import Vector
+from zsim.scenario.scenario import Silence
+from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+from zsim_bridges.vehicle_links.vehicle_state import AIRBORNE, STILL, VehicleState
+
+TAKEOFF_S = 20.0  # chosen: four times what an AR.Drone takes; then it is given up
+LINK_LOST_S = 1.0  # chosen: heartbeats come once a second, telemetry ten times as often
+
+Phase = Literal["idle", "taking_off", "airborne", "landing", "killed"]
+Action = Literal["none", "take_off", "hold", "fly", "land", "kill"]
+
+
+class Demand(NamedTuple):
+    """What an aircraft is to do now.
+
+    Attributes:
+        action: `none`: send nothing that starts or steers a motor.
+        velocity_m_s: where it is to fly [W].
+        yaw_rate_rad_s: how it is to turn, counter-clockwise.
+    """
+
+    action: Action
+    velocity_m_s: Vector = STILL
+    yaw_rate_rad_s: float = 0.0
+
+
+class Failsafe:
+    """The phases of a flight, from what is commanded and who is silent.
+
+    Args:
+        silence: of the scenario.
+        limits: that hold whatever is commanded.
+        armed: whether it begins armed.
+
+    Attributes:
+        armed: whether commands are obeyed.
+        phase: of the flight.
+        commander: source of the last setpoint.
+        reason: why it left the commander's control last; empty for never.
+    """
+
+    def __init__(self, silence: Silence, limits: FlightLimits, armed: bool = False) -> None:
+        self._hover_ns = round(silence.hover_s * 1e9)
+        self._land_ns = self._hover_ns + round(silence.land_s * 1e9)
+        self._limits = limits
+        self.armed = armed
+        self.phase: Phase = "idle"
+        self.commander: str | None = None
+        self.reason = ""
+        self._setpoint: flight_messages.Velocity | None = None
+        self._setpoint_ns = self._clock_ns = self._began_ns = 0
+
+    # Operators
+
+    def arm(self, now_ns: int, vehicle: VehicleState) -> str | None:
+        """Obey from now on; return None, or why not."""
+        if vehicle.received_ns is None or now_ns - vehicle.received_ns > LINK_LOST_S * 1e9:
+            return "nothing comes from the aircraft; check its address, and that it is switched on"
+        self.armed = True
+        if self.phase == "killed":
+            self._enter("idle", now_ns)
+        return None
+
+    def disarm(self, vehicle: VehicleState) -> str | None:
+        """Obey no longer; return None, or why not."""
+        if vehicle.state not in ("landed", "emergency"):
+            return f"the aircraft is {vehicle.state}; land first, or kill"
+        self.armed, self.phase = False, "idle"
+        return None
+
+    def kill(self, now_ns: int) -> None:
+        """Stop the motors, armed or not, until it is armed again."""
+        self.armed = False
+        self._enter("killed", now_ns)
+        self.reason = "killed by an operator"
+
+    def land(self, reason: str, now_ns: int) -> None:
+        """Land, if it flies for this driver."""
+        if self.phase in ("taking_off", "airborne"):
+            self._enter("landing", now_ns)
+            self.reason = reason
+
+    # What comes
+
+    def on_clock(self, now_ns: int) -> None:
+        """The world is there."""
+        self._clock_ns = now_ns
+
+    def on_command(self, command: flight_messages.Command, now_ns: int, vehicle: VehicleState) -> str | None:
+        """Take an accepted command; return None, or why it is not obeyed."""
+        if not self.armed:
+            return "its driver is not armed; an operator asks `arm` of it"
+        match command:
+            case flight_messages.Mode():
+                return self._on_mode(command.mode, now_ns, vehicle)
+            case flight_messages.Velocity():
+                self._setpoint, self._setpoint_ns, self.commander = command, now_ns, command.source
+                return None
+            case _:
+                return f"a driver does not take {type(command).__name__}; send velocity"
+
+    def _on_mode(self, mode: str, now_ns: int, vehicle: VehicleState) -> str | None:
+        if mode == "takeoff":
+            if vehicle.state != "landed":
+                return f"the aircraft is {vehicle.state}; a take-off needs it landed"
+            self._setpoint = self.commander = None
+            self._enter("taking_off", now_ns)
+        elif mode == "land":
+            self._enter("landing", now_ns)
+        elif mode == "emergency":
+            self._enter("killed", now_ns)
+        elif self.phase == "killed":
+            self._enter("idle", now_ns)
+        return None
+
+    # What is asked of the aircraft
+
+    def demand(self, now_ns: int, vehicle: VehicleState) -> Demand:
+        """Return what the aircraft is to do now."""
+        self._advance(now_ns, vehicle)
+        match self.phase:
+            case "killed":
+                return Demand("kill")
+            case "taking_off":
+                return Demand("take_off")
+            case "landing":
+                return Demand("land")
+            case "airborne":
+                return self._airborne(now_ns, vehicle)
+            case _:
+                return Demand("none")
+
+    def _advance(self, now_ns: int, vehicle: VehicleState) -> None:
+        """Go on to the next phase where the aircraft has reached it, or somebody is silent."""
+        airborne = vehicle.state in AIRBORNE
+        if self.phase == "taking_off" and airborne:
+            self._enter("airborne", now_ns)
+        elif self.phase == "taking_off" and now_ns - self._began_ns > TAKEOFF_S * 1e9:
+            self.land(f"the take-off took longer than {TAKEOFF_S:g} s", now_ns)
+        elif self.phase == "landing" and vehicle.state in ("landed", "emergency") and self._settled(now_ns):
+            self._enter("idle", now_ns)
+        elif self.phase == "idle" and self.armed and airborne:
+            self._enter("airborne", now_ns)  # a driver that is started again in flight
+        elif self.phase == "airborne":
+            self._watch(now_ns, vehicle)
+
+    def _settled(self, now_ns: int) -> bool:
+        """Tell whether an aircraft has had the time to show that it obeys."""
+        return now_ns - self._began_ns > LINK_LOST_S * 1e9
+
+    def _watch(self, now_ns: int, vehicle: VehicleState) -> None:
+        if vehicle.state == "landed" and self._settled(now_ns):
+            self._enter("idle", now_ns)
+        elif vehicle.pose is not None and self._limits.is_breached(vehicle.pose.position_m):
+            self.land("it is outside the fence", now_ns)
+        elif self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:
+            self.land(f"{self.commander} is silent", now_ns)
+        elif now_ns - max(self._clock_ns, self._began_ns) > self._land_ns:
+            self.land("the world is silent", now_ns)
+
+    def _airborne(self, now_ns: int, vehicle: VehicleState) -> Demand:
+        setpoint, pose = self._setpoint, vehicle.pose
+        if setpoint is None or pose is None or now_ns - self._setpoint_ns > self._hover_ns:
+            return Demand("hold")
+        velocity = setpoint.velocity_m_s
+        if setpoint.frame == "heading":
+            velocity = turned(velocity, float(heading(pose.q_WB)))
+        velocity = self._limits.limited(velocity, pose.position_m)
+        return Demand("fly", velocity, self._limits.yaw_rate(setpoint.yaw_rate_rad_s))
+
+    def _enter(self, phase: Phase, now_ns: int) -> None:
+        if phase != self.phase:
+            self.phase, self._began_ns = phase, now_ns
+        if phase in ("landing", "killed"):
+            self._setpoint = self.commander = None
+
+
+def turned(velocity: Vector, yaw_rad: float) -> Vector:
+    """Return a velocity of the heading frame in W."""
+    x, y, z = velocity
+    return x * cos(yaw_rad) - y * sin(yaw_rad), x * sin(yaw_rad) + y * cos(yaw_rad), z

@@ -1,0 +1,182 @@
+"""Nothing moves unasked; who is silent has its aircraft hold, and then land."""
+
+import math
+from typing import Any
+
+import pytest
+
+from zsim.contract.flight_messages import Ardrone, Mode, Velocity
+from zsim.math.frames import quaternion_from_heading
+from zsim.scenario.scenario import Silence
+from zsim_bridges.vehicle_links.failsafe import TAKEOFF_S, Failsafe
+from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+from zsim_bridges.vehicle_links.vehicle_state import Pose, VehicleState
+
+S = 1_000_000_000
+LIMITS = FlightLimits(speed_m_s=2.0, radius_m=10.0)
+
+
+class Flight:
+    """A failsafe, its aircraft, and the time."""
+
+    def __init__(self, armed: bool = True, state: Any = "landed") -> None:
+        self.failsafe = Failsafe(Silence(), LIMITS, armed)
+        self.now_ns = 100 * S
+        self.position, self.yaw = (0.0, 0.0, 1.0), 0.0
+        self.state: Any = state
+        self.hears_clock = True
+
+    @property
+    def vehicle(self) -> VehicleState:
+        w, x, y, z = quaternion_from_heading(self.yaw).tolist()
+        return VehicleState(self.state, 90.0, Pose(self.now_ns, self.position, q_WB=(w, x, y, z)), self.now_ns)
+
+    def after(self, seconds: float) -> str:
+        """Let time pass; return what is asked of the aircraft then."""
+        until_ns = self.now_ns + round(seconds * S)
+        action = ""
+        while self.now_ns < until_ns:
+            self.now_ns += S // 50
+            if self.hears_clock:
+                self.failsafe.on_clock(self.now_ns)
+            action = self.failsafe.demand(self.now_ns, self.vehicle).action
+        return action
+
+    def mode(self, mode: Any) -> str | None:
+        return self.failsafe.on_command(Mode(0, 0, "controller.main", mode), self.now_ns, self.vehicle)
+
+    def fly(self, *velocity: float, yaw_rate: float = 0.0, frame: Any = "world") -> str | None:
+        x, y, z = velocity
+        command = Velocity(0, 0, "controller.main", (x, y, z), yaw_rate, frame)
+        return self.failsafe.on_command(command, self.now_ns, self.vehicle)
+
+    def takes_off(self) -> "Flight":
+        assert self.mode("takeoff") is None
+        assert self.after(1) == "take_off"
+        self.state = "hovering"
+        assert self.after(0.1) == "hold"
+        return self
+
+
+def test_nothing_is_asked_before_it_is_armed():
+    flight = Flight(armed=False)
+    assert "arm" in (flight.mode("takeoff") or "")
+    assert "arm" in (flight.fly(1, 0, 0) or "")
+    assert flight.after(1) == "none"
+    flight.state = "flying"  # by its own pilot
+    assert flight.after(1) == "none"
+    assert flight.failsafe.arm(flight.now_ns, flight.vehicle) is None
+    assert flight.after(0.1) == "hold"
+
+
+def test_it_is_not_armed_without_a_link():
+    flight = Flight(armed=False)
+    assert flight.failsafe.arm(flight.now_ns, VehicleState())
+    assert flight.failsafe.arm(flight.now_ns, flight.vehicle._replace(received_ns=flight.now_ns - 2 * S))
+    assert not flight.failsafe.armed
+
+
+def test_a_flight():
+    flight = Flight().takes_off()
+    flight.fly(1, 0, 0, yaw_rate=0.5)
+    demand = flight.failsafe.demand(flight.now_ns, flight.vehicle)
+    assert (demand.action, demand.velocity_m_s, demand.yaw_rate_rad_s) == ("fly", (1, 0, 0), 0.5)
+    assert flight.failsafe.commander == "controller.main"
+    flight.mode("land")
+    assert flight.after(2) == "land"
+    flight.fly(1, 0, 0)
+    assert flight.after(0.1) == "land"
+    flight.state = "landed"
+    assert flight.after(2) == "none"
+    assert flight.failsafe.armed
+
+
+def test_the_heading_frame_is_turned_by_the_aircrafts_own_yaw():
+    flight = Flight().takes_off()
+    flight.yaw = math.pi / 2
+    flight.fly(1, 0, 0.2, frame="heading")
+    assert flight.failsafe.demand(flight.now_ns, flight.vehicle).velocity_m_s == pytest.approx((0, 1, 0.2))
+
+
+def test_a_silent_commander_holds_and_then_lands():
+    flight = Flight().takes_off()
+    flight.fly(1, 0, 0)
+    assert flight.after(0.4) == "fly"
+    assert flight.after(0.3) == "hold"
+    flight.fly(1, 0, 0)
+    assert flight.after(0.1) == "fly"
+    assert flight.after(2.0) == "hold"
+    assert flight.after(0.6) == "land"
+    assert "controller.main" in flight.failsafe.reason
+
+
+def test_a_drone_that_nobody_flies_holds_for_ever():
+    assert Flight().takes_off().after(60) == "hold"
+
+
+def test_a_silent_world_is_a_landing():
+    flight = Flight().takes_off()
+    flight.hears_clock = False
+    assert flight.after(2.0) == "hold"
+    assert flight.after(1.0) == "land"
+    assert flight.failsafe.reason == "the world is silent"
+
+
+def test_outside_the_fence_it_lands():
+    flight = Flight().takes_off()
+    flight.position = (9.99, 0, 1)
+    flight.fly(1, 0, 0)
+    assert flight.failsafe.demand(flight.now_ns, flight.vehicle).velocity_m_s[0] < 0.2
+    flight.position = (11.5, 0, 1)
+    assert flight.after(0.1) == "land"
+
+
+def test_a_driver_that_begins_in_flight_holds():
+    flight = Flight(state="flying")
+    assert flight.after(0.1) == "hold"
+    flight.fly(0, 1, 0)
+    assert flight.after(0.1) == "fly"
+
+
+def test_kill_stops_the_motors_armed_or_not_until_it_is_armed_again():
+    for armed in (True, False):
+        flight = Flight(armed=armed, state="flying")
+        flight.failsafe.kill(flight.now_ns)
+        assert flight.after(5) == "kill"
+        flight.state = "landed"
+        assert flight.after(5) == "kill"
+        assert flight.mode("takeoff")
+        assert flight.failsafe.arm(flight.now_ns, flight.vehicle) is None
+        assert flight.after(0.1) == "none"
+
+
+def test_an_emergency_is_left_by_reset():
+    flight = Flight().takes_off()
+    flight.mode("emergency")
+    assert flight.after(1) == "kill"
+    flight.state = "landed"
+    flight.mode("reset")
+    assert flight.after(1) == "none"
+
+
+def test_it_is_disarmed_on_the_ground_alone():
+    flight = Flight().takes_off()
+    assert "land" in (flight.failsafe.disarm(flight.vehicle) or "")
+    flight.state = "landed"
+    assert flight.failsafe.disarm(flight.vehicle) is None
+    assert flight.after(1) == "none"
+
+
+def test_a_takeoff_that_does_not_succeed_is_given_up():
+    flight = Flight()
+    flight.mode("takeoff")
+    assert flight.after(TAKEOFF_S - 1) == "take_off"
+    assert flight.after(1.5) == "land"
+    assert flight.after(2) == "none"
+
+
+def test_what_a_driver_does_not_take_is_refused_with_what_it_does():
+    flight = Flight().takes_off()
+    command = Ardrone(0, 0, "controller.main", 0, 0, 0, 0)
+    assert "velocity" in (flight.failsafe.on_command(command, flight.now_ns, flight.vehicle) or "")
+    assert "landed" in (flight.mode("takeoff") or "")
