@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 BRAKING_M_S2 = 1.0  # chosen: half of what an AR.Drone at 12 deg of tilt has; the speed towards a fence follows from it
-RETURN_1_S = 1.0  # chosen: as fast as the formation loop closes
+RETURN_M_S = 0.5  # chosen: slow, since nobody asked for it
 BREACH_M = 1.0  # chosen: how far outside it lands; the fence itself stops it before
 
 
@@ -60,4 +60,4 @@ class FlightLimits(NamedTuple):
 
 def _approach(distance_m: float) -> float:
     """Return the greatest speed towards a fence from which the aircraft still stops before it; outside, back to it."""
-    return math.sqrt(2.0 * BRAKING_M_S2 * distance_m) if distance_m > 0.0 else RETURN_1_S * distance_m
+    return math.sqrt(2.0 * BRAKING_M_S2 * distance_m) if distance_m > 0.0 else max(-RETURN_M_S, distance_m)
