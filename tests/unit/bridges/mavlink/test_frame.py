@@ -1,0 +1,95 @@
+"""Frames that are whole, cut, damaged or foreign, in datagrams and in streams."""
+
+import random
+import struct
+
+import pytest
+
+from zsim_bridges.mavlink.wire import dialect
+from zsim_bridges.mavlink.wire.checksum import checksum
+from zsim_bridges.mavlink.wire.frame import Link, Parser
+
+MESSAGES = [dialect.Heartbeat(type=2), dialect.Statustext(6, "hello"), dialect.Attitude(1, 0.5), dialect.Ping()]
+
+
+def test_the_checksum_is_mcrf4xx() -> None:
+    assert checksum(b"123456789") == 0x6F91  # check value of CRC-16/MCRF4XX
+
+
+def test_a_stream_is_read_however_it_is_cut() -> None:
+    link = Link(1, 1)
+    data = b"".join(link.pack(message) for message in MESSAGES) + Link(1, 1, version=1).pack(MESSAGES[0])
+    for size in (1, 3, 7, len(data)):
+        parser = Parser(datagrams=False)
+        parts = [data[start : start + size] for start in range(0, len(data), size)]
+        received = [each.message for part in parts for each in parser.feed(part)]
+        assert received == [*MESSAGES, MESSAGES[0]]
+        assert not +parser.refused
+
+
+def test_sequence_numbers_wrap_after_255() -> None:
+    link, parser = Link(1, 1), Parser()
+    seqs = [received.seq for _ in range(257) for received in parser.feed(link.pack(MESSAGES[0]))]
+    assert seqs == [*range(256), 0]
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_damaged_frame_is_counted_and_the_next_one_is_read(version) -> None:
+    link, parser = Link(1, 1, version=version), Parser()
+    first, second = link.pack(MESSAGES[2]), link.pack(MESSAGES[0])
+    damaged = first[:-3] + bytes([first[-3] ^ 1]) + first[-2:]
+    assert [received.message for received in parser.feed(damaged + second)] == [MESSAGES[0]]
+    assert parser.refused["bad_crc"] == 1
+
+
+def test_a_cut_datagram_is_counted_and_does_not_reach_into_the_next() -> None:
+    link, parser = Link(1, 1), Parser()
+    assert parser.feed(link.pack(MESSAGES[1])[:-1]) == []
+    assert parser.refused["truncated"] >= 1
+    assert [received.message for received in parser.feed(link.pack(MESSAGES[0]))] == [MESSAGES[0]]
+
+
+def test_an_unknown_message_is_counted_and_skipped() -> None:
+    parser = Parser()
+    body = bytes((1, 0, 0, 0, 1, 1)) + (50_000).to_bytes(3, "little") + b"\x07"
+    unknown = b"\xfd" + body + checksum(body).to_bytes(2, "little")
+    assert [received.message for received in parser.feed(unknown + Link(1, 1).pack(MESSAGES[0]))] == [MESSAGES[0]]
+    assert parser.refused["unknown"] == 1
+
+
+def test_a_frame_with_flags_that_must_not_be_ignored_is_refused() -> None:
+    body = bytes((1, 0x02, 0, 0, 1, 1, 0, 0, 0, 7))
+    parser = Parser()
+    extra = bytes([50])  # of HEARTBEAT
+    assert parser.feed(b"\xfd" + body + checksum(body + extra).to_bytes(2, "little")) == []
+    assert parser.refused["incompatible"] == 1
+
+
+def test_bytes_between_frames_are_noise() -> None:
+    parser = Parser()
+    assert len(parser.feed(b"hello" + Link(1, 1).pack(MESSAGES[0]) + b"bye")) == 1
+    assert parser.refused["noise"] == 8
+
+
+def test_a_payload_longer_than_known_is_read_as_far_as_known() -> None:
+    payload = bytes(9) + b"extension to come"
+    body = bytes((len(payload), 0, 0, 0, 1, 1, 0, 0, 0)) + payload
+    (received,) = Parser().feed(b"\xfd" + body + checksum(body + bytes([50])).to_bytes(2, "little"))
+    assert received.message == dialect.Heartbeat()
+
+
+def test_a_value_out_of_range_is_refused() -> None:
+    with pytest.raises(struct.error):
+        Link(1, 1).pack(dialect.Heartbeat(type=256))
+    with pytest.raises(ValueError, match="SETUP_SIGNING has the id 256"):
+        Link(1, 1, version=1).pack(dialect.SetupSigning())
+
+
+def test_garbage_yields_nothing_but_what_is_in_it() -> None:
+    rng = random.Random(5)
+    parser, stream = Parser(), Parser(datagrams=False)
+    for _ in range(2000):
+        data = rng.randbytes(rng.randint(0, 300))
+        assert parser.feed(data) == []
+        assert stream.feed(data) == []
+    assert sum(parser.refused.values()) > 0
