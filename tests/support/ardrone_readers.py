@@ -1,0 +1,21 @@
+"""What unmodified programs for the AR.Drone read of bytes of ours, each in a process of its own."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SCRIPT = Path(__file__).parent / "pyardrone_reads.py"
+
+
+def pyardrone_reads(what: str, data: bytes) -> dict[str, Any]:
+    """Return what pyardrone reads: `navdata`, numbers by option, or `video`, numbers by field of the header."""
+    if importlib.util.find_spec("pyardrone") is None:
+        pytest.skip("pyardrone is not installed")
+    done = subprocess.run([sys.executable, str(SCRIPT), what], input=data, capture_output=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr.decode()
+    return json.loads(done.stdout)

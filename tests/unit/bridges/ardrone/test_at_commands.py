@@ -1,0 +1,122 @@
+"""AT commands: what is on the wire, what is refused, and other programs' commands."""
+
+import math
+import random
+import struct
+
+import pytest
+
+from zsim_bridges.ardrone.wire import at_commands as at
+
+FLOATS = {
+    -1.0: -1082130432,
+    -0.8: -1085485875,
+    -0.5: -1090519040,
+    -0.3: -1097229926,
+    0.05: 1028443341,
+    0.3: 1050253722,
+    0.5: 1056964608,
+    0.75: 1061158912,
+    0.8: 1061997773,
+    1.0: 1065353216,
+}  # AR.Drone Developer Guide, and other programs' tables
+COMMANDS = [
+    at.ref(1, takes_off=True),
+    at.Pcmd(2, 1, 0.5, -0.5, 1.0, -1.0),
+    at.PcmdMag(3, 5, 0.5, -0.5, 1.0, -1.0, 0.25, 0.125),
+    at.FlatTrim(4),
+    at.Calibrate(5, 0),
+    at.ConfigIds(6, "aabbccdd", "11223344", "01234567"),
+    at.Config(7, "control:flight_anim", "3,1000"),
+    at.Control(8, at.ACKNOWLEDGE),
+    at.ResetWatchdog(9),
+    at.Led(10, 3, 2.0, 5),
+    at.Animation(11, 18, 15),
+]
+
+
+@pytest.mark.parametrize(("value", "bits"), FLOATS.items())
+def test_a_float_is_the_integer_of_the_same_bits(value: float, bits: int):
+    assert at.bits_of_float(value) == bits
+    assert at.float_of_bits(bits) == struct.unpack("<f", struct.pack("<f", value))[0]
+
+
+def test_the_guide_s_words():
+    assert at.ref(1, takes_off=True).bits == 290718208
+    assert at.ref(1, takes_off=False).bits == 290717696
+    assert at.ref(1, takes_off=False, emergency=True).bits == 290717952
+    assert at.format_command(at.Pcmd(21625, 1, 0.0, 0.0, 0.0, -0.8)) == b"AT*PCMD=21625,1,0,0,0,-1085485875\r"
+
+
+def test_what_is_written_is_read():
+    datagram = b"".join(map(at.format_command, COMMANDS))
+    assert at.parse(datagram) == at.Parsed(COMMANDS, [])
+
+
+def test_a_comma_after_the_last_argument_is_let_pass():
+    assert at.parse(b"AT*COMWDG=4,\r").commands == [at.ResetWatchdog(4)]
+    assert at.parse(b"AT*REF=5,512,\r").commands == [at.Ref(5, 512)]
+
+
+def test_a_string_may_hold_commas_and_nothing():
+    parsed = at.parse(b'AT*CONFIG=1,"leds:leds_anim","3,1073741824,2"\rAT*CONFIG=2,"network:owner_mac",""\r')
+    assert parsed.commands == [
+        at.Config(1, "leds:leds_anim", "3,1073741824,2"),
+        at.Config(2, "network:owner_mac", ""),
+    ]
+
+
+def test_commands_of_the_sdk_without_a_meaning_here_are_known():
+    assert at.parse(b"AT*PMODE=1,2\rAT*MISC=2,2,20,2000,3000\r") == at.Parsed(
+        [at.Ignored(1, "PMODE"), at.Ignored(2, "MISC")], []
+    )
+
+
+@pytest.mark.parametrize(
+    ("datagram", "reason"),
+    [
+        (b"AT*REF=1,29071820", "does not end in a carriage return"),
+        (b"AT*REF=1,\r", "REF has 0 arguments; must have 1"),
+        (b"AT*REF=1,512,7\r", "REF has 2 arguments"),
+        (b'AT*REF=1,"512"\r', "must be an integer"),
+        (b"AT*REF=1,99999999999\r", "must be an integer"),
+        (b"AT*REF=1,9999999999\r", "of 32 bits"),
+        (b"AT*REF=9999999999,512\r", "sequence number"),
+        (b"AT*REF=-1,512\r", "is no AT command"),
+        (b"AT*FLIP=1,1\r", "FLIP is not known"),
+        (b"at*ref=1,512\r", "is no AT command"),
+        (b"AT*PCMD=1,1,2143289344,0,0,0\r", "finite"),  # a NaN
+        (b"AT*PCMD=1,1,2139095040,0,0,0\r", "finite"),  # infinity
+        (b"AT*PCMD=1,1,4000000000,0,0,0\r", "finite"),
+        (b'AT*CONFIG=1,"a:b,"c"\r', "CONFIG has the argument"),
+        (b"AT*CONFIG=1,1,2\r", "must be a string"),
+        (b"AT*REF=1,\xb2\r", "is no AT command"),
+        (b"AT*REF=1," + b"1" * 1100 + b"\r", "must have at most 1024"),
+        (b"\r", "is no AT command"),
+        (b"A" * 9000, "must have at most 8192"),
+    ],
+)
+def test_what_is_no_command_is_refused_with_a_reason(datagram: bytes, reason: str):
+    commands, refusals = at.parse(datagram)
+    assert commands == []
+    assert len(refusals) == 1
+    assert reason in refusals[0]
+
+
+def test_a_refused_command_leaves_the_others_of_its_datagram():
+    parsed = at.parse(b"AT*REF=1,512\rgarbage\rAT*COMWDG=2\r")
+    assert parsed.commands == [at.Ref(1, 512), at.ResetWatchdog(2)]
+    assert len(parsed.refusals) == 1
+
+
+def test_nothing_that_anybody_sends_raises():
+    chance = random.Random(1)
+    good = b"".join(map(at.format_command, COMMANDS))
+    for _ in range(2000):
+        datagram = bytearray(good)
+        for _ in range(chance.randrange(1, 30)):
+            datagram[chance.randrange(len(datagram))] = chance.randrange(256)
+        commands, refusals = at.parse(bytes(datagram[: chance.randrange(len(datagram) + 1)]))
+        for command in commands:
+            assert all(math.isfinite(value) for value in command if isinstance(value, float))
+        assert commands or refusals or len(datagram) >= 0

@@ -1,0 +1,167 @@
+"""Navdata: a packet of a real aircraft, the sizes of its headers, and what another program reads of ours."""
+
+import random
+import struct
+
+import pytest
+from ardrone_readers import pyardrone_reads
+
+from zsim_bridges.ardrone.wire import navdata, navdata_options
+from zsim_bridges.ardrone.wire.navdata import NavdataError, NavdataTemplate, StateBit
+from zsim_bridges.ardrone.wire.navdata_options import FULL_TAGS, GPS_TAG, LAYOUTS
+
+BOOTSTRAP = bytes.fromhex("88776655100c804f0100000000000000ffff0800a6020000")  # captured from an aircraft
+SIZES = {
+    0: 148,
+    1: 8,
+    2: 52,
+    3: 46,
+    4: 16,
+    5: 12,
+    6: 88,
+    7: 16,
+    8: 24,
+    9: 76,
+    10: 56,
+    11: 16,
+    12: 44,
+    13: 92,
+    14: 108,
+    15: 364,
+    16: 328,
+    17: 8,
+    18: 40,
+    19: 65,
+    20: 12,
+    21: 18,
+    22: 75,
+    23: 56,
+    24: 72,
+    25: 32,
+    26: 8,
+    GPS_TAG: 216,
+    28: 6,
+    29: 32,
+    0xFFFF: 8,
+}  # bytes, of the structures of the SDK
+OPTIONS = tuple(tag for tag in LAYOUTS if tag != navdata_options.CHECKSUM_TAG)
+
+
+def counted(tag: int):
+    """Return an option whose numbers differ, as far as a byte can hold them."""
+    layout = LAYOUTS[tag]
+    return layout.nested(tuple((7 * tag + k) % 100 for k in range(len(layout.codec.unpack(bytes(layout.codec.size))))))
+
+
+def test_the_packet_of_a_real_aircraft():
+    assert navdata.pack(0x4F800C10, 1, 0) == BOOTSTRAP
+    packet = navdata.unpack(BOOTSTRAP)
+    assert packet.bootstrap
+    assert packet.sequence == 1
+    assert packet.options == {}
+    assert packet.state == (
+        StateBit.ALTITUDE_CONTROL
+        | StateBit.NAVDATA_DEMO
+        | StateBit.NAVDATA_BOOTSTRAP
+        | StateBit.PIC_VERSION_OK
+        | StateBit.AT_THREAD
+        | StateBit.NAVDATA_THREAD
+        | StateBit.VIDEO_THREAD
+        | StateBit.ACQUISITION_THREAD
+        | StateBit.COM_WATCHDOG
+    )
+
+
+def test_sizes():
+    assert {tag: layout.size for tag, layout in LAYOUTS.items()} == SIZES
+    assert len(NavdataTemplate((0, 16)).packet(0, 1, 0)) == 500
+    assert len(NavdataTemplate(FULL_TAGS).packet(0, 1, 0)) == 1904
+    assert len(NavdataTemplate((*FULL_TAGS, GPS_TAG)).packet(0, 1, 0)) == 2120
+
+
+@pytest.mark.parametrize("tag", OPTIONS)
+def test_what_is_packed_is_unpacked(tag: int):
+    option = counted(tag)
+    packet = navdata.unpack(navdata.pack(3, 9, 1, [(tag, option)]))
+    assert packet == (StateBit.FLYING | StateBit.VIDEO, 9, 1, {tag: option}, {})
+
+
+def test_a_template_is_the_packet():
+    template = NavdataTemplate(FULL_TAGS)
+    for tag in FULL_TAGS:
+        template.put(tag, counted(tag))
+    template.filler(26)(77)
+    template.filler(GPS_TAG)(1, 2, 3)  # is not in it
+    expected = [(tag, counted(tag) if tag != 26 else (77,)) for tag in FULL_TAGS]
+    assert template.packet(5, 6, 0) == navdata.pack(5, 6, 0, expected)
+
+
+@pytest.mark.parametrize("magic", navdata.MAGICS)
+def test_both_magics_are_read(magic: int):
+    packet = bytearray(BOOTSTRAP)
+    packet[:4] = struct.pack("<I", magic)
+    packet[-4:] = struct.pack("<I", sum(packet[:-8]))
+    assert navdata.unpack(bytes(packet)).sequence == 1
+
+
+def test_an_option_of_another_size_is_kept_as_it_came():
+    body = struct.pack("<IIII", navdata.MAGIC, 0, 1, 0) + struct.pack("<HHif", GPS_TAG, 12, 5, 0.5)
+    packet = navdata.unpack(body + struct.pack("<HHI", 0xFFFF, 8, sum(body)))
+    assert packet.options == {}
+    assert packet.unknown == {GPS_TAG: struct.pack("<if", 5, 0.5)}
+
+
+@pytest.mark.parametrize(
+    ("datagram", "reason"),
+    [
+        (BOOTSTRAP[:-1], "has 23 bytes"),
+        (b"\0" + BOOTSTRAP[1:], "begins with 0x55667700"),
+        (BOOTSTRAP[:-1] + b"\1", "the checksum is"),
+        (BOOTSTRAP[:16] + b"\0\0\0\0" + BOOTSTRAP[16:], "has the size 0"),
+        (BOOTSTRAP[:16] + b"\0\0\xff\0" + BOOTSTRAP[16:], "beyond the packet's 28 bytes"),
+        (BOOTSTRAP[:16] + struct.pack("<HHI", 26, 8, 0), "has no checksum"),
+    ],
+)
+def test_what_is_no_packet_is_refused_with_a_reason(datagram: bytes, reason: str):
+    with pytest.raises(NavdataError, match=reason):
+        navdata.unpack(datagram)
+
+
+def test_nothing_that_anybody_sends_raises_anything_else():
+    chance = random.Random(2)
+    good = NavdataTemplate(FULL_TAGS).packet(0, 1, 0)
+    refused = 0
+    for _ in range(1000):
+        datagram = bytearray(good)
+        for _ in range(chance.randrange(1, 20)):
+            datagram[chance.randrange(len(datagram))] = chance.randrange(256)
+        try:
+            navdata.unpack(bytes(datagram[: chance.randrange(len(datagram) + 1)]))
+        except NavdataError:
+            refused += 1
+    assert refused > 900
+
+
+def test_pyardrone_reads_every_number_of_every_option():
+    template = NavdataTemplate(FULL_TAGS)
+    for tag in FULL_TAGS:
+        template.put(tag, counted(tag))
+    read = pyardrone_reads("navdata", template.packet(int(StateBit.FLYING), 12, 1))
+    assert read.pop("metadata") == [navdata.MAGIC, 1, 12, 1]
+    assert len(read.pop("cks")) == 1
+    names = {"euler_angles": "eular_angles"}  # as it is written there
+    expected = {LAYOUTS[tag].name: list(LAYOUTS[tag].flat(counted(tag))) for tag in FULL_TAGS}
+    assert read == {names.get(name, name): values for name, values in expected.items()}
+
+
+class TestArdroneSdk:
+    """What the unmodified parser of ardrone-sdk reads of our packets."""
+
+    def test_it_reads_a_demo(self):
+        parser = pytest.importorskip("ardrone.navdata")
+        demo = LAYOUTS[0].zeros()._replace(ctrl_state=4 << 16, battery_percent=77, theta_mdeg=2500.0, altitude_mm=1000)
+        read = parser.decode(navdata.pack(StateBit.FLYING | StateBit.COMMAND_ACK, 3, 0, [(0, demo)]))
+        assert read["state"]["fly"] == read["state"]["command"] == 1
+        assert read["state"]["emergency"] == 0
+        assert (read["demo"]["ctrl_state"], read["demo"]["battery"], read["demo"]["altitude"]) == (4 << 16, 77, 1000)
+        assert read["demo"]["theta"] == 2
