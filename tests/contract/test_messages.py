@@ -51,6 +51,12 @@ CONTRACT = {
     "drone/*/cmd/attitude": "source orientation_wxyz thrust_n yaw_rate_rad_s",
     "drone/*/cmd/rotors": "source speed_rad_s",
     "drone/*/cmd/mode": "source mode",
+    "drone/*/accepted/velocity": "source velocity_m_s yaw_rate_rad_s frame",
+    "drone/*/accepted/ardrone": "source forward left up yaw_left hover",
+    "drone/*/accepted/attitude": "source orientation_wxyz thrust_n yaw_rate_rad_s",
+    "drone/*/accepted/rotors": "source speed_rad_s",
+    "drone/*/accepted/mode": "source mode",
+    "drone/*/link": "source peer state age_ms loss_percent round_trip_ms clock_offset_ms refused",
     "drone/*/estimate": "position_m velocity_m_s orientation_wxyz yaw_rad covariance yaw_sigma_rad gyro_bias_rad_s "
     "sensors",
     "cluster/*/state": "phase drones names value desired desired_rate trajectory_t_s margin reason",
@@ -75,6 +81,10 @@ NAMES = {
 LENGTHS = {"covariance": 36, "accel_m_s2": 3, "gyro_rad_s": 3, "orientation_wxyz": 4, "rotor_rad_s": 4}
 SHAPES = sorted(CONTRACT)
 INT64 = -(2**63), 2**63 - 1
+NULLABLE = {
+    *("commander", "trajectory_t_s", "until_ns"),
+    *("age_ms", "loss_percent", "round_trip_ms", "clock_offset_ms"),
+}
 FREE = {"data", "args", "parameters"}  # fields of free content
 
 every_message = pytest.mark.parametrize("shape", SHAPES)
@@ -391,7 +401,7 @@ def fits(value: Any, wrong: Any) -> bool:
 def test_a_wrong_type_is_refused(shape: str):
     plain = example(shape)
     for (path, value), wrong in product(leaves(plain), WRONG):
-        empty_allowed = path[-1] in ("commander", "trajectory_t_s", "until_ns") and wrong is None
+        empty_allowed = path[-1] in NULLABLE and wrong is None
         if fits(value, wrong) or empty_allowed:
             continue
         line = refusal(shape, pack(replaced(plain, path, wrong)))

@@ -10,6 +10,7 @@ Quaternion = tuple[Number, Number, Number, Number]
 Rotors = Annotated[tuple[Number, ...], Meta(min_length=4, max_length=8)]
 Covariance = Annotated[tuple[Number, ...], Meta(min_length=36, max_length=36)]
 DroneState = Literal["landed", "taking_off", "hovering", "flying", "landing", "emergency"]
+Connection = Literal["waiting", "connected", "armed", "lost"]
 Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"]
 
 
@@ -83,6 +84,26 @@ class Mode(Command, frozen=True):
     """Take off, land, stop the rotors at once, or leave the emergency; open to all with the commander's priority."""
 
     mode: Literal["takeoff", "land", "emergency", "reset"]
+
+
+class LinkState(Message, frozen=True):
+    """The link of a driver to the aircraft that flies as an external drone.
+
+    `state`: `waiting` for the first datagram; `connected`, disarmed: nothing is sent that starts or steers a motor;
+    `armed`; `lost` after silence. `peer` is the address that is obeyed. `age_ms` is the wall time since the newest
+    datagram of the peer, `loss_percent` the share of its datagrams that were lost lately, `clock_offset_ms` its clock
+    less the driver's; None where it is not known. `refused` counts datagrams that were not understood, or of
+    another.
+    """
+
+    source: str
+    peer: str
+    state: Connection
+    age_ms: Number | None
+    loss_percent: Number | None
+    round_trip_ms: Number | None
+    clock_offset_ms: Number | None
+    refused: Count
 
 
 class Estimate(Message, frozen=True):

@@ -82,6 +82,21 @@ def command(drone: str, kind: str) -> str:
     return f"drone/{drone}/cmd/{kind}"
 
 
+def accepted(drone: str, kind: str) -> str:
+    """Return the key on which the world repeats a command to an external drone that it accepts."""
+    return f"drone/{drone}/accepted/{kind}"
+
+
+def link(drone: str) -> str:
+    """Return the key on which a driver publishes the state of its link to an external drone."""
+    return f"drone/{drone}/link"
+
+
+def driver(drone: str) -> str:
+    """Return the key on which the driver of an external drone answers requests."""
+    return f"drone/{drone}/driver"
+
+
 def estimate(drone: str) -> str:
     return f"drone/{drone}/estimate"
 

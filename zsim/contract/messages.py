@@ -52,12 +52,14 @@ class RotorInfo(Struct, frozen=True):
 class DroneInfo(Struct, frozen=True):
     """A drone of the run, the model of its aircraft, and its rotors in the order of `rotor_rad_s`.
 
-    Records of older versions name no rotors.
+    Records of older versions name no rotors. `body` is left out of a simulated drone; an external one is published by
+    its driver, and the world integrates nothing of it.
     """
 
     name: str
     model: str
     rotors: tuple[RotorInfo, ...] = ()
+    body: Literal["external"] | UnsetType = UNSET
 
 
 class ClusterInfo(Struct, frozen=True):
@@ -134,6 +136,12 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("drone", "cmd/attitude"): flight_messages.Attitude,
     ("drone", "cmd/rotors"): flight_messages.RotorSpeeds,
     ("drone", "cmd/mode"): flight_messages.Mode,
+    ("drone", "accepted/velocity"): flight_messages.Velocity,
+    ("drone", "accepted/ardrone"): flight_messages.Ardrone,
+    ("drone", "accepted/attitude"): flight_messages.Attitude,
+    ("drone", "accepted/rotors"): flight_messages.RotorSpeeds,
+    ("drone", "accepted/mode"): flight_messages.Mode,
+    ("drone", "link"): flight_messages.LinkState,
     ("drone", "estimate"): flight_messages.Estimate,
     ("drone", "sightings"): camera_messages.Sightings,
     **{("drone", f"camera/{name}"): camera_messages.CameraImage for name in CAMERAS},

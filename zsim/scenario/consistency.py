@@ -14,7 +14,7 @@ from zsim.scenario import fault_check
 from zsim.scenario.fault_kinds import kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.role_table import AGENTS
-from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, space_name
+from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, space_name
 from zsim.scenario.sighting_check import sighting_faults
 from zsim.schema.checker import Fault, show
 from zsim.sensors.imu import BOARD_RATE_HZ
@@ -334,7 +334,8 @@ def _injected_faults(
     processes = tuple(name for name in expected or () if name is not None)
     kinds = kinds_of(declarations([drone for _, drone in drones]))
     rotors = {drone.name: vehicles[drone.model].rotor_names if drone.model in vehicles else () for _, drone in drones}
-    known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds, rotors)
+    external = tuple(drone.name for _, drone in drones if drone.body == EXTERNAL)
+    known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds, rotors, external)
     for index, fault in _entries(scenario.faults):
         for path, text in fault_check.flaws(fault, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text

@@ -20,7 +20,8 @@ class Known(NamedTuple):
     """Names that a target may have, and the kinds of faults of the run.
 
     `processes` are those that take part, beside estimators and controllers. `rotors` are those of each drone; none of
-    one whose vehicle is a module that is not read here.
+    one whose vehicle is a module that is not read here. `external` are those of the drones whose bodies and sensors
+    nobody simulates.
     """
 
     drones: tuple[str, ...]
@@ -28,6 +29,7 @@ class Known(NamedTuple):
     processes: tuple[str, ...] = ()
     kinds: Mapping[str, FaultKind] = KINDS
     rotors: Mapping[str, tuple[str, ...]] = {}
+    external: tuple[str, ...] = ()
 
 
 def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
@@ -72,6 +74,8 @@ def _target_flaws(fault: Mapping[str, Any], kind: FaultKind, known: Known) -> It
         allowed = {"drone": known.drones, "world": ("world",), "radio": ("world", *known.clusters)}[kind.strikes]
         if target not in allowed:
             yield "target", f"{actual}; must be {'one of ' if len(allowed) > 1 else ''}{listed(allowed)}"
+        elif kind.strikes == "drone" and target in known.external:
+            yield "target", f"{actual}, whose body is external; must be a drone that is simulated"
 
 
 def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterator[Flaw]:

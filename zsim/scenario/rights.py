@@ -19,11 +19,12 @@ LAST_VALUES = (
     "drone/*/sensor/status",
     "drone/*/truth",
     "drone/*/estimate",
+    keys.link("*"),
     keys.camera_info("*", "*"),
     "cluster/*/state",
     "process/*/snapshot",
 )
-OPERATOR, RECORDER, WORLD, ROUTER = "operator", "recorder", "world", "router"
+OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "router", "driver"
 
 
 class Rights(NamedTuple):
@@ -63,6 +64,8 @@ def of(process: str, scenario: Scenario) -> Rights:
         return union([_own(process), _READER])
     if role == OPERATOR:
         return union([_own(process), _READER, _OPERATOR])
+    if role == DRIVER:
+        return union([_own(process), _driver(thing, scenario)])
     if role in _OF_CAMERAS:
         return union([_own(process), *(_OF_CAMERAS[role](drone) for drone in watched(thing, scenario))])
     about = AGENTS[role].about if role in AGENTS else None
@@ -99,7 +102,7 @@ def _own(process: str) -> Rights:
 
 
 _READER = Rights(reads=("**", keys.BATCH), asks=LAST_VALUES, watches=(keys.token("*"),))
-_OPERATOR = Rights(writes=(keys.command("*", "*"),), asks=(keys.CONTROL, keys.cluster_control("*")))
+_OPERATOR = Rights(writes=(keys.command("*", "*"),), asks=(keys.CONTROL, keys.cluster_control("*"), keys.driver("*")))
 
 
 def _about_drone(thing: str, scenario: Scenario, role: str) -> Rights:
@@ -111,6 +114,19 @@ def _about_drone(thing: str, scenario: Scenario, role: str) -> Rights:
         reads=(keys.sensors(thing), keys.gate(thing), *estimate, *_of_mates(thing, scenario)),
         writes=(*estimate, keys.estimates_view(f"{role}.{thing}")),
         asks=(keys.status(thing), *estimate),
+    )
+
+
+def _driver(thing: str, scenario: Scenario) -> Rights:
+    """Return what the driver of an external drone may do: what the world does for a simulated one, for it alone."""
+    if thing not in scenario.external():
+        return Rights()
+    last = (keys.status(thing), keys.truth(thing), keys.estimate(thing), keys.link(thing))
+    return Rights(
+        reads=(keys.accepted(thing, "*"),),
+        writes=(keys.sensors(thing), keys.truth(thing), keys.estimate(thing), keys.link(thing)),
+        asks=last,
+        answers=(keys.driver(thing),),
     )
 
 

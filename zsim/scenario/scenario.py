@@ -27,6 +27,8 @@ ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no
 VARIABLES_MAX = 4 * ROBOTS_MAX  # of a formation: four a robot
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
+EXTERNAL = "external"  # body of a drone that a driver publishes
+
 Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
 Coordinate = Annotated[float, Meta(ge=-100_000, le=100_000)]  # m; beyond it a tangent plane is no map
 Position = tuple[Coordinate, Coordinate, Coordinate]
@@ -42,6 +44,8 @@ class Drone(Spec, frozen=True, kw_only=True):
     name: Name
     model: str = "ardrone2"
     """A stock vehicle, or `package.module` of the user's that defines VEHICLE."""
+    body: Literal["simulated", "external"] | UnsetType = UNSET
+    """Unset: simulated, and left out of the resolved text. An external one is published by its driver."""
     position_m: Position
     yaw_deg: Real = 0.0
     mass_kg: Mass = ARDRONE2.mass_kg
@@ -58,6 +62,11 @@ class Drone(Spec, frozen=True, kw_only=True):
     takeoff_height_m: TakeoffHeight = ARDRONE2.takeoff_height_m
     limits: Limits = ARDRONE2.limits
     sensors: Sensors
+
+    @property
+    def is_external(self) -> bool:
+        """Whether a driver, and not the world, has its body and its sensors."""
+        return self.body == EXTERNAL
 
 
 class Wind(Spec, frozen=True, kw_only=True):
@@ -271,6 +280,10 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def cluster(self, name: str) -> Cluster:
         """Return the cluster of that name; KeyError if there is none."""
         return {cluster.name: cluster for cluster in self.clusters}[name]
+
+    def external(self) -> list[str]:
+        """Return the names of the drones whose bodies are external."""
+        return [drone.name for drone in self.drones if drone.is_external]
 
     def expected(self) -> list[str]:
         """Return the names of the processes without which a run does not start."""

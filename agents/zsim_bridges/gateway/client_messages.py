@@ -29,10 +29,16 @@ RESERVED_KEYS = (
     keys.VIEW_DRONES,
     "drone/*/sensor/**",
     keys.truth("*"),
+    keys.accepted("*", "*"),
+    keys.link("*"),
+    keys.driver("*"),
     CONTROL_KEYS[1],
     keys.cluster_request("*"),
 )
-"""Keys on which the world, or a process in its own name, publishes: a client's message would be taken for theirs."""
+"""Keys on which the world, or a process in its own name, publishes: a client's message would be taken for theirs.
+
+A driver is asked to arm by operators on Zenoh alone.
+"""
 CACHED_VALUES = 256  # values; one goes to many clients, and is encoded once
 INTEGER_MAX = 2.0**63  # a double above it is no integer of 64 bits
 JSON = ("application/json", "text/json", "text/json5")

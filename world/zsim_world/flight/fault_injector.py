@@ -208,7 +208,9 @@ class FaultInjector:
         clusters = tuple(cluster.name for cluster in scenario.clusters)
         gating = (p.name for p in self._barrier.participants.values() if p.gating)
         processes = (*scenario.expected(), *gating)
-        for path, text in flaws(args, Known(drones, clusters, processes, self._kinds, self._effects.rotors)):
+        external = tuple(scenario.external())
+        known = Known(drones, clusters, processes, self._kinds, self._effects.rotors, external)
+        for path, text in flaws(args, known):
             return f"{path or 'args'} {text}"
         immune = self._immunity(args["target"]) if args["kind"] == PROCESS_KILL else None
         if immune:

@@ -83,7 +83,10 @@ class World(Coordinator):
             command_delay_ns=self.clock.delay_ns,
             seed=s.seed,
             origin=messages.Origin(env.latitude_deg, env.longitude_deg, env.height_m),
-            drones=tuple(messages.DroneInfo(d.name, d.model, self.fleet.rotor_info(i)) for i, d in enumerate(s.drones)),
+            drones=tuple(
+                messages.DroneInfo(d.name, d.model, self.fleet.rotor_info(i), "external" if d.is_external else UNSET)
+                for i, d in enumerate(s.drones)
+            ),
             clusters=tuple(messages.ClusterInfo(c.name, tuple(c.drones)) for c in s.clusters),
             scenario=text,
             scenario_sha256=scenario_file.sha256(text),

@@ -56,6 +56,18 @@ def test_every_kind_is_taken_with_what_it_needs(kind: str):
         assert paths == ([parameter.name] if parameter.required else [])
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_nobody_simulates_of_an_external_drone_cannot_fail(kind: str):
+    known = KNOWN._replace(external=("drone1",))
+    found = list(flaws(sound(kind), known))
+    if KINDS[kind].strikes != "drone":
+        assert found == []
+    else:
+        ((path, text),) = found
+        assert path == "target"
+        assert has_terms(text, "'drone1'", "external", "simulated", kind)
+
+
 BAD = [math.nan, math.inf, "x", True, [1, 2], {}, -1e12, 10**400, [math.nan, 0, 0]]
 
 

@@ -183,6 +183,22 @@ def named(scenario: Scenario) -> str:
     return scenario_file.sha256(scenario_file.to_text(scenario))
 
 
+def test_a_body_that_is_not_given_stands_in_no_resolved_text():
+    plain = scenario_file.resolve(document())
+    assert "body" not in scenario_file.to_text(plain)
+    assert plain.external() == []
+    external = scenario_file.resolve(document(drones=[drone("a"), drone("b", x=5.0, body="external")]))
+    assert external.external() == ["b"]
+    assert scenario_file.from_text(scenario_file.to_text(external)) == external
+
+
+def test_faults_of_a_body_that_is_external_are_refused():
+    fault = {"kind": "gps_noise", "target": "b", "factor": 2.0}
+    drones = [drone("a"), drone("b", x=5.0, body="external")]
+    assert_faults(faults_of(document(drones=drones, faults=[fault])), ("faults[0].target", "'b'", "external"))
+    assert scenario_file.resolve(document(drones=drones, faults=[{**fault, "target": "a"}]))
+
+
 def test_whole_numbers_and_floats_are_the_same_scenario():
     whole, floats = document(duration_s=10), document(duration_s=10.0)
     assert named(scenario_file.resolve(whole)) == named(scenario_file.resolve(floats))
