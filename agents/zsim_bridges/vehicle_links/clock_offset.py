@@ -38,6 +38,16 @@ class ClockOffset:
         return self._least[0][1] - self.round_trip_ns // 2 if self._least else 0
 
     @property
+    def ahead_ms(self) -> float | None:
+        """Return the other clock's time minus this one's, None while it is not known."""
+        return -self.offset_ns / 1e6 if self._least else None
+
+    @property
+    def round_trip_ms(self) -> float | None:
+        """Return the shortest round trip of the window, None where none was measured."""
+        return self._round_trips[0][1] / 1e6 if self._round_trips else None
+
+    @property
     def round_trip_ns(self) -> int:
         """Return the shortest round trip of the window; 0 where none was measured."""
         return self._round_trips[0][1] if self._round_trips else 0

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from zsim.contract import flight_messages, keys, messages
+from zsim.contract.flight_messages import Connection
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED, ControlAnswer
 from zsim.errors import DecodeError, RunError
@@ -18,11 +19,11 @@ from zsim.scenario import scenario_file
 from zsim.transport.session import Query, RawSample, Session
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.clock_offset import ClockOffset
+from zsim_bridges.vehicle_links.driver_options import DriverOptions
 from zsim_bridges.vehicle_links.external_drone import ExternalDrone
 from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe
-from zsim_bridges.vehicle_links.flight_limits import FlightLimits
 from zsim_bridges.vehicle_links.vehicle_session import Channel, LinkFigures, VehicleSession
-from zsim_bridges.vehicle_links.vehicle_state import AIRBORNE
+from zsim_bridges.vehicle_links.vehicle_state import AIRBORNE, VehicleState
 
 TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
 REPORT_S = 1.0  # s, wall; of the link's figures
@@ -61,14 +62,9 @@ class DriverProcess:
         link: an open session.
         info: of the run.
         observer: of this process in it.
-        drone: which drone of the run the aircraft is.
-        make_session: makes the session with the aircraft, at a time of the driver's clock.
-        limits: that hold whatever is commanded.
-        armed: whether it begins armed.
+        options: what it is given.
+        session: with the aircraft.
         say: prints a line.
-
-    Raises:
-        RunError: the drone is not external, or the run does not keep the pace of the wall clock.
     """
 
     def __init__(
@@ -76,20 +72,19 @@ class DriverProcess:
         link: Session,
         info: Info,
         observer: ObserverProcess,
-        drone: str,
-        make_session: Callable[[int], VehicleSession],
-        limits: FlightLimits,
-        armed: bool,
+        options: DriverOptions,
+        session: VehicleSession,
         say: Say,
     ) -> None:
-        check_external(info, drone)
-        self._link, self._observer, self._drone, self._say = link, observer, drone, say
+        self._link, self._observer, self._session, self._say = link, observer, session, say
+        self._drone = options.drone
         self._clock = DriverClock(info.rate or 1.0)
-        self._session = make_session(self._clock.now_ns())
-        self._failsafe = Failsafe(scenario_file.from_text(info.scenario).silence, limits, armed)
-        self._external = ExternalDrone(drone, self._clock.to_simulated)
+        silence = scenario_file.from_text(info.scenario).silence
+        self._failsafe = Failsafe(silence, options.limits, options.armed)
+        self._external = ExternalDrone(options.drone, self._clock.to_simulated)
         self._sockets: list[asyncio.DatagramTransport] = []
-        self._reported_s, self._reported = 0.0, ("", "", "")
+        self._reported_s = 0.0
+        self._reported: tuple[Connection, str, str] | None = None
         self._report_seq = self._ignored = 0
 
     async def run(self, stopped: Callable[[], bool]) -> None:
@@ -150,10 +145,15 @@ class DriverProcess:
         now_ns = self._clock.now_ns()
         self._clock.on_gate(clock.t_ns)
         self._failsafe.on_clock(now_ns)
-        vehicle = self._session.state
+        vehicle = self._vehicle()
         if vehicle.received_ns is not None and now_ns - vehicle.received_ns < LINK_LOST_S * 1e9:
             for key, message in self._external.gate(clock.t_ns, vehicle, self._failsafe.commander):
                 self._link.put(key, message)
+
+    def _vehicle(self) -> VehicleState:
+        """Return what is known of the aircraft; one whose motors were stopped is in an emergency."""
+        vehicle = self._session.state
+        return vehicle._replace(state="emergency") if self._failsafe.phase == "killed" else vehicle
 
     def _on_accepted(self, key: str, payload: bytes) -> None:
         """Hand a command on at once."""
@@ -207,10 +207,10 @@ class DriverProcess:
         for channel, datagram in self._session.advance(now_ns, demand):
             self._sockets[channel].sendto(datagram)
 
-    def _reported_now(self) -> tuple[str, str, str]:
+    def _reported_now(self) -> tuple[Connection, str, str]:
         return self._link_state(self._clock.now_ns()), self._failsafe.phase, self._failsafe.reason
 
-    def _link_state(self, now_ns: int) -> str:
+    def _link_state(self, now_ns: int) -> Connection:
         received_ns = self._session.state.received_ns
         if received_ns is None:
             return "waiting"
@@ -232,7 +232,7 @@ class DriverProcess:
             source=self._observer.name,
             peer=f"{channel.host}:{channel.port}",
             state=state,
-            age_ms=0.0 if received_ns is None else (now_ns - received_ns) / 1e6,
+            age_ms=None if received_ns is None else (now_ns - received_ns) / 1e6,
             loss_percent=figures.loss_percent,
             round_trip_ms=figures.round_trip_ms,
             clock_offset_ms=figures.clock_offset_ms,

@@ -31,7 +31,7 @@ class StreamLoss:
         self._last = None
 
     @property
-    def percent(self) -> float:
-        """Return the share of what was sent that has not come."""
+    def percent(self) -> float | None:
+        """Return the share of what was sent that has not come; None before the first message."""
         sent = sum(self._steps)
-        return 100.0 * (1.0 - len(self._steps) / sent) if sent else 0.0
+        return 100.0 * (1.0 - len(self._steps) / sent) if sent else None

@@ -16,17 +16,18 @@ class Channel(NamedTuple):
 
 
 class LinkFigures(NamedTuple):
-    """How good the link is.
+    """How good the link is; None for what is not known.
 
     Attributes:
         loss_percent: of what the aircraft has sent within some seconds.
-        round_trip_ms, clock_offset_ms: of the aircraft's clock, 0 where the wire cannot measure it.
+        round_trip_ms: of a question to it and its answer.
+        clock_offset_ms: its clock less that of this process.
         refused: datagrams, or messages in them, that were not taken.
     """
 
-    loss_percent: float = 0.0
-    round_trip_ms: float = 0.0
-    clock_offset_ms: float = 0.0
+    loss_percent: float | None = None
+    round_trip_ms: float | None = None
+    clock_offset_ms: float | None = None
     refused: int = 0
 
 

@@ -29,6 +29,7 @@ from zsim_deploy.arguments import (
 from zsim_deploy.cli import (
     bridge_commands,
     camera_commands,
+    driver_commands,
     federation_commands,
     hosts_commands,
     inventory_commands,
@@ -189,6 +190,10 @@ for family in (
     bridge_commands,
 ):
     app.add_typer(family.app)
+for wire, drive in (("mavlink", driver_commands.drive_mavlink), ("ardrone", driver_commands.drive_ardrone)):
+    both_ways = typer.Typer(name=wire)
+    both_ways.command("drive")(drive)
+    app.add_typer(both_ways)
 app.add_typer(federation_commands.faults, rich_help_panel=federation_commands.PANEL)
 for group in (inventory_commands.certs, inventory_commands.rendering):
     app.add_typer(group, rich_help_panel=HOSTS)

@@ -1,0 +1,74 @@
+"""From what an aircraft is to do to AT commands. Pure.
+
+REF says take off or land and is repeated for as long as it is meant; PCMD is sent every 30 ms; both with numbers that
+go up. Source: AR.Drone Developer Guide SDK 2.0, chapter 6.
+"""
+
+from collections.abc import Iterator
+from math import cos, sin
+
+from zsim.math.frames import heading
+from zsim.math.rotation import Vector
+from zsim_bridges.ardrone.drive.tilt_control import TiltControl
+from zsim_bridges.ardrone.wire import at_commands
+from zsim_bridges.ardrone.wire.at_commands import Command, Pcmd
+from zsim_bridges.vehicle_links.failsafe import Demand
+from zsim_bridges.vehicle_links.vehicle_state import Pose
+
+PERIOD_NS = 30_000_000  # Developer Guide 6.3: at most 30 ms between commands
+HOVER = 0  # flag of a PCMD: hold the place
+
+
+class FlightCommands:
+    """What is sent to one aircraft.
+
+    Args:
+        control: its velocity loop.
+    """
+
+    def __init__(self, control: TiltControl) -> None:
+        self._control = control
+        self._sent_ns = -PERIOD_NS
+        self._last: Demand | None = None
+        self._toggles = False
+
+    def advance(
+        self, now_ns: int, demand: Demand, emergency: bool, pose: Pose | None, velocity_m_s: Vector
+    ) -> Iterator[Command]:
+        """Yield the commands that are due, without their numbers; none where nothing is demanded.
+
+        Args:
+            emergency: whether the aircraft is in its emergency.
+            velocity_m_s: of the aircraft in the heading frame.
+        """
+        if demand == self._last and now_ns - self._sent_ns < PERIOD_NS:
+            return
+        self._last, self._sent_ns = demand, now_ns
+        match demand.action:
+            case "none":
+                return
+            case "kill":
+                yield self._toggle(wanted=True, emergency=emergency)
+            case "land":
+                yield at_commands.ref(0, takes_off=False)
+                yield Pcmd(0, HOVER, 0.0, 0.0, 0.0, 0.0)
+            case "take_off" if emergency:
+                yield self._toggle(wanted=False, emergency=emergency)
+            case _:
+                yield at_commands.ref(0, takes_off=True)
+                yield self._pcmd(now_ns, demand, pose, velocity_m_s)
+
+    def _toggle(self, wanted: bool, emergency: bool) -> Command:
+        """Return the next REF of a pulse of the emergency bit, which the aircraft takes at its rise."""
+        self._toggles = emergency != wanted and not self._toggles
+        return at_commands.ref(0, takes_off=False, emergency=self._toggles)
+
+    def _pcmd(self, now_ns: int, demand: Demand, pose: Pose | None, velocity_m_s: Vector) -> Command:
+        if demand.action != "fly" or pose is None:
+            self._control.reset()
+            return Pcmd(0, HOVER, 0.0, 0.0, 0.0, 0.0)
+        yaw = float(heading(pose.q_WB))
+        x, y, z = demand.velocity_m_s
+        wanted = x * cos(yaw) + y * sin(yaw), y * cos(yaw) - x * sin(yaw), z
+        shares = self._control.shares(now_ns, wanted, velocity_m_s, demand.yaw_rate_rad_s)
+        return Pcmd(0, at_commands.PROGRESSIVE, -shares.left, -shares.forward, shares.up, -shares.yaw_left)

@@ -1,0 +1,48 @@
+"""`zsim mavlink drive`: a MAVLink vehicle as a drone of a run."""
+
+import asyncio
+from collections.abc import Callable
+
+from zsim.contract.messages import Info
+from zsim.scenario import scenario_file
+from zsim.transport.session import Session
+from zsim_bridges.mavlink.drive.autopilot_session import AutopilotSession
+from zsim_bridges.mavlink.wire.signing import Signing
+from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.vehicle_links.driver_options import DriverOptions
+from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external
+from zsim_bridges.vehicle_links.vehicle_session import Channel
+
+
+def drive(
+    link: Session,
+    info: Info,
+    observer: ObserverProcess,
+    stopped: Callable[[], bool],
+    say: Callable[[str], None],
+    options: DriverOptions,
+    channel: Channel,
+    system: int = 0,
+    signing: Signing | None = None,
+) -> None:
+    """Drive one vehicle in one run until that is over.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        observer: of this process in it.
+        stopped: called now and then; True ends the run.
+        say: prints a line.
+        options: of the driver.
+        channel: UDP port of the vehicle.
+        system: its system id; 0 for the first autopilot that shows itself.
+        signing: of both ways, None for none.
+
+    Raises:
+        RunError: the drone is not external, or the run does not keep the pace of the wall clock.
+    """
+    check_external(info, options.drone)
+    drone = scenario_file.from_text(info.scenario).drone(options.drone)
+    origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
+    session = AutopilotSession(channel, origin, drone.takeoff_height_m, system, options.origin_m, signing)
+    asyncio.run(DriverProcess(link, info, observer, options, session, say).run(stopped))

@@ -1,0 +1,121 @@
+"""`zsim mavlink drive` and `zsim ardrone drive`: a real aircraft is a drone of a run."""
+
+import math
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from zsim_deploy.arguments import WorldAccess, participant_options, positive
+
+if TYPE_CHECKING:
+    from zsim_bridges.mavlink.wire.signing import Signing
+    from zsim_bridges.vehicle_links.driver_options import DriverOptions
+    from zsim_deploy.roles.roles import Serve
+
+DroneName = Annotated[str, typer.Argument(help="The drone of the run that it is; `body: external` in the scenario.")]
+Armed = Annotated[bool, typer.Option("--armed", help="Obey from the start; else an operator asks `arm` first.")]
+Speed = Annotated[float, typer.Option(callback=positive, help="Greatest horizontal speed, m/s.")]
+Climb = Annotated[float, typer.Option(callback=positive, help="Greatest vertical speed, m/s.")]
+Radius = Annotated[float | None, typer.Option(callback=positive, help="Fence about the origin of W, m.")]
+Ceiling = Annotated[float | None, typer.Option(callback=positive, help="Greatest height over the origin of W, m.")]
+Name = Annotated[str, typer.Option(help="Process name (default driver.DRONE, or the certificate's).")]
+
+
+@participant_options
+def drive_mavlink(
+    reach: WorldAccess,
+    drone: DroneName,
+    address: Annotated[str, typer.Argument(help="UDP port of the vehicle: udp://HOST:PORT.")],
+    local_port: Annotated[int, typer.Option(min=0, max=65535, help="UDP port here; 0 for any.")] = 0,
+    system: Annotated[int, typer.Option(min=0, max=255, help="Its system id; 0 for the first that shows itself.")] = 0,
+    signing_key: Annotated[Path | None, typer.Option(help="File with the 32 bytes of a MAVLink 2 signing key.")] = None,
+    origin: Annotated[
+        str | None, typer.Option(help="Where its local frame begins, X,Y,Z m in W (default: as it says).")
+    ] = None,
+    armed: Armed = False,
+    speed: Speed = 2.0,
+    climb: Climb = 1.0,
+    radius: Radius = None,
+    ceiling: Ceiling = None,
+    name: Name = "",
+) -> None:
+    """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
+    from zsim_bridges.mavlink.mavlink_driver import drive
+    from zsim_bridges.vehicle_links.driver_options import udp_channel
+
+    options = _options(drone, (speed, climb), (radius, ceiling), armed, origin, None)
+    channel = udp_channel(address, local_port)
+    signing = _signing(signing_key)
+    _serve(partial(drive, options=options, channel=channel, system=system, signing=signing), reach, drone, name)
+
+
+@participant_options
+def drive_ardrone(
+    reach: WorldAccess,
+    drone: DroneName,
+    address: Annotated[str, typer.Argument(help="Address of the aircraft, such as 192.168.1.12.")],
+    origin: Annotated[
+        str | None, typer.Option(help="Where it stands at the start, X,Y,Z m in W (default: the scenario's place).")
+    ] = None,
+    yaw: Annotated[
+        float | None, typer.Option(help="Its heading at the start, deg from east (default: by its magnetometer).")
+    ] = None,
+    armed: Armed = False,
+    speed: Speed = 2.0,
+    climb: Climb = 1.0,
+    radius: Radius = None,
+    ceiling: Ceiling = None,
+    name: Name = "",
+) -> None:
+    """Let an AR.Drone 2.0 fly as a drone of the run."""
+    from zsim_bridges.ardrone.ardrone_driver import drive
+
+    options = _options(drone, (speed, climb), (radius, ceiling), armed, origin, yaw)
+    _serve(partial(drive, options=options, address=address), reach, drone, name)
+
+
+def _options(
+    drone: str,
+    speeds: tuple[float, float],
+    fence: tuple[float | None, float | None],
+    armed: bool,
+    origin: str | None,
+    yaw_deg: float | None,
+) -> "DriverOptions":
+    from zsim_bridges.vehicle_links.driver_options import DriverOptions, position
+    from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+
+    speed, climb = speeds
+    radius, ceiling = (math.inf if limit is None else limit for limit in fence)
+    limits = FlightLimits(speed, climb, radius_m=radius, ceiling_m=ceiling)
+    return DriverOptions(drone, limits, armed, position(origin) if origin else None, yaw_deg)
+
+
+def _serve(drive: "Serve", reach: WorldAccess, drone: str, name: str) -> None:
+    from zsim_deploy.roles.process_identity import process_name
+    from zsim_deploy.roles.roles import serve_runs
+
+    serve_runs(process_name("driver", name, reach.who, drone), drive, reach)
+
+
+def _signing(path: Path | None) -> "Signing | None":
+    """Return what signs with the key of a file.
+
+    Raises:
+        RunError: there is no such key.
+    """
+    if path is None:
+        return None
+    from zsim.errors import RunError
+    from zsim_bridges.mavlink.wire.signing import KEY_BYTES, Signing
+
+    try:
+        key = path.read_bytes()
+    except OSError as error:
+        why = f"cannot be read ({error.strerror}); give --signing-key a file of {KEY_BYTES} bytes"
+        raise RunError(f"{path}: {why}") from error
+    if len(key) != KEY_BYTES:
+        raise RunError(f"{path}: has {len(key)} bytes; a signing key has {KEY_BYTES}")
+    return Signing(key)
