@@ -41,8 +41,10 @@ class VehicleSession(Protocol):
     """
 
     channels: tuple[Channel, ...]
-    state: VehicleState
     texts: list[str]
+
+    @property
+    def state(self) -> VehicleState: ...
 
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
         """Take a datagram from one of its ports."""

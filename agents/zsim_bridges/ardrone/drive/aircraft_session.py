@@ -73,7 +73,7 @@ class AircraftSession:
         limits: AircraftLimits = AircraftLimits(),  # noqa: B008
         ports: tuple[int, int] = (navdata.PORT, at_commands.PORT),
     ) -> None:
-        self.channels = Channel(host, ports[0]), Channel(host, ports[1])
+        self.channels: tuple[Channel, ...] = Channel(host, ports[0]), Channel(host, ports[1])
         self.texts: list[str] = []
         self._readings = readings
         self._commands = FlightCommands(TiltControl(limits.tilt_rad, limits.climb_m_s, limits.yaw_rate_rad_s))
@@ -155,8 +155,7 @@ class AircraftSession:
 
     def _fly(self, now_ns: int, demand: Demand) -> Iterator[Command]:
         emergency = StateBit.EMERGENCY in self._bits
-        readings = self._readings
-        yield from self._commands.advance(now_ns, demand, emergency, readings.pose, readings.velocity_m_s)
+        yield from self._commands.advance(now_ns, demand, emergency, self._readings.pose)
 
     def _numbered(self, command: Command) -> bytes:
         self._sequence += 1

@@ -5,10 +5,8 @@ go up. Source: AR.Drone Developer Guide SDK 2.0, chapter 6.
 """
 
 from collections.abc import Iterator
-from math import cos, sin
 
 from zsim.math.frames import heading
-from zsim.math.rotation import Vector
 from zsim_bridges.ardrone.drive.tilt_control import TiltControl
 from zsim_bridges.ardrone.wire import at_commands
 from zsim_bridges.ardrone.wire.at_commands import Command, Pcmd
@@ -32,14 +30,12 @@ class FlightCommands:
         self._last: Demand | None = None
         self._toggles = False
 
-    def advance(
-        self, now_ns: int, demand: Demand, emergency: bool, pose: Pose | None, velocity_m_s: Vector
-    ) -> Iterator[Command]:
+    def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: Pose | None) -> Iterator[Command]:
         """Yield the commands that are due, without their numbers; none where nothing is demanded.
 
         Args:
             emergency: whether the aircraft is in its emergency.
-            velocity_m_s: of the aircraft in the heading frame.
+            pose: of the aircraft.
         """
         if demand == self._last and now_ns - self._sent_ns < PERIOD_NS:
             return
@@ -56,19 +52,17 @@ class FlightCommands:
                 yield self._toggle(wanted=False, emergency=emergency)
             case _:
                 yield at_commands.ref(0, takes_off=True)
-                yield self._pcmd(now_ns, demand, pose, velocity_m_s)
+                yield self._pcmd(now_ns, demand, pose)
 
     def _toggle(self, wanted: bool, emergency: bool) -> Command:
         """Return the next REF of a pulse of the emergency bit, which the aircraft takes at its rise."""
         self._toggles = emergency != wanted and not self._toggles
         return at_commands.ref(0, takes_off=False, emergency=self._toggles)
 
-    def _pcmd(self, now_ns: int, demand: Demand, pose: Pose | None, velocity_m_s: Vector) -> Command:
+    def _pcmd(self, now_ns: int, demand: Demand, pose: Pose | None) -> Command:
         if demand.action != "fly" or pose is None:
             self._control.reset()
             return Pcmd(0, HOVER, 0.0, 0.0, 0.0, 0.0)
-        yaw = float(heading(pose.q_WB))
-        x, y, z = demand.velocity_m_s
-        wanted = x * cos(yaw) + y * sin(yaw), y * cos(yaw) - x * sin(yaw), z
-        shares = self._control.shares(now_ns, wanted, velocity_m_s, demand.yaw_rate_rad_s)
+        yaw_rad, yaw_rate = float(heading(pose.q_WB)), demand.yaw_rate_rad_s
+        shares = self._control.shares(now_ns, demand.velocity_m_s, pose.velocity_m_s, yaw_rad, yaw_rate)
         return Pcmd(0, at_commands.PROGRESSIVE, -shares.left, -shares.forward, shares.up, -shares.yaw_left)

@@ -39,7 +39,6 @@ class NavdataReadings:
 
     Attributes:
         pose: newest, None before the first packet with what it needs.
-        velocity_m_s: in the heading frame.
         clock: of the aircraft.
         readings: not yet taken.
     """
@@ -57,7 +56,6 @@ class NavdataReadings:
         self._stated_yaw_rad = yaw_rad
         self._yaw_offset_rad: float | None = None
         self.pose: Pose | None = None
-        self.velocity_m_s: Vector = (0.0, 0.0, 0.0)
         self.clock = ClockOffset()
         self.readings: list[Reading] = []
         self._last: dict[str, tuple] = {}
@@ -104,7 +102,7 @@ class NavdataReadings:
         if mag := options.get(MAGNETO):
             self._align(yaw, self._magnetic_yaw(roll, pitch, _flipped((mag.mx, mag.my, mag.mz))), dt_s)
         yaw += self._yaw_offset_rad or 0.0
-        vx, vy, vz = self.velocity_m_s = _flipped((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
+        vx, vy, vz = own = _flipped((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
         velocity = vx * math.cos(yaw) - vy * math.sin(yaw), vx * math.sin(yaw) + vy * math.cos(yaw), vz
         if 0.0 < dt_s < STEP_S_MAX:
             self._x, self._y = self._x + dt_s * velocity[0], self._y + dt_s * velocity[1]
@@ -112,7 +110,7 @@ class NavdataReadings:
         position = self._x, self._y, self._ground_m + max(0, demo.altitude_mm) / 1e3
         rate = self._last.get("imu", ((), (0.0, 0.0, 0.0)))[1]
         self.pose = Pose(taken_ns, position, velocity, (w, x, y, z), rate)
-        self._read_new("flow", taken_ns, self.velocity_m_s, 1.0)
+        self._read_new("flow", taken_ns, own, 1.0)
 
     def _magnetic_yaw(self, roll: float, pitch: float, m: Vector) -> float:
         """Return the heading of which the field of the Earth, seen in B, tells."""
@@ -136,7 +134,11 @@ class NavdataReadings:
         place = gps.latitude_deg, gps.longitude_deg, gps.elevation_m
         x, y, z = geodetic_to_enu(place, self._origin).tolist()
         course = math.radians(gps.degree)
-        velocity = gps.speed_m_s * math.sin(course), gps.speed_m_s * math.cos(course), self.velocity_m_s[2]
+        velocity = (
+            gps.speed_m_s * math.sin(course),
+            gps.speed_m_s * math.cos(course),
+            self.pose.velocity_m_s[2] if self.pose else 0.0,
+        )
         sigma_m = gps.ehpe_m or SIGMA_UNKNOWN_M
         before_ns = self._gps_ns
         if self._read_new("gps", taken_ns, *place, (x, y, z), velocity, sigma_m, GPS_FIX, gps.satellites):

@@ -38,28 +38,30 @@ class TiltControl:
         """Forget the wind."""
         self._wind_m_s2, self._then_ns = [0.0, 0.0], None
 
-    def shares(self, now_ns: int, wanted_m_s: Vector, measured_m_s: Vector, yaw_rate_rad_s: float) -> TiltShares:
+    def shares(
+        self, now_ns: int, wanted_m_s: Vector, measured_m_s: Vector, yaw_rad: float, yaw_rate_rad_s: float
+    ) -> TiltShares:
         """Return the command towards a velocity.
 
         Args:
             now_ns: time of the command.
-            wanted_m_s, measured_m_s: velocities in the heading frame.
-            yaw_rate_rad_s: counter-clockwise.
+            wanted_m_s, measured_m_s: velocities [W].
+            yaw_rad: heading of the aircraft.
+            yaw_rate_rad_s: counter-clockwise, wanted.
         """
         dt_s = 0.0 if self._then_ns is None else (now_ns - self._then_ns) * 1e-9
         self._then_ns = now_ns
-        forward, left = (self._tilt(axis, wanted_m_s[axis], measured_m_s[axis], dt_s) for axis in (0, 1))
-        up, yaw = wanted_m_s[2] / self._climb_m_s, yaw_rate_rad_s / self._yaw_rate_rad_s
-        return TiltShares(forward, left, _clipped(up), _clipped(yaw))
-
-    def _tilt(self, axis: int, wanted: float, measured: float, dt_s: float) -> float:
-        """Return the share of tilt along an axis; the integral stands still where the tilt is at its limit."""
-        error = wanted - measured
-        accel = VELOCITY_1_S * error + DRAG_1_S * wanted + self._wind_m_s2[axis]
-        share = accel / (G_M_S2 * self._slope)
-        if abs(share) < 1.0 and dt_s < STEP_S_MAX:
-            self._wind_m_s2[axis] += INTEGRAL_1_S2 * error * dt_s
-        return _clipped(share)
+        errors = [wanted - measured for wanted, measured in zip(wanted_m_s[:2], measured_m_s[:2], strict=True)]
+        x, y = (
+            VELOCITY_1_S * error + DRAG_1_S * wanted + wind
+            for error, wanted, wind in zip(errors, wanted_m_s[:2], self._wind_m_s2, strict=True)
+        )
+        if math.hypot(x, y) < G_M_S2 * self._slope and dt_s < STEP_S_MAX:  # else the tilt is at its limit
+            for axis in (0, 1):
+                self._wind_m_s2[axis] += INTEGRAL_1_S2 * errors[axis] * dt_s
+        c, s, full = math.cos(yaw_rad), math.sin(yaw_rad), G_M_S2 * self._slope
+        up, turn = wanted_m_s[2] / self._climb_m_s, yaw_rate_rad_s / self._yaw_rate_rad_s
+        return TiltShares(*map(_clipped, ((x * c + y * s) / full, (y * c - x * s) / full, up, turn)))
 
 
 def _clipped(share: float) -> float:

@@ -67,7 +67,7 @@ class AutopilotSession:
         local_origin_m: Vector | None = None,
         signing: Signing | None = None,
     ) -> None:
-        self.channels = (channel,)
+        self.channels: tuple[Channel, ...] = (channel,)
         self.texts: list[str] = []
         self._system = system
         self._takeoff_height_m = takeoff_height_m
@@ -107,7 +107,8 @@ class AutopilotSession:
         if wanted and isinstance(message, dialect.Heartbeat) and message.autopilot in CONTROL:
             self._autopilot = AutopilotState(*address, message.autopilot)
             return True
-        if received.system_id != getattr(self._autopilot, "address", address)[0]:
+        system = self._autopilot.address[0] if self._autopilot else self._system
+        if system not in (0, received.system_id):
             self._refused += 1
             if address not in self._strangers and len(self._strangers) < OTHERS_MAX:
                 self._strangers.add(address)

@@ -1,0 +1,169 @@
+"""An AR.Drone is set up, flown by velocities and landed; nothing is sent that was not demanded."""
+
+import math
+
+import numpy as np
+import pytest
+from fake_aircraft import FIELD_UT, STEP_NS, FakeAircraft
+
+from zsim.math.frames import heading
+from zsim_bridges.ardrone.drive.aircraft_session import AircraftSession
+from zsim_bridges.ardrone.drive.navdata_readings import NavdataReadings
+from zsim_bridges.vehicle_links.failsafe import Demand
+from zsim_bridges.vehicle_links.vehicle_state import Pose
+
+ORIGIN = (-34.603, -58.368, 25.0)
+S = 1_000_000_000
+
+
+class Loop:
+    """A session and its aircraft; what the one sends reaches the other after a delay."""
+
+    def __init__(self, delay_s: float = 0.0, yaw: float = 1.0) -> None:
+        self.aircraft = FakeAircraft(yaw)
+        self.session = AircraftSession("127.0.0.2", NavdataReadings(ORIGIN, (0.0, 0.0, 0.0), FIELD_UT))
+        self.now_ns = 100 * S
+        self._delay_ns = round(delay_s * S)
+        self._under_way: list[tuple[int, int, bytes]] = []
+        self.cut = False
+
+    def run(self, seconds: float, demand: Demand = Demand("none")) -> None:  # noqa: B008
+        for _ in range(round(seconds * S / STEP_NS)):
+            self.now_ns += STEP_NS
+            packet = self.aircraft.step(self.now_ns)
+            if packet and not self.cut:
+                self.session.receive(0, packet, self.now_ns)
+            self._under_way += [(self.now_ns, *each) for each in self.session.advance(self.now_ns, demand)]
+            while self._under_way and self._under_way[0][0] + self._delay_ns <= self.now_ns:
+                _, channel, datagram = self._under_way.pop(0)
+                if not self.cut:
+                    self.aircraft.receive(channel, datagram)
+
+    @property
+    def pose(self) -> Pose:
+        assert self.session.state.pose is not None
+        return self.session.state.pose
+
+    def until(self, state: str, demand: Demand, within_s: float = 10.0) -> None:
+        for _ in range(round(within_s / 0.1)):
+            self.run(0.1, demand)
+            if self.session.state.state == state:
+                return
+        pytest.fail(f"it is {self.session.state.state} after {within_s} s; must be {state}")
+
+
+def test_it_is_set_up_entry_by_entry():
+    loop = Loop()
+    loop.run(5)
+    assert loop.aircraft.config["general:navdata_demo"] == "FALSE"
+    assert int(loop.aircraft.config["general:navdata_options"]) >> 27 & 1
+    assert list(loop.aircraft.config).index("control:outdoor") < list(loop.aircraft.config).index(
+        "control:euler_angle_max"
+    )
+    assert len(loop.aircraft.config) == 7
+    assert set(loop.aircraft.names) == {"Config", "Control", "ResetWatchdog"}  # nothing that moves it
+
+
+def test_it_is_set_up_again_when_it_was_switched_on_again():
+    loop = Loop()
+    loop.run(5)
+    loop.aircraft, loop.aircraft.has_client = FakeAircraft(), True
+    loop.run(5)
+    assert len(loop.aircraft.config) == 7
+    assert loop.session.state.received_ns == loop.now_ns
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])
+def test_a_flight_from_the_ground_to_the_ground(yaw: float):
+    loop = Loop(delay_s=0.1, yaw=yaw)
+    loop.run(5)
+    assert (loop.session.state.state, loop.session.state.battery_percent) == ("landed", 66)
+    loop.until("hovering", Demand("take_off"))
+    loop.aircraft.wind_m_s2 = (0.6, -0.4)
+    demand = Demand("fly", (1.0, 0.5, 0.2), 0.3)
+    loop.run(12, demand)
+    speeds = []
+    for _ in range(50):
+        loop.run(0.1, demand)
+        speeds.append(tuple(loop.aircraft.velocity))
+    assert loop.session.state.state == "flying"
+    assert np.mean(speeds, axis=0) == pytest.approx((1.0, 0.5, 0.2), abs=0.05)
+    assert np.std(speeds, axis=0).max() < 0.05
+    pose = loop.pose
+    assert pose.velocity_m_s == pytest.approx(loop.aircraft.velocity, abs=0.02)
+    assert pose.position_m == pytest.approx(loop.aircraft.position, abs=0.3)
+    assert math.remainder(float(heading(pose.q_WB)) - loop.aircraft.yaw, 2 * math.pi) == pytest.approx(0, abs=0.02)
+    loop.until("landing", Demand("land"))
+    loop.until("landed", Demand("land"), 30)
+
+
+def test_the_velocity_answers_without_overshoot_to_speak_of():
+    loop = Loop(delay_s=0.15)
+    loop.run(5)
+    loop.until("hovering", Demand("take_off"))
+    most = 0.0
+    for _ in range(400):
+        loop.run(0.02, Demand("fly", (1.0, 0.0, 0.0)))
+        most = max(most, loop.aircraft.velocity[0])
+    assert most < 1.2
+    assert loop.aircraft.velocity[0] == pytest.approx(1.0, abs=0.03)
+
+
+def test_kill_stops_the_motors_and_a_take_off_leaves_the_emergency():
+    loop = Loop()
+    loop.run(5)
+    loop.until("hovering", Demand("take_off"))
+    loop.until("emergency", Demand("kill"), 1)
+    loop.run(2, Demand("kill"))
+    assert loop.session.state.state == "emergency"
+    loop.until("hovering", Demand("take_off"))
+
+
+def test_readings_have_our_units_and_axes():
+    loop = Loop(yaw=0.0)
+    loop.run(6)
+    newest = {reading.sensor: reading.values for reading in loop.session.take_readings()}
+    accel, gyro = newest["imu"]
+    assert accel == pytest.approx((0.0, 0.0, 9.80665))
+    assert gyro[:2] == pytest.approx((math.radians(1), math.radians(-2)))
+    assert newest["mag"][0] == pytest.approx(FIELD_UT, abs=0.2)
+    assert newest["baro"] == pytest.approx((100_000, 0))
+    assert newest["gps"][3] == pytest.approx((0, 0, 0), abs=1e-3)
+    assert newest["gps"][5:] == (2.0, 3, 9)
+    assert loop.session.take_readings() == []
+
+
+def test_a_slow_sensor_is_read_when_it_measures_and_not_with_each_packet():
+    loop = Loop()
+    loop.run(10)
+    count = {"imu": 0, "gps": 0, "mag": 0}
+    for reading in loop.session.take_readings():
+        if reading.sensor in count:
+            count[reading.sensor] += 1
+    assert count["imu"] > 1500
+    assert count["gps"] == count["mag"] == 1  # it stands still: nothing changes
+
+
+def test_loss_is_measured_and_garbage_counted():
+    loop = Loop()
+    loop.run(5)
+    draw = np.random.default_rng(4)
+    for _ in range(1000):
+        loop.now_ns += STEP_NS
+        sent = loop.aircraft.step(loop.now_ns)
+        if sent and draw.random() > 0.05:
+            loop.session.receive(0, sent, loop.now_ns)
+    before = loop.session.state
+    packet = loop.aircraft.step(loop.now_ns) or b""
+    for _ in range(300):
+        cut = packet[: draw.integers(1, len(packet))]
+        flipped = bytearray(packet)
+        flipped[draw.integers(4, len(packet) - 8)] ^= 1 << draw.integers(8)
+        loop.session.receive(0, cut, loop.now_ns)
+        loop.session.receive(0, bytes(flipped), loop.now_ns)
+        loop.session.receive(0, draw.bytes(50), loop.now_ns)
+    figures = loop.session.figures(loop.now_ns)
+    assert figures.loss_percent == pytest.approx(5, abs=2)
+    assert figures.refused == 900
+    assert figures.clock_offset_ms == pytest.approx(3000, abs=10)
+    assert loop.session.state == before

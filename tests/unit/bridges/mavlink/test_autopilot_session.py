@@ -1,0 +1,269 @@
+"""A vehicle is flown from the ground to the ground, PX4 and ArduPilot; nothing is sent that was not demanded."""
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_autopilot import ARDUPILOT, PX4, STEP_NS, FakeAutopilot
+from scipy.spatial.transform import Rotation
+
+from zsim.math.frames import heading
+from zsim_bridges.mavlink.drive.autopilot_session import AutopilotSession
+from zsim_bridges.mavlink.drive.telemetry import Telemetry
+from zsim_bridges.mavlink.ned_frames import attitude_turned, flipped, heading_to_ned, swapped
+from zsim_bridges.mavlink.wire import dialect
+from zsim_bridges.mavlink.wire.frame import Link, Parser
+from zsim_bridges.vehicle_links.failsafe import Demand
+from zsim_bridges.vehicle_links.vehicle_session import Channel
+from zsim_bridges.vehicle_links.vehicle_state import Pose
+
+ORIGIN = (-34.603, -58.368, 25.0)
+S = 1_000_000_000
+AUTOPILOTS = pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
+
+
+class Loop:
+    """A session and its vehicle, joined by a link without delay."""
+
+    def __init__(self, autopilot: int, height_m: float = 2.0) -> None:
+        self.vehicle = FakeAutopilot(autopilot)
+        self.session = AutopilotSession(Channel("127.0.0.1", 1), ORIGIN, height_m)
+        self.now_ns = 100 * S
+        self.sent: list[Any] = []
+        self.cut = False
+        self._parser = Parser()
+
+    def run(self, seconds: float, demand: Demand = Demand("none")) -> None:  # noqa: B008
+        for _ in range(round(seconds * S / STEP_NS)):
+            self.now_ns += STEP_NS
+            for datagram in self.vehicle.step(self.now_ns):
+                if not self.cut:
+                    self.session.receive(0, datagram, self.now_ns)
+            for _, datagram in self.session.advance(self.now_ns, demand):
+                self.sent += [received.message for received in self._parser.feed(datagram)]
+                if not self.cut:
+                    self.vehicle.receive(datagram, self.now_ns)
+
+    @property
+    def pose(self) -> Pose:
+        assert self.session.state.pose is not None
+        return self.session.state.pose
+
+    def until(self, state: str, demand: Demand, within_s: float = 20.0) -> None:
+        for _ in range(round(within_s / 0.1)):
+            self.run(0.1, demand)
+            if self.session.state.state == state:
+                return
+        pytest.fail(f"it is {self.session.state.state} after {within_s} s; must be {state}")
+
+
+@AUTOPILOTS
+def test_a_flight_from_the_ground_to_the_ground(autopilot: int):
+    loop = Loop(autopilot)
+    loop.run(1)
+    assert loop.session.state.state == "landed"
+    assert loop.session.state.battery_percent == 77
+    loop.until("taking_off", Demand("take_off"))
+    loop.until("hovering", Demand("take_off"))
+    assert loop.pose.position_m[2] > 1.6
+    loop.run(2, Demand("hold"))
+    assert loop.session.state.state == "hovering"
+    loop.run(4, Demand("fly", (1.0, 0.5, 0.25), 0.3))
+    assert loop.session.state.state == "flying"
+    assert loop.pose.velocity_m_s == pytest.approx((1.0, 0.5, 0.25), abs=0.01)
+    last = loop.vehicle.setpoints[-1]
+    assert (last.vx, last.vy, last.vz, last.yaw_rate) == pytest.approx((0.5, 1.0, -0.25, -0.3))
+    loop.until("landing", Demand("land"))
+    loop.until("landed", Demand("land"))
+
+
+@AUTOPILOTS
+def test_nothing_that_starts_or_steers_a_motor_is_sent_unasked(autopilot: int):
+    loop = Loop(autopilot)
+    loop.run(20)
+    kinds = {type(message) for message in loop.sent}
+    assert kinds <= {dialect.Heartbeat, dialect.Timesync, dialect.CommandLong}
+    assert {m.command for m in loop.sent if isinstance(m, dialect.CommandLong)} <= {511, 512}
+
+
+@AUTOPILOTS
+def test_a_command_that_is_lost_is_sent_again(autopilot: int):
+    loop = Loop(autopilot)
+    loop.run(1)
+    loop.cut = True
+    loop.run(2, Demand("take_off"))
+    loop.cut = False
+    loop.until("hovering", Demand("take_off"))
+
+
+def test_kill_is_repeated_until_the_motors_stand():
+    loop = Loop(PX4)
+    loop.until("hovering", Demand("take_off"))
+    loop.sent.clear()
+    loop.cut = True
+    loop.run(1, Demand("kill"))
+    kills = [m for m in loop.sent if isinstance(m, dialect.CommandLong) and m.command == 400]
+    assert len(kills) == 5
+    assert {(m.param1, m.param2) for m in kills} == {(0, 21196)}
+    loop.cut = False
+    loop.run(1, Demand("kill"))
+    assert not loop.vehicle.armed
+
+
+def test_a_changed_setpoint_is_sent_at_once_and_one_that_holds_is_repeated():
+    loop = Loop(PX4)
+    loop.until("hovering", Demand("take_off"))
+    loop.run(1, Demand("hold"))
+    now_ns = loop.now_ns + 1_000_000
+    first, second = Demand("fly", (1.0, 0.0, 0.0)), Demand("fly", (1.1, 0.0, 0.0))
+    sent = [list(loop.session.advance(now_ns + k, demand)) for k, demand in enumerate((first, first, second))]
+    assert [len(datagrams) for datagrams in sent] == [1, 0, 1]
+    count = len(loop.vehicle.setpoints)
+    loop.run(2, first)
+    assert len(loop.vehicle.setpoints) - count >= 49
+
+
+def test_the_first_autopilot_is_the_vehicle_and_others_are_refused():
+    loop = Loop(PX4)
+    loop.run(1)
+    stranger = Link(9, 1)
+    loop.session.receive(0, stranger.pack(dialect.Heartbeat(2, PX4, 128, 0, 4, 3)), loop.now_ns)
+    loop.session.receive(0, stranger.pack(dialect.LocalPositionNed(0, 50.0)), loop.now_ns)
+    assert loop.session.figures(loop.now_ns).refused == 2
+    assert loop.pose.position_m[1] == pytest.approx(0.0)
+    assert sum("system 9" in text for text in loop.session.texts) == 1
+
+
+def test_a_system_that_was_asked_for_alone_is_the_vehicle():
+    session = AutopilotSession(Channel("127.0.0.1", 1), ORIGIN, 2.0, system=3)
+    for system in (1, 3):
+        session.receive(0, Link(system, 1).pack(dialect.Heartbeat(2, PX4, 0, 0, 3, 3)), 0)
+    assert session.figures(0).refused == 1
+    assert session.state.received_ns == 0
+
+
+def test_loss_round_trip_and_offset_are_measured():
+    loop = Loop(PX4)
+    loop.run(5)
+    figures = loop.session.figures(loop.now_ns)
+    assert figures.loss_percent == 0
+    assert figures.round_trip_ms == pytest.approx(20, abs=1)
+    assert figures.clock_offset_ms == pytest.approx(7000, abs=11)
+    draw = np.random.default_rng(1)
+    for _ in range(200):
+        loop.now_ns += STEP_NS
+        for datagram in loop.vehicle.step(loop.now_ns):
+            if draw.random() > 0.1:
+                loop.session.receive(0, datagram, loop.now_ns)
+    assert loop.session.figures(loop.now_ns).loss_percent == pytest.approx(10, abs=4)
+
+
+def test_garbage_is_counted_and_changes_nothing():
+    loop = Loop(PX4)
+    loop.run(1)
+    before, draw = loop.session.state, np.random.default_rng(2)
+    for length in itertools.islice(itertools.cycle((1, 8, 40, 300)), 400):
+        loop.session.receive(0, b"\xfd" + draw.bytes(length), loop.now_ns)
+    assert loop.session.state == before
+    assert loop.session.figures(loop.now_ns).refused >= 400
+
+
+# Axes and units
+
+
+def telemetry(*messages: Any) -> Telemetry:
+    made = Telemetry(ORIGIN)
+    for message in messages:
+        assert made.receive(message, 50 * S)
+    return made
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_attitudes_agree_with_scipys_rotations(seed: int):
+    q_NF = Rotation.random(rng=np.random.default_rng(seed))
+    x, y, z, w = q_NF.as_quat()
+    ned_to_enu, flu_to_frd = (
+        Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]]),
+        Rotation.from_matrix(np.diag([1, -1, -1])),
+    )
+    expected = (ned_to_enu * q_NF * flu_to_frd).as_matrix()
+    turned = attitude_turned((w, x, y, z))
+    found = Rotation.from_quat([*turned[1:], turned[0]]).as_matrix()
+    assert found == pytest.approx(expected, abs=1e-12)
+    assert np.abs(attitude_turned(turned)) == pytest.approx(np.abs([w, x, y, z]), abs=1e-12)
+
+
+def test_vectors_and_headings():
+    assert swapped((1, 2, 3)) == (2, 1, -3)
+    assert flipped((1, 2, 3)) == (1, -2, -3)
+    assert heading_to_ned(math.pi / 2) == pytest.approx(0.0)
+    assert heading_to_ned(heading_to_ned(0.7)) == pytest.approx(0.7)
+
+
+def test_a_pose_stands_in_w_where_the_vehicles_own_origin_is():
+    origin = dialect.GpsGlobalOrigin(-345930000, -583680000, 35000)  # 0.01 deg north, 10 m higher
+    north = dialect.AttitudeQuaternion(0, 1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3)
+    made = telemetry(origin, north, dialect.LocalPositionNed(0, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125)).pose
+    assert made is not None
+    assert made.position_m == pytest.approx((2.0, 1 + 1109.4, 13.0), abs=0.3)
+    assert made.velocity_m_s == (0.25, 0.5, 0.125)
+    assert float(heading(made.q_WB)) == pytest.approx(math.pi / 2)
+    assert made.w_WB_B == pytest.approx((0.1, -0.2, -0.3))
+
+
+READINGS: dict[str, tuple[Any, str, tuple]] = {
+    "imu": (
+        dialect.HighresImu(5, 1, 2, -9.8, 0.1, 0.2, 0.3, fields_updated=0x3F),
+        "imu",
+        ((1, -2, 9.8), (0.1, -0.2, -0.3)),
+    ),
+    "mag": (dialect.HighresImu(5, xmag=0.1, ymag=0.2, zmag=0.3, fields_updated=0x1C0), "mag", ((10, -20, -30),)),
+    "baro": (dialect.ScaledPressure(5, 1013.25), "baro", (101325, 0)),
+    "imu of ArduPilot": (dialect.ScaledImu(5, 0, 0, -1000, 100, 0, 0), "imu", ((0, 0, 9.80665), (0.1, 0, 0))),
+    "flow": (dialect.OpticalFlow(5, flow_comp_m_x=1, flow_comp_m_y=2, quality=255), "flow", ((1, -2, 0), 1)),
+    "sonar": (dialect.DistanceSensor(5, 20, 600, 150, orientation=25), "sonar", (1.5, True)),
+    "sonar too far": (dialect.DistanceSensor(5, 20, 600, 700, orientation=25), "sonar", (7.0, False)),
+    "gps": (
+        dialect.GpsRawInt(
+            5,
+            3,
+            -346030000,
+            -583680000,
+            25000,
+            vel=200,
+            cog=9000,
+            satellites_visible=8,
+            alt_ellipsoid=25000,
+            h_acc=1500,
+        ),
+        "gps",
+        (-34.603, -58.368, 25.0, (0, 0, 0), (2, 0, 0), 1.5, 3, 8),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", READINGS)
+def test_readings_have_our_units_and_axes(name: str):
+    message, sensor, expected = READINGS[name]
+    (reading,) = telemetry(message).readings
+    assert reading.sensor == sensor
+    for found, wanted in zip(reading.values, expected, strict=True):
+        assert found == pytest.approx(wanted, abs=1e-4)
+
+
+IGNORED: dict[str, Callable[[], Any]] = {
+    "no number": lambda: dialect.LocalPositionNed(0, math.nan),
+    "infinite": lambda: dialect.HighresImu(5, xacc=math.inf, fields_updated=0x3F),
+    "a kind that is not read": lambda: dialect.VfrHud(),
+}
+
+
+@pytest.mark.parametrize("name", IGNORED)
+def test_what_is_no_reading_is_left_out(name: str):
+    made = Telemetry(ORIGIN)
+    assert not made.receive(IGNORED[name](), 0)
+    assert made.readings == []
+    assert made.pose is None
