@@ -21,12 +21,18 @@ class ExternalControl(NamedTuple):
         parameters: of DO_SET_MODE that leads there, from the second on.
         takes_off: whether it takes off in it; else in a mode of its own.
         relative_takeoff: whether the height of a take-off is over home; else over the sea.
+        own: further modes in which it is when nobody but this driver has control: it may be led back from them.
     """
 
     custom_mode: int
     parameters: tuple[float, ...]
     takes_off: bool
     relative_takeoff: bool
+    own: tuple[int, ...]
+
+    def is_taken_over(self, custom_mode: int) -> bool:
+        """Tell whether somebody else, its pilot first of all, has chosen a mode."""
+        return custom_mode != self.custom_mode and custom_mode not in self.own
 
     def is_on(self, custom_mode: int) -> bool:
         return custom_mode == self.custom_mode
@@ -36,8 +42,15 @@ class ExternalControl(NamedTuple):
         return command(system, component, DO_SET_MODE, CUSTOM_MODE_ENABLED, *self.parameters)
 
 
-OFFBOARD = ExternalControl(6 << 16, (6, 0), takes_off=False, relative_takeoff=False)  # PX4_CUSTOM_MAIN_MODE_OFFBOARD
-GUIDED = ExternalControl(4, (4,), takes_off=True, relative_takeoff=True)  # Mode::Number::GUIDED
+_AUTO = 4 << 16  # PX4_CUSTOM_MAIN_MODE_AUTO
+OFFBOARD = ExternalControl(
+    6 << 16,  # PX4_CUSTOM_MAIN_MODE_OFFBOARD
+    (6, 0),
+    takes_off=False,
+    relative_takeoff=False,
+    own=(_AUTO | 2 << 24, _AUTO | 3 << 24, _AUTO | 6 << 24),  # take-off, loiter (also where setpoints stay away), land
+)
+GUIDED = ExternalControl(4, (4,), takes_off=True, relative_takeoff=True, own=(9,))  # Mode::Number::GUIDED, LAND
 CONTROL = {PX4: OFFBOARD, ARDUPILOT: GUIDED}
 
 

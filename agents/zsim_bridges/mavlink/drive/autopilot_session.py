@@ -8,7 +8,7 @@ from typing import Any
 
 from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.drive.autopilot_modes import ARDUPILOT, CONTROL, PX4
-from zsim_bridges.mavlink.drive.autopilot_state import CLIMBED, AutopilotState
+from zsim_bridges.mavlink.drive.autopilot_state import CLIMBED, IN_AIR, AutopilotState
 from zsim_bridges.mavlink.drive.demand_sequence import DemandSequence
 from zsim_bridges.mavlink.drive.telemetry import Telemetry
 from zsim_bridges.mavlink.wire import dialect
@@ -83,7 +83,7 @@ class AutopilotSession:
         self._strangers: set[tuple[int, int]] = set()
         self._refused = 0
         self._ground_m: float | None = None
-        self._flies = False
+        self._flies = self._taken_over = False
         self._answers: list[Any] = []
 
     # What arrives
@@ -127,6 +127,16 @@ class AutopilotSession:
             case _:
                 self._autopilot.receive(message)
                 self._telemetry.receive(message, now_ns)
+                self._report_mode(self._autopilot)
+
+    def _report_mode(self, autopilot: AutopilotState) -> None:
+        """Print when somebody else takes the vehicle over in the air, and when it is given back."""
+        in_air = autopilot.armed and autopilot.landed == IN_AIR
+        taken_over = in_air and CONTROL[autopilot.autopilot].is_taken_over(autopilot.custom_mode)
+        if taken_over != self._taken_over:
+            self._taken_over = taken_over
+            what = "somebody else has control" if taken_over else "it is given back"
+            self.texts.append(f"{what} (mode {autopilot.custom_mode:#x})")
 
     def _on_timesync(self, message: Any, now_ns: int) -> None:
         """Answer a question for the time here; take the answer to ours."""

@@ -51,7 +51,10 @@ class DemandSequence:
         if demand.action != self._action:
             self._action = demand.action
             self._commanded_ns.clear()
+        taken_over = autopilot.landed == IN_AIR and control.is_taken_over(autopilot.custom_mode)
         match demand.action:
+            case "hold" | "fly" | "land" if taken_over:
+                return
             case "take_off":
                 yield from self._take_off(now_ns, autopilot, control)
             case "hold" | "fly":

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_autopilot import ARDUPILOT, PX4, STEP_NS, FakeAutopilot
+from fake_autopilot import ARDUPILOT, HOLD, PX4, STEP_NS, FakeAutopilot
 from scipy.spatial.transform import Rotation
 
 from zsim.math.frames import heading
@@ -97,6 +97,39 @@ def test_a_command_that_is_lost_is_sent_again(autopilot: int):
     loop.run(2, Demand("take_off"))
     loop.cut = False
     loop.until("hovering", Demand("take_off"))
+
+
+@AUTOPILOTS
+def test_a_pilot_who_takes_over_is_left_alone_until_the_next_take_off(autopilot: int):
+    loop = Loop(autopilot)
+    loop.until("hovering", Demand("take_off"))
+    loop.run(2, Demand("hold"))
+    loop.vehicle.mode = 3 << 16 if autopilot == PX4 else 5  # position, loiter
+    loop.run(1, Demand("hold"))
+    loop.sent.clear()
+    loop.run(5, Demand("fly", (1.0, 0.0, 0.0)))
+    loop.run(5, Demand("land"))
+    assert not any(isinstance(message, dialect.SetPositionTargetLocalNed) for message in loop.sent)
+    assert {m.command for m in loop.sent if isinstance(m, dialect.CommandLong)} <= {511, 512}
+    assert sum("somebody else has control" in text for text in loop.session.texts) == 1
+    loop.run(1, Demand("kill"))
+    assert not loop.vehicle.armed
+    loop.vehicle.position[2] = 0.0
+    loop.until("hovering", Demand("take_off"))
+    loop.run(3, Demand("fly", (1.0, 0.0, 0.0)))
+    assert loop.pose.velocity_m_s[0] == pytest.approx(1.0, abs=0.01)
+
+
+def test_an_autopilot_that_fell_back_to_hold_is_led_back():
+    loop = Loop(PX4)
+    loop.until("hovering", Demand("take_off"))
+    loop.run(2, Demand("hold"))
+    loop.cut = True
+    loop.vehicle.mode = HOLD
+    loop.run(2, Demand("fly", (1.0, 0.0, 0.0)))
+    loop.cut = False
+    loop.run(3, Demand("fly", (1.0, 0.0, 0.0)))
+    assert loop.pose.velocity_m_s[0] == pytest.approx(1.0, abs=0.01)
 
 
 def test_kill_is_repeated_until_the_motors_stand():
