@@ -27,6 +27,7 @@ from zsim_deploy.arguments import (
     require,
 )
 from zsim_deploy.cli import (
+    ardrone_commands,
     bridge_commands,
     camera_commands,
     federation_commands,
@@ -190,6 +191,7 @@ for family in (
 ):
     app.add_typer(family.app)
 app.add_typer(federation_commands.faults, rich_help_panel=federation_commands.PANEL)
+app.add_typer(ardrone_commands.ardrone, rich_help_panel=bridge_commands.TRANSLATE)
 for group in (inventory_commands.certs, inventory_commands.rendering):
     app.add_typer(group, rich_help_panel=HOSTS)
 
