@@ -27,6 +27,7 @@ from zsim_deploy.arguments import (
     require,
 )
 from zsim_deploy.cli import (
+    ardrone_commands,
     bridge_commands,
     camera_commands,
     driver_commands,
@@ -190,11 +191,12 @@ for family in (
     bridge_commands,
 ):
     app.add_typer(family.app)
-for wire, drive in (("mavlink", driver_commands.drive_mavlink), ("ardrone", driver_commands.drive_ardrone)):
-    both_ways = typer.Typer(name=wire)
-    both_ways.command("drive")(drive)
-    app.add_typer(both_ways)
+mavlink = typer.Typer(name="mavlink")
+mavlink.command("drive")(driver_commands.drive_mavlink)
+ardrone_commands.ardrone.command("drive")(driver_commands.drive_ardrone)
+app.add_typer(mavlink)
 app.add_typer(federation_commands.faults, rich_help_panel=federation_commands.PANEL)
+app.add_typer(ardrone_commands.ardrone, rich_help_panel=bridge_commands.TRANSLATE)
 for group in (inventory_commands.certs, inventory_commands.rendering):
     app.add_typer(group, rich_help_panel=HOSTS)
 

@@ -1,4 +1,4 @@
-"""Pictures from the keys of cameras to the loop of the node, of those cameras alone that somebody looks at."""
+"""Pictures from the keys of cameras to an event loop, of those cameras alone that somebody looks at."""
 
 import asyncio
 import contextlib
