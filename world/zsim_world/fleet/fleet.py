@@ -1,5 +1,7 @@
 """The fleet: all drones of a scenario, one gate at a time. The only thing that the rest of the world uses.
 
+An external drone has a row as every other, so that it is run into and blows on those below; it is led, not integrated.
+
 Heights: `baro` altitude_m is the height over the origin of W (zeroed at the field, as the aircraft does at power-up),
 and pressure_pa is that of the standard atmosphere at `environment.height_m` + altitude_m.
 """
@@ -24,6 +26,7 @@ from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.initial_state import arrays
+from zsim_world.fleet.state_rules import state_refusal
 from zsim_world.physics.air import WIND
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import WHOSE, Sampled, Sampler, SensorSample, with_more
@@ -70,6 +73,7 @@ class Fleet:
     Attributes:
         names: in scenario order, in which drones are counted.
         rotors: how many each has.
+        external: the drones that are not integrated, each with its place among them.
         sensors: of each.
         environment: of the scenario.
         gps_sigma_m: of each drone's fixes.
@@ -92,6 +96,7 @@ class Fleet:
         vehicles = [_vehicle(index, drone) for index, drone in enumerate(scenario.drones)]
         self.rotors = [len(vehicle.rotors) for vehicle in vehicles]
         self.count = len(self.names)
+        self.external = {i: e for e, i in enumerate(i for i, d in enumerate(scenario.drones) if d.is_external)}
         self.gps_sigma_m = [_gps_sigma(drone.sensors.gps) for drone in scenario.drones]
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
         self._ticks = round(scenario.time.gate_ms / scenario.time.physics_dt_ms)
@@ -190,6 +195,11 @@ class Fleet:
         s, accel = self.bodies.state.copy(), self.bodies.accel[:, 0:3].copy()
         return TrueState(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], accel, s[:, STATE.size :])
 
+    def lead(self, i: int, pose: NDArray[np.float64]) -> None:
+        """Let an external drone be where a pose says, (STATE.size + its rotors,), and move on with its velocity."""
+        self.bodies.pose[self.external[i], : len(pose)] = pose
+        self.bodies.state[i, : len(pose)] = pose
+
     def status(self, i: int) -> tuple[DroneState, float, bool]:
         """Return the firmware's mode, the charge [%], and whether the hull touched another in the last gate."""
         charge = 100.0 * self.bodies.energy.item(i) / self.bodies.vehicle.item(i, VEHICLE.capacity)
@@ -212,8 +222,8 @@ class Fleet:
     def takeoff(self, i: int) -> str | None:
         """Start a take-off; return None, or why not."""
         charge = self.status(i)[1]
-        if self._mode(i) != firmware.LANDED:
-            return self._not_while(i, "a take-off needs it landed")
+        if refusal := self._state_refusal(i, "takeoff"):
+            return refusal
         least = TAKEOFF_CHARGE * self.boards.setting.item(i, SETTING.low_battery)
         if charge < least:
             return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {least:g} %"
@@ -225,8 +235,8 @@ class Fleet:
 
     def land(self, i: int) -> str | None:
         """Start a landing; return None, or why not."""
-        if self._mode(i) in (firmware.LANDED, firmware.EMERGENCY):
-            return self._not_while(i, "a landing needs it in the air")
+        if refusal := self._state_refusal(i, "land"):
+            return refusal
         if self._mode(i) != firmware.LANDING:
             self._enter(i, firmware.LANDING)
         return None
@@ -238,8 +248,8 @@ class Fleet:
 
     def reset(self, i: int) -> str | None:
         """Leave the emergency; return None, or why not."""
-        if self._mode(i) != firmware.EMERGENCY:
-            return self._not_while(i, "a reset needs an emergency")
+        if refusal := self._state_refusal(i, "reset"):
+            return refusal
         self._enter(i, firmware.LANDED)
         return None
 
@@ -262,23 +272,35 @@ class Fleet:
 
     def set_attitude(self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0) -> str | None:
         """Fly a tilt (of q_WB, w first; its heading is not used), thrust [N] and yaw rate; return None, or why not."""
-        if sum(x * x for x in q_WB) < QUATERNION_SQUARE_MIN:
-            return f"{self.names[i]} was sent the orientation {list(q_WB)}; must be a quaternion of length 1"
+        if fault := self.orientation_fault(i, q_WB):
+            return fault
         return self._set(i, firmware.ATTITUDE, (*q_WB, thrust_n, yaw_rate_rad_s))
 
     def set_rotors(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
         """Command the speeds of all rotors within their limits; return None, or why not."""
+        if fault := self.rotors_fault(i, speed_rad_s):
+            return fault
+        return self._set(i, firmware.ROTORS, tuple(speed_rad_s))
+
+    def orientation_fault(self, i: int, q_WB: Sequence[float]) -> str | None:
+        """Return why an orientation sent to a drone is none, None if it is one."""
+        if sum(x * x for x in q_WB) < QUATERNION_SQUARE_MIN:
+            return f"{self.names[i]} was sent the orientation {list(q_WB)}; must be a quaternion of length 1"
+        return None
+
+    def rotors_fault(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
+        """Return why rotor speeds sent to a drone are not for it, None if they are."""
         if len(speed_rad_s) != self.rotors[i]:
             return f"{self.names[i]} was sent {len(speed_rad_s)} rotor speeds; it has {self.rotors[i]} rotors"
-        return self._set(i, firmware.ROTORS, tuple(speed_rad_s))
+        return None
 
     def release(self, i: int) -> None:
         """Let nobody fly the drone any more: it hovers."""
         self.boards.setpoint[i, SETPOINT.kind] = firmware.NONE
 
     def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
-        if self._mode(i) not in (firmware.HOVERING, firmware.FLYING):
-            return self._not_while(i, "a setpoint needs it hovering or flying")
+        if refusal := self._state_refusal(i, "setpoint"):
+            return refusal
         if not math.isfinite(sum(values)):
             return f"{self.names[i]} was sent a setpoint with {list(values)}; must be finite"
         row = self.boards.setpoint[i]
@@ -290,8 +312,8 @@ class Fleet:
     def _mode(self, i: int) -> int:
         return int(self.boards.memory.item(i, MEMORY.mode))
 
-    def _not_while(self, i: int, need: str) -> str:
-        return f"{self.names[i]} is {firmware.MODES[self._mode(i)]}; {need}"
+    def _state_refusal(self, i: int, asked: str) -> str | None:
+        return state_refusal(self.names[i], firmware.MODES[self._mode(i)], asked)
 
     def _enter(self, i: int, mode: int) -> None:
         kernel.enter(self.boards.memory[i], self.boards.belief[i], mode)
@@ -332,7 +354,7 @@ class Fleet:
 
 def _sighting_sampler(scenario: Scenario, hulls: NDArray[np.float64]) -> SightingSampler | None:
     """Return what makes the sightings of a scenario, None where no drone has any."""
-    has_some = any(drone.sensors.sightings is not UNSET for drone in scenario.drones)
+    has_some = any(drone.sensors.sightings is not UNSET and not drone.is_external for drone in scenario.drones)
     return SightingSampler(scenario, hulls.copy()) if has_some else None
 
 

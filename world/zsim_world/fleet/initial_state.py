@@ -57,12 +57,14 @@ def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensor
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:
     drones, n, obstacles = scenario.drones, len(scenario.drones), obstacle_rows(scenario.environment)
     each = rotors.shape[1] // ROTOR.size
+    state = np.array([_standing(drone, own, each) for drone, own in zip(drones, row, strict=True)])
+    external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
     half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
     return Bodies(
         each=tuple(range(each)),
         vehicle=row,
         rotors=rotors,
-        state=np.array([_standing(drone, own, each) for drone, own in zip(drones, row, strict=True)]),
+        state=state,
         accel=np.zeros((n, 6)),
         anchor=np.array([_anchors(drone, own) for drone, own in zip(drones, row, strict=True)]),
         command=np.zeros((n, each)),
@@ -76,6 +78,8 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         bumping=np.zeros((n, len(obstacles)), dtype=np.int8),
         bumped=np.zeros((n, len(obstacles)), dtype=np.int8),
         lanes=body_blocks(row, rotors, np.array([[half_decay(lag, dt)] for lag in row[:, VEHICLE.rotor_lag]])),
+        external=external,
+        pose=state[external],
     )
 
 

@@ -1,7 +1,8 @@
 """The kernel: one gate of all drones, a pure function of the arrays that it is given.
 
 In every physics tick, in this order: the firmware (every 5 ms) reads the newest samples and commands the rotors; all
-drones are integrated; gusts move on (every 5 ms); drones meet; sensors that are due sample the new state.
+drones are integrated, and external ones put where they are; gusts move on (every 5 ms); drones meet; sensors that are
+due sample the new state.
 """
 
 import math
@@ -17,7 +18,7 @@ from zsim_world.physics.air import WIND, blow
 from zsim_world.physics.contacts import meet_drones, meet_obstacles
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import drained
-from zsim_world.physics.simd import accelerate, line_up, move
+from zsim_world.physics.simd import accelerate, lead, line_up, move
 from zsim_world.sensors import sensor_set as ss
 from zsim_world.sensors.equations import (
     BodyTruth,
@@ -293,6 +294,7 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
             if clock[CLOCK.tick] % clock[CLOCK.ticks_per_step] == 0:
                 steer(time, bodies, boards)
             move(bodies, time.spans[SPAN.dt])
+            lead(bodies, time.spans[SPAN.dt])
             clock[CLOCK.tick] += 1
         step = ticks == 0 or clock[CLOCK.tick] % clock[CLOCK.ticks_per_step] == 0
         if step and ticks > 0:

@@ -37,6 +37,7 @@ MESSAGES = (  # in the order of KINDS
 )
 STOCK_SENSORS = len(STOCK)
 TRUTH, STATUS = STOCK_SENSORS, STOCK_SENSORS + 1
+OWN_MESSAGES = 2  # of a simulated drone in every gate: these
 WHICH, STAMPS, ENDS = 0, 1, 2  # rows of `columns`
 OTHER_TRUTHS = tuple((flight_messages.Truth, rotors) for rotors in range(ROTORS_MIN + 1, ROTORS_MAX + 1))
 LAYOUTS = Layouts((*MESSAGES, *OTHER_TRUTHS))
@@ -81,6 +82,7 @@ class PublishedState(NamedTuple):
     commanders: NDArray[np.int64]  # (N,), number of the word that names each one's
     counts: NDArray[np.int64]  # (N, kinds), messages that each key has had
     rotors: NDArray[np.int64]  # (N,), of each
+    own: NDArray[np.int64]  # (N,), messages beside its samples: truth and status, or none of an external drone
 
 
 class UserPayloads(NamedTuple):
@@ -116,7 +118,10 @@ class GatePublication:
         commanders = np.zeros(fleet.count, dtype=np.int64)
         counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
         rotors = np.array(fleet.rotors, dtype=np.int64)
-        self._fleetwide = PublishedState(fleet.touching, np.array(fleet.gps_sigma_m), commanders, counts, rotors)
+        own_messages = np.array([0 if i in fleet.external else OWN_MESSAGES for i in range(fleet.count)])
+        self._first = int(np.argmax(own_messages))  # a drone with a status, which numbers the gates
+        sigmas_m = np.array(fleet.gps_sigma_m)
+        self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, counts, rotors, own_messages)
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = encoding.words((*firmware.MODES, None))
         self._room_beside = 0  # bytes of users' messages
@@ -140,7 +145,7 @@ class GatePublication:
     def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the present gate; `commanders` are those of the drones, None for none."""
         fleet, wide = self._fleet, self._fleetwide
-        count = len(fleet.sampled.whose) + 2 * fleet.count
+        count = len(fleet.sampled.whose) + int(wide.own.sum())
         payloads = self._payloads()
         if count > self._written.columns.shape[1] or len(payloads.data) > self._room_beside:
             self._room_beside = 2 * len(payloads.data)
@@ -151,7 +156,7 @@ class GatePublication:
         out = self._written
         size = publish(self._held, *fleet.sampled, *payloads, fleet.t_ns)
         which, stamps, ends = out.columns[:, :count].copy()
-        seq = int(wide.counts[0, STATUS]) - 1
+        seq = int(wide.counts[self._first, STATUS]) - 1
         data = out.data[:size].tobytes()
         return GateMessages(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
 
@@ -265,17 +270,17 @@ def _fill_truth(row: MessageRow, state: NDArray, accel: NDArray, rotors: int) ->
 
 
 @compiled
-def _by_drone(whose: NDArray, first: NDArray) -> None:
-    """Set where the messages of each drone begin, (N + 1,): its samples, truth and status."""
+def _by_drone(whose: NDArray, own: NDArray, first: NDArray) -> None:
+    """Set where the messages of each drone begin, (N + 1,): its samples, and `own` ones."""
     first[:] = 0
     for m in range(whose.shape[0]):
         first[whose[m, WHOSE.drone] + 1] += 1
     for i in range(len(first) - 1):
-        first[i + 1] += first[i] + 2
+        first[i + 1] += first[i] + own[i]
 
 
 @compiled
-def _in_order(whose: NDArray, first: NDArray) -> NDArray:
+def _in_order(whose: NDArray, own: NDArray, first: NDArray) -> NDArray:
     """Return which sample, or -1 for truth and -2 for status, stands at each place."""
     drones = len(first) - 1
     order, free = np.empty(first[drones], np.int64), first.copy()
@@ -284,7 +289,8 @@ def _in_order(whose: NDArray, first: NDArray) -> NDArray:
         order[free[i]] = m
         free[i] += 1
     for i in range(drones):
-        order[free[i]], order[free[i] + 1] = -1, -2
+        if own[i] > 0:
+            order[free[i]], order[free[i] + 1] = -1, -2
     return order
 
 
@@ -344,8 +350,8 @@ def publish(held: List, whose: NDArray, values: NDArray, data: NDArray, ends: ND
     row, program = MessageRow(np.zeros(INTS, np.int64), floats, floats.view(np.uint64)), Program(OPS, FIRST, LITERALS)
     drones, kinds = wide.counts.shape
     first, columns, at = out.first, out.columns, 0
-    _by_drone(whose, first)
-    order = _in_order(whose, first)
+    _by_drone(whose, wide.own, first)
+    order = _in_order(whose, wide.own, first)
     for i in range(drones):
         for place in range(first[i], first[i + 1]):
             kind = _fill(row, order[place], i, sampled, seen, wide, now_ns, first[i + 1] - first[i] - 1)

@@ -4,10 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from zsim.contract import keys, messages
+from zsim.contract.flight_messages import Ardrone
 from zsim.contract.run_messages import PRIORITY_MAX, ControlRequest, Fault
 from zsim.runtime.link_faults import NEVER, RADIO, WORLD, distance_between, joins, place_of, total_delay_ns
 from zsim.scenario.scenario import Scenario
+from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.flight.barrier import Barrier
 from zsim_world.flight.budgets import Budgets
@@ -78,6 +82,7 @@ class CommandIntake:
     outbox: RunOutbox
     queue: CommandQueue
     fleet: Fleet
+    drivers: ExternalDrones
     faults_at: LinkFaultsAt
     budgets: Budgets
 
@@ -107,13 +112,24 @@ class CommandIntake:
         late_ns = self._links.delay_ns(drone, keys.command(drone, kind), message, gate_ns)
         if late_ns is None:
             return True  # the link loses it; its sender has sent it all the same
-        apply_ns = gate_ns + self.clock.delay_ns + late_ns
+        external, delay_ns = index in self.drivers, self.clock.delay_ns
+        if external:  # its link is real, and delays commands by itself
+            gate_ns, delay_ns = min(gate_ns, self.clock.now_ns), 0
+        apply_ns = gate_ns + delay_ns + late_ns
         if not gating:  # a rerun needs the event: without it the command is not carried out
             if not self.budgets.spend(source, f"drone/{drone}/cmd/", source in self.barrier.participants):
                 self.outbox.refuse(source, f"drone/{drone}/cmd/{kind}", too_many(source))
                 return True
             self._publish_command(drone, kind, message, apply_ns)
-        return self.queue.push(index, kind, message, apply_ns)
+        is_new = self.queue.push(index, kind, message, apply_ns)
+        if external and is_new:
+            self._carry_out_external()
+        return is_new
+
+    def _carry_out_external(self) -> None:
+        """Hand on at once what is due for external drones."""
+        for command in self.queue.pop(self.clock.now_ns, self.drivers.__contains__):
+            self._carry_out(command, self.clock.next_ns)
 
     def _no_drone(self, name: str) -> Refusal:
         return Refusal("drone", repr(name[:40]), "must be one of `drones` in world/info")
@@ -137,12 +153,16 @@ class CommandIntake:
     def apply(self, t_ns: int) -> None:
         """Hand the commands that take effect at t_ns to the firmware."""
         for command in self.queue.pop(t_ns):
-            drone = self.fleet.names[command.drone]
-            if self._links.lost_by_radio(drone, command, t_ns + self.clock.gate_ns):
-                continue
-            refusal = self.queue.refusal(command) or self._apply(drone, command)
-            if refusal:
-                self.outbox.refuse(command.source, keys.command(drone, command.kind), refusal)
+            self._carry_out(command, t_ns + self.clock.gate_ns)
+
+    def _carry_out(self, command: QueuedCommand, gate_ns: int) -> None:
+        """Hand a command on that takes effect before a gate, unless the radio loses it or it is refused."""
+        drone = self.fleet.names[command.drone]
+        if self._links.lost_by_radio(drone, command, gate_ns):
+            return
+        refusal = self.queue.refusal(command) or self._apply(drone, command)
+        if refusal:
+            self.outbox.refuse(command.source, keys.command(drone, command.kind), refusal)
 
     def _apply(self, drone: str, command: QueuedCommand) -> str | None:
         """Hand a command to the firmware; return why it is refused."""
@@ -155,6 +175,8 @@ class CommandIntake:
 
     def _apply_setpoint(self, command: QueuedCommand) -> str | None:
         m, i, fleet = command.message, command.drone, self.fleet
+        if i in self.drivers:
+            return self._hand_on(command)
         if command.kind == "velocity":
             return fleet.set_velocity(i, m.velocity_m_s, m.yaw_rate_rad_s, m.frame)
         if command.kind == "ardrone":
@@ -166,15 +188,34 @@ class CommandIntake:
     def _apply_mode(self, drone: str, command: QueuedCommand) -> str | None:
         fleet, source, mode = self.fleet, command.source, command.message.mode
         enter = {"takeoff": fleet.takeoff, "land": fleet.land, "emergency": fleet.emergency, "reset": fleet.reset}
-        refusal = enter[mode](command.drone)
+        refusal = self._hand_on(command) if command.drone in self.drivers else enter[mode](command.drone)
         if refusal is None:
             self.outbox.notice("mode", drone, f"{source} asks {drone} to {mode}", {"mode": mode}, source)
         return refusal
 
+    def _hand_on(self, command: QueuedCommand) -> str | None:
+        """Repeat a command for the driver of an external drone; return why it is refused."""
+        refusal = self.drivers.command_refusal(command.drone, command.kind, command.message)
+        if refusal is None:
+            self._put_accepted(command.drone, command.kind, command.message)
+        return refusal
+
+    def _put_accepted(self, i: int, kind: str, message: Any) -> None:
+        key = keys.accepted(self.fleet.names[i], kind)
+        self.outbox.put(key, msgspec.structs.replace(message, seq=self.outbox.next_seq(key)))
+
+    def _release_drone(self, i: int) -> None:
+        """Let nobody fly a drone any more: it hovers."""
+        if i in self.drivers:
+            hover = Ardrone(self.clock.now_ns, 0, WORLD, 0.0, 0.0, 0.0, 0.0, hover=True)
+            self._put_accepted(i, "ardrone", hover)
+        else:
+            self.fleet.release(i)
+
     def release_all(self, source: str) -> None:
         """Take the drones from a process that flew them and is gone: they hover."""
         for i in self.queue.remove_source(source):
-            self.fleet.release(i)
+            self._release_drone(i)
             self.outbox.event("release", self.fleet.names[i], f"{source} flies it no longer", source=source)
 
     # Requests
@@ -199,7 +240,7 @@ class CommandIntake:
             return refused_argument(request, "drone", f"one of {', '.join(self._index)}")
         refusal = self.queue.release(index, request.source)
         if refusal is None:
-            self.fleet.release(index)
+            self._release_drone(index)
         return refusal
 
     def _requested(self, request: ControlRequest) -> int | None:

@@ -92,13 +92,22 @@ class CommandQueue:
         self._queued.setdefault(apply_ns, []).append(command)
         return True
 
-    def pop(self, t_ns: int) -> list[QueuedCommand]:
+    def pop(self, t_ns: int, wanted: Callable[[int], bool] | None = None) -> list[QueuedCommand]:
         """Return the commands that take effect up to t_ns, in the order in which they do.
 
         Drone and kind stand last in the order only to make it independent of arrival.
+
+        Args:
+            wanted: tells of which drones; None: of all.
         """
         instants = sorted([instant for instant in self._queued if instant <= t_ns])
-        return [command for instant in instants for command in sorted(self._queued.pop(instant), key=_order)]
+        due = [command for instant in instants for command in sorted(self._queued.pop(instant), key=_order)]
+        if wanted is None:
+            return due
+        for command in due:
+            if not wanted(command.drone):
+                self._queued.setdefault(command.apply_ns, []).append(command)
+        return [command for command in due if wanted(command.drone)]
 
     def refusal(self, command: QueuedCommand) -> Refusal | None:
         """Return why the source may not command the drone now, None if it may."""

@@ -53,10 +53,12 @@ class Coordinator(ABC):
         requests: on `world/control`, all of them counted.
         statistics: of the run so far.
         refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
+        external: names of the drones of which drivers publish sensors, truth and status.
         diverged: what is to be raised once the end is published, None for a run that ended well.
     """
 
     refused_queries: tuple[str, ...] = ()
+    external: frozenset[str] = frozenset()
 
     def __init__(
         self,
@@ -103,6 +105,9 @@ class Coordinator(ABC):
     @abstractmethod
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
         """Take a command to a drone; return False for a duplicate."""
+
+    def take_of_driver(self, drone: str, message: Any) -> str | None:  # noqa: B027 - a replay has no drivers
+        """Take what the driver of an external drone has published; return why it is refused."""
 
     def release_drones(self, name: str) -> None:  # noqa: B027 - a replay has no commanders
         """Take the drones from a process that flew them and is gone."""

@@ -15,10 +15,13 @@ from zsim.contract.snapshot import State
 from zsim.contract.views import DroneView, ViewDrones
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
+from zsim.scenario.external_bodies import check_pace
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
+from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import GatePublication
+from zsim_world.flight.barrier import Participant
 from zsim_world.flight.command_intake import CommandIntake
 from zsim_world.flight.command_queue import CommandQueue
 from zsim_world.flight.coordinator import Coordinator
@@ -37,8 +40,12 @@ class World(Coordinator):
         wall_ns: monotonic wall time.
         run_id: given by a launcher, and by tests that compare records.
 
+    Raises:
+        ScenarioError: it has external drones, and the mode is "lockstep".
+
     Attributes:
         fleet: the drones.
+        drivers: what is published of the external ones among them.
         queue: of the commands, with the commander of each drone.
         faults: that are injected.
         diverged: what is to be raised once the end is published, None for a state that stayed finite.
@@ -52,17 +59,29 @@ class World(Coordinator):
         wall_ns: Callable[[], int] = lambda: 0,
         run_id: str | None = None,
     ) -> None:
+        check_pace(scenario, mode)
         super().__init__(scenario, mode, rate, wall_ns, run_id, scenario.expected())
         clock, barrier, outbox = self.clock, self.barrier, self.outbox
         self.fleet = Fleet(scenario)
+        self.drivers = ExternalDrones(self.fleet)
+        self.external = self.drivers.names
+        self._simulated = [i for i in range(self.fleet.count) if i not in self.drivers]
         self.queue = CommandQueue(self.names)
         self.faults = FaultInjector(scenario, clock, barrier, outbox, self.fleet.impairment)
         self._intake = CommandIntake(
-            scenario, clock, barrier, outbox, self.queue, self.fleet, self.faults.of_links, self.budgets
+            scenario,
+            clock,
+            barrier,
+            outbox,
+            self.queue,
+            self.fleet,
+            self.drivers,
+            self.faults.of_links,
+            self.budgets,
         )
         self._operations |= {**self._intake.operations(), **self.faults.operations()}
         self._publication = GatePublication(self.fleet)
-        self._hash = TruthHash(self.fleet.count)
+        self._hash = TruthHash(len(self._simulated))
         self._last_ns = round(scenario.duration_s * 1e9) // clock.gate_ns * clock.gate_ns
         self.statistics.separation(self.fleet.closest_m())
 
@@ -124,6 +143,7 @@ class World(Coordinator):
             "queue": self.queue,
             "faults": self.faults,
             "publication": self._publication,
+            "drivers": self.drivers,
         }
 
     def keep_truth(self, copy: Callable[[memoryview], object], hashed: Iterable[bytes] = ()) -> None:
@@ -134,6 +154,9 @@ class World(Coordinator):
 
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
         return self._intake.accept(drone, kind, message)
+
+    def take_of_driver(self, drone: str, message: Any) -> str | None:
+        return self.drivers.take(drone, message, self.now_ns)
 
     def release_drones(self, name: str) -> None:
         self._intake.release_all(name)
@@ -156,10 +179,11 @@ class World(Coordinator):
     def _integrate(self) -> bool:
         """Integrate one gate; return whether the state is still finite."""
         if self.clock.mode == "realtime":
-            self.statistics.deadlines(self.barrier.participants.values(), self.clock.required_ns)
+            self.statistics.deadlines(self._paced(), self.clock.required_ns)
             self.barrier.give_up_late()
         self._intake.apply(self.now_ns)
         self.faults.apply(self.now_ns)
+        self.drivers.lead()
         try:
             self.fleet.advance()
         except DivergedError as error:
@@ -172,6 +196,11 @@ class World(Coordinator):
         self._publish_collisions()
         return True
 
+    def _paced(self) -> list[Participant]:
+        """Return who has a deadline at every gate: not who does nothing but estimate drones that have none."""
+        unpaced = {f"estimator.{drone}" for drone in self.external}
+        return [p for p in self.barrier.participants.values() if not p.served_names <= unpaced]
+
     def _publish_collisions(self) -> None:
         for i, j in self.fleet.collisions():
             name, other = self.names[i], self.names[j]
@@ -181,8 +210,10 @@ class World(Coordinator):
             self.outbox.notice("collision", name, f"{name} runs into {other}", {"other": other})
 
     def _publish_gate(self, wall_ns: int) -> None:
-        self._hash.add(self.now_ns, self.fleet.bodies.state)
-        self.outbox.put(keys.GATE, self._publication.gate(self.queue.commanders()))
+        state = self.fleet.bodies.state
+        self._hash.add(self.now_ns, state[self._simulated] if self.external else state)
+        if self._simulated:
+            self.outbox.put(keys.GATE, self._publication.gate(self.queue.commanders()))
         self.statistics.gate(self.now_ns, wall_ns)
         self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
 
@@ -208,6 +239,8 @@ class World(Coordinator):
         drones, commanders = [], self.queue.commanders()
         for i, name in enumerate(self.names):
             state, battery_percent, _ = self.fleet.status(i)
+            if status := self.drivers.status(i):
+                state, battery_percent = status.state, status.battery_percent
             pose = (tuple(truth.position_m[i].tolist()), tuple(truth.orientation_wxyz[i].tolist()))
             rotors = tuple(truth.rotor_rad_s[i, : self.fleet.rotors[i]].tolist())
             drones.append(DroneView(name, *pose, rotors, state, battery_percent, commanders[i]))

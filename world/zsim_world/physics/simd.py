@@ -154,6 +154,18 @@ def line_up(bodies: Bodies) -> None:
 
 
 @inlined
+def lead(bodies: Bodies, dt: float) -> None:
+    """Move the external drones on with their velocities over one tick of dt [s], whatever became of them in it."""
+    for e in range(bodies.external.shape[0]):
+        i, pose = bodies.external[e], bodies.pose[e]
+        for c in range(3):
+            pose[STATE.p_WB + c] += pose[STATE.v_WB + c] * dt
+        for c in range(pose.shape[0]):
+            bodies.state[i, c] = pose[c]
+        _put_state(bodies.lanes[i // LANES], i % LANES, pose, bodies.each)
+
+
+@inlined
 def _put_state(lanes: NDArray, k: int, state: NDArray, each: tuple[int, ...]) -> None:
     for c in range(STATE.size):
         lanes[LANES * (BODY_LANES.state + c) + k] = state[c]

@@ -62,7 +62,7 @@ class FleetSensors(NamedTuple):
 
 
 def fleet_sensors(scenario: Scenario) -> FleetSensors:
-    """Return the sensors of a scenario's drones.
+    """Return the sensors of a scenario's drones; an external one has none here.
 
     Raises:
         DocumentError: a user's module is not there, or is not what the scenario was resolved with.
@@ -70,7 +70,8 @@ def fleet_sensors(scenario: Scenario) -> FleetSensors:
     sections = [list(drone.sensors.sections()) for drone in scenario.drones]
     kinds = {name: kind for of_drone in sections for name, kind, _ in of_drone if name not in STOCK}
     names = (*SENSORS, *sorted(kinds))
-    own = [{name: settings for name, _, settings in of_drone} for of_drone in sections]
+    simulated = [() if drone.is_external else of for drone, of in zip(scenario.drones, sections, strict=True)]
+    own = [{name: settings for name, _, settings in of_drone} for of_drone in simulated]
     types = STOCK | kinds
     return FleetSensors(names, tuple(types[n] for n in names), [[each.get(n) for n in names] for each in own])
 

@@ -178,10 +178,10 @@ class SightingSampler:
 
 
 def _watching(scenario: Scenario) -> Iterator[tuple[int, str, Camera, SightingModel]]:
-    """Yield every camera in whose pictures a detector looks: drone, name, camera, detector."""
+    """Yield every camera of a simulated drone in whose pictures a detector looks: drone, name, camera, detector."""
     for i, drone in enumerate(scenario.drones):
         model = drone.sensors.sightings
-        if model is not UNSET:
+        if model is not UNSET and not drone.is_external:
             for name, camera in drone.sensors.cameras().items():
                 if name in model.cameras:
                     yield i, name, camera, model

@@ -31,6 +31,7 @@ REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take un
 PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
 RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
 OF_CAMERAS = (camera_messages.CameraInfo, camera_messages.Sightings)  # relayed too, from whoever has a camera
+OF_DRIVERS = ("truth", "link")  # what they publish of an external drone beside its sensors
 PROCESSES, VIEWS = "process/", "view/"  # the last are nothing to the world
 OWN = keys.process(WORLD, "")
 
@@ -226,6 +227,9 @@ class MessageIntake:
             elif kind in OF_CAMERAS and not keys.is_sensor(key):
                 self.outputs.passed(sample)
                 self._relay_of_camera(key, sample.payload)
+            elif self._is_of_driver(key):
+                self.outputs.passed(sample)
+                self._take_of_driver(key, sample.payload)
             elif key.startswith(PROCESSES) or (key.startswith("drone/") and "/cmd/" in key):
                 self.outputs.passed(sample)
                 self._hand_over(key, sample.payload, wall_ns)
@@ -281,6 +285,25 @@ class MessageIntake:
             raise DecodeError(f"{key}: t_ns is {message.t_ns}; must be <= {self.world.now_ns}, the newest gate")
         self.history.add(key, payload, message.t_ns)
         self.world.count_output(message.source)
+
+    def _is_of_driver(self, key: str) -> bool:
+        """Tell whether the driver of an external drone publishes on a key, and not the world."""
+        kind, drone, what = keys.parts(key)
+        of_driver = what in OF_DRIVERS or what.startswith("sensor/")
+        return of_driver and kind == "drone" and drone in self.world.external
+
+    def _take_of_driver(self, key: str, payload: bytes) -> None:
+        """Keep what a driver publishes of its drone, unless the world refuses it."""
+        drone = keys.thing(key)
+        try:
+            message = messages.decode(key, payload)
+            refusal = self.world.take_of_driver(drone, message)
+            if refusal is not None:
+                raise DecodeError(refusal)
+            self.history.add(key, payload, message.t_ns)
+        except DecodeError as error:
+            self.history.add_foreign(key, payload)
+            self._refuse(f"driver.{drone}", key, error)
 
     def _read_phase(self, key: str, payload: bytes) -> None:
         if self._states[key] % PHASE_EVERY == 0:

@@ -123,6 +123,8 @@ class Bodies(NamedTuple):
     bumping: NDArray  # int8 (N, M), whose hull touches which obstacle
     bumped: NDArray  # int8 (N, M), contacts that began in this gate
     lanes: NDArray  # (blocks, columns of a block), see physics/simd.py
+    external: NDArray  # int64 (E,), the drones that are not integrated
+    pose: NDArray  # (E, STATE.size + R), where they are: moved on with their velocities in every tick
 
 
 class Boards(NamedTuple):

@@ -1,0 +1,172 @@
+"""External drones, as their drivers publish them: where each is, in which state, and what it can be asked. No clock.
+
+A driver publishes a pose for a gate now and then. Between two of them the drone is moved on with its velocity, as long
+as a pose may be trusted; then it stands where that led to.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.contract.flight_messages import DroneState, Status, Truth
+from zsim.contract.snapshot import State
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.fleet.state_rules import state_refusal
+from zsim_world.state.fleet_arrays import STATE, VEHICLE
+
+POSE_AGE_MAX_NS = 500_000_000  # chosen: 25 gates, as an estimate that is flown on; 1 m at 2 m/s
+DISTANCE_MAX_M = 100_000.0  # of each coordinate, as places in a scenario: beyond it a tangent plane is no map
+SPEED_MAX_M_S = 200.0  # chosen: twice the fastest racing drones
+RATE_MAX_RAD_S = 100.0  # chosen: twice what a gyroscope of 2000 deg/s measures, and more
+UNIT_SLACK = 0.01  # of a quaternion's length; single precision is within 1e-6
+
+
+class Pose(NamedTuple):
+    """A row of a fleet's states, and the gate that it is of [ns]."""
+
+    t_ns: int
+    row: NDArray[np.float64]  # (STATE.size + rotors of the drone,)
+
+
+class ExternalDrones:
+    """The external drones of a fleet; `i` counts them among all its drones.
+
+    Args:
+        fleet: is led by their poses.
+    """
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self._index = {fleet.names[i]: i for i in fleet.external}
+        self._poses: dict[int, Pose] = {}
+        self._statuses: dict[int, Status] = {}
+
+    def __contains__(self, i: int) -> bool:
+        return i in self._fleet.external
+
+    @property
+    def names(self) -> frozenset[str]:
+        return frozenset(self._index)
+
+    def snapshot(self) -> State:
+        """Return what the drivers have published last."""
+        poses = {i: [pose.t_ns, pose.row] for i, pose in self._poses.items()}
+        return {"poses": poses, "statuses": {i: [*_fields(status)] for i, status in self._statuses.items()}}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self._poses = {i: Pose(t_ns, row.copy()) for i, (t_ns, row) in state["poses"].items()}
+        self._statuses = {i: Status(*fields) for i, fields in state["statuses"].items()}
+
+    # What a driver publishes
+
+    def take(self, drone: str, message: Any, now_ns: int) -> str | None:
+        """Take a message of a driver; return why it is refused.
+
+        Args:
+            message: a Truth or a Status; of others only the stamp is judged.
+            now_ns: newest gate.
+        """
+        i = self._index[drone]
+        if message.t_ns > now_ns:
+            return f"t_ns is {message.t_ns}; must be <= {now_ns}, the newest gate"
+        if isinstance(message, Truth):
+            return self._take_truth(i, message, now_ns)
+        if isinstance(message, Status):
+            former = self._statuses.get(i)
+            if former is not None and message.t_ns < former.t_ns:
+                return f"t_ns is {message.t_ns}; must be >= {former.t_ns}, that of the last one"
+            self._statuses[i] = message
+        return None
+
+    def _take_truth(self, i: int, truth: Truth, now_ns: int) -> str | None:
+        former = self._poses.get(i)
+        if former is not None and truth.t_ns < former.t_ns:
+            return f"t_ns is {truth.t_ns}; must be >= {former.t_ns}, that of the last one"
+        if now_ns - truth.t_ns > POSE_AGE_MAX_NS:
+            return f"t_ns is {truth.t_ns}; must be >= {now_ns - POSE_AGE_MAX_NS}, {POSE_AGE_MAX_NS / 1e9:g} s ago"
+        fault = truth_fault(truth, self._fleet.rotors[i])
+        if fault is None:
+            self._poses[i] = Pose(truth.t_ns, self._row(i, truth))
+        return fault
+
+    def _row(self, i: int, truth: Truth) -> NDArray[np.float64]:
+        """Return a truth as a state: a unit quaternion, and rotors within what the drone's have."""
+        row = np.empty(STATE.size + len(truth.rotor_rad_s))
+        row[STATE.p_WB : STATE.p_WB + 3], row[STATE.v_WB : STATE.v_WB + 3] = truth.position_m, truth.velocity_m_s
+        row[STATE.q_WB : STATE.q_WB + 4] = np.divide(truth.orientation_wxyz, math.hypot(*truth.orientation_wxyz))
+        row[STATE.w_WB_B : STATE.w_WB_B + 3] = truth.angular_velocity_rad_s
+        most = self._fleet.bodies.vehicle.item(i, VEHICLE.rotor_max)
+        row[STATE.size :] = np.clip(truth.rotor_rad_s, 0.0, most)
+        return row
+
+    # Time
+
+    def lead(self) -> None:
+        """Put every drone whose driver has published a pose where it is now, before the fleet goes on."""
+        now_ns = self._fleet.t_ns
+        for i, pose in self._poses.items():
+            self._fleet.lead(i, ahead(pose, now_ns))
+
+    # What it can be asked
+
+    def status(self, i: int) -> Status | None:
+        """Return the newest status, None before the first."""
+        return self._statuses.get(i)
+
+    def command_refusal(self, i: int, kind: str, message: Any) -> str | None:
+        """Return why a command is not handed on to the driver, None if it is.
+
+        A stop of the rotors is always handed on; all else is judged by the state that the driver has published last.
+        """
+        name, asked = self._fleet.names[i], message.mode if kind == "mode" else "setpoint"
+        if asked == "emergency":
+            return None
+        if i not in self._statuses:
+            return f"{name} has no state: its driver has published none; start driver.{name}"
+        state: DroneState = self._statuses[i].state
+        return state_refusal(name, state, asked) or self._setpoint_fault(i, kind, message)
+
+    def _setpoint_fault(self, i: int, kind: str, message: Any) -> str | None:
+        if kind == "rotors":
+            return self._fleet.rotors_fault(i, message.speed_rad_s)
+        return self._fleet.orientation_fault(i, message.orientation_wxyz) if kind == "attitude" else None
+
+
+def ahead(pose: Pose, t_ns: int) -> NDArray[np.float64]:
+    """Return the state at t_ns of what was at a pose: at constant velocity, at rest once the pose is too old."""
+    row, age_ns = pose.row.copy(), max(0, t_ns - pose.t_ns)
+    p, v = slice(STATE.p_WB, STATE.p_WB + 3), slice(STATE.v_WB, STATE.v_WB + 3)
+    row[p] += row[v] * (min(age_ns, POSE_AGE_MAX_NS) * 1e-9)
+    if age_ns >= POSE_AGE_MAX_NS:
+        row[v] = row[STATE.w_WB_B : STATE.w_WB_B + 3] = 0.0
+    return row
+
+
+def truth_fault(truth: Truth, rotors: int) -> str | None:
+    """Return what is absurd about a truth whose numbers are finite, None if nothing is."""
+    limits = (
+        ("position_m", DISTANCE_MAX_M, "m"),
+        ("velocity_m_s", SPEED_MAX_M_S, "m/s"),
+        ("angular_velocity_rad_s", RATE_MAX_RAD_S, "rad/s"),
+    )
+    for name, most, unit in limits:
+        values: Sequence[float] = getattr(truth, name)
+        if max(map(abs, values)) > most:
+            return f"{name} is {_shown(values)}; each must be within {most:g} {unit}"
+    if abs(math.hypot(*truth.orientation_wxyz) - 1.0) > UNIT_SLACK:
+        return f"orientation_wxyz is {_shown(truth.orientation_wxyz)}; must be a quaternion of length 1"
+    if len(truth.rotor_rad_s) != rotors:
+        return f"rotor_rad_s has {len(truth.rotor_rad_s)} speeds; must have {rotors}, as the drone has rotors"
+    return None
+
+
+def _shown(values: Sequence[float]) -> str:
+    return f"[{', '.join(f'{value:g}' for value in values)}]"
+
+
+def _fields(status: Status) -> tuple[Any, ...]:
+    return tuple(getattr(status, name) for name in Status.__struct_fields__)

@@ -1,0 +1,23 @@
+"""Drones whose bodies are external: what a run with them needs."""
+
+from zsim.errors import ScenarioError
+from zsim.scenario.fault_check import listed
+from zsim.scenario.scenario import Scenario
+
+
+def check_pace(scenario: Scenario, mode: str) -> None:
+    """Refuse to run external drones, whose time is the wall's, otherwise than in realtime.
+
+    Raises:
+        ScenarioError: the scenario has some, and the mode is not "realtime".
+    """
+    external = scenario.external()
+    if external and mode != "realtime":
+        who = f"{listed(external)} {'is' if len(external) == 1 else 'are'} external"
+        needed = "time passes there as on the wall: run it with --realtime, on processes of its own"
+        raise ScenarioError([f"{scenario.name}: body of {who}, and the run is in {mode}; {needed}"])
+
+
+def awaited_drivers(scenario: Scenario) -> list[str]:
+    """Return the names of the processes that publish the external drones."""
+    return [f"driver.{drone}" for drone in scenario.external()]
