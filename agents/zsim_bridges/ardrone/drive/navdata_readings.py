@@ -62,6 +62,7 @@ class NavdataReadings:
         self._barometer = FieldBarometer()
         self._then_ns: int | None = None
         self._gps_ns: int | None = None
+        self._fix: tuple = ()
 
     def receive(self, packet: Navdata, now_ns: int) -> None:
         """Take a packet that arrived now."""
@@ -140,9 +141,11 @@ class NavdataReadings:
             self.pose.velocity_m_s[2] if self.pose else 0.0,
         )
         sigma_m = gps.ehpe_m or SIGMA_UNKNOWN_M
-        before_ns = self._gps_ns
-        if self._read_new("gps", taken_ns, *place, (x, y, z), velocity, sigma_m, GPS_FIX, gps.satellites):
-            self._gps_ns = taken_ns
+        before_ns, fix = self._gps_ns, (place, gps.speed_m_s, gps.degree)
+        if fix != self._fix and self._read_new(
+            "gps", taken_ns, *place, (x, y, z), velocity, sigma_m, GPS_FIX, gps.satellites
+        ):
+            self._gps_ns, self._fix = taken_ns, fix
             if before_ns is not None:  # the first tells nothing of a place that is stated better
                 share = min(1.0, GPS_1_S * (taken_ns - before_ns) * 1e-9)
                 self._x, self._y = self._x + share * (x - self._x), self._y + share * (y - self._y)
