@@ -7,7 +7,7 @@ from typing import Any
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.run_messages import ControlAnswer, Event, Join
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Event, Join
 from zsim.transport.session import FarEnd, RawSample, ReceivedSample
 
 PATIENCE_S = 120.0  # after which a test that waits for ever fails
@@ -43,6 +43,20 @@ class FakeSubscription:
         self._arrived.put(None)
 
 
+class FakeQuery:
+    """A request, and its answer once there is one."""
+
+    def __init__(self, expression: str, payload: bytes) -> None:
+        self.expression, self.payload = expression, payload
+        self.answered: ControlAnswer | None = None
+
+    def request(self) -> ControlRequest:
+        return messages.decode_as(ControlRequest, self.payload, self.expression)
+
+    def answer(self, answer: ControlAnswer) -> None:
+        self.answered = answer
+
+
 class FakeLink:
     """A session.
 
@@ -75,8 +89,15 @@ class FakeLink:
         self._callbacks: list[tuple[str, Callable[[RawSample], None]]] = []
         self._on_link: Callable[[bool], None] = lambda up: None
         self._on_tokens: list[tuple[str, Callable[[str, bool], None]]] = []
+        self._on_queries: dict[str, Callable[[Any], None]] = {}
 
     # What a test does
+
+    def ask(self, key: str, payload: bytes) -> "FakeQuery":
+        """Ask who answers on a key; return what is answered then."""
+        query = FakeQuery(key, payload)
+        self._on_queries[key](query)
+        return query
 
     def deliver(self, key: str, message: Struct | bytes) -> None:
         """Let something arrive, at subscribers to come as well."""
@@ -168,7 +189,7 @@ class FakeLink:
         self._on_tokens.append((expression, callback))
 
     def declare_queryable(self, expression: str, callback: Callable[[Any], None]) -> None:
-        return
+        self._on_queries[expression] = callback
 
     def declare_process(self, name: str) -> None:
         return

@@ -173,21 +173,31 @@ class DriverProcess:
 
     def _on_request(self, query: Query) -> None:
         """Answer an operator."""
-        request, now_ns, vehicle = query.request(), self._clock.now_ns(), self._session.state
-        match request.op:
-            case "arm":
-                error = self._failsafe.arm(now_ns, vehicle)
-            case "disarm":
-                error = self._failsafe.disarm(vehicle)
-            case "kill":
-                self._failsafe.kill(now_ns)
-                error = None
-            case _:
-                error = f"op is {request.op!r}; must be one of arm, disarm, kill"
+        now_ns = self._clock.now_ns()
+        try:
+            request = query.request()
+        except DecodeError as error:
+            self._observer.health.refused += 1
+            query.answer(ControlAnswer(False, str(error)))
+            return
+        error = self._operate(request.op, now_ns)
         query.answer(ControlAnswer(error is None, error or ""))
         self._say(f"{self._observer.name}: {request.source or 'somebody'} asks {request.op}: {error or 'done'}")
         self._send()
         self._report(now_ns)
+
+    def _operate(self, op: str, now_ns: int) -> str | None:
+        """Do what an operator asks; return None, or why not."""
+        match op:
+            case "arm":
+                return self._failsafe.arm(now_ns, self._session.state)
+            case "disarm":
+                return self._failsafe.disarm(self._session.state)
+            case "kill":
+                self._failsafe.kill(now_ns)
+                return None
+            case _:
+                return f"op is {op[:40]!r}; must be one of arm, disarm, kill"
 
     # What goes out
 

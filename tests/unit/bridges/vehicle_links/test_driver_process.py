@@ -1,0 +1,253 @@
+"""The driver's process, with a session and an aircraft of the test's own on a UDP port of loopback."""
+
+import asyncio
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+from fake_link import FakeLink
+
+from zsim.contract import flight_messages, keys, messages
+from zsim.contract.messages import DroneInfo, Info, Origin
+from zsim.contract.run_messages import Clock
+from zsim.errors import RunError
+from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.vehicle_links.driver_options import DriverOptions, position, udp_channel
+from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external
+from zsim_bridges.vehicle_links.failsafe import Demand
+from zsim_bridges.vehicle_links.vehicle_session import Channel, LinkFigures
+from zsim_bridges.vehicle_links.vehicle_state import Pose, Reading, VehicleState
+
+SCENARIO = """
+name: one
+duration_s: 10
+sensors: {preset: paper}
+drones: [{name: drone1, position_m: [0, 0, 0]}, {name: drone2, position_m: [3, 0, 0], body: external}]
+"""
+ME, GATE_NS = "driver.drone2", 20_000_000
+
+
+def info(mode: Any = "realtime") -> Info:
+    drones = DroneInfo("drone1", "ardrone2"), DroneInfo("drone2", "ardrone2", body="external")
+    return Info(
+        0, 0, 1, "r", "zsim", mode, 1.0, GATE_NS, 1, 1, 1, Origin(0.0, 0.0, 0.0), drones, (), SCENARIO, "", "", ""
+    )
+
+
+class Session:
+    """Sends its demands by name, and takes what comes for the state that it then has."""
+
+    def __init__(self, port: int) -> None:
+        self.channels: tuple[Channel, ...] = (Channel("127.0.0.1", port),)
+        self.texts: list[str] = []
+        self.state = VehicleState()
+        self._readings: list[Reading] = []
+
+    def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
+        self.state = VehicleState(datagram.decode(), 50.0, Pose(now_ns, (1.0, 2.0, 3.0)), now_ns)  # type: ignore[arg-type]
+        self._readings.append(Reading("sonar", now_ns, (3.0, True)))
+
+    def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
+        yield 0, demand.action.encode()
+
+    def take_readings(self) -> list[Reading]:
+        taken, self._readings = self._readings, []
+        return taken
+
+    def figures(self, now_ns: int) -> LinkFigures:
+        return LinkFigures(loss_percent=1.0)
+
+
+class Aircraft(asyncio.DatagramProtocol):
+    """Keeps what it is sent; answers with its state."""
+
+    def __init__(self) -> None:
+        self.demands: list[str] = []
+        self.state = "landed"
+        self.news = asyncio.Event()
+
+    def connection_made(self, transport: Any) -> None:
+        self._transport = transport
+        self.port = transport.get_extra_info("sockname")[1]
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        if self.demands[-1:] != [data.decode()]:
+            self.demands.append(data.decode())
+        self._transport.sendto(self.state.encode(), addr)
+        self.news.set()
+
+    async def next(self) -> None:
+        """Wait for the next datagram."""
+        self.news.clear()
+        await asyncio.wait_for(self.news.wait(), 30)
+
+    async def until(self, demand: str) -> None:
+        while self.demands[-1:] != [demand]:
+            await self.next()
+
+
+class Flight:
+    """A run whose clock the test lets go on, its driver, and the aircraft."""
+
+    def __init__(self, armed: bool) -> None:
+        self.link, self.lines, self.armed = FakeLink(), [], armed
+        self.stop, self.t_ns = False, 0
+
+    async def __aenter__(self) -> "Flight":
+        loop = asyncio.get_running_loop()
+        self._transport, self.aircraft = await loop.create_datagram_endpoint(Aircraft, local_addr=("127.0.0.1", 0))
+        observer = ObserverProcess(self.link, info(), ME)  # type: ignore[arg-type]
+        options = DriverOptions("drone2", armed=self.armed)
+        process = DriverProcess(
+            self.link,
+            info(),
+            observer,
+            options,
+            Session(self.aircraft.port),
+            self.lines.append,  # type: ignore[arg-type]
+        )
+        self.task = loop.create_task(process.run(lambda: self.stop))
+        await self.aircraft.until("none")
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.stop = True
+        self.aircraft.state = "landed"
+        await self.task
+        self._transport.close()
+
+    async def gate(self) -> None:
+        """Let the world reach its next gate, and the driver take it."""
+        self.t_ns += GATE_NS
+        self.link.deliver(keys.CLOCK, Clock(self.t_ns, 0, "r", 1, "running", 1.0))
+        await asyncio.sleep(0)
+
+    def command(self, kind: str, message: Any) -> None:
+        self.link.deliver(keys.accepted("drone2", kind), message)
+
+    def links(self) -> list[str]:
+        """Return the states of the link that were published."""
+        return [report.state for report in self.link.published_on(keys.link("drone2"))]
+
+    def take_off(self) -> None:
+        self.command("mode", flight_messages.Mode(0, 0, "controller.main", "takeoff"))
+
+    def ask(self, op: Any) -> Any:
+        return self.link.ask(
+            keys.driver("drone2"), msgspec.msgpack.encode({"op": op, "args": {}, "source": "operator"})
+        )
+
+    async def answered(self, op: Any) -> Any:
+        query = self.ask(op)
+        for _ in range(1000):
+            await asyncio.sleep(0)
+            if query.answered is not None:
+                return query.answered
+        return pytest.fail("no answer")
+
+
+def fly(test: Any) -> None:
+    asyncio.run(test())
+
+
+def test_a_gate_is_published_when_the_world_reaches_it():
+    async def test() -> None:
+        async with Flight(armed=False) as flight:
+            for _ in range(3):
+                await flight.gate()
+            statuses = flight.link.published_on(keys.status("drone2"))
+            assert [status.t_ns for status in statuses] == [GATE_NS, 2 * GATE_NS, 3 * GATE_NS]
+            assert {status.state for status in statuses} == {"landed"}
+            assert flight.link.published_on(keys.sensor("drone2", "sonar"))
+            while flight.links()[-1] == "waiting":
+                await flight.aircraft.next()
+            assert flight.links() == ["waiting", "connected"]
+
+    fly(test)
+
+
+def test_it_flies_when_it_is_armed_and_lands_what_flies_before_it_leaves():
+    async def test() -> None:
+        async with Flight(armed=False) as flight:
+            await flight.gate()
+            flight.take_off()
+            assert (await flight.answered("arm")).ok
+            assert flight.aircraft.demands == ["none"]  # what was commanded before is forgotten
+            flight.take_off()
+            await flight.aircraft.until("take_off")
+            flight.aircraft.state = "hovering"
+            await flight.aircraft.until("hold")
+            velocity = flight_messages.Velocity(0, 0, "controller.main", (1.0, 0.0, 0.0), 0.0, "world")
+            flight.command("velocity", velocity)
+            await flight.aircraft.until("fly")
+            assert not (await flight.answered("disarm")).ok
+            flight.stop = True
+            await flight.aircraft.until("land")
+        assert any("lands" in line for line in flight.lines)
+        assert sum("not obeyed" in line for line in flight.lines) == 1
+
+    fly(test)
+
+
+def test_kill_reaches_the_aircraft_at_once_and_shows():
+    async def test() -> None:
+        async with Flight(armed=True) as flight:
+            flight.aircraft.state = "flying"
+            await flight.aircraft.until("hold")
+            assert (await flight.answered("kill")).ok
+            await flight.aircraft.until("kill")
+            await flight.gate()
+            assert flight.link.published_on(keys.status("drone2"))[-1].state == "emergency"
+
+    fly(test)
+
+
+BAD = {"an unknown op": ("fly", "arm, disarm, kill"), "no text": (7, "op")}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_request_is_answered_with_the_reason(name: str):
+    op, term = BAD[name]
+
+    async def test() -> None:
+        async with Flight(armed=False) as flight:
+            answer = await flight.answered(op)
+            assert not answer.ok
+            assert term in answer.error
+            flight.link.deliver(keys.accepted("drone2", "velocity"), b"garbage")
+            assert (await flight.answered("arm")).ok
+
+    fly(test)
+
+
+def test_what_cannot_be_driven_is_refused():
+    for drone, run, term in (
+        ("ghost", info(), "drone1, drone2"),
+        ("drone1", info(), "body: external"),
+        ("drone2", info("lockstep"), "--realtime"),
+    ):
+        with pytest.raises(RunError, match=term):
+            check_external(run, drone)
+    check_external(info(), "drone2")
+
+
+def test_addresses_and_places():
+    assert udp_channel("udp://192.168.1.20:14580", 14540) == Channel("192.168.1.20", 14580, 14540)
+    assert position(" 1, -2.5,0") == (1.0, -2.5, 0.0)
+    for bad in ("", "192.168.1.20", "tcp://a:1", "udp://a", "udp://:14540", "udp://a:x", "udp://a:99999"):
+        with pytest.raises(RunError):
+            udp_channel(bad)
+    for bad in ("", "1,2", "1,2,x", "1 2 3"):
+        with pytest.raises(RunError):
+            position(bad)
+
+
+def test_the_link_is_a_message_of_the_contract():
+    async def test() -> None:
+        async with Flight(armed=False) as flight:
+            (first, *_) = flight.link.published_on(keys.link("drone2"))
+            assert messages.decode(keys.link("drone2"), messages.encode(first)) == first
+            assert (first.source, first.loss_percent, first.round_trip_ms) == (ME, 1.0, None)
+
+    fly(test)
