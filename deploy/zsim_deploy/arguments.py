@@ -139,7 +139,11 @@ class FlightOptions(NamedTuple):
 
     def scenario(self, elsewhere: bool = False) -> Any:
         """Return the scenario, the classes that it names loaded here; `elsewhere`: it flies on other hosts."""
-        return load_scenario(self.path, self.overrides, self.seed, self.duration, elsewhere)
+        from zsim.scenario.external_bodies import check_pace
+
+        scenario = load_scenario(self.path, self.overrides, self.seed, self.duration, elsewhere)
+        check_pace(scenario, self.mode_and_rate()[0])
+        return scenario
 
     def mode_and_rate(self) -> tuple[str, float]:
         """Return the mode of a run, and its pace in simulated per wall seconds; 0 is as fast as it goes."""

@@ -29,6 +29,8 @@ class Inbox:
             is better than none.
         uncounted: keys of which everything that comes late is handed out with the next gate in any case: it belongs to
             no gate, as what a detector finds in a picture.
+        sparse: closing keys whose publishers may skip gates, as the driver of an external drone: one is waited for only
+            as long as it comes at every gate.
 
     Attributes:
         duplicates: messages that came again before their gate was taken.
@@ -41,9 +43,12 @@ class Inbox:
         counted: Sequence[str] = (),
         keep_late: bool = False,
         uncounted: Sequence[str] = (),
+        sparse: Sequence[str] = (),
     ) -> None:
         self._closing = dict.fromkeys(gate_keys)
-        self._beside = dict.fromkeys(key for key in gate_keys if not keys.is_status(key))  # not closed by GateMessages
+        self._sparse = dict.fromkeys(sparse, (ALWAYS_NS, ALWAYS_NS))  # with the stamps of its last two messages
+        of_world = {key for key in gate_keys if keys.is_status(key) and key not in self._sparse}
+        self._beside = dict.fromkeys(key for key in gate_keys if key not in of_world)  # not closed by GateMessages
         self._meters = {keys.status(drone): _Meter() for drone in counted}
         self._came_of: dict[str, list[int] | None] = {}
         self._waiting: dict[int, dict[tuple[str, int], tuple[str, Any]]] = {}
@@ -51,10 +56,10 @@ class Inbox:
         self._lacking: dict[int, dict[str, None]] = {}
         self._gates: list[int] = []
         self._expected_from_ns: dict[str, int] = {}
-        self._pulse = next((key for key in gate_keys if keys.is_status(key)), None)
+        self._pulse = next((key for key in gate_keys if key in of_world), None)
         self._beats: dict[int, int] = {}
         self._last_beat: tuple[int, int] | None = None
-        self._taken_ns = -1
+        self._taken_ns = self._former_ns = -1  # the gates that were taken last
         self._keep_late = keep_late
         self._uncounted = frozenset(uncounted)
         self._belated: dict[tuple[str, int], tuple[str, Any]] = {}
@@ -62,9 +67,17 @@ class Inbox:
         self.duplicates = 0
         self.late = 0
 
+    @property
+    def may_skip(self) -> bool:
+        """Tell whether all closing keys are of publishers that may skip gates."""
+        return len(self._sparse) == len(self._closing)
+
     def put(self, key: str, message: Any) -> bool:
         """Keep one message, or GateMessages on `keys.GATE`; return False for a duplicate or one that is too late."""
         t_ns = message.t_ns
+        if key in self._sparse:
+            _, newest_ns = last = self._sparse[key]
+            self._sparse[key] = (newest_ns, t_ns) if t_ns > newest_ns else last
         if t_ns <= self._taken_ns:
             self.late += 1
             return self._put_late(key, message)
@@ -149,7 +162,7 @@ class Inbox:
     def missing(self, t_ns: int) -> str | None:
         """Return a key that the gate still lacks, None when it is complete."""
         for key in self._lacking.get(t_ns, self._closing):
-            if self._expects(key, t_ns):
+            if self._expects(key, t_ns) and self._comes_along(key):
                 return key
         for key, meter in self._meters.items():
             if meter.counts and meter.short(t_ns) and self._expects(key, t_ns):
@@ -159,7 +172,7 @@ class Inbox:
     def missing_last(self, t_ns: int) -> str | None:
         """Return the missing key that is last among the closing keys: a thread that waits for it wakes up once."""
         for key in reversed(self._lacking.get(t_ns, self._closing)):
-            if self._expects(key, t_ns):
+            if self._expects(key, t_ns) and self._comes_along(key):
                 return key
         return self.missing(t_ns)
 
@@ -172,6 +185,11 @@ class Inbox:
 
     def _expects(self, key: str, t_ns: int) -> bool:
         return t_ns >= self._expected_from_ns.get(key, ALWAYS_NS)
+
+    def _comes_along(self, key: str) -> bool:
+        """Tell whether a message of a key has come for both of the gates that were taken last, if it may skip any."""
+        former_ns, newest_ns = self._sparse.get(key, (NEVER_NS, NEVER_NS))
+        return newest_ns >= self._taken_ns and former_ns >= self._former_ns
 
     def take(self, t_ns: int) -> list[tuple[str, Any]]:
         """Return all inputs stamped up to t_ns in order of (t_ns, key, seq), and forget them."""
@@ -188,7 +206,7 @@ class Inbox:
         for meter in self._meters.values():
             if meter.partial or meter.counts or meter.came:
                 meter.forget(t_ns)
-        self._taken_ns = t_ns
+        self._former_ns, self._taken_ns = self._taken_ns, t_ns
         return _once(ready) if len(ready) > 1 else ready
 
     def _with_belated(self, ready: list[tuple[str, Any]]) -> list[tuple[str, Any]]:

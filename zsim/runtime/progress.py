@@ -23,6 +23,7 @@ SLOW_S = 3.0  # wall time; what is compiled is loaded within two, unless the mac
 SLOW_NOTICE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
 REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
 _NUMBER = re.compile(r"-?[0-9][0-9.]*")
+DRIVERS, COMINGS = "driver.", ("join", "leave")  # they are started by hand, and whoever does so looks here
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
@@ -166,7 +167,7 @@ class Screen:
             self.say(text)
 
     def event(self, line: dict[str, Any]) -> None:
-        if line["kind"] not in QUIET:
+        if line["kind"] not in QUIET or (line["kind"] in COMINGS and line["text"].startswith(DRIVERS)):
             self.say(f"  {line['t_s']:8.2f} s  {line['kind']}: {line['text']}")
 
     def health(self, line: dict[str, Any]) -> None:

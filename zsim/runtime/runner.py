@@ -145,7 +145,8 @@ class Runner:
             return True
         if self._member.is_fetching:
             return False
-        self._member.check_reach(t_ns, self._resumed_ns)
+        if not self._inbox.may_skip:
+            self._member.check_reach(t_ns, self._resumed_ns)
         self._resumed_ns = None
         if self._member.failure:
             self._leave = str(self._member.failure)

@@ -1,9 +1,11 @@
 """What reaches an agent's process: subscriptions, taken apart into an inbox, and what other threads of Zenoh bring."""
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from operator import itemgetter
 from typing import Any
+
+from msgspec import UNSET
 
 from zsim.contract import flight_messages, keys, messages, run_messages, world_events
 from zsim.contract.framing import GateMessages, run_key_table
@@ -38,14 +40,16 @@ class RunnerInputs:
         self._agent = agent
         self._health = health
         self._say = say
-        self.inbox = Inbox(agent.gate_keys, agent.counted, info.mode == "realtime", agent.uncounted)
+        self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
+        of_drivers = [key for key in agent.gate_keys if keys.thing(key) in self._external]
+        self.inbox = Inbox(agent.gate_keys, agent.counted, info.mode == "realtime", agent.uncounted, of_drivers)
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
         self._table = run_key_table(info)
-        self._gate_key = _gate_key(agent)
+        self._gate_key = _gate_key(agent, self._external)
         self.notices: deque[WorldEvent] = deque()
         self.queries: deque[Query] = deque()
         self.links: deque[bool] = deque()
@@ -56,7 +60,8 @@ class RunnerInputs:
         """Subscribe to all that the agent reads, and answer its requests; show that the process lives."""
         closing = [self._agent.reads[place] for place in self._expressions.readers_of_any(self._agent.gate_keys)]
         for expression in dict.fromkeys([*closing, *self._agent.reads]):
-            subscribed = self._gate_key if self._gate_key and keys.is_sensor(expression) else expression
+            of_world = keys.is_sensor(expression) and keys.thing(expression) not in self._external
+            subscribed = self._gate_key if self._gate_key and of_world else expression
             if subscribed not in self._subscriptions:
                 self._subscriptions[subscribed] = self._link.subscribe(subscribed)
         self._link.declare_subscriber(keys.EVENT, self._on_event)
@@ -187,8 +192,12 @@ class RunnerInputs:
         self.wake()
 
 
-def _gate_key(agent: Agent) -> str:
-    """Return on which key an agent takes the sensors of a gate as GateMessages; none for one that does not."""
-    if len(agent.counted) > 1:
+def _gate_key(agent: Agent, external: Container[str]) -> str:
+    """Return on which key an agent takes the sensors of a gate as GateMessages; none for one that does not.
+
+    What drivers publish of external drones comes on the keys of these.
+    """
+    of_world = [drone for drone in agent.counted if drone not in external]
+    if of_world and len(agent.counted) > 1:
         return keys.GATE
-    return keys.gate(agent.counted[0]) if agent.counted and agent.takes_gates else ""
+    return keys.gate(of_world[0]) if of_world and agent.takes_gates else ""

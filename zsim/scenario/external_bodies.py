@@ -18,6 +18,10 @@ def check_pace(scenario: Scenario, mode: str) -> None:
         raise ScenarioError([f"{scenario.name}: body of {who}, and the run is in {mode}; {needed}"])
 
 
-def awaited_drivers(scenario: Scenario) -> list[str]:
-    """Return the names of the processes that publish the external drones."""
-    return [f"driver.{drone}" for drone in scenario.external()]
+def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
+    """Return what to tell whoever starts a run of the drivers that are to be started beside it; a line, or none."""
+    drivers, expected = [f"driver.{drone}" for drone in scenario.external()], scenario.expected()
+    awaited, others = (listed([d for d in drivers if (d in expected) is wanted]) for wanted in (True, False))
+    waits = [f"the run waits for {awaited}"] if awaited else []
+    waits += [f"{others} may come at any time"] if others else []
+    return [f"external drones: {', and '.join(waits)}; start drivers with --connect {endpoint}"] if drivers else []

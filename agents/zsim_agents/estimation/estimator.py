@@ -62,18 +62,22 @@ class Estimator(Agent):
         if banks:
             self.uncounted = tuple(keys.detections(drone) for drone in read if not has_own_sightings(scenario, drone))
             self.reads += self.uncounted
-        self._last: list[flight_messages.Estimate] = []
+        self._last: dict[str, flight_messages.Estimate] = {}
         self._view_key = keys.estimates_view(self.name)
         self.takes_gates = COMPILES and not make
         self._since_ns = 0
         self._index = {drone: i for i, drone in enumerate(read)}
         self._names = names
+        self._silent = {drone.name for drone in scenario.drones if drone.is_external}
+        self._external = frozenset(self._silent)
 
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
         self._since_ns = t_ns - self.period_ns
         super().deliver(t_ns, inputs)
 
     def receive(self, key: str, message: Any) -> None:
+        if self._external and isinstance(message, flight_messages.Status):
+            self._silent.discard(keys.thing(key))
         if not isinstance(message, flight_messages.Status):
             # what a slow link brings has not arrived before the last gate, whatever stamp it bears
             t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
@@ -88,14 +92,18 @@ class Estimator(Agent):
 
     def step(self, t_ns: int) -> list[Output]:
         estimates = cast("list[Any]", self._estimators.estimate(t_ns * 1e-9))
-        self._last = [
-            flight_messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source)
-            for key, estimate in zip(self.writes, estimates, strict=True)
-        ]
-        return list(map(Output, self.writes, self._last))
+        named = zip(self._names, self.writes, estimates, strict=True)
+        if self._external:  # nothing is known of one whose driver has been silent since the last gate
+            named = [each for each in named if each[0] not in self._silent]
+            self._silent = set(self._external)
+        self._last = {
+            drone: flight_messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source)
+            for drone, key, estimate in named
+        }
+        return [Output(keys.estimate(drone), estimate) for drone, estimate in self._last.items()]
 
     def views(self, t_ns: int) -> list[Output]:
-        shown = tuple(map(estimate_view, self._names, self._last))
+        shown = tuple(estimate_view(drone, estimate) for drone, estimate in self._last.items())
         return [Output(self._view_key, ViewEstimates(t_ns, self.next_seq(self._view_key), shown))]
 
     def rehearse(self) -> None:
@@ -127,7 +135,8 @@ class Estimator(Agent):
 
 def has_own_sightings(scenario: Scenario, drone: str) -> bool:
     """Tell whether the world computes a drone's sightings; else a detector's are used."""
-    return scenario.drone(drone).sensors.sightings is not UNSET
+    spec = scenario.drone(drone)
+    return spec.sensors.sightings is not UNSET and not spec.is_external
 
 
 def _reads(drones: Sequence[str], own: Sequence[str]) -> tuple[str, ...]:

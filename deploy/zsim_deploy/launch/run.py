@@ -14,6 +14,7 @@ from zsim.record import repair
 from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
+from zsim.scenario.external_bodies import driver_lines
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import BottomCamera, FrontCamera
 from zsim.transport.open_files import launcher_files, require_files
@@ -222,6 +223,8 @@ def _interrupt(number: int, _: object) -> None:
 
 
 def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher, signals: EndSignals) -> Outcome:
+    for line in driver_lines(options.scenario, endpoint):
+        screen.say(line)
     supervisor = Supervisor(options.scenario.processes, screen)
     supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
 
