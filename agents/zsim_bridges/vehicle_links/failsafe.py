@@ -111,6 +111,9 @@ class Failsafe:
             case flight_messages.Velocity():
                 self._setpoint, self._setpoint_ns, self.commander = command, now_ns, command.source
                 return None
+            case flight_messages.Ardrone(hover=True):  # as the world has it where nobody flies the drone any more
+                self._setpoint = self.commander = None
+                return None
             case _:
                 return f"a driver does not take {type(command).__name__}; send velocity"
 

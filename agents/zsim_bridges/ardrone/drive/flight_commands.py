@@ -14,6 +14,7 @@ from zsim_bridges.vehicle_links.failsafe import Demand
 from zsim_bridges.vehicle_links.vehicle_state import Pose
 
 PERIOD_NS = 30_000_000  # Developer Guide 6.3: at most 30 ms between commands
+CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller commands once
 HOVER = 0  # flag of a PCMD: hold the place
 
 
@@ -37,7 +38,7 @@ class FlightCommands:
             emergency: whether the aircraft is in its emergency.
             pose: of the aircraft.
         """
-        if demand == self._last and now_ns - self._sent_ns < PERIOD_NS:
+        if now_ns - self._sent_ns < (PERIOD_NS if demand == self._last else CHANGED_NS):
             return
         self._last, self._sent_ns = demand, now_ns
         match demand.action:

@@ -24,6 +24,7 @@ from zsim_bridges.vehicle_links.failsafe import Demand
 REPEAT_NS = 1_000_000_000  # chosen: an autopilot answers a command within some 0.1 s
 KILL_REPEAT_NS = 200_000_000  # chosen: the one command that may not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz: PX4 takes 2 Hz for silence
+CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller commands once
 STREAMED_NS = 600_000_000  # PX4 wants more than 0.5 s of setpoints before OFFBOARD
 VELOCITY_AND_YAW_RATE = 0b0101_1100_0111  # POSITION_TARGET_TYPEMASK: position, acceleration and yaw are ignored
 LOCAL_NED = 1  # MAV_FRAME
@@ -80,7 +81,8 @@ class DemandSequence:
         """Yield a setpoint, and the command for the mode in which it is obeyed."""
         if now_ns - self._setpoint_ns > STREAMED_NS:
             self._stream_ns = now_ns
-        if demand != self._setpoint or now_ns - self._setpoint_ns >= SETPOINT_NS:
+        age_ns = now_ns - self._setpoint_ns
+        if age_ns >= (CHANGED_NS if demand != self._setpoint else SETPOINT_NS):
             self._setpoint, self._setpoint_ns = demand, now_ns
             yield setpoint(demand, autopilot)
         streamed = now_ns - self._stream_ns >= STREAMED_NS

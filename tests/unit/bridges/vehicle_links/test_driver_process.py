@@ -99,8 +99,9 @@ class Flight:
         self._transport, self.aircraft = await loop.create_datagram_endpoint(Aircraft, local_addr=("127.0.0.1", 0))
         observer = ObserverProcess(self.link, info(), ME)  # type: ignore[arg-type]
         options = DriverOptions("drone2", armed=self.armed)
+        link: Any = self.link
         process = DriverProcess(
-            self.link,
+            link,
             info(),
             observer,
             options,

@@ -175,6 +175,15 @@ def test_a_takeoff_that_does_not_succeed_is_given_up():
     assert flight.after(2) == "none"
 
 
+def test_a_drone_that_is_released_holds():
+    flight = Flight().takes_off()
+    flight.fly(1, 0, 0)
+    hover = Ardrone(0, 0, "world", 0, 0, 0, 0, hover=True)
+    assert flight.failsafe.on_command(hover, flight.now_ns, flight.vehicle) is None
+    assert flight.after(60) == "hold"
+    assert flight.failsafe.commander is None
+
+
 def test_what_a_driver_does_not_take_is_refused_with_what_it_does():
     flight = Flight().takes_off()
     command = Ardrone(0, 0, "controller.main", 0, 0, 0, 0)
