@@ -145,7 +145,8 @@ class TruthHash:
 
     def flush(self) -> None:
         """Take in the rows that were added."""
-        if not self._held:
+        if not self._held or not self._rows.size:  # of a run whose drones are all external there is nothing
+            self._held = 0
             return
         self._hash.update(data := self._rows[: self._held].data)
         if self._copy:
