@@ -32,6 +32,7 @@ from zsim_deploy.cli import (
     federation_commands,
     hosts_commands,
     inventory_commands,
+    mavlink_commands,
     record_commands,
     role_commands,
 )
@@ -190,6 +191,7 @@ for family in (
 ):
     app.add_typer(family.app)
 app.add_typer(federation_commands.faults, rich_help_panel=federation_commands.PANEL)
+app.add_typer(mavlink_commands.app, rich_help_panel=bridge_commands.TRANSLATE)
 for group in (inventory_commands.certs, inventory_commands.rendering):
     app.add_typer(group, rich_help_panel=HOSTS)
 
