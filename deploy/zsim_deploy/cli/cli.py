@@ -34,6 +34,7 @@ from zsim_deploy.cli import (
     federation_commands,
     hosts_commands,
     inventory_commands,
+    mavlink_commands,
     record_commands,
     role_commands,
 )
@@ -191,12 +192,11 @@ for family in (
     bridge_commands,
 ):
     app.add_typer(family.app)
-mavlink = typer.Typer(name="mavlink")
-mavlink.command("drive")(driver_commands.drive_mavlink)
+mavlink_commands.app.command("drive")(driver_commands.drive_mavlink)
 ardrone_commands.ardrone.command("drive")(driver_commands.drive_ardrone)
-app.add_typer(mavlink)
 app.add_typer(federation_commands.faults, rich_help_panel=federation_commands.PANEL)
 app.add_typer(ardrone_commands.ardrone, rich_help_panel=bridge_commands.TRANSLATE)
+app.add_typer(mavlink_commands.app, rich_help_panel=bridge_commands.TRANSLATE)
 for group in (inventory_commands.certs, inventory_commands.rendering):
     app.add_typer(group, rich_help_panel=HOSTS)
 

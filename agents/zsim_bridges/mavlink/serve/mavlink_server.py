@@ -1,0 +1,261 @@
+"""The process: one run's drones as MAVLink vehicles; it commands, and never gates."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event
+from zsim.errors import DecodeError, RunError
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Drone
+from zsim.transport.session import Session
+from zsim_bridges.mavlink.serve.peers import Address
+from zsim_bridges.mavlink.serve.vehicle_ports import VehiclePort, VehiclePorts
+from zsim_bridges.mavlink.vehicle.enums import COMPONENT_AUTOPILOT
+from zsim_bridges.mavlink.vehicle.personality import PERSONALITIES
+from zsim_bridges.mavlink.vehicle.telemetry import Level
+from zsim_bridges.mavlink.vehicle.vehicle import Options, Vehicle
+from zsim_bridges.mavlink.wire.frame import Link, Received, Version
+from zsim_bridges.mavlink.wire.signing import Signing
+from zsim_bridges.message_intake import MessageIntake
+from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.vehicle_links.command_sender import CommandSender
+
+POLL_S = 0.1  # how often a stop is looked for
+TICK_S = 0.1  # wall time between two looks at what wall time brings
+SYSTEM_IDS = 254  # 255 is the ground station's by custom
+PORTS = 65535
+Say = Callable[[str], None]
+
+
+class ServeOptions(NamedTuple):
+    """How the drones are offered.
+
+    Attributes:
+        autopilot: whose modes and parameters they have.
+        level: of the rates of telemetry.
+        listen: address on which the ports are opened.
+        gcs, gcs_local: the ground station, and the first port that talks with it.
+        api, api_local: the first of the programs' ports, and the first port that talks with them.
+        key: of signatures; None for none.
+        version: of MAVLink in what is sent.
+        rate: pace that is asked of a run as fast as possible; None for none.
+    """
+
+    autopilot: str
+    level: Level
+    listen: str
+    gcs: Address
+    gcs_local: int
+    api: Address
+    api_local: int
+    key: bytes | None
+    version: Version
+    rate: float | None
+
+
+def serve(
+    link: Session,
+    info: Info,
+    observer: ObserverProcess,
+    stopped: Callable[[], bool],
+    say: Say,
+    options: ServeOptions,
+) -> None:
+    """Serve one run until it is over.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        observer: of this process in it.
+        stopped: called now and then; True ends the run.
+        say: prints a line.
+        options: how the drones are offered.
+
+    Raises:
+        RunError: the run keeps no pace, has too many drones, or a port cannot be opened.
+    """
+    set_pace(link, info, observer.name, options.rate)
+    server = MavlinkServer(link, info, observer, say, options)
+    asyncio.run(server.run(stopped))
+
+
+def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
+    """Ask the world for a pace, where one is given; refuse a run that has none.
+
+    Raises:
+        RunError: the run goes as fast as possible, or the world refuses the pace.
+    """
+    if rate is None:
+        if info.mode == "lockstep" and not info.rate:
+            why = "clients of MAVLink time by the wall clock"
+            raise RunError(f"{name}: the run goes as fast as possible, and {why}; give --rate, or run it with --rate")
+        return
+    answer = link.request(keys.CONTROL, "rate", name, {"value": rate})
+    if not answer.ok:
+        raise RunError(f"{name}: the world does not set the pace to {rate:g}: {answer.error}")
+
+
+class Served(NamedTuple):
+    """A vehicle and its ports."""
+
+    vehicle: Vehicle
+    ports: VehiclePorts
+
+
+class MavlinkServer:
+    """One run on UDP."""
+
+    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: ServeOptions) -> None:
+        self._link = link
+        self._info = info
+        self._observer = observer
+        self._say = say
+        self._options = options
+        self._signing = Signing(options.key) if options.key else None
+        self._counted: dict[str, int] = {}
+        drones = scenario_file.from_text(info.scenario).drones
+        if len(drones) > SYSTEM_IDS:
+            raise RunError(f"{observer.name}: the run has {len(drones)} drones; MAVLink has {SYSTEM_IDS} system ids")
+        self._served = {drone.name: self._offer(i, drone) for i, drone in enumerate(drones)}
+        self._routes = {key: route for drone in self._served for key, route in _routes(drone)}
+
+    def _offer(self, index: int, drone: Drone) -> Served:
+        options, system_id = self._options, index + 1
+        sender = CommandSender(drone.name, self._observer.name, self._link.put)
+        shown = Options(system_id, PERSONALITIES[options.autopilot], options.level, self._observer.name)
+        vehicle = Vehicle(drone, self._info.origin, sender, shown)
+
+        def on_received(received: Received) -> None:
+            vehicle.on_message(received, time.monotonic_ns())
+            self._flush(served)
+
+        ports = [
+            VehiclePort((options.listen, port), peer, self._signing, on_received)
+            for port, peer in (
+                (options.gcs_local + index, options.gcs),
+                (options.api_local + index, (options.api[0], options.api[1] + index)),
+            )
+        ]
+        packer = Link(system_id, COMPONENT_AUTOPILOT, self._signing, options.version)
+        served = Served(vehicle, VehiclePorts(ports, packer))
+        return served
+
+    async def run(self, stopped: Callable[[], bool]) -> None:
+        """Serve until the run is over or a stop is requested."""
+        loop = asyncio.get_running_loop()
+        intake = MessageIntake(self._link, self._info, self._observer.health, loop)
+        for served in self._served.values():
+            served.ports.open(loop, time.monotonic)
+        self._announce()
+        ticking = loop.create_task(self._tick_always())
+        try:
+            while not (stopped() or self._observer.end_reason):
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(intake.news.wait(), POLL_S)
+                self._take_in(intake)
+                self._observer.tick()
+        finally:
+            ticking.cancel()
+            intake.close()
+            for served in self._served.values():
+                served.ports.close(loop)
+
+    def _announce(self) -> None:
+        options, last = self._options, len(self._served) - 1
+        for what, (host, port), local, step in (
+            ("ground station", options.gcs, options.gcs_local, 0),
+            ("programs", options.api, options.api_local, last),
+        ):
+            to = f"{port}" if not step else f"{port} to {port + step}"
+            own = f"{local}" if not last else f"{local} to {local + last}"
+            self._say(f"{self._observer.name}: {what}: UDP {host}:{to}, from {options.listen}:{own}")
+
+    def _take_in(self, intake: MessageIntake) -> None:
+        """Take in what has come; of a drone's messages the newest of each."""
+        newest: dict[str, bytes] = {}
+        for arrived in intake.arrivals():
+            for key, payload in arrived:
+                if key in self._routes:
+                    newest[key] = payload
+                elif key == keys.CLOCK:
+                    self._observer.update_clock(payload)
+                elif key == keys.EVENT:
+                    self._on_event(payload)
+        self._update(newest)
+
+    def _update(self, newest: dict[str, bytes]) -> None:
+        stepping: dict[str, Served] = {}
+        for key, payload in newest.items():
+            message = self._decoded(key, payload)
+            if message is None:
+                continue
+            drone, name = self._routes[key]
+            served = self._served[drone]
+            served.vehicle.state.update(name, message)
+            if name == "status":
+                stepping[drone] = served
+        for served in stepping.values():
+            served.vehicle.step()
+            self._flush(served)
+
+    def _decoded(self, key: str, payload: bytes) -> Any:
+        try:
+            return messages.decode(key, payload)
+        except DecodeError:
+            self._observer.health.refused += 1
+            return None
+
+    def _on_event(self, payload: bytes) -> None:
+        event = self._decoded(keys.EVENT, payload)
+        if isinstance(event, Event):
+            for served in self._served.values():
+                served.vehicle.on_event(event)
+
+    async def _tick_always(self) -> None:
+        while True:
+            if self._signing:
+                self._signing.advance(time.time())
+            for served in self._served.values():
+                served.vehicle.tick(time.monotonic_ns())
+                self._flush(served)
+            self._count_refused()
+            await asyncio.sleep(TICK_S)
+
+    def _flush(self, served: Served) -> None:
+        served.ports.send(served.vehicle.take())
+
+    def _count_refused(self) -> None:
+        """Count what clients sent and was refused; print each reason once."""
+        for drone, served in self._served.items():
+            for reason, count in served.ports.refused().items():
+                mark = f"{drone} {reason}"
+                before = self._counted.get(mark, 0)
+                if count and not before:
+                    self._say(f"{self._observer.name}: {drone}: {REASONS[reason]}; counted from now on")
+                self._counted[mark] = count
+                self._observer.health.refused += count - before
+
+
+REASONS = {
+    "bad_crc": "a frame with a wrong checksum",
+    "unknown": "a message that is not in the dialect",
+    "incompatible": "a frame with flags that are not known",
+    "truncated": "a frame that is cut",
+    "unsigned": "a frame without a signature",
+    "bad_signature": "a frame with a wrong signature",
+    "replayed": "a signed frame that was sent before",
+    "noise": "bytes that are no frame",
+    "stranger": "a datagram of who is not the configured peer",
+}
+
+
+def _routes(drone: str) -> list[tuple[str, tuple[str, str]]]:
+    """Return the keys of a drone that are read, each with the drone and the name of the message."""
+    sensors = [(keys.sensor(drone, name), (drone, name)) for name in keys.SENSORS]
+    own = (keys.truth(drone), "truth"), (keys.estimate(drone), "estimate"), (keys.status(drone), "status")
+    return [*sensors, *((key, (drone, name)) for key, name in own)]

@@ -1,0 +1,221 @@
+"""Upload and download of missions, fences and rally points, item by item.
+
+Source: https://mavlink.io/en/services/mission.html.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from zsim_bridges.mavlink.vehicle.enums import (
+    ALL_MISSION_TYPES,
+    FENCE,
+    MISSION,
+    Cmd,
+    Frame,
+    MissionResult,
+)
+from zsim_bridges.mavlink.vehicle.mission import COMMANDS, FRAMES, LOCAL, MissionItem
+from zsim_bridges.mavlink.wire import dialect
+from zsim_bridges.mavlink.wire.message import Message
+
+ITEMS_MAX = 1000  # chosen: of one mission; autopilots keep some hundreds
+RETRY_NS = 500_000_000  # ns of wall time until an item is requested again
+TRIES_MAX = 10
+DEGREES, LOCAL_M = 1e-7, 1e-4  # what one of x and y in MISSION_ITEM_INT is
+PLACED = (
+    Cmd.FENCE_RETURN_POINT,
+    Cmd.FENCE_POLYGON_INCLUSION,
+    Cmd.FENCE_POLYGON_EXCLUSION,
+    Cmd.FENCE_CIRCLE_INCLUSION,
+    Cmd.FENCE_CIRCLE_EXCLUSION,
+)
+Loaded = Callable[[int, list[MissionItem]], None]
+
+
+class MissionProtocol:
+    """The transfers of one vehicle.
+
+    Args:
+        send: sends a message.
+        loaded: called with the type and the items of an upload that is complete, or of a removal.
+        home: returns item 0 of ArduPilot's missions; None where item 0 is the first waypoint.
+        asks_int: whether items are asked for as MISSION_ITEM_INT at first.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[Message], None],
+        loaded: Loaded,
+        home: Callable[[], MissionItem] | None,
+        asks_int: bool,
+    ) -> None:
+        self._send = send
+        self._loaded = loaded
+        self._home = home
+        self._asks_int = asks_int
+        self._items: dict[int, list[MissionItem]] = {}
+        self._upload: _Upload | None = None
+
+    def stored(self, type_: int) -> list[MissionItem]:
+        """Return all items of a type, ArduPilot's item 0 included."""
+        items = self._items.get(type_, [])
+        return [self._home(), *items] if self._home and type_ == MISSION else items
+
+    def on_message(self, message: Message, sender: tuple[int, int], wall_ns: int) -> bool:
+        """Take a message of the protocol; False for any other.
+
+        Args:
+            sender: system and component id.
+            wall_ns: wall time, of any zero.
+        """
+        match message:
+            case dialect.MissionCount():
+                self._begin(message, sender, wall_ns)
+            case dialect.MissionItemInt() | dialect.MissionItem():
+                self._take(message, sender, wall_ns)
+            case dialect.MissionRequestList():
+                count = len(self.stored(message.mission_type))
+                self._send(dialect.MissionCount(*sender, count=count, mission_type=message.mission_type))
+            case dialect.MissionRequestInt() | dialect.MissionRequest():
+                self._answer(message, sender)
+            case dialect.MissionClearAll():
+                self._clear(message.mission_type, sender)
+            case dialect.MissionAck():
+                pass
+            case _:
+                return False
+        return True
+
+    def tick(self, wall_ns: int) -> None:
+        """Ask again for an item that has not come."""
+        upload = self._upload
+        if upload is None or wall_ns - upload.asked_ns < RETRY_NS:
+            return
+        upload.tries += 1
+        if upload.tries > TRIES_MAX:
+            self._end(upload, MissionResult.OPERATION_CANCELLED)
+        else:
+            self._request(upload, wall_ns)
+
+    def _begin(self, count: dialect.MissionCount, sender: tuple[int, int], wall_ns: int) -> None:
+        upload = _Upload(sender, count.mission_type, count.count)
+        if count.count > ITEMS_MAX:
+            self._end(upload, MissionResult.NO_SPACE)
+        elif count.mission_type not in (MISSION, FENCE):
+            self._end(upload, MissionResult.UNSUPPORTED)
+        elif count.count == 0:
+            self._finish(upload)
+        else:
+            self._upload = upload
+            self._request(upload, wall_ns)
+
+    def _request(self, upload: "_Upload", wall_ns: int) -> None:
+        upload.asked_ns = wall_ns
+        as_int = self._asks_int != bool(upload.tries % 2)  # some clients know one of the two only
+        kind = dialect.MissionRequestInt if as_int else dialect.MissionRequest
+        self._send(kind(*upload.sender, seq=len(upload.items), mission_type=upload.type))
+
+    def _take(self, message: dialect.MissionItemInt | dialect.MissionItem, sender: tuple[int, int], now: int) -> None:
+        upload = self._upload
+        if upload is None or upload.sender != sender or message.seq != len(upload.items):
+            return  # repeated, or not asked for
+        item = item_of(message)
+        is_home = upload.type == MISSION and self._home is not None and message.seq == 0
+        fault = None if is_home else item_fault(item, upload.type)
+        if fault is not None:
+            self._end(upload, fault)
+            return
+        upload.items.append(item)
+        upload.tries = 0
+        if len(upload.items) == upload.count:
+            self._finish(upload)
+        else:
+            self._request(upload, now)
+
+    def _finish(self, upload: "_Upload") -> None:
+        items = upload.items[1:] if self._home and upload.type == MISSION else upload.items
+        self._items[upload.type] = items
+        self._loaded(upload.type, items)
+        self._end(upload, MissionResult.ACCEPTED)
+
+    def _end(self, upload: "_Upload", result: MissionResult) -> None:
+        self._upload = None
+        self._send(dialect.MissionAck(*upload.sender, type=result, mission_type=upload.type))
+
+    def _answer(self, request: dialect.MissionRequestInt | dialect.MissionRequest, sender: tuple[int, int]) -> None:
+        items = self.stored(request.mission_type)
+        if request.seq >= len(items):
+            result = MissionResult.INVALID_SEQUENCE
+            self._send(dialect.MissionAck(*sender, type=result, mission_type=request.mission_type))
+            return
+        as_int = isinstance(request, dialect.MissionRequestInt)
+        self._send(message_of(items[request.seq], request, sender, as_int))
+
+    def _clear(self, type_: int, sender: tuple[int, int]) -> None:
+        for each in (MISSION, FENCE) if type_ == ALL_MISSION_TYPES else (type_,):
+            self._items[each] = []
+            self._loaded(each, [])
+        self._send(dialect.MissionAck(*sender, type=MissionResult.ACCEPTED, mission_type=type_))
+
+
+class _Upload:
+    """An upload under way."""
+
+    def __init__(self, sender: tuple[int, int], type_: int, count: int) -> None:
+        self.sender = sender
+        self.type = type_
+        self.count = count
+        self.items: list[MissionItem] = []
+        self.asked_ns = 0
+        self.tries = 0
+
+
+def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> MissionItem:
+    """Return the item in a message."""
+    unit = 1.0
+    if isinstance(message, dialect.MissionItemInt):
+        unit = LOCAL_M if message.frame in LOCAL else DEGREES
+    params = message.param1, message.param2, message.param3, message.param4
+    x, y = unit * message.x, unit * message.y
+    return MissionItem(message.frame, message.command, params, x, y, message.z, bool(message.autocontinue))
+
+
+def item_fault(item: MissionItem, type_: int) -> MissionResult | None:
+    """Return what is wrong with an item, None if nothing is."""
+    known: Sequence[Any] = COMMANDS if type_ == MISSION else PLACED
+    if item.command not in known:
+        return MissionResult.UNSUPPORTED
+    if item.frame not in FRAMES:
+        return MissionResult.UNSUPPORTED_FRAME
+    if not math.isfinite(item.z) and item.command != Cmd.NAV_LAND:
+        return MissionResult.INVALID
+    if item.frame not in LOCAL and (abs(item.x) > 90.0 or abs(item.y) > 180.0):
+        return MissionResult.INVALID
+    if not (math.isfinite(item.x) and math.isfinite(item.y)) and type_ == FENCE:
+        return MissionResult.INVALID
+    return None
+
+
+def message_of(item: MissionItem, request: Any, sender: tuple[int, int], as_int: bool) -> Message:
+    """Return the message of an item, as MISSION_ITEM_INT or MISSION_ITEM."""
+    fields: dict[str, Any] = {
+        **dict(zip(("target_system", "target_component"), sender, strict=True)),
+        **{f"param{i + 1}": value for i, value in enumerate(item.params)},
+        "seq": request.seq,
+        "frame": item.frame,
+        "command": item.command,
+        "autocontinue": int(item.autocontinue),
+        "z": item.z,
+        "mission_type": request.mission_type,
+    }
+    if not as_int:
+        return dialect.MissionItem(**fields, x=item.x, y=item.y)
+    unit = LOCAL_M if item.frame in LOCAL else DEGREES
+    x, y = (round(value / unit) if math.isfinite(value) else 0 for value in (item.x, item.y))
+    return dialect.MissionItemInt(**fields, x=x, y=y)
+
+
+def home_item(latitude_deg: float, longitude_deg: float, height_m: float) -> MissionItem:
+    """Return item 0 of ArduPilot's missions."""
+    return MissionItem(Frame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), latitude_deg, longitude_deg, height_m)

@@ -1,0 +1,140 @@
+"""Setpoints of MAVLink as what is to be held: all frames and masks that make sense.
+
+Source: https://mavlink.io/en/messages/common.html#SET_POSITION_TARGET_LOCAL_NED.
+"""
+
+import math
+from typing import NamedTuple
+
+from zsim.math.rotation import Vector
+from zsim_bridges.mavlink.vehicle import axes
+from zsim_bridges.mavlink.vehicle.enums import AttitudeMask, Frame, TypeMask
+from zsim_bridges.mavlink.vehicle.guidance import NOWHERE, AttitudeTarget, Axes, Target
+from zsim_bridges.mavlink.vehicle.mission import ABSOLUTE, RELATIVE
+from zsim_bridges.mavlink.vehicle.vehicle_state import VehicleState
+from zsim_bridges.mavlink.wire import dialect
+
+POSITION = TypeMask.X | TypeMask.Y | TypeMask.Z
+VELOCITY = TypeMask.VX | TypeMask.VY | TypeMask.VZ
+ALONG_HEADING = (Frame.BODY_NED, Frame.BODY_OFFSET_NED, Frame.BODY_FRD)
+FROM_HERE = (Frame.LOCAL_OFFSET_NED, Frame.BODY_NED, Frame.BODY_OFFSET_NED, Frame.BODY_FRD)
+LOCAL_FRAMES = (Frame.LOCAL_NED, *FROM_HERE)
+HOVER_THRUST = 0.5  # of the thrust of a setpoint; MPC_THR_HOVER
+PLACE_MAX_M = 1e6  # m; farther away is no place to fly to
+SPEED_MAX_M_S = 1e3  # m/s; likewise
+
+Setpoint = Target | AttitudeTarget
+
+
+class Refusal(NamedTuple):
+    """Why a setpoint is not flown."""
+
+    reason: str
+
+
+def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) -> Setpoint | Refusal:
+    """Return what SET_POSITION_TARGET_LOCAL_NED asks for."""
+    if message.coordinate_frame not in LOCAL_FRAMES:
+        return Refusal(f"frame {message.coordinate_frame} of a local setpoint is not flown")
+    place = message.x, message.y, message.z
+    along_heading = message.coordinate_frame in ALONG_HEADING
+    if message.coordinate_frame in FROM_HERE:
+        position = _from_here(axes.frd(place) if along_heading else axes.ned(place), along_heading, state)
+    else:
+        position = axes.ned(place)
+    return _target(message, position, along_heading, state)
+
+
+def from_global(message: dialect.SetPositionTargetGlobalInt, state: VehicleState) -> Setpoint | Refusal:
+    """Return what SET_POSITION_TARGET_GLOBAL_INT asks for."""
+    if message.coordinate_frame not in (*ABSOLUTE, *RELATIVE):
+        return Refusal(f"frame {message.coordinate_frame} of a global setpoint is not flown")
+    if not math.isfinite(message.alt):
+        return _target(message, (math.nan, math.nan, math.nan), False, state)
+    place = 1e-7 * message.lat_int, 1e-7 * message.lon_int
+    height_m = message.alt
+    if message.coordinate_frame in RELATIVE:
+        height_m += state.to_global(state.home_m or state.position_m)[2]
+    return _target(message, state.to_local(*place, height_m), False, state)
+
+
+def _from_here(offset: Vector, along_heading: bool, state: VehicleState) -> Vector:
+    """Return a place that is given from where the vehicle is."""
+    x, y, z = offset
+    if along_heading:
+        c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
+        x, y = c * x - s * y, s * x + c * y
+    own_x, own_y, own_z = state.position_m
+    return own_x + x, own_y + y, own_z + z
+
+
+def _target(
+    message: dialect.SetPositionTargetLocalNed | dialect.SetPositionTargetGlobalInt,
+    position_m: Vector,
+    along_heading: bool,
+    state: VehicleState,
+) -> Setpoint | Refusal:
+    mask = TypeMask(message.type_mask)
+    position = _axes(mask, position_m)
+    given = message.vx, message.vy, message.vz
+    velocity = _velocity(mask, given, along_heading)
+    if position == NOWHERE and velocity is None:
+        return Refusal("a setpoint without position and velocity is not flown")
+    if not _is_sane(position, velocity or (0.0, 0.0, 0.0)):
+        return Refusal("a setpoint is beyond all bounds")
+    along = along_heading and position == NOWHERE
+    if along_heading and not along and velocity is not None:
+        velocity = _turned(velocity, state.yaw_rad)
+    yaw, yaw_rate = _yaw(mask, message.yaw, message.yaw_rate, message.coordinate_frame, state)
+    return Target(position, velocity or (0.0, 0.0, 0.0), yaw, yaw_rate, along)
+
+
+def _axes(mask: TypeMask, position_m: Vector) -> Axes:
+    """Return the axes in W that are given; x of W is y of MAVLink."""
+    bits = (TypeMask.Y, TypeMask.X, TypeMask.Z)
+    x, y, z = (None if mask & bit or not math.isfinite(p) else p for p, bit in zip(position_m, bits, strict=True))
+    return x, y, z
+
+
+def _velocity(mask: TypeMask, given: Vector, along_heading: bool) -> Vector | None:
+    bits = (TypeMask.VX, TypeMask.VY, TypeMask.VZ)
+    if all(mask & bit or not math.isfinite(v) for v, bit in zip(given, bits, strict=True)):
+        return None
+    x, y, z = (0.0 if mask & bit or not math.isfinite(v) else v for v, bit in zip(given, bits, strict=True))
+    return axes.frd((x, y, z)) if along_heading else axes.ned((x, y, z))
+
+
+def _turned(v_H: Vector, yaw_rad: float) -> Vector:
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return c * v_H[0] - s * v_H[1], s * v_H[0] + c * v_H[1], v_H[2]
+
+
+def _is_sane(position: Axes, velocity: Vector) -> bool:
+    near = all(p is None or abs(p) < PLACE_MAX_M for p in position)
+    return near and all(abs(v) < SPEED_MAX_M_S for v in velocity)
+
+
+def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: VehicleState) -> tuple[float | None, float]:
+    """Return the yaw counter-clockwise from east, None where it is not given, and the rate."""
+    rate = 0.0 if mask & TypeMask.YAW_RATE or not math.isfinite(yaw_rate) else -max(-100.0, min(100.0, yaw_rate))
+    if mask & TypeMask.YAW or not math.isfinite(yaw) or abs(yaw) > 1e3:
+        return None, rate
+    if frame in (Frame.BODY_OFFSET_NED, Frame.BODY_FRD):
+        return axes.wrapped(state.yaw_rad - yaw), 0.0
+    return axes.yaw_ned(yaw), 0.0
+
+
+def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoint | Refusal:
+    """Return what SET_ATTITUDE_TARGET asks for; half of the thrust carries the weight [N]."""
+    mask = AttitudeMask(message.type_mask & 0xFF)
+    values = (*message.q, message.thrust, message.body_yaw_rate)
+    if mask & AttitudeMask.ATTITUDE:
+        return Refusal("body rates alone are not flown; give an attitude")
+    length = math.hypot(*message.q)
+    if not all(map(math.isfinite, values)) or not 0.5 < length < 2.0:
+        return Refusal("the attitude of a setpoint is no quaternion")
+    w, x, y, z = axes.attitude_ned((message.q[0], message.q[1], message.q[2], message.q[3]))
+    q_WB = w / length, x / length, y / length, z / length
+    thrust = HOVER_THRUST if mask & AttitudeMask.THRUST else max(0.0, min(1.0, message.thrust))
+    rate = 0.0 if mask & AttitudeMask.YAW_RATE else -max(-10.0, min(10.0, message.body_yaw_rate))
+    return AttitudeTarget(q_WB, weight_n * thrust / HOVER_THRUST, rate)

@@ -1,0 +1,161 @@
+"""Which messages of telemetry a vehicle sends, and how often; what clients change of that."""
+
+from typing import Literal
+
+from zsim_bridges.mavlink.vehicle import telemetry_messages as build
+from zsim_bridges.mavlink.vehicle.telemetry_messages import Builder
+from zsim_bridges.mavlink.vehicle.telemetry_source import TelemetrySource
+from zsim_bridges.mavlink.wire import dialect
+from zsim_bridges.mavlink.wire.message import LAYOUTS, Message
+
+Level = Literal["normal", "full"]
+SECOND_NS = 1_000_000_000
+RATE_MAX_HZ = 50.0  # Hz; one of each with a gate of 20 ms
+
+BUILDERS: dict[type[Message], Builder] = {
+    dialect.Heartbeat: build.heartbeat,
+    dialect.SysStatus: build.sys_status,
+    dialect.SystemTime: build.system_time,
+    dialect.Attitude: build.attitude,
+    dialect.AttitudeQuaternion: build.attitude_quaternion,
+    dialect.LocalPositionNed: build.local_position_ned,
+    dialect.Odometry: build.odometry,
+    dialect.GlobalPositionInt: build.global_position_int,
+    dialect.GpsRawInt: build.gps_raw_int,
+    dialect.VfrHud: build.vfr_hud,
+    dialect.Altitude: build.altitude,
+    dialect.BatteryStatus: build.battery_status,
+    dialect.ExtendedSysState: build.extended_sys_state,
+    dialect.EstimatorStatus: build.estimator_status,
+    dialect.EkfStatusReport: build.ekf_status_report,
+    dialect.HomePosition: build.home_position,
+    dialect.GpsGlobalOrigin: build.gps_global_origin,
+    dialect.PositionTargetLocalNed: build.position_target_local_ned,
+    dialect.ScaledImu: build.scaled_imu,
+    dialect.RawImu: build.raw_imu,
+    dialect.HighresImu: build.highres_imu,
+    dialect.ScaledPressure: build.scaled_pressure,
+    dialect.DistanceSensor: build.distance_sensor,
+    dialect.OpticalFlow: build.optical_flow,
+    dialect.MissionCurrent: build.mission_current,
+    dialect.FenceStatus: build.fence_status,
+    dialect.Vibration: build.vibration,
+}
+Rates = dict[type[Message], tuple[float, float]]
+"""Rates at the levels normal and full [Hz of simulated time]."""
+
+BOTH: Rates = {
+    dialect.SysStatus: (1.0, 5.0),
+    dialect.SystemTime: (1.0, 1.0),
+    dialect.Attitude: (10.0, 50.0),
+    dialect.LocalPositionNed: (10.0, 50.0),
+    dialect.GlobalPositionInt: (5.0, 50.0),
+    dialect.GpsRawInt: (5.0, 5.0),
+    dialect.VfrHud: (4.0, 20.0),
+    dialect.BatteryStatus: (0.5, 1.0),
+    dialect.ExtendedSysState: (2.0, 5.0),
+    dialect.HomePosition: (0.5, 1.0),
+    dialect.GpsGlobalOrigin: (0.2, 1.0),
+    dialect.PositionTargetLocalNed: (2.0, 10.0),
+    dialect.MissionCurrent: (1.0, 1.0),
+    dialect.DistanceSensor: (2.0, 10.0),
+    dialect.Vibration: (0.1, 1.0),
+}
+PX4: Rates = {
+    dialect.AttitudeQuaternion: (10.0, 50.0),
+    dialect.Odometry: (0.0, 30.0),
+    dialect.HighresImu: (5.0, 50.0),
+    dialect.Altitude: (1.0, 10.0),
+    dialect.EstimatorStatus: (1.0, 5.0),
+    dialect.ScaledPressure: (1.0, 5.0),
+    dialect.OpticalFlow: (0.0, 15.0),
+}
+ARDUPILOT: Rates = {
+    dialect.RawImu: (2.0, 50.0),
+    dialect.ScaledImu: (0.0, 50.0),
+    dialect.EkfStatusReport: (1.0, 10.0),
+    dialect.FenceStatus: (1.0, 2.0),
+    dialect.ScaledPressure: (2.0, 10.0),
+}
+STREAMS: dict[int, tuple[type[Message], ...]] = {  # MAV_DATA_STREAM, as ArduCopter fills them
+    1: (dialect.RawImu, dialect.ScaledPressure, dialect.ScaledImu),
+    2: (dialect.SysStatus, dialect.MissionCurrent, dialect.GpsRawInt, dialect.FenceStatus),
+    6: (dialect.GlobalPositionInt, dialect.LocalPositionNed),
+    10: (dialect.Attitude,),
+    11: (dialect.VfrHud,),
+    12: (dialect.SystemTime, dialect.EkfStatusReport, dialect.DistanceSensor, dialect.BatteryStatus, dialect.Vibration),
+}
+ALL_STREAMS = 0
+BY_ID = {LAYOUTS[kind].id: kind for kind in BUILDERS}
+
+
+class Telemetry:
+    """What one vehicle sends of itself.
+
+    Args:
+        source: of what is sent.
+        level: of the rates at the start.
+    """
+
+    def __init__(self, source: TelemetrySource, level: Level) -> None:
+        rates = {**BOTH, **(PX4 if source.personality.name == "px4" else ARDUPILOT)}
+        column = 1 if level == "full" else 0
+        self._source = source
+        self._defaults = {kind: pair[column] for kind, pair in rates.items()}
+        self._interval_ns: dict[type[Message], int] = {}
+        self._due_ns: dict[type[Message], int] = {}
+        for kind in self._defaults:
+            self._put(kind, self._defaults[kind])
+
+    def _put(self, kind: type[Message], rate_hz: float) -> None:
+        if rate_hz <= 0:
+            self._interval_ns.pop(kind, None)
+            return
+        self._interval_ns[kind] = round(SECOND_NS / min(rate_hz, RATE_MAX_HZ))
+        self._due_ns[kind] = 0
+
+    def due(self, t_ns: int) -> list[Message]:
+        """Return the messages that are due at a gate."""
+        self._source.advance()
+        messages = []
+        for kind, interval_ns in self._interval_ns.items():
+            due_ns = self._due_ns[kind]
+            if t_ns < due_ns:
+                continue
+            self._due_ns[kind] = max(due_ns + interval_ns, t_ns + interval_ns // 2)
+            if (message := BUILDERS[kind](self._source)) is not None:
+                messages.append(message)
+        return messages
+
+    def build(self, message_id: int) -> Message | None:
+        """Return a message now; None for one that this vehicle has not."""
+        kind = BY_ID.get(message_id)
+        self._source.advance()
+        return BUILDERS[kind](self._source) if kind else None
+
+    def put_interval(self, message_id: int, interval_us: float) -> bool:
+        """Send a message at an interval: -1 never, 0 as at the start; False for one that this vehicle has not."""
+        kind = BY_ID.get(message_id)
+        if kind is None:
+            return False
+        if kind is not dialect.Heartbeat:
+            default_hz = self._defaults.get(kind, 0.0)
+            self._put(kind, default_hz if interval_us == 0 else max(0.0, 1e6 / interval_us))
+        return True
+
+    def interval_us(self, message_id: int) -> int:
+        """Return the interval of a message: -1 where it is not sent, 0 where there is no such message."""
+        kind = BY_ID.get(message_id)
+        if kind is None:
+            return 0
+        if kind is dialect.Heartbeat:
+            return 1_000_000
+        return self._interval_ns[kind] // 1000 if kind in self._interval_ns else -1
+
+    def put_stream(self, stream: int, rate_hz: float) -> None:
+        """Send a group of messages at a rate, of the old protocol."""
+        for number, kinds in STREAMS.items():
+            if stream in (ALL_STREAMS, number):
+                for kind in kinds:
+                    if kind in self._defaults:
+                        self._put(kind, rate_hz)

@@ -1,0 +1,327 @@
+"""The messages of telemetry, each made of a vehicle at a gate; None where there is nothing to tell."""
+
+import math
+from collections.abc import Callable
+
+from zsim.math import frames
+from zsim_bridges.mavlink.vehicle import axes
+from zsim_bridges.mavlink.vehicle.enums import (
+    TYPE_QUADROTOR,
+    BaseMode,
+    EstimatorFlag,
+    Frame,
+    GpsFix,
+    Health,
+    LandedState,
+    SystemStatus,
+    TypeMask,
+)
+from zsim_bridges.mavlink.vehicle.guidance import Target
+from zsim_bridges.mavlink.vehicle.personality import BY_STICKS, Mode
+from zsim_bridges.mavlink.vehicle.telemetry_source import TelemetrySource
+from zsim_bridges.mavlink.wire import dialect
+from zsim_bridges.mavlink.wire.message import Message
+
+UNKNOWN_16, UNKNOWN_8 = 65535, 255
+GAUSS_PER_UT, MILLIGAUSS_PER_UT = 0.01, 10.0
+MG_PER_M_S2 = 1000.0 / 9.80665
+MAVLINK_VERSION = 3  # of HEARTBEAT
+NAN = math.nan
+LANDED_STATES = {
+    "landed": LandedState.ON_GROUND,
+    "taking_off": LandedState.TAKEOFF,
+    "hovering": LandedState.IN_AIR,
+    "flying": LandedState.IN_AIR,
+    "landing": LandedState.LANDING,
+    "emergency": LandedState.UNDEFINED,
+}
+Builder = Callable[[TelemetrySource], Message | None]
+
+
+def heartbeat(s: TelemetrySource) -> dialect.Heartbeat:
+    flight, modes = s.flight, s.personality.modes
+    mode = flight.mode
+    base = BaseMode.CUSTOM | BaseMode.STABILIZE
+    base |= BaseMode.MANUAL_INPUT if mode in BY_STICKS else BaseMode.GUIDED | BaseMode.AUTO
+    if flight.is_armed:
+        base |= BaseMode.ARMED
+    custom = modes[Mode.MISSION] if flight.foreign_commander else modes[mode]
+    return dialect.Heartbeat(TYPE_QUADROTOR, s.personality.autopilot, base, custom, _system_status(s), MAVLINK_VERSION)
+
+
+def _system_status(s: TelemetrySource) -> SystemStatus:
+    if s.state.state == "emergency":
+        return SystemStatus.EMERGENCY
+    if s.state.is_airborne and (s.state.is_battery_low or s.breach):
+        return SystemStatus.CRITICAL
+    return SystemStatus.ACTIVE if s.flight.is_armed else SystemStatus.STANDBY
+
+
+def sys_status(s: TelemetrySource) -> Message:
+    present = int(Health(0x3FFFFFFF) & _ALL_HEALTH)
+    return dialect.SysStatus(
+        onboard_control_sensors_present=present,
+        onboard_control_sensors_enabled=present,
+        onboard_control_sensors_health=int(s.state.health()),
+        voltage_battery=round(1000 * s.voltage_v),
+        current_battery=-1,
+        battery_remaining=round(s.battery_percent),
+    )
+
+
+_ALL_HEALTH = Health(sum(part.value for part in Health if part is not Health.GEOFENCE))
+
+
+def system_time(s: TelemetrySource) -> Message:
+    return dialect.SystemTime(time_unix_usec=0, time_boot_ms=s.boot_ms)
+
+
+def attitude(s: TelemetrySource) -> Message:
+    return dialect.Attitude(s.boot_ms, *s.rpy_ned_rad, *axes.frd(s.state.rate_rad_s))
+
+
+def attitude_quaternion(s: TelemetrySource) -> Message:
+    return dialect.AttitudeQuaternion(s.boot_ms, *axes.attitude_ned(s.state.q_WB), *axes.frd(s.state.rate_rad_s))
+
+
+def local_position_ned(s: TelemetrySource) -> Message:
+    return dialect.LocalPositionNed(s.boot_ms, *s.position_ned_m, *s.velocity_ned_m_s)
+
+
+def odometry(s: TelemetrySource) -> Message:
+    vx, vy, vz = _body_velocity(s)
+    level, up = (sigma * sigma for sigma in s.state.sigma_m)
+    pose = (level, *(0.0,) * 5, level, *(0.0,) * 4, up, *(0.0,) * 3, NAN, 0.0, 0.0, NAN, 0.0, NAN)
+    return dialect.Odometry(
+        time_usec=s.boot_us,
+        frame_id=Frame.LOCAL_NED,
+        child_frame_id=Frame.BODY_FRD,
+        x=s.position_ned_m[0],
+        y=s.position_ned_m[1],
+        z=s.position_ned_m[2],
+        q=axes.attitude_ned(s.state.q_WB),
+        vx=vx,
+        vy=vy,
+        vz=vz,
+        rollspeed=s.state.rate_rad_s[0],
+        pitchspeed=-s.state.rate_rad_s[1],
+        yawspeed=-s.state.rate_rad_s[2],
+        pose_covariance=pose,
+        velocity_covariance=(NAN, *(0.0,) * 20),
+        estimator_type=3,  # MAV_ESTIMATOR_TYPE_GPS_INS
+    )
+
+
+def _body_velocity(s: TelemetrySource) -> tuple[float, float, float]:
+    w, x, y, z = s.state.q_WB
+    v = frames.rotate((w, -x, -y, -z), s.state.velocity_m_s).tolist()
+    return axes.frd((v[0], v[1], v[2]))
+
+
+def global_position_int(s: TelemetrySource) -> Message:
+    latitude, longitude, height = s.place
+    north, east, down = (_int16(100 * v) for v in s.velocity_ned_m_s)
+    return dialect.GlobalPositionInt(
+        s.boot_ms,
+        round(1e7 * latitude),
+        round(1e7 * longitude),
+        round(1000 * height),
+        round(1000 * s.state.altitude_m),
+        north,
+        east,
+        down,
+        round(math.degrees(s.rpy_ned_rad[2]) % 360.0 * 100) % 36000,
+    )
+
+
+def _int16(value: float) -> int:
+    return max(-32767, min(32767, round(value)))
+
+
+def gps_raw_int(s: TelemetrySource) -> Message:
+    gps = s.state.samples.get("gps")
+    if gps is None or s.state.has_failed("gps"):
+        fix = GpsFix.NO_GPS if gps is None else GpsFix.NO_FIX
+        return dialect.GpsRawInt(s.boot_us, fix, eph=UNKNOWN_16, epv=UNKNOWN_16, vel=UNKNOWN_16, cog=UNKNOWN_16)
+    vx, vy, _ = gps.velocity_m_s
+    course = math.degrees(math.atan2(vx, vy)) % 360.0
+    sigma_mm = min(round(1000 * gps.sigma_m), 2**32 - 1)
+    return dialect.GpsRawInt(
+        time_usec=gps.t_sample_ns // 1000,
+        fix_type=min(gps.fix, 8),
+        lat=round(1e7 * gps.latitude_deg),
+        lon=round(1e7 * gps.longitude_deg),
+        alt=round(1000 * gps.altitude_m),
+        eph=100,  # HDOP 1: zsim has a standard deviation alone
+        epv=100,
+        vel=min(65534, round(100 * math.hypot(vx, vy))),
+        cog=round(100 * course) % 36000,
+        satellites_visible=min(gps.satellites, 254),
+        alt_ellipsoid=round(1000 * gps.altitude_m),
+        h_acc=sigma_mm,
+        v_acc=sigma_mm,
+    )
+
+
+def vfr_hud(s: TelemetrySource) -> Message:
+    vx, vy, vz = s.state.velocity_m_s
+    speed = math.hypot(vx, vy)
+    heading = round(math.degrees(s.rpy_ned_rad[2])) % 360
+    return dialect.VfrHud(speed, speed, heading, 50 if s.state.is_airborne else 0, s.place[2], vz)
+
+
+def altitude(s: TelemetrySource) -> Message:
+    z, height = s.state.position_m[2], s.place[2]
+    return dialect.Altitude(s.boot_us, z, height, z, s.state.altitude_m, NAN, NAN)
+
+
+def battery_status(s: TelemetrySource) -> Message:
+    used = round(s.capacity_mah * (1.0 - s.battery_percent / 100.0))
+    return dialect.BatteryStatus(
+        current_consumed=max(0, used),
+        energy_consumed=-1,
+        temperature=32767,
+        voltages=(min(65534, round(1000 * s.voltage_v)), *(UNKNOWN_16,) * 9),
+        current_battery=-1,
+        type=1,  # MAV_BATTERY_TYPE_LIPO
+        battery_remaining=round(s.battery_percent),
+        charge_state=2 if s.state.is_battery_low else 1,  # LOW, OK of MAV_BATTERY_CHARGE_STATE
+    )
+
+
+def extended_sys_state(s: TelemetrySource) -> Message:
+    return dialect.ExtendedSysState(0, LANDED_STATES[s.state.state])
+
+
+def estimator_flags(s: TelemetrySource) -> int:
+    """Return what is known: all, but for the absolute position without GPS."""
+    flags = sum(flag.value for flag in EstimatorFlag)
+    if s.state.is_estimated and s.state.has_failed("gps"):
+        flags &= ~(EstimatorFlag.POS_HORIZ_ABS | EstimatorFlag.PRED_POS_HORIZ_ABS)
+    return flags
+
+
+def estimator_status(s: TelemetrySource) -> Message:
+    level, up = s.state.sigma_m
+    return dialect.EstimatorStatus(
+        time_usec=s.boot_us, flags=estimator_flags(s), pos_horiz_accuracy=level, pos_vert_accuracy=up
+    )
+
+
+def ekf_status_report(s: TelemetrySource) -> Message:
+    return dialect.EkfStatusReport(estimator_flags(s))
+
+
+def home_position(s: TelemetrySource) -> Message | None:
+    if s.state.home_m is None:
+        return None
+    latitude, longitude, height = s.home_place
+    return dialect.HomePosition(
+        round(1e7 * latitude),
+        round(1e7 * longitude),
+        round(1000 * height),
+        *axes.ned(s.state.home_m),
+        (1.0, 0.0, 0.0, 0.0),
+        time_usec=s.boot_us,
+    )
+
+
+def gps_global_origin(s: TelemetrySource) -> Message:
+    latitude, longitude, height = s.state.origin
+    return dialect.GpsGlobalOrigin(round(1e7 * latitude), round(1e7 * longitude), round(1000 * height), s.boot_us)
+
+
+def position_target_local_ned(s: TelemetrySource) -> Message | None:
+    target = s.flight.target
+    if not isinstance(target, Target):
+        return None
+    position = axes.ned(tuple(0.0 if p is None else p for p in target.position_m))  # type: ignore[arg-type]
+    mask = TypeMask.AX | TypeMask.AY | TypeMask.AZ
+    for p, bit in zip(target.position_m, (TypeMask.Y, TypeMask.X, TypeMask.Z), strict=True):
+        mask |= bit if p is None else TypeMask(0)
+    mask |= TypeMask.YAW_RATE if target.yaw_rad is not None else TypeMask.YAW
+    frame = Frame.BODY_NED if target.along_heading else Frame.LOCAL_NED
+    velocity = axes.frd(target.velocity_m_s) if target.along_heading else axes.ned(target.velocity_m_s)
+    yaw = axes.yaw_ned(target.yaw_rad) if target.yaw_rad is not None else 0.0
+    return dialect.PositionTargetLocalNed(
+        s.boot_ms, frame, mask, *position, *velocity, 0.0, 0.0, 0.0, yaw, -target.yaw_rate_rad_s
+    )
+
+
+def scaled_imu(s: TelemetrySource) -> Message | None:
+    imu, mag = s.state.samples.get("imu"), s.state.samples.get("mag")
+    if imu is None or s.state.has_failed("imu"):
+        return None
+    accel = (_int16(MG_PER_M_S2 * a) for a in axes.frd(imu.accel_m_s2))
+    gyro = (_int16(1000 * w) for w in axes.frd(imu.gyro_rad_s))
+    field = (_int16(MILLIGAUSS_PER_UT * b) for b in axes.frd(mag.field_ut)) if mag else (0, 0, 0)
+    return dialect.ScaledImu(s.boot_ms, *accel, *gyro, *field)
+
+
+def raw_imu(s: TelemetrySource) -> Message | None:
+    scaled = scaled_imu(s)
+    if not isinstance(scaled, dialect.ScaledImu):
+        return None
+    m = scaled
+    return dialect.RawImu(s.boot_us, m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro, m.xmag, m.ymag, m.zmag)
+
+
+def highres_imu(s: TelemetrySource) -> Message | None:
+    imu = s.state.samples.get("imu")
+    if imu is None or s.state.has_failed("imu"):
+        return None
+    mag, baro = s.state.samples.get("mag"), s.state.samples.get("baro")
+    ax, ay, az = axes.frd(imu.accel_m_s2)
+    wx, wy, wz = axes.frd(imu.gyro_rad_s)
+    mx, my, mz = (GAUSS_PER_UT * b for b in axes.frd(mag.field_ut)) if mag else (0.0, 0.0, 0.0)
+    pressure, height = (baro.pressure_pa / 100.0, baro.altitude_m) if baro else (0.0, 0.0)
+    updated = 0x3F | (0x1C0 if mag else 0) | (0xA00 if baro else 0)  # HIGHRES_IMU_UPDATED_FLAGS
+    t_us = imu.t_sample_ns // 1000
+    return dialect.HighresImu(
+        t_us, ax, ay, az, wx, wy, wz, mx, my, mz, pressure, 0.0, height, 0.0, fields_updated=updated
+    )
+
+
+def scaled_pressure(s: TelemetrySource) -> Message | None:
+    baro = s.state.samples.get("baro")
+    if baro is None or s.state.has_failed("baro"):
+        return None
+    return dialect.ScaledPressure(s.boot_ms, baro.pressure_pa / 100.0)
+
+
+def distance_sensor(s: TelemetrySource) -> Message | None:
+    sonar = s.state.samples.get("sonar")
+    if sonar is None or s.state.has_failed("sonar"):
+        return None
+    return dialect.DistanceSensor(
+        s.boot_ms,
+        min_distance=3,
+        max_distance=600,
+        current_distance=max(0, min(65535, round(100 * sonar.range_m))) if sonar.valid else 601,
+        type=1,  # MAV_DISTANCE_SENSOR_ULTRASOUND
+        orientation=25,  # MAV_SENSOR_ROTATION_PITCH_270: downwards
+        covariance=UNKNOWN_8,
+    )
+
+
+def optical_flow(s: TelemetrySource) -> Message | None:
+    flow = s.state.samples.get("flow")
+    if flow is None or s.state.has_failed("flow"):
+        return None
+    forward, left, _ = flow.velocity_m_s
+    quality = max(0, min(255, round(255 * flow.quality)))
+    return dialect.OpticalFlow(s.boot_us, 0, 0, 0, forward, -left, quality, s.state.altitude_m)
+
+
+def mission_current(s: TelemetrySource) -> Message:
+    mission = s.flight.mission
+    return dialect.MissionCurrent(mission.current, mission.first + len(mission.items))
+
+
+def fence_status(s: TelemetrySource) -> Message:
+    breached = s.breach != 0
+    return dialect.FenceStatus(int(breached), min(s.breaches, UNKNOWN_16), s.breach, s.breach_ns // 1_000_000)
+
+
+def vibration(s: TelemetrySource) -> Message:
+    return dialect.Vibration(s.boot_us)
