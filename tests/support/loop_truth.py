@@ -15,7 +15,7 @@ from zsim_analysis.reading.formation import Formation, formation
 def offset_ns(record: Path, drone: str, rate: float) -> float:
     """Return wall time times rate minus simulated time of a record: the median over the truth of a drone."""
     with RecordReader(record) as reader:
-        truths = [each for each in reader.messages([keys.truth(drone)])]
+        truths = list(reader.messages([keys.truth(drone)]))
         return float(np.median([rate * each.wall_ns - each.t_ns for each in truths]))
 
 

@@ -40,6 +40,9 @@ from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, MANOEUVRE_S, ZERO
 
 Array = NDArray[np.float64]
 
+LINK_S = (
+    0.4  # s, chosen: what a radio, and telemetry that is sent now and then, add to the latency of an external drone
+)
 LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the gyroscope's drift
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
 VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest, or in gentle flight
@@ -212,7 +215,8 @@ def innovation_limits(gate_probability: float) -> Array:
 def age_max_s(drone: Drone, gate_s: float) -> float:
     """Return the oldest age [s] at which a reading of a drone can be used."""
     latency_s = max(_section(drone.sensors, name).latency_ms for name in SENSORS) * 1e-3
-    return 2.0 * latency_s + 5.0 * gate_s
+    link_s = LINK_S if drone.is_external else 0.0
+    return 2.0 * latency_s + 5.0 * gate_s + link_s
 
 
 def _section(sensors: Sensors, name: str) -> Sensor:

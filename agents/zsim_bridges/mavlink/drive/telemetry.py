@@ -51,6 +51,9 @@ class Telemetry:
         self.readings: list[Reading] = []
         self._q_WB, self._w_WB_B = LEVEL, STILL
         self._flow_ns = self._measured_flow_ns = -FLOW_LOST_NS
+        self._last: dict[str, tuple] = {}
+        self._pressure_pa = 0.0
+        self._fix: tuple = ()
         self._barometer = FieldBarometer()
         self._handlers: dict[type, Callable[[Any, int], None]] = {
             dialect.AttitudeQuaternion: self._on_attitude,
@@ -116,7 +119,7 @@ class Telemetry:
         if updated & MAG == MAG:
             self._read("mag", taken_ns, flipped([UT_PER_GAUSS * field for field in (m.xmag, m.ymag, m.zmag)]))
         if updated & PRESSURE:
-            self._read_pressure(taken_ns, PA_PER_HPA * m.abs_pressure)
+            self._on_static_pressure(taken_ns, PA_PER_HPA * m.abs_pressure)
 
     def _on_scaled_imu(self, m: Any, now_ns: int) -> None:
         """Take what ArduPilot sends: mg, mrad/s, mgauss."""
@@ -127,9 +130,12 @@ class Telemetry:
             self._read("mag", taken_ns, flipped([UT_PER_GAUSS * field / 1e3 for field in (m.xmag, m.ymag, m.zmag)]))
 
     def _on_pressure(self, m: Any, now_ns: int) -> None:
-        self._read_pressure(self._boot(m, now_ns), PA_PER_HPA * m.press_abs)
+        self._on_static_pressure(self._boot(m, now_ns), PA_PER_HPA * m.press_abs)
 
-    def _read_pressure(self, taken_ns: int, pressure_pa: float) -> None:
+    def _on_static_pressure(self, taken_ns: int, pressure_pa: float) -> None:
+        if pressure_pa == self._pressure_pa:
+            return
+        self._pressure_pa = pressure_pa
         height_m = self.pose.position_m[2] if self.pose else 0.0
         self._read("baro", taken_ns, pressure_pa, self._barometer.altitude_m(pressure_pa, height_m))
 
@@ -140,6 +146,9 @@ class Telemetry:
         speed, course = m.vel / 100.0, math.radians(m.cog / 100.0)
         climb = self.pose.velocity_m_s[2] if self.pose else 0.0
         sigma_m = m.h_acc / 1e3 or (DOP_M * m.eph / 100.0 if m.eph != 0xFFFF else 0.0) or SIGMA_UNKNOWN_M
+        if (place, m.time_usec) == self._fix:
+            return
+        self._fix = place, m.time_usec
         x, y, z = geodetic_to_enu(place, self._origin).tolist()
         velocity = speed * math.sin(course), speed * math.cos(course), climb
         fix, satellites = min(m.fix_type, 3), m.satellites_visible
@@ -162,7 +171,10 @@ class Telemetry:
         return v[0] * math.cos(yaw) + v[1] * math.sin(yaw), v[1] * math.cos(yaw) - v[0] * math.sin(yaw), v[2]
 
     def _read(self, sensor: str, taken_ns: int, *values: Any) -> None:
-        self.readings.append(Reading(sensor, taken_ns, values))
+        """Add a reading if it differs from the last one: vehicles repeat what slow sensors measured before."""
+        if self._last.get(sensor) != values:
+            self._last[sensor] = values
+            self.readings.append(Reading(sensor, taken_ns, values))
 
     def _boot(self, m: Any, now_ns: int) -> int:
         return _taken(self.boot_clock, m.time_boot_ms * 1_000_000, now_ns)
