@@ -13,11 +13,11 @@ from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone
 from zsim.transport.session import Session
+from zsim_bridges.mavlink.autopilot.enums import COMPONENT_AUTOPILOT
+from zsim_bridges.mavlink.autopilot.personality import PERSONALITIES
 from zsim_bridges.mavlink.serve.peers import Address
 from zsim_bridges.mavlink.serve.vehicle_ports import VehiclePort, VehiclePorts
-from zsim_bridges.mavlink.vehicle.enums import COMPONENT_AUTOPILOT
-from zsim_bridges.mavlink.vehicle.personality import PERSONALITIES
-from zsim_bridges.mavlink.vehicle.telemetry import Level
+from zsim_bridges.mavlink.telemetry.telemetry import Level
 from zsim_bridges.mavlink.vehicle.vehicle import Options, Vehicle
 from zsim_bridges.mavlink.wire.frame import Link, Received, Version
 from zsim_bridges.mavlink.wire.signing import Signing

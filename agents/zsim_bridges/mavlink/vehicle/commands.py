@@ -8,16 +8,16 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from zsim.math.rotation import Vector
-from zsim_bridges.mavlink.vehicle import axes
-from zsim_bridges.mavlink.vehicle.enums import FORCE, Cmd, Result
-from zsim_bridges.mavlink.vehicle.flight import Flight
-from zsim_bridges.mavlink.vehicle.guidance import Target
-from zsim_bridges.mavlink.vehicle.mission import ABSOLUTE, FRAMES, LOCAL, MissionItem, place_of
+from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot.enums import FORCE, Cmd, Result
+from zsim_bridges.mavlink.autopilot.parameters import Parameters
+from zsim_bridges.mavlink.autopilot.personality import Mode, Personality, Settings
+from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
+from zsim_bridges.mavlink.flight.flight import Flight
+from zsim_bridges.mavlink.flight.guidance import Target
+from zsim_bridges.mavlink.flight.mission import ABSOLUTE, FRAMES, LOCAL, MissionItem, place_of
+from zsim_bridges.mavlink.telemetry.telemetry import Telemetry
 from zsim_bridges.mavlink.vehicle.mission_protocol import DEGREES, LOCAL_M
-from zsim_bridges.mavlink.vehicle.parameters import Parameters
-from zsim_bridges.mavlink.vehicle.personality import Personality, Settings
-from zsim_bridges.mavlink.vehicle.telemetry import Telemetry
-from zsim_bridges.mavlink.vehicle.vehicle_state import VehicleState
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.message import Message
 
@@ -93,9 +93,9 @@ class Commands:
         self._handlers: dict[int, Callable[[Request], Answer]] = {
             Cmd.COMPONENT_ARM_DISARM: self._arm,
             Cmd.NAV_TAKEOFF: self._take_off,
-            Cmd.NAV_LAND: lambda _: self._mode_named("LAND"),
-            Cmd.NAV_RETURN_TO_LAUNCH: lambda _: self._mode_named("RETURN"),
-            Cmd.NAV_LOITER_UNLIM: lambda _: self._mode_named("HOLD"),
+            Cmd.NAV_LAND: lambda _: answered(flight.set_mode(Mode.LAND)),
+            Cmd.NAV_RETURN_TO_LAUNCH: lambda _: answered(flight.set_mode(Mode.RETURN)),
+            Cmd.NAV_LOITER_UNLIM: lambda _: answered(flight.set_mode(Mode.HOLD)),
             Cmd.DO_SET_MODE: self._set_mode,
             Cmd.DO_REPOSITION: self._reposition,
             Cmd.DO_PAUSE_CONTINUE: self._pause,
@@ -138,10 +138,6 @@ class Commands:
             return Answer(Result.DENIED, f"take-off to {altitude_m:.1f} m over home")
         return answered(self._flight.take_off(altitude_m))
 
-    def _mode_named(self, name: str) -> Answer:
-        mode = next(mode for mode in self._personality.modes if mode.value == name)
-        return answered(self._flight.set_mode(mode))
-
     def _set_mode(self, request: Request) -> Answer:
         main, sub = _id(request.params[1]), _id(request.params[2])
         custom = main << 16 | sub << 24 if self._personality.name == "px4" else main
@@ -178,7 +174,7 @@ class Commands:
 
     def _pause(self, request: Request) -> Answer:
         if request.params[0] == 0.0:
-            return answered(self._flight.pause())
+            return answered(self._flight.set_mode(Mode.HOLD))
         return answered(self._flight.start_mission())
 
     def _change_speed(self, request: Request) -> Answer:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from zsim_bridges.mavlink.vehicle.enums import (
+from zsim_bridges.mavlink.autopilot.enums import (
     ALL_MISSION_TYPES,
     FENCE,
     MISSION,
@@ -15,7 +15,7 @@ from zsim_bridges.mavlink.vehicle.enums import (
     Frame,
     MissionResult,
 )
-from zsim_bridges.mavlink.vehicle.mission import COMMANDS, FRAMES, LOCAL, MissionItem
+from zsim_bridges.mavlink.flight.mission import COMMANDS, FRAMES, LOCAL, MissionItem
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.message import Message
 

@@ -7,11 +7,11 @@ import math
 from typing import NamedTuple
 
 from zsim.math.rotation import Vector
-from zsim_bridges.mavlink.vehicle import axes
-from zsim_bridges.mavlink.vehicle.enums import AttitudeMask, Frame, TypeMask
-from zsim_bridges.mavlink.vehicle.guidance import NOWHERE, AttitudeTarget, Axes, Target
-from zsim_bridges.mavlink.vehicle.mission import ABSOLUTE, RELATIVE
-from zsim_bridges.mavlink.vehicle.vehicle_state import VehicleState
+from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot.enums import AttitudeMask, Frame, TypeMask
+from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
+from zsim_bridges.mavlink.flight.guidance import NOWHERE, AttitudeTarget, Axes, Target
+from zsim_bridges.mavlink.flight.mission import ABSOLUTE, RELATIVE
 from zsim_bridges.mavlink.wire import dialect
 
 POSITION = TypeMask.X | TypeMask.Y | TypeMask.Z

@@ -6,20 +6,22 @@ from zsim.contract.messages import Origin
 from zsim.contract.run_messages import Event
 from zsim.scenario.scenario import Drone
 from zsim.schema.quantities import G_M_S2
-from zsim_bridges.mavlink.vehicle import personality as personalities
-from zsim_bridges.mavlink.vehicle import setpoints, telemetry_messages
-from zsim_bridges.mavlink.vehicle.command_output import CommandOutput
+from zsim_bridges.mavlink.autopilot import personality as personalities
+from zsim_bridges.mavlink.autopilot.enums import COMPONENT_AUTOPILOT, FENCE, MISSION, Capability, Result, Severity
+from zsim_bridges.mavlink.autopilot.personality import Personality, Settings
+from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
+from zsim_bridges.mavlink.flight.command_output import CommandOutput
+from zsim_bridges.mavlink.flight.flight import Flight
+from zsim_bridges.mavlink.flight.geofence import Geofence
+from zsim_bridges.mavlink.flight.guidance import Target
+from zsim_bridges.mavlink.flight.mission import MissionItem, place_of
+from zsim_bridges.mavlink.telemetry import state_telemetry
+from zsim_bridges.mavlink.telemetry.telemetry import Level, Telemetry
+from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource
+from zsim_bridges.mavlink.vehicle import setpoints
 from zsim_bridges.mavlink.vehicle.commands import Commands, request_of
-from zsim_bridges.mavlink.vehicle.enums import COMPONENT_AUTOPILOT, FENCE, MISSION, Capability, Result, Severity
-from zsim_bridges.mavlink.vehicle.flight import Flight
-from zsim_bridges.mavlink.vehicle.geofence import Geofence
-from zsim_bridges.mavlink.vehicle.guidance import Target
-from zsim_bridges.mavlink.vehicle.mission import Mission, MissionItem, place_of
+from zsim_bridges.mavlink.vehicle.drone_watch import DroneWatch
 from zsim_bridges.mavlink.vehicle.mission_protocol import MissionProtocol, home_item, item_fault, item_of
-from zsim_bridges.mavlink.vehicle.personality import FenceAction, Mode, Personality, Settings
-from zsim_bridges.mavlink.vehicle.telemetry import Level, Telemetry
-from zsim_bridges.mavlink.vehicle.telemetry_source import TelemetrySource
-from zsim_bridges.mavlink.vehicle.vehicle_state import VehicleState
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Received
 from zsim_bridges.mavlink.wire.message import Message
@@ -66,14 +68,12 @@ class Vehicle:
         self._fence = Geofence()
         output = CommandOutput(sender)
         self.flight = Flight(options.source, person, self._settings, self.state, output, self.report)
-        self.flight.mission = Mission(first=0 if person.needs_stream else 1, turns=person.needs_stream)
         self._source = TelemetrySource(drone, self.state, self.flight, person)
+        self._watch = DroneWatch(drone.name, options.source, self._source, self._settings, self._fence, self.report)
         self._telemetry = Telemetry(self._source, options.level)
         self._missions = self._mission_protocol()
         self._commands = self._command_table()
         self._heartbeat_ns: int | None = None
-        self._failed: set[str] = set()
-        self._was_low = False
         self._weight_n = drone.mass_kg * G_M_S2
         self._refused: set[str] = set()
 
@@ -113,9 +113,8 @@ class Vehicle:
 
     def step(self) -> None:
         """Do what is due at a gate, after the state has been updated."""
-        self._watch_drone()
+        self._watch.look()
         self.flight.step()
-        self._watch_fence()
         self._report_reached()
         self.outbox += self._telemetry.due(self.state.t_ns)
 
@@ -123,51 +122,17 @@ class Vehicle:
         """Do what wall time brings, also while simulated time stands: heartbeats, and requests once more."""
         if self._heartbeat_ns is None or wall_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = wall_ns
-            self.outbox.append(telemetry_messages.heartbeat(self._source))
+            self.outbox.append(state_telemetry.heartbeat(self._source))
         self._missions.tick(wall_ns)
-
-    def on_event(self, event: Event) -> None:
-        """Tell the operator of an event about the drone."""
-        name = self._drone.name
-        if event.kind in ("fault", "fault_end", "fault_clear") and event.data.get("target") == name:
-            over = "" if event.kind == "fault" else " is over"
-            self.report(Severity.CRITICAL if not over else Severity.NOTICE, f"Fault {event.data.get('kind')}{over}")
-        elif event.kind == "collision" and name in (event.subject, *map(str, event.data.values())):
-            self.report(Severity.CRITICAL, "Collision")
-        elif event.kind == "refused" and event.source == self._options.source and f"/{name}/" in f"{event.subject}/":
-            self.report(Severity.WARNING, f"Refused: {event.data.get('reason', event.text)}")
-
-    def _watch_drone(self) -> None:
-        """Tell of sensors that fail and come back, and of a low battery."""
-        failed = set(self.state.failed_sensors())
-        for name in sorted(failed - self._failed):
-            self.report(Severity.CRITICAL, f"{name.upper()} lost")
-        for name in sorted(self._failed - failed):
-            self.report(Severity.INFO, f"{name.upper()} back")
-        self._failed = failed
-        if self.state.is_battery_low and not self._was_low:
-            self.report(Severity.CRITICAL, f"Low battery: {self._source.battery_percent:.0f} %")
-        self._was_low = self.state.is_battery_low
-
-    def _watch_fence(self) -> None:
-        action = self._settings.fence_action
-        if action is FenceAction.NONE or not self.state.is_steerable:
-            self._source.breach = 0
-            return
-        breach = self._fence.breach(self.state.position_m, self.state, self._settings)
-        if breach and not self._source.breach:
-            self._source.breaches += 1
-            self._source.breach_ns = self.state.t_ns
-            self.report(Severity.CRITICAL, f"Geofence breached: {action.value and action.name.lower()}")
-            mode = {FenceAction.HOLD: Mode.HOLD, FenceAction.RETURN: Mode.RETURN, FenceAction.LAND: Mode.LAND}
-            if action in mode and not self.flight.foreign_commander:
-                self.flight.set_mode(mode[action])
-        self._source.breach = breach
 
     def _report_reached(self) -> None:
         for number in self.flight.mission.reached:
             self.outbox.append(dialect.MissionItemReached(number))
         self.flight.mission.reached.clear()
+
+    def on_event(self, event: Event) -> None:
+        """Take an event of the run."""
+        self._watch.on_event(event)
 
     # From clients
 
@@ -256,7 +221,7 @@ class Vehicle:
     def _set_current(self, number: int) -> None:
         if not self.flight.mission.set_current(number):
             self._answer(f"no item {number}")
-        self.outbox.append(telemetry_messages.mission_current(self._source))
+        self.outbox.append(state_telemetry.mission_current(self._source))
 
     def _go_to(self, message: dialect.MissionItem | dialect.MissionItemInt, sender: tuple[int, int]) -> None:
         item = item_of(message)
@@ -276,7 +241,7 @@ class Vehicle:
             case dialect.Ping(target_system=0):
                 self.outbox.append(dialect.Ping(message.time_usec, message.seq, *sender))
             case dialect.Timesync(tc1=0):
-                self.outbox.append(dialect.Timesync(tc1=wall_ns, ts1=message.ts1))
+                self.outbox.append(dialect.Timesync(tc1=self.state.t_ns, ts1=message.ts1))
             case dialect.AutopilotVersionRequest():
                 self.outbox.append(self._version())
             case dialect.LogRequestList():

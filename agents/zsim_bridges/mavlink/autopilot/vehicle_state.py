@@ -11,8 +11,8 @@ from zsim.math import frames
 from zsim.math.geodetic import anchor, geodetic
 from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Drone
-from zsim_bridges.mavlink.vehicle import axes
-from zsim_bridges.mavlink.vehicle.enums import Health
+from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot.enums import Health
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an estimator that is silent for longer is not flown by
 SAMPLES_MISSED = 5  # periods of a sensor without a sample: it has failed
@@ -120,6 +120,11 @@ class VehicleState:
     def is_steerable(self) -> bool:
         """Whether the firmware takes setpoints."""
         return self.status is not None and self.status.state in ("hovering", "flying")
+
+    @property
+    def commander(self) -> str | None:
+        """Who flies the drone."""
+        return self.status.commander if self.status else None
 
     @property
     def state(self) -> str:

@@ -5,11 +5,11 @@ from functools import cached_property
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Drone
 from zsim.vehicles.vehicle_catalogue import vehicle_of
-from zsim_bridges.mavlink.vehicle.axes import ned
-from zsim_bridges.mavlink.vehicle.flight import Flight
-from zsim_bridges.mavlink.vehicle.geofence import BREACH_NONE
-from zsim_bridges.mavlink.vehicle.personality import Personality
-from zsim_bridges.mavlink.vehicle.vehicle_state import VehicleState
+from zsim_bridges.mavlink.autopilot.axes import ned
+from zsim_bridges.mavlink.autopilot.personality import Personality
+from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
+from zsim_bridges.mavlink.flight.flight import Flight
+from zsim_bridges.mavlink.flight.geofence import BREACH_NONE
 
 
 class TelemetrySource:
@@ -70,3 +70,8 @@ class TelemetrySource:
     @cached_property
     def velocity_ned_m_s(self) -> Vector:
         return ned(self.state.velocity_m_s)
+
+
+def int16(value: float) -> int:
+    """Return a whole number that fits into a field of 16 bits."""
+    return max(-32767, min(32767, round(value)))

@@ -5,7 +5,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from zsim_bridges.mavlink.vehicle.enums import ParamType
+from zsim_bridges.mavlink.autopilot.enums import ParamType
 from zsim_bridges.mavlink.wire import dialect
 
 ID_MAX = 16  # characters of a name

@@ -1,10 +1,10 @@
 """Which messages of telemetry a vehicle sends, and how often; what clients change of that."""
 
+from collections.abc import Callable
 from typing import Literal
 
-from zsim_bridges.mavlink.vehicle import telemetry_messages as build
-from zsim_bridges.mavlink.vehicle.telemetry_messages import Builder
-from zsim_bridges.mavlink.vehicle.telemetry_source import TelemetrySource
+from zsim_bridges.mavlink.telemetry import sensor_telemetry, state_telemetry
+from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.message import LAYOUTS, Message
 
@@ -12,34 +12,35 @@ Level = Literal["normal", "full"]
 SECOND_NS = 1_000_000_000
 RATE_MAX_HZ = 50.0  # Hz; one of each with a gate of 20 ms
 
+Builder = Callable[[TelemetrySource], Message | None]
 BUILDERS: dict[type[Message], Builder] = {
-    dialect.Heartbeat: build.heartbeat,
-    dialect.SysStatus: build.sys_status,
-    dialect.SystemTime: build.system_time,
-    dialect.Attitude: build.attitude,
-    dialect.AttitudeQuaternion: build.attitude_quaternion,
-    dialect.LocalPositionNed: build.local_position_ned,
-    dialect.Odometry: build.odometry,
-    dialect.GlobalPositionInt: build.global_position_int,
-    dialect.GpsRawInt: build.gps_raw_int,
-    dialect.VfrHud: build.vfr_hud,
-    dialect.Altitude: build.altitude,
-    dialect.BatteryStatus: build.battery_status,
-    dialect.ExtendedSysState: build.extended_sys_state,
-    dialect.EstimatorStatus: build.estimator_status,
-    dialect.EkfStatusReport: build.ekf_status_report,
-    dialect.HomePosition: build.home_position,
-    dialect.GpsGlobalOrigin: build.gps_global_origin,
-    dialect.PositionTargetLocalNed: build.position_target_local_ned,
-    dialect.ScaledImu: build.scaled_imu,
-    dialect.RawImu: build.raw_imu,
-    dialect.HighresImu: build.highres_imu,
-    dialect.ScaledPressure: build.scaled_pressure,
-    dialect.DistanceSensor: build.distance_sensor,
-    dialect.OpticalFlow: build.optical_flow,
-    dialect.MissionCurrent: build.mission_current,
-    dialect.FenceStatus: build.fence_status,
-    dialect.Vibration: build.vibration,
+    dialect.Heartbeat: state_telemetry.heartbeat,
+    dialect.SysStatus: state_telemetry.sys_status,
+    dialect.SystemTime: state_telemetry.system_time,
+    dialect.Attitude: state_telemetry.attitude,
+    dialect.AttitudeQuaternion: state_telemetry.attitude_quaternion,
+    dialect.LocalPositionNed: state_telemetry.local_position_ned,
+    dialect.Odometry: state_telemetry.odometry,
+    dialect.GlobalPositionInt: state_telemetry.global_position_int,
+    dialect.GpsRawInt: sensor_telemetry.gps_raw_int,
+    dialect.VfrHud: state_telemetry.vfr_hud,
+    dialect.Altitude: state_telemetry.altitude,
+    dialect.BatteryStatus: sensor_telemetry.battery_status,
+    dialect.ExtendedSysState: state_telemetry.extended_sys_state,
+    dialect.EstimatorStatus: state_telemetry.estimator_status,
+    dialect.EkfStatusReport: state_telemetry.ekf_status_report,
+    dialect.HomePosition: state_telemetry.home_position,
+    dialect.GpsGlobalOrigin: state_telemetry.gps_global_origin,
+    dialect.PositionTargetLocalNed: state_telemetry.position_target_local_ned,
+    dialect.ScaledImu: sensor_telemetry.scaled_imu,
+    dialect.RawImu: sensor_telemetry.raw_imu,
+    dialect.HighresImu: sensor_telemetry.highres_imu,
+    dialect.ScaledPressure: sensor_telemetry.scaled_pressure,
+    dialect.DistanceSensor: sensor_telemetry.distance_sensor,
+    dialect.OpticalFlow: sensor_telemetry.optical_flow,
+    dialect.MissionCurrent: state_telemetry.mission_current,
+    dialect.FenceStatus: state_telemetry.fence_status,
+    dialect.Vibration: sensor_telemetry.vibration,
 }
 Rates = dict[type[Message], tuple[float, float]]
 """Rates at the levels normal and full [Hz of simulated time]."""

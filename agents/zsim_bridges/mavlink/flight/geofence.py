@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from zsim.math.rotation import Vector
-from zsim_bridges.mavlink.vehicle.enums import Cmd
-from zsim_bridges.mavlink.vehicle.mission import MissionItem, place_of
-from zsim_bridges.mavlink.vehicle.personality import Settings
-from zsim_bridges.mavlink.vehicle.vehicle_state import VehicleState
+from zsim_bridges.mavlink.autopilot.enums import Cmd
+from zsim_bridges.mavlink.autopilot.personality import Settings
+from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
+from zsim_bridges.mavlink.flight.mission import MissionItem, place_of
 
 Point = tuple[float, float]
 BREACH_NONE, BREACH_ALTITUDE, BREACH_BOUNDARY = 0, 2, 3  # FENCE_BREACH

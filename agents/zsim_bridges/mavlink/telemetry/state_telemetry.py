@@ -1,30 +1,25 @@
-"""The messages of telemetry, each made of a vehicle at a gate; None where there is nothing to tell."""
+"""Messages about what a vehicle does and where it is, each made at a gate; None where there is nothing to send."""
 
 import math
-from collections.abc import Callable
 
 from zsim.math import frames
-from zsim_bridges.mavlink.vehicle import axes
-from zsim_bridges.mavlink.vehicle.enums import (
+from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot.enums import (
     TYPE_QUADROTOR,
     BaseMode,
     EstimatorFlag,
     Frame,
-    GpsFix,
     Health,
     LandedState,
     SystemStatus,
     TypeMask,
 )
-from zsim_bridges.mavlink.vehicle.guidance import Target
-from zsim_bridges.mavlink.vehicle.personality import BY_STICKS, Mode
-from zsim_bridges.mavlink.vehicle.telemetry_source import TelemetrySource
+from zsim_bridges.mavlink.autopilot.personality import BY_STICKS, Mode
+from zsim_bridges.mavlink.flight.guidance import Target
+from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource, int16
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.message import Message
 
-UNKNOWN_16, UNKNOWN_8 = 65535, 255
-GAUSS_PER_UT, MILLIGAUSS_PER_UT = 0.01, 10.0
-MG_PER_M_S2 = 1000.0 / 9.80665
 MAVLINK_VERSION = 3  # of HEARTBEAT
 NAN = math.nan
 LANDED_STATES = {
@@ -35,7 +30,6 @@ LANDED_STATES = {
     "landing": LandedState.LANDING,
     "emergency": LandedState.UNDEFINED,
 }
-Builder = Callable[[TelemetrySource], Message | None]
 
 
 def heartbeat(s: TelemetrySource) -> dialect.Heartbeat:
@@ -120,7 +114,7 @@ def _body_velocity(s: TelemetrySource) -> tuple[float, float, float]:
 
 def global_position_int(s: TelemetrySource) -> Message:
     latitude, longitude, height = s.place
-    north, east, down = (_int16(100 * v) for v in s.velocity_ned_m_s)
+    north, east, down = (int16(100 * v) for v in s.velocity_ned_m_s)
     return dialect.GlobalPositionInt(
         s.boot_ms,
         round(1e7 * latitude),
@@ -134,35 +128,6 @@ def global_position_int(s: TelemetrySource) -> Message:
     )
 
 
-def _int16(value: float) -> int:
-    return max(-32767, min(32767, round(value)))
-
-
-def gps_raw_int(s: TelemetrySource) -> Message:
-    gps = s.state.samples.get("gps")
-    if gps is None or s.state.has_failed("gps"):
-        fix = GpsFix.NO_GPS if gps is None else GpsFix.NO_FIX
-        return dialect.GpsRawInt(s.boot_us, fix, eph=UNKNOWN_16, epv=UNKNOWN_16, vel=UNKNOWN_16, cog=UNKNOWN_16)
-    vx, vy, _ = gps.velocity_m_s
-    course = math.degrees(math.atan2(vx, vy)) % 360.0
-    sigma_mm = min(round(1000 * gps.sigma_m), 2**32 - 1)
-    return dialect.GpsRawInt(
-        time_usec=gps.t_sample_ns // 1000,
-        fix_type=min(gps.fix, 8),
-        lat=round(1e7 * gps.latitude_deg),
-        lon=round(1e7 * gps.longitude_deg),
-        alt=round(1000 * gps.altitude_m),
-        eph=100,  # HDOP 1: zsim has a standard deviation alone
-        epv=100,
-        vel=min(65534, round(100 * math.hypot(vx, vy))),
-        cog=round(100 * course) % 36000,
-        satellites_visible=min(gps.satellites, 254),
-        alt_ellipsoid=round(1000 * gps.altitude_m),
-        h_acc=sigma_mm,
-        v_acc=sigma_mm,
-    )
-
-
 def vfr_hud(s: TelemetrySource) -> Message:
     vx, vy, vz = s.state.velocity_m_s
     speed = math.hypot(vx, vy)
@@ -173,20 +138,6 @@ def vfr_hud(s: TelemetrySource) -> Message:
 def altitude(s: TelemetrySource) -> Message:
     z, height = s.state.position_m[2], s.place[2]
     return dialect.Altitude(s.boot_us, z, height, z, s.state.altitude_m, NAN, NAN)
-
-
-def battery_status(s: TelemetrySource) -> Message:
-    used = round(s.capacity_mah * (1.0 - s.battery_percent / 100.0))
-    return dialect.BatteryStatus(
-        current_consumed=max(0, used),
-        energy_consumed=-1,
-        temperature=32767,
-        voltages=(min(65534, round(1000 * s.voltage_v)), *(UNKNOWN_16,) * 9),
-        current_battery=-1,
-        type=1,  # MAV_BATTERY_TYPE_LIPO
-        battery_remaining=round(s.battery_percent),
-        charge_state=2 if s.state.is_battery_low else 1,  # LOW, OK of MAV_BATTERY_CHARGE_STATE
-    )
 
 
 def extended_sys_state(s: TelemetrySource) -> Message:
@@ -248,71 +199,6 @@ def position_target_local_ned(s: TelemetrySource) -> Message | None:
     )
 
 
-def scaled_imu(s: TelemetrySource) -> Message | None:
-    imu, mag = s.state.samples.get("imu"), s.state.samples.get("mag")
-    if imu is None or s.state.has_failed("imu"):
-        return None
-    accel = (_int16(MG_PER_M_S2 * a) for a in axes.frd(imu.accel_m_s2))
-    gyro = (_int16(1000 * w) for w in axes.frd(imu.gyro_rad_s))
-    field = (_int16(MILLIGAUSS_PER_UT * b) for b in axes.frd(mag.field_ut)) if mag else (0, 0, 0)
-    return dialect.ScaledImu(s.boot_ms, *accel, *gyro, *field)
-
-
-def raw_imu(s: TelemetrySource) -> Message | None:
-    scaled = scaled_imu(s)
-    if not isinstance(scaled, dialect.ScaledImu):
-        return None
-    m = scaled
-    return dialect.RawImu(s.boot_us, m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro, m.xmag, m.ymag, m.zmag)
-
-
-def highres_imu(s: TelemetrySource) -> Message | None:
-    imu = s.state.samples.get("imu")
-    if imu is None or s.state.has_failed("imu"):
-        return None
-    mag, baro = s.state.samples.get("mag"), s.state.samples.get("baro")
-    ax, ay, az = axes.frd(imu.accel_m_s2)
-    wx, wy, wz = axes.frd(imu.gyro_rad_s)
-    mx, my, mz = (GAUSS_PER_UT * b for b in axes.frd(mag.field_ut)) if mag else (0.0, 0.0, 0.0)
-    pressure, height = (baro.pressure_pa / 100.0, baro.altitude_m) if baro else (0.0, 0.0)
-    updated = 0x3F | (0x1C0 if mag else 0) | (0xA00 if baro else 0)  # HIGHRES_IMU_UPDATED_FLAGS
-    t_us = imu.t_sample_ns // 1000
-    return dialect.HighresImu(
-        t_us, ax, ay, az, wx, wy, wz, mx, my, mz, pressure, 0.0, height, 0.0, fields_updated=updated
-    )
-
-
-def scaled_pressure(s: TelemetrySource) -> Message | None:
-    baro = s.state.samples.get("baro")
-    if baro is None or s.state.has_failed("baro"):
-        return None
-    return dialect.ScaledPressure(s.boot_ms, baro.pressure_pa / 100.0)
-
-
-def distance_sensor(s: TelemetrySource) -> Message | None:
-    sonar = s.state.samples.get("sonar")
-    if sonar is None or s.state.has_failed("sonar"):
-        return None
-    return dialect.DistanceSensor(
-        s.boot_ms,
-        min_distance=3,
-        max_distance=600,
-        current_distance=max(0, min(65535, round(100 * sonar.range_m))) if sonar.valid else 601,
-        type=1,  # MAV_DISTANCE_SENSOR_ULTRASOUND
-        orientation=25,  # MAV_SENSOR_ROTATION_PITCH_270: downwards
-        covariance=UNKNOWN_8,
-    )
-
-
-def optical_flow(s: TelemetrySource) -> Message | None:
-    flow = s.state.samples.get("flow")
-    if flow is None or s.state.has_failed("flow"):
-        return None
-    forward, left, _ = flow.velocity_m_s
-    quality = max(0, min(255, round(255 * flow.quality)))
-    return dialect.OpticalFlow(s.boot_us, 0, 0, 0, forward, -left, quality, s.state.altitude_m)
-
-
 def mission_current(s: TelemetrySource) -> Message:
     mission = s.flight.mission
     return dialect.MissionCurrent(mission.current, mission.first + len(mission.items))
@@ -320,8 +206,4 @@ def mission_current(s: TelemetrySource) -> Message:
 
 def fence_status(s: TelemetrySource) -> Message:
     breached = s.breach != 0
-    return dialect.FenceStatus(int(breached), min(s.breaches, UNKNOWN_16), s.breach, s.breach_ns // 1_000_000)
-
-
-def vibration(s: TelemetrySource) -> Message:
-    return dialect.Vibration(s.boot_us)
+    return dialect.FenceStatus(int(breached), min(s.breaches, 0xFFFF), s.breach, s.breach_ns // 1_000_000)

@@ -7,7 +7,7 @@ import math
 from typing import NamedTuple
 
 from zsim.math.rotation import Quaternion, Vector
-from zsim_bridges.mavlink.vehicle.axes import wrapped
+from zsim_bridges.mavlink.autopilot.axes import wrapped
 
 K_POSITION_1_S = 0.8  # 1/s; that of the firmware's own hold
 K_YAW_1_S = 1.5  # 1/s, chosen: a turn of 90 deg in 2 s
@@ -39,7 +39,12 @@ class Target(NamedTuple):
     @property
     def is_moving(self) -> bool:
         """Whether it goes on somewhere for ever."""
-        return any(self.velocity_m_s) or (bool(self.yaw_rate_rad_s) and self.yaw_rad is None)
+        return any(self.velocity_m_s) or (self.yaw_rad is None and self.yaw_rate_rad_s != 0.0)
+
+    def leads_up(self, z_m: float) -> bool:
+        """Return whether it leads above z in W."""
+        z = self.position_m[2]
+        return self.velocity_m_s[2] > 0.0 or (z is not None and z > z_m)
 
 
 class AttitudeTarget(NamedTuple):
@@ -48,6 +53,15 @@ class AttitudeTarget(NamedTuple):
     q_WB: Quaternion
     thrust_n: float
     yaw_rate_rad_s: float
+
+    @property
+    def is_moving(self) -> bool:
+        """A tilt that is held for ever flies away."""
+        return True
+
+    def leads_up(self, z_m: float) -> bool:
+        """No take-off begins with a tilt."""
+        return False
 
 
 class SpeedLimits(NamedTuple):

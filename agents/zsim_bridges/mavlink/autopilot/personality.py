@@ -9,9 +9,9 @@ from enum import Enum
 from typing import Literal, NamedTuple
 
 from zsim.scenario.scenario import Drone
-from zsim_bridges.mavlink.vehicle.enums import Autopilot, ParamType
-from zsim_bridges.mavlink.vehicle.guidance import SpeedLimits
-from zsim_bridges.mavlink.vehicle.parameters import Parameters, ParameterSpec
+from zsim_bridges.mavlink.autopilot.enums import Autopilot, ParamType
+from zsim_bridges.mavlink.autopilot.parameters import Parameters, ParameterSpec
+from zsim_bridges.mavlink.flight.guidance import SpeedLimits
 
 REAL, INT, BYTE = ParamType.REAL32, ParamType.INT32, ParamType.INT8
 CM = 0.01  # m; ArduPilot's parameters of places and speeds

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from zsim.math.rotation import Vector
-from zsim_bridges.mavlink.vehicle import axes
-from zsim_bridges.mavlink.vehicle.enums import Cmd, Frame
-from zsim_bridges.mavlink.vehicle.guidance import Target, distance_m
-from zsim_bridges.mavlink.vehicle.personality import Settings
-from zsim_bridges.mavlink.vehicle.vehicle_state import VehicleState
+from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot.enums import Cmd, Frame
+from zsim_bridges.mavlink.autopilot.personality import Settings
+from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
+from zsim_bridges.mavlink.flight.guidance import Target, distance_m
 
 JUMPS_MAX = 1000  # at once without a waypoint between them: a circle of jumps
 ABSOLUTE = (Frame.GLOBAL, Frame.GLOBAL_INT)

@@ -1,0 +1,1 @@
+"""What an autopilot is to its clients: enumerations, axes, modes, parameters, and the state of its vehicle. Pure."""

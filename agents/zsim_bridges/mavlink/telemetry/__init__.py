@@ -1,0 +1,1 @@
+"""What a vehicle sends of itself, and how often. Pure."""
