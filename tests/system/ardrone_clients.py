@@ -138,9 +138,13 @@ class PlainPilot:
         """Send AT commands with sequence numbers of this program."""
         datagram = b""
         for command in commands:
-            self._sequence += 1
-            datagram += at_commands.format_command(command._replace(sequence=self._sequence))
+            datagram += at_commands.format_command(command._replace(sequence=self.next_sequence()))
         self.send_raw(datagram)
+
+    def next_sequence(self) -> int:
+        """Return the next sequence number of this program."""
+        self._sequence += 1
+        return self._sequence
 
     def send_raw(self, datagram: bytes, port: int = at_commands.PORT) -> None:
         """Send any bytes."""
