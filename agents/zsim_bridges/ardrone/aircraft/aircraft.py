@@ -97,6 +97,11 @@ class Aircraft:
         """The camera whose pictures are streamed."""
         return CAMERAS[0] if self._channel in FRONT_CHANNELS else CAMERAS[1]
 
+    @property
+    def is_steered(self) -> bool:
+        """Whether a pilot's program steers it now."""
+        return self._flight.setpoint is not None
+
     # The run
 
     def update(self, message: Any) -> None:

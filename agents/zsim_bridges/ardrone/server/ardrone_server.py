@@ -172,7 +172,12 @@ class ArdroneServer:
     def _on_event(self, payload: bytes) -> None:
         """Count and print which commands of pilots' programs the world refuses."""
         event = self._decoded(keys.EVENT, payload)
-        if event is not None and (event.kind, event.source) == ("refused", self._observer.name):
+        if event is None or (event.kind, event.source) != ("refused", self._observer.name):
+            return
+        _, thing, what = keys.parts(event.subject)
+        drone = self._drones.get(thing)
+        is_overtaken = what != "cmd/mode" and drone is not None and not drone.aircraft.is_steered
+        if not is_overtaken:  # a setpoint of the gate in which the pilot lands the drone says nothing
             self._refuse(f"{event.subject}: {event.data.get('reason', event.text)}")
 
     def _refuse(self, reason: str) -> None:

@@ -5,6 +5,7 @@ from fractions import Fraction
 from typing import Any, NamedTuple
 
 import av
+from av.error import FFmpegError
 from av.video.frame import PictureType
 
 WIDTH_PX, HEIGHT_PX = 640, 360  # as displayed; coded in whole macroblocks, 640 x 368
@@ -69,7 +70,7 @@ def _picture(jpeg: bytes) -> Any:
     reader: Any = av.CodecContext.create("mjpeg", "r")
     try:
         pictures = reader.decode(av.Packet(jpeg))
-    except (av.error.FFmpegError, ValueError) as error:
+    except (FFmpegError, ValueError) as error:
         raise PictureError(f"it is no JPEG that can be read ({error})") from error
     if not pictures:
         raise PictureError("it is no JPEG that can be read")

@@ -1,0 +1,223 @@
+"""Programs for the AR.Drone, unmodified, fly the drones of a run through `zsim ardrone serve`."""
+
+import ftplib
+import io
+import math
+import socket
+from collections.abc import Iterator
+
+import pytest
+from ardrone_clients import PlainPilot, addresses, node, node_modules, python, serve
+from federation import ONE, Federation, Role
+from picture_pump import pumping
+from wire import PATIENCE_S, Client
+
+from zsim_bridges.ardrone.wire import at_commands, configuration_text
+from zsim_bridges.ardrone.wire.navdata import StateBit
+
+__all__ = ["node_modules"]
+
+pytestmark = pytest.mark.xdist_group("ardrone")
+
+FLEET = """
+name: fleet
+seed: 3
+duration_s: 3600
+drones:
+  - {name: drone1, position_m: [0, 0, 0], yaw_deg: 90}
+  - {name: drone2, position_m: [20, 0, 0], yaw_deg: 0}
+  - {name: drone3, position_m: [40, 0, 0], yaw_deg: 45}
+  - {name: drone4, position_m: [60, 0, 0], yaw_deg: 180}
+  - {name: drone5, position_m: [80, 0, 0], yaw_deg: 0}
+  - {name: drone6, position_m: [100, 0, 0], yaw_deg: 0, limits: {tilt_deg: 5}}
+processes: {expect: []}
+"""
+BOOTSTRAP_BYTES, DEMO_BYTES, FULL_BYTES, GPS_BYTES = 24, 500, 1904, 2120
+DEMO_AND_TIME = 1 << 0 | 1 << 1
+WITH_GPS = 65_537 | 1 << 27
+
+
+class Fleet:
+    """A world in real pace, its drones as AR.Drones, and a program beside."""
+
+    def __init__(self, federation: Federation) -> None:
+        self.addresses = addresses(6)
+        self.world = federation.world(FLEET, "--rate", "1")
+        self.server: Role = serve(federation, self.addresses[0])
+        self.client: Client = federation.client()
+        self.server.line(f"drone6 is an AR.Drone 2.0 at {self.addresses[5]}")
+
+    def states(self) -> dict[str, str]:
+        """Return the state of each drone."""
+        return {key.split("/")[1]: status["state"] for key, status in self.client.get("drone/*/sensor/status").items()}
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[Fleet]:
+    """A fleet that the tests of this file share; each leaves its drones on the ground."""
+    with Federation(tmp_path_factory.mktemp("ardrone")) as federation:
+        yield Fleet(federation)
+
+
+def test_programs_fly_five_drones_at_once(fleet: Fleet, node_modules) -> None:
+    one, two, three, four, five, _ = fleet.addresses
+    programs = [
+        node("fly.js", node_modules, one, two),
+        node("mission.js", node_modules, three),
+        python("pyardrone_flies.py", four),
+        python("ardrone_sdk_flies.py", five),
+    ]
+    try:
+        with pumping(fleet.client, "drone/drone4/camera/front", (320, 180)):
+            pair, mission, pyardrone, sdk = (program.events() for program in programs)
+    finally:
+        for program in programs:
+            program.close()
+    for address in (one, two):
+        flown = {each["event"]: each for each in pair if each["ip"] == address}
+        assert list(flown) == ["configured", "hovering", "flying", "stopped", "landed"]
+        assert 0.9 < flown["hovering"]["altitude"] < 1.2
+        assert flown["flying"]["state"] == "CTRL_FLYING"
+        assert flown["flying"]["speed"] > 500.0
+        assert -12.0 < flown["flying"]["pitch"] < -1.0
+        assert abs(flown["stopped"]["speed"]) < 300.0
+    arrived, landed = mission
+    assert (abs(arrived["x"] - 1.0), abs(arrived["y"])) < (0.4, 0.4)
+    assert abs(arrived["z"] - 1.5) < 0.2
+    assert abs(arrived["yaw"] - math.pi / 2) < 0.2
+    assert landed["event"] == "landed"
+    assert [each["event"] for each in pyardrone] == ["connected", "hovering", "turned", "picture", "landed"]
+    assert pyardrone[2]["altitude_mm"] > 1400
+    assert pyardrone[3]["shape"] == [360, 640, 3]
+    assert [each["event"] for each in sdk] == ["hovering", "flying", "landed"]
+    assert set(fleet.states().values()) == {"landed"}
+    assert "is landing" not in fleet.server.text()
+
+
+def test_navdata_begins_with_bootstrap_and_is_acknowledged(fleet: Fleet) -> None:
+    with PlainPilot(fleet.addresses[5]) as pilot:
+        pilot.request()
+        datagram, sender = pilot.receive()
+        assert len(datagram) == BOOTSTRAP_BYTES
+        assert sender == (fleet.addresses[5], 5554)
+        pilot.config("general:navdata_demo", "TRUE")
+        assert len(pilot.receive()[0]) == DEMO_BYTES
+        pilot.config("general:navdata_demo", "FALSE")
+        assert len(pilot.receive()[0]) == FULL_BYTES
+        pilot.config("general:navdata_options", str(WITH_GPS))
+        packet = pilot.until(lambda packet: 27 in packet.options)
+        assert abs(packet.options[27].latitude_deg + 34.603) < 0.01
+        pilot.config("general:navdata_options", "65537")
+        pilot.config("general:navdata_demo", "TRUE")
+
+
+def test_a_demo_comes_fifteen_times_a_simulated_second(fleet: Fleet) -> None:
+    with PlainPilot(fleet.addresses[5]) as pilot:
+        pilot.request()
+        pilot.config("general:navdata_options", str(DEMO_AND_TIME))
+        pilot.config("general:navdata_demo", "TRUE")
+        pilot.until(lambda packet: 1 in packet.options)
+        times_s = [_seconds(next(pilot.packets()).options[1].time) for _ in range(20)]
+        pilot.config("general:navdata_options", "65537")
+    numbers = [math.floor(15 * t + 1e-6) for t in times_s]
+    assert numbers == list(range(numbers[0], numbers[0] + 20))
+
+
+def _seconds(time: int) -> float:
+    return (time >> 21) + (time & 0x1FFFFF) / 1e6
+
+
+def test_the_control_port_has_the_configuration(fleet: Fleet) -> None:
+    with PlainPilot(fleet.addresses[5]) as pilot:
+        pilot.request()
+        pilot.send(at_commands.ResetWatchdog(0))
+        pilot.config("CONTROL:euler_angle_max", "0.3")
+        entries = configuration_text.parse_configuration(pilot.configuration())
+        assert entries["general:num_version_soft"] == "2.4.8"
+        assert float(entries["control:euler_angle_max"]) == pytest.approx(math.radians(5.0), abs=1e-4)  # the drone's
+        kept = configuration_text.parse_custom_list(pilot.configuration(at_commands.SEND_CUSTOM_LIST))
+        assert kept.sessions == {"00000000": "default"}
+
+
+def test_the_version_comes_by_ftp_and_the_question_is_answered(fleet: Fleet) -> None:
+    address = fleet.addresses[5]
+    with ftplib.FTP() as ftp:
+        ftp.connect(address, 5551, PATIENCE_S)
+        ftp.login()
+        content = io.BytesIO()
+        ftp.retrbinary("RETR version.txt", content.write)
+        assert content.getvalue().strip() == b"2.4.8"
+        assert ftp.nlst() == ["version.txt"]
+        with pytest.raises(ftplib.error_perm, match="550"):
+            ftp.retrbinary("RETR ../../etc/passwd", content.write)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
+        asker.settimeout(PATIENCE_S)
+        asker.sendto(b"PARROT AUTH", (address, 5552))
+        assert asker.recv(100) == b"PARROT AUTH OK"
+
+
+def test_a_drone_that_another_process_flies_is_shown_and_not_obeyed(fleet: Fleet) -> None:
+    with PlainPilot(fleet.addresses[5]) as pilot:
+        pilot.request()
+        pilot.config("general:navdata_demo", "TRUE")
+        statuses = fleet.client.subscribe("drone/drone6/sensor/status")
+        fleet.client.put("drone/drone6/cmd/mode", t_ns=0, source="tester.one", mode="takeoff")
+        statuses.until(lambda status: status["state"] == "hovering")
+        for _ in range(3):
+            still = {"velocity_m_s": [0.0, 0.0, 0.3], "yaw_rate_rad_s": 0.0, "frame": "world"}
+            fleet.client.put("drone/drone6/cmd/velocity", t_ns=0, source="tester.one", **still)
+        statuses.until(lambda status: status["commander"] == "tester.one")
+        pilot.request()  # it was silent, and is sent no more
+        shown = pilot.until(lambda packet: StateBit.FLYING in packet.state and packet.options[0].ctrl_state >> 16 == 3)
+        assert shown.options[0].altitude_mm > 500
+        pilot.send(at_commands.ref(0, takes_off=False, emergency=True), at_commands.Pcmd(0, 1, 1.0, 0.0, 0.0, 0.0))
+        fleet.server.line(r"drone6: REF is not obeyed: tester\.one flies the drone")
+        fleet.server.line(r"drone6: PCMD is not obeyed: tester\.one flies the drone")
+        packet = next(pilot.packets())
+        assert not packet.state & (StateBit.EMERGENCY | StateBit.USER_EMERGENCY)
+        assert fleet.states()["drone6"] in ("flying", "hovering")
+        fleet.client.put("drone/drone6/cmd/mode", t_ns=0, source="tester.one", mode="land")
+        statuses.until(lambda status: status["state"] == "landed")
+        assert fleet.client.request("world/control", "release", source="tester.one", drone="drone6")["ok"]
+
+
+def test_a_run_as_fast_as_possible_is_refused_or_paced(federation: Federation) -> None:
+    federation.world(ONE, "--expect", "nobody.yet")
+    first = addresses(20)[-1]
+    refused = serve(federation, first)
+    refused.ends(with_code=2)
+    refused.line("flown as fast as possible.*--rate 1")
+    paced = serve(federation, first, "--rate", "2")
+    paced.line(f"drone1 is an AR.Drone 2.0 at {first}")
+    assert federation.client().get("clock")["clock"]["state"] == "waiting"
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--addresses", "192.0.2.1"), "192.0.2.1 is reached by every host.*--peer HOST"),
+        (("--addresses", "192.0.2.1", "--peer", "192.0.2.9"), "the address is not this host's"),
+        (("--addresses", "drone9=127.0.0.9"), "--addresses names 'drone9'; must be one of drone1"),
+        (("--addresses", "here"), "must be an IPv4 address"),
+    ],
+)
+def test_addresses_that_cannot_be_had_are_refused(fleet: Fleet, options: tuple[str, ...], reason: str) -> None:
+    # a server beside the fleet's, under another name
+    endpoint = fleet.server.arguments[fleet.server.arguments.index("--connect") + 1]
+    role = Role(["ardrone", "serve", "--connect", endpoint, "--name", "ardrone.other", *options])
+    try:
+        role.ends(with_code=2)
+        role.line(reason)
+    finally:
+        role.close()
+
+
+def test_a_second_server_on_the_same_addresses_is_refused(fleet: Fleet) -> None:
+    endpoint = fleet.server.arguments[fleet.server.arguments.index("--connect") + 1]
+    where = ("--addresses", fleet.addresses[0], "--name", "ardrone.other")
+    role = Role(["ardrone", "serve", "--connect", endpoint, *where])
+    try:
+        role.ends(with_code=2)
+        role.line("UDP port 5554 of .* cannot be had: another program has it")
+    finally:
+        role.close()

@@ -1,0 +1,163 @@
+"""Addresses, and who is let in on a drone's ports."""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Awaitable, Callable
+
+import pytest
+from refused import refused
+
+from zsim.errors import RunError
+from zsim_bridges.ardrone.server.addresses import Peers, drone_addresses, peer_addresses
+from zsim_bridges.ardrone.server.datagram_ports import DatagramPort, open_datagram_port
+from zsim_bridges.ardrone.server.stream_port import CONNECTIONS_MAX, StreamPort, read_until_end
+
+HOME = "127.0.0.1"
+ELSEWHERE = Peers("192.0.2.1", frozenset({"192.0.2.9"}))  # as on an address that other hosts reach
+HERE = Peers("127.0.0.2", frozenset())
+NAMES = ["drone1", "drone2"]
+
+
+def test_addresses_follow_the_first():
+    assert drone_addresses("127.0.0.254", [*NAMES, "drone3"]) == {
+        "drone1": "127.0.0.254",
+        "drone2": "127.0.0.255",
+        "drone3": "127.0.1.0",
+    }
+
+
+def test_addresses_by_name_leave_the_others_out():
+    assert drone_addresses("drone2=192.168.1.5", NAMES) == {"drone2": "192.168.1.5"}
+
+
+@pytest.mark.parametrize(
+    ("text", "terms"),
+    [
+        ("localhost", ("'localhost'", "IPv4")),
+        ("", ("''", "IPv4")),
+        ("255.255.255.255", ("255.255.255.255", "enough")),
+        ("drone3=127.0.0.2", ("'drone3'", "drone1", "drone2")),
+        ("drone1=127.0.0.2,drone2=127.0.0.2", ("address", "own")),
+        ("drone1=::1", ("'::1'", "IPv4")),
+    ],
+)
+def test_addresses_that_are_none(text: str, terms: tuple[str, ...]):
+    with refused(RunError, *terms):
+        drone_addresses(text, NAMES)
+
+
+def test_peers_are_names_or_addresses():
+    assert peer_addresses(["localhost", "192.0.2.9"]) == {"127.0.0.1", "192.0.2.9"}
+    with refused(RunError, "--peer", "no.such.host.invalid"):
+        peer_addresses(["no.such.host.invalid"])
+
+
+def test_on_loopback_everybody_of_this_host_is_obeyed():
+    assert HERE.allow(HOME)
+
+
+def test_elsewhere_those_that_were_named_alone():
+    assert ELSEWHERE.allow("192.0.2.9")
+    assert not ELSEWHERE.allow("192.0.2.10")
+    assert not ELSEWHERE.allow(HOME)
+    with refused(RunError, "192.0.2.1", "--peer"):
+        Peers("192.0.2.1", frozenset())
+
+
+class Refusals(list[str]):
+    """Reasons, and a way to wait for one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.came = asyncio.Event()
+
+    def add(self, reason: str) -> None:
+        self.append(reason)
+        self.came.set()
+
+
+def run(test: Callable[[Refusals], Awaitable[None]]) -> None:
+    async def within() -> None:
+        await asyncio.wait_for(test(Refusals()), 60.0)
+
+    asyncio.run(within())
+
+
+def test_a_stranger_s_datagrams_are_counted_and_not_taken():
+    async def test(refusals: Refusals) -> None:
+        taken: list[bytes] = []
+        port = DatagramPort(ELSEWHERE, lambda data, _: taken.append(data), refusals.add)
+        number = await _opened(port)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.sendto(b"AT*REF=1,290718208\r", (HOME, number))
+            await refusals.came.wait()
+        port.close()
+        assert taken == []
+        assert refusals == ["127.0.0.1 sends datagrams, and is no --peer"]
+
+    run(test)
+
+
+def test_a_datagram_of_this_host_is_taken_on_loopback():
+    async def test(refusals: Refusals) -> None:
+        taken: asyncio.Queue[bytes] = asyncio.Queue()
+        port = DatagramPort(HERE, lambda data, _: taken.put_nowait(data), refusals.add)
+        number = await _opened(port)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as pilot:
+            pilot.sendto(b"hello", (HOME, number))
+            assert await taken.get() == b"hello"
+        port.close()
+        assert refusals == []
+
+    run(test)
+
+
+async def _opened(port: DatagramPort) -> int:
+    await open_datagram_port(HOME, 0, port)
+    assert port._transport is not None
+    return port._transport.get_extra_info("sockname")[1]
+
+
+def test_a_stranger_s_connection_is_ended_and_counted():
+    async def test(refusals: Refusals) -> None:
+        port = StreamPort(ELSEWHERE, read_until_end, refusals.add)
+        reader, writer = await asyncio.open_connection(HOME, await port.open(HOME, 0))
+        with contextlib.suppress(ConnectionError):
+            assert await reader.read(1) == b""
+        writer.close()
+        await port.close()
+        assert refusals == ["127.0.0.1 connects, and is no --peer"]
+
+    run(test)
+
+
+def test_there_is_an_end_to_connections():
+    async def test(refusals: Refusals) -> None:
+        port = StreamPort(HERE, read_until_end, refusals.add)
+        number = await port.open(HOME, 0)
+        connections = [await asyncio.open_connection(HOME, number) for _ in range(CONNECTIONS_MAX + 1)]
+        await refusals.came.wait()
+        assert len(port.writers) <= CONNECTIONS_MAX
+        assert "connections already" in refusals[0]
+        await port.close()
+        for _, writer in connections:
+            writer.close()
+
+    run(test)
+
+
+def test_what_is_broadcast_comes_to_all():
+    async def test(refusals: Refusals) -> None:
+        port = StreamPort(HERE, read_until_end, refusals.add)
+        number = await port.open(HOME, 0)
+        connections = [await asyncio.open_connection(HOME, number) for _ in range(2)]
+        while len(port.writers) < 2:
+            await asyncio.sleep(0)
+        port.broadcast(b"news")
+        for reader, writer in connections:
+            assert await reader.readexactly(4) == b"news"
+            writer.close()
+        await port.close()
+
+    run(test)

@@ -1,0 +1,145 @@
+"""The live video: frames that can be decoded from an IDR frame on, behind their headers."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+import synthetic_pictures
+
+from zsim.contract.camera_messages import CameraImage
+from zsim_bridges.ardrone.server.addresses import Peers
+from zsim_bridges.ardrone.wire import pave
+from zsim_bridges.ardrone.wire.pave import FrameType, PaveHeader
+
+av = pytest.importorskip("av")
+
+from zsim_bridges.ardrone.server.video_encoder import IDR_EVERY, PictureError, VideoEncoder, nal_units  # noqa: E402
+from zsim_bridges.ardrone.server.video_server import VideoServer  # noqa: E402
+
+HOME = "127.0.0.1"
+
+
+def jpeg(shade: int) -> bytes:
+    return synthetic_pictures.jpeg(shade, 320, 240)
+
+
+def picture(shade: int, t_ms: int = 0, data: bytes | None = None) -> CameraImage:
+    content = jpeg(shade) if data is None else data
+    return CameraImage(
+        t_ns=0, seq=0, t_sample_ns=t_ms * 1_000_000, source="camera", width=320, height=240, data=content
+    )
+
+
+def shades(frames: list[bytes]) -> list[float]:
+    """Return the mean brightness of each frame, as another decoder of H.264 has it."""
+    decoder = av.CodecContext.create("h264", "r")
+    decoder.thread_count = 1
+    decoded = [frame for data in (*frames, None) for frame in decoder.decode(av.Packet(data) if data else None)]
+    assert {(frame.width, frame.height) for frame in decoded} <= {(640, 360)}
+    return [float(frame.to_ndarray(format="gray").mean()) for frame in decoded]
+
+
+def test_pictures_are_what_was_encoded():
+    encoder = VideoEncoder()
+    frames = [encoder.encode(jpeg(shade), begins=False) for shade in (40, 120, 200)]
+    assert [frame.is_idr for frame in frames if frame] == [True, False, False]
+    brightness = shades([frame.data for frame in frames if frame])
+    assert brightness[0] < brightness[1] < brightness[2]
+
+
+def test_an_idr_frame_has_sps_and_pps_and_comes_every_second_and_when_it_is_asked_for():
+    encoder = VideoEncoder()
+    frames = [encoder.encode(jpeg(100), begins=k == 5) for k in range(IDR_EVERY + 6)]
+    begins = [k for k, frame in enumerate(frames) if frame and frame.is_idr]
+    assert begins == [0, 5, IDR_EVERY + 5]
+    for frame in frames:
+        assert frame is not None
+        assert (frame.sps_size > 0, frame.pps_size > 0) == (frame.is_idr, frame.is_idr)
+        assert sum(size for _, size in nal_units(frame.data)) == len(frame.data)
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff", b"\xff\xd8\xff" + bytes(500)])
+def test_what_is_no_picture_is_refused(data: bytes):
+    with pytest.raises(PictureError, match="no JPEG"):
+        VideoEncoder().encode(data, begins=False)
+
+
+class Stream:
+    """A connection to a video server."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader = reader
+        self.writer = writer
+
+    async def frame(self) -> tuple[PaveHeader, bytes]:
+        header = pave.unpack(await self._reader.readexactly(pave.HEADER_SIZE))
+        return header, await self._reader.readexactly(header.payload_size)
+
+
+def run(test: Callable[[VideoServer, Callable[[], Awaitable[Stream]], list[str]], Awaitable[None]]) -> None:
+    async def served() -> None:
+        refusals: list[str] = []
+        server = VideoServer(Peers("127.0.0.2", frozenset()), refusals.append)
+        number = await server.port.open(HOME, 0)
+
+        async def connect() -> Stream:
+            before = len(server.port.writers)
+            stream = Stream(*await asyncio.open_connection(HOME, number))
+            while len(server.port.writers) == before:
+                await asyncio.sleep(0)
+            return stream
+
+        try:
+            await asyncio.wait_for(test(server, connect, refusals), 60.0)
+        finally:
+            server.close()
+            await server.port.close()
+
+    asyncio.run(served())
+
+
+def test_a_connection_begins_with_an_idr_frame():
+    async def test(server: VideoServer, connect, _: list[str]) -> None:
+        first = await connect()
+        server.on_picture(picture(60, t_ms=100))
+        header, data = await first.frame()
+        assert header.frame_type == FrameType.IDR
+        assert (header.timestamp_ms, header.encoded_height, header.display_height) == (100, 368, 360)
+        server.on_picture(picture(80))
+        assert (await first.frame())[0].frame_type == FrameType.P
+        second = await connect()
+        server.on_picture(picture(100))
+        for stream in (first, second):
+            header, data = await stream.frame()
+            assert header.frame_type == FrameType.IDR
+            assert header.frame_number == 2
+            assert shades([data])
+            stream.writer.close()
+
+    run(test)
+
+
+def test_nothing_is_encoded_while_nobody_is_connected():
+    async def test(server: VideoServer, connect, _: list[str]) -> None:
+        server.on_picture(picture(60))
+        assert not server.is_watched
+        stream = await connect()
+        server.on_picture(picture(60))
+        assert (await stream.frame())[0].frame_number == 0
+        stream.writer.close()
+
+    run(test)
+
+
+def test_a_picture_that_cannot_be_read_is_counted_and_the_next_one_comes():
+    async def test(server: VideoServer, connect, refusals: list[str]) -> None:
+        stream = await connect()
+        server.on_picture(picture(0, data=b"\xff\xd8\xff" + bytes(100)))
+        while not refusals:
+            await asyncio.sleep(0)
+        server.on_picture(picture(60))
+        assert (await stream.frame())[0].frame_type == FrameType.IDR
+        assert "a picture cannot be streamed" in refusals[0]
+        stream.writer.close()
+
+    run(test)
