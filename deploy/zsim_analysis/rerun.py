@@ -17,6 +17,7 @@ from zsim.contract.fingerprint import fingerprint
 from zsim.errors import RecordError, RunError
 from zsim.record import RecordReader
 from zsim.runtime.progress import Screen, Throttle
+from zsim.scenario.fault_check import listed
 from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, RecordedRun, gates, open_run, recorded_agents
 from zsim_analysis.rerun_bus import RerunBus, TruthComparison
 from zsim_world.flight.world import World
@@ -58,6 +59,9 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
     with open_run(place) as record:
         if record.info.replay_of:
             raise RunError(f"{place}: is the record of a replay; rerun that of run {record.info.replay_of}")
+        if external := record.scenario.external():
+            reason = f"has drones whose bodies are external ({listed(external)}); they cannot be flown again"
+            raise RunError(f"{place}: {reason}")
         agents = recorded_agents(record.reader, record.info, record.scenario)
         _warn(record.info, agents, note)
         if commands_only or agents.why_not:

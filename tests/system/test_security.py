@@ -16,7 +16,7 @@ import zenoh
 from federation import ONE, PAIR, PAIR_ROLES, Federation, Role
 from forked_commands import USER_FAULT, refusal
 from refused import has_terms, parts
-from rights_table import KEYS, ROLES, SCENARIO, keys_of
+from rights_table import KEYS, ROLES, SCENARIO, SIMULATED, keys_of
 from secured import HOST, PREFIX, READY, SHORT_S, SITE, Certificates, KeyLog, RawClient, hub, site, tls_endpoint
 
 from zsim.scenario import rights, scenario_file
@@ -256,7 +256,7 @@ def test_a_certificate_whose_time_is_over_says_so(made: Certificates) -> None:
 
 
 def test_a_world_whose_time_is_over_says_so(made: Certificates, tmp_path: Path) -> None:
-    (tmp_path / "scenario.yaml").write_text(SCENARIO)
+    (tmp_path / "scenario.yaml").write_text(SIMULATED)
     folder = made.of("world", days=-0.5, host="past")
     line = refusal("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--tls", str(folder))
     assert has_terms(line, "world", "certs init --renew")
@@ -281,7 +281,7 @@ def test_a_certificate_for_another_name_is_a_line_at_once(
     endpoint = tls_endpoint()
     if "[" in role[-1]:
         secured = ("--listen", endpoint, "--tls", str(world.tls), "--access", str(world.access))
-        federation.start("world", federation.write(SCENARIO), *secured)
+        federation.start("world", federation.write(SIMULATED), *secured)
     folder = made.of("estimator.drone1")
     line = refusal(*(part.format(free=tls_endpoint()) for part in role), "--connect", endpoint, "--tls", str(folder))
     assert has_terms(line, str(folder), "estimator.drone1", name, "--tls")
@@ -290,7 +290,7 @@ def test_a_certificate_for_another_name_is_a_line_at_once(
 def test_a_world_with_the_certificate_of_another_is_a_line_before_it_compiles(
     made: Certificates, tmp_path: Path
 ) -> None:
-    (tmp_path / "scenario.yaml").write_text(SCENARIO)
+    (tmp_path / "scenario.yaml").write_text(SIMULATED)
     folder = made.of("recorder")
     line = refusal("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--tls", str(folder))
     assert has_terms(line, str(folder), "recorder", "world", "--tls")
@@ -328,7 +328,7 @@ def test_a_right_that_is_lacking_is_a_line(federation: Federation, made: Certifi
     rules = access_control(scenario_file.from_text(SCENARIO), ["estimator.drone1", "operator.main"], {})
     endpoint, world = tls_endpoint(), made.identity("world", rules)
     secured = ("--listen", endpoint, "--tls", str(world.tls), "--access", str(world.access))
-    federation.start("world", federation.write(SCENARIO), *secured)
+    federation.start("world", federation.write(SIMULATED), *secured)
     own, operator = ("--connect", endpoint, "--tls", str(made.of("estimator.drone1"))), str(made.of("operator.main"))
     for command, terms in LACKING:
         assert has_terms(refusal(*command, *own), "estimator.drone1", *terms, "zsim certs init"), command
@@ -405,7 +405,7 @@ def test_files_of_no_use_are_a_line(tmp_path: Path, name: str) -> None:
 
 def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path: Path) -> None:
     folder, access = made.of("operator.main"), tmp_path / "access.json"
-    (tmp_path / "scenario.yaml").write_text(SCENARIO)
+    (tmp_path / "scenario.yaml").write_text(SIMULATED)
     world = ("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--access", str(access))
     tls = ("--tls", str(made.of("world")))
     assert has_terms(refusal("keys", "--tls", str(folder)), "--tls", "tls/ADDRESS:PORT")

@@ -5,7 +5,7 @@ is not counted: a number that is missing there may never have reached the world,
 """
 
 from array import array
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -155,8 +155,9 @@ class _Numbers:
 
 def completeness(reader: RecordReader) -> Completeness:
     """Return whether a record has everything: all of it is read, and every check sum compared."""
-    is_replay = _is_replay(reader)
-    numbers = _Numbers(() if is_replay else filter(_is_numbered, reader.topics()))
+    info = _info(reader)
+    is_replay, external = info is not None and bool(info.replay_of), _external(info)
+    numbers = _Numbers(key for key in reader.topics() if not is_replay and _is_numbered(key, external))
     clocks: list[run_messages.Clock] = []
     decode = msgspec.msgpack.Decoder(run_messages.Clock).decode
     for recorded in reader.messages(by_time=False):
@@ -189,16 +190,24 @@ def record_completeness(path: Path) -> Completeness:
         return completeness(reader)
 
 
-def _is_replay(reader: RecordReader) -> bool:
-    """Tell whether a record is of a replay: that has clocks of its own, and numbers of the run that it played."""
+def _info(reader: RecordReader) -> messages.Info | None:
+    """Return the `world/info` of a record: a replay has clocks of its own, and numbers of the run that it played."""
     info = reader.last(keys.INFO)
     try:
-        return info is not None and bool(messages.decode(keys.INFO, info.payload).replay_of)
+        return messages.decode(keys.INFO, info.payload) if info else None
     except DecodeError:
-        return False
+        return None
 
 
-def _is_numbered(key: str) -> bool:
+def _external(info: messages.Info | None) -> frozenset[str]:
+    """Return the drones of which drivers publish, and not the world."""
+    drones = info.drones if info else ()
+    return frozenset(drone.name for drone in drones if drone.body is not msgspec.UNSET)
+
+
+def _is_numbered(key: str, external: Container[str]) -> bool:
     """Tell whether only the world publishes on a key, in one run of numbers."""
-    group, _, what = keys.parts(key)
-    return key == keys.EVENT or (group == "drone" and (what == "truth" or what.startswith("sensor/")))
+    group, drone, what = keys.parts(key)
+    if group != "drone":
+        return key == keys.EVENT
+    return what.startswith("accepted/") or (drone not in external and (what == "truth" or what.startswith("sensor/")))

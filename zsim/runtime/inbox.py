@@ -16,6 +16,7 @@ from zsim.contract.framing import GateMessages
 GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
+UNHEARD_NS = ALWAYS_NS - 1  # before whatever was taken last
 
 
 class Inbox:
@@ -46,7 +47,7 @@ class Inbox:
         sparse: Sequence[str] = (),
     ) -> None:
         self._closing = dict.fromkeys(gate_keys)
-        self._sparse = dict.fromkeys(sparse, (ALWAYS_NS, ALWAYS_NS))  # with the stamps of its last two messages
+        self._sparse = dict.fromkeys(sparse, (UNHEARD_NS, UNHEARD_NS))  # with the stamps of its last two messages
         of_world = {key for key in gate_keys if keys.is_status(key) and key not in self._sparse}
         self._beside = dict.fromkeys(key for key in gate_keys if key not in of_world)  # not closed by GateMessages
         self._meters = {keys.status(drone): _Meter() for drone in counted}

@@ -37,6 +37,7 @@ class Track:
         status_t_ns: (S,) instants of status.
         states: (S,) state of the firmware by name.
         battery_percent: (S,).
+        external: whether it is the pose that a driver has published: the best that it had, not the truth.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Track:
     status_t_ns: Times
     states: list[str]
     battery_percent: Array
+    external: bool = False
 
     @property
     def p_W(self) -> Array:
@@ -254,11 +256,12 @@ class FlightReader:
         """Return the flight when all messages are added; the arguments describe its record, if there is one."""
         info = self._infos[-1] if self._infos else None
         names = [drone.name for drone in info.drones] if info else sorted(self._truth)
+        external = {drone.name for drone in info.drones if drone.body is not msgspec.UNSET} if info else set[str]()
         members = {c.name: c.drones for c in info.clusters} if info else dict.fromkeys(self._states, ())
         return RecordedFlight(
             info=info,
             scenario=scenario_of(info),
-            tracks=[self._track(name) for name in names],
+            tracks=[self._track(name, name in external) for name in names],
             clusters=[_states(name, drones, self._states.get(name, [])) for name, drones in members.items()],
             events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
             processes=list(self._processes.values()),
@@ -268,7 +271,7 @@ class FlightReader:
             undecoded=self._undecoded,
         )
 
-    def _track(self, name: str) -> Track:
+    def _track(self, name: str, external: bool) -> Track:
         times, values = self._truth.get(name, (array("q"), array("d")))
         status_times, states, battery = self._status.get(name, (array("q"), [], array("d")))
         t_ns, first = np.unique(np.array(times, np.int64), return_index=True)
@@ -280,6 +283,7 @@ class FlightReader:
             status_t_ns=status_t_ns,
             states=[states[i] for i in status_first],
             battery_percent=np.array(battery, np.float64)[status_first],
+            external=external,
         )
 
 

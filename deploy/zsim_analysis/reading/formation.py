@@ -72,10 +72,16 @@ def common_instants(tracks: list[Track]) -> tuple[Times, list[NDArray[np.intp]]]
 
 
 def min_separation_m(tracks: list[Track]) -> float | None:
-    """Return the least true distance [m] of two drones that are both in the air.
+    """Return the least true distance [m] of two drones that are both in the air, external ones where they are known.
 
     Where no status shows a drone in the air, all instants count; None when there are no two drones.
     """
+    simulated = [track for track in tracks if not track.external]  # whose truth has more instants
+    each = (_least_m(tracks), _least_m(simulated) if len(simulated) < len(tracks) else None)
+    return min((least for least in each if least is not None), default=None)
+
+
+def _least_m(tracks: list[Track]) -> float | None:
     tracks = [track for track in tracks if len(track.t_ns)]
     t_ns, places = common_instants(tracks)
     if len(tracks) < 2 or not len(t_ns):
@@ -196,9 +202,12 @@ def _difference(space: ClusterSpace, to: Array, desired: Array) -> Array:
 
 
 def _true(space: ClusterSpace, members: list[Track], wanted_ns: Times) -> Array:
-    """Return the cluster variables (K, 4n) of where the drones truly were; NaN without truth or frame."""
+    """Return the cluster variables (K, 4n) of where the drones truly were; NaN without truth or frame.
+
+    Nobody knows where an external one truly is.
+    """
     true = np.full((len(wanted_ns), space.size), np.nan)
-    if len(members) < space.n:
+    if len(members) < space.n or any(track.external for track in members):
         return true
     t_ns, places = common_instants(members)
     _, rows, common = np.intersect1d(wanted_ns, t_ns, assume_unique=True, return_indices=True)

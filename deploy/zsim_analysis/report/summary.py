@@ -11,7 +11,7 @@ from msgspec import Struct
 from zsim import __version__
 from zsim.contract.fingerprint import TruthHash
 from zsim.contract.run_messages import Event
-from zsim_analysis.reading.flight import TRUTH_WIDTH, RecordedFlight, RecordedProcess
+from zsim_analysis.reading.flight import TRUTH_WIDTH, RecordedFlight, RecordedProcess, Track
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m, window
 from zsim_analysis.reading.recorded_run import command_age_ms
 
@@ -69,9 +69,9 @@ class RecordFacts(Struct, frozen=True):
         gaps: `gates` that are missing one behind the other, `from_s` the first of them `to_s` the last.
         messages_missing: of the world, by their numbers.
         undecoded: messages that are not of the type of their key.
-        truth_instants: truth messages that went into the hash.
+        truth_instants: truth messages that went into the hash: those of simulated drones.
         truth_missing: truth messages that a whole run of this length would have besides.
-        truth_sha256: as TruthHash of every truth message, by time, then in the order of the drones.
+        truth_sha256: as TruthHash of every one of them, by time, then in the order of the drones.
     """
 
     messages: int
@@ -163,7 +163,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
 
 def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
     """Return what is on record of a flight whose last instant is at `last_ns` as far as it is known."""
-    tracks, state = flight.tracks, flight.completeness
+    tracks, state = [track for track in flight.tracks if not track.external], flight.completeness
     t_ns = np.concatenate([track.t_ns for track in tracks] or [np.zeros(0, np.int64)])
     states = np.concatenate([track.truth for track in tracks] or [np.zeros((0, TRUTH_WIDTH))])
     drone = np.repeat(np.arange(len(tracks)), [len(track.t_ns) for track in tracks])
@@ -179,22 +179,22 @@ def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
         messages_missing=state.messages_missing,
         undecoded=flight.undecoded,
         truth_instants=len(t_ns),
-        truth_missing=_missing(flight, last_ns),
+        truth_missing=_missing(flight, tracks, last_ns),
         truth_sha256=truth.hexdigest(),
     )
 
 
-def _missing(flight: RecordedFlight, last_ns: int) -> int:
-    """Return how many truth messages there are not, every gate from the first one on to the last.
+def _missing(flight: RecordedFlight, tracks: list[Track], last_ns: int) -> int:
+    """Return how many truth messages of some drones there are not, every gate from the first one on to the last.
 
     A flight has truth from 0 or the first gate on, a replay from where it was begun.
     """
     gate_ns = flight.info.gate_ns if flight.info else None
-    present = sum(len(track.t_ns) for track in flight.tracks)
+    present = sum(len(track.t_ns) for track in tracks)
     if not gate_ns or not present:
         return 0
     first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns)
-    return max(0, len(flight.tracks) * ((last_ns - first_ns) // gate_ns + 1) - present)
+    return max(0, len(tracks) * ((last_ns - first_ns) // gate_ns + 1) - present)
 
 
 def _notes(
@@ -277,7 +277,11 @@ def _truth_notes(record: RecordFacts, reported: str | None) -> list[str]:
 def _formation_notes(flight: RecordedFlight, formations: list[Formation], window_s: tuple[float, float]) -> list[str]:
     notes = []
     judged = {formation.name for formation in formations}
+    external = {track.name for track in flight.tracks if track.external}
     for cluster in flight.clusters:
+        if own := [drone for drone in cluster.drones if drone in external]:
+            are = f"{', '.join(own)}, whose {'body is' if len(own) == 1 else 'bodies are'} external"
+            notes.append(f"Cluster {cluster.name} has {are}: nobody knows its truth, and no figure is against it.")
         if cluster.name not in judged:
             notes.append(f"Cluster {cluster.name} published no state that can be judged: no table of it.")
     for formation in formations:

@@ -14,6 +14,7 @@ from msgspec import Struct
 from zsim import __version__
 from zsim.errors import ScenarioError
 from zsim.scenario import overrides, scenario_file
+from zsim.scenario.external_bodies import check_pace
 from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import Scenario
 from zsim.scenario.scenario_file import EXAMPLE
@@ -124,7 +125,7 @@ class SweepDesign:
         return {axis.path: axis.draw(self.seed, self.plan.runs) for axis in drawn}
 
     def scenario(self, run: int) -> Scenario:
-        """Return the resolved scenario of a run.
+        """Return the resolved scenario of a run, which is flown in lockstep.
 
         Raises:
             ScenarioError: with every fault, a line each.
@@ -139,6 +140,7 @@ class SweepDesign:
         if faults:
             raise ScenarioError(faults)
         check_classes(scenario, self.plan.source)
+        check_pace(scenario, "lockstep")
         return scenario
 
     def faults(self, progress: Callable[[int, int], None] = lambda run, of: None) -> list[str]:

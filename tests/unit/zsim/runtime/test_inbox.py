@@ -330,3 +330,98 @@ def test_what_a_replay_brings_of_a_gate_that_came_whole_is_left_out():
         inbox.put(key, message)
     assert inbox.missing(GATE_NS) is None
     assert sorted(key for key, _ in inbox.take(GATE_NS)) == sorted([keys.gate("d1"), keys.estimate("d1")])
+
+
+# Publishers that may skip gates, as drivers of external drones
+
+SPARSE = (keys.status("d3"), keys.estimate("d3"))
+CLOSING = (keys.status("d1"), keys.estimate("d1"), *SPARSE)
+
+
+def closed_by(drone: str, gate: int, seq: int | None = None) -> list[Sent]:
+    t_ns, number = gate * GATE_NS, gate if seq is None else seq
+    return [(keys.status(drone), status(t_ns, number, 9)), (keys.estimate(drone), estimate(t_ns, number))]
+
+
+def sparse_inbox(gates: int) -> Inbox:
+    """Return an inbox of a controller of d1 and the external d3, through with so many gates of both."""
+    inbox = Inbox(CLOSING, keep_late=True, sparse=SPARSE)
+    for gate in range(gates):
+        for sent in closed_by("d3", gate) + closed_by("d1", gate):
+            inbox.put(*sent)
+        assert inbox.missing(gate * GATE_NS) is None
+        inbox.take(gate * GATE_NS)
+    return inbox
+
+
+def put_all(inbox: Inbox, messages_sent: list[Sent]) -> None:
+    for sent in messages_sent:
+        inbox.put(*sent)
+
+
+def test_who_comes_at_every_gate_is_waited_for():
+    inbox = sparse_inbox(3)
+    put_all(inbox, closed_by("d1", 3))
+    assert inbox.missing(3 * GATE_NS) in SPARSE
+    assert inbox.missing_last(3 * GATE_NS) in SPARSE
+    put_all(inbox, closed_by("d3", 3))
+    assert inbox.missing(3 * GATE_NS) is None
+
+
+def test_who_has_skipped_a_gate_is_not_waited_for_until_it_has_come_twice():
+    inbox = sparse_inbox(3)
+    put_all(inbox, closed_by("d1", 3))
+    inbox.take(3 * GATE_NS)  # given up: the next gate is there
+    for gate in range(4, 8):
+        put_all(inbox, closed_by("d1", gate))
+        assert inbox.missing(gate * GATE_NS) is None
+        inbox.take(gate * GATE_NS)
+    waited = []
+    for gate in range(8, 12):  # it is back, each time behind the other one
+        put_all(inbox, closed_by("d1", gate))
+        waited.append(inbox.missing(gate * GATE_NS) is not None)
+        if not waited[-1]:
+            taken = inbox.take(gate * GATE_NS)
+            assert any(keys.thing(key) == "d3" for key, _ in taken) == (gate > 8)
+        put_all(inbox, closed_by("d3", gate, seq=gate - 8))
+        if waited[-1]:
+            assert inbox.missing(gate * GATE_NS) is None
+            inbox.take(gate * GATE_NS)
+    assert waited == [False, False, True, True]
+
+
+def test_who_comes_at_every_second_gate_is_never_waited_for_and_what_it_brings_is_handed_out():
+    inbox = sparse_inbox(0)
+    brought = []
+    for gate in range(12):
+        put_all(inbox, closed_by("d1", gate))
+        assert inbox.missing(gate * GATE_NS) is None
+        brought += [message.t_ns for key, message in inbox.take(gate * GATE_NS) if key == SPARSE[1]]
+        if gate % 2 == 0:
+            put_all(inbox, closed_by("d3", gate, seq=gate // 2))
+    assert brought == [gate * GATE_NS for gate in range(0, 11, 2)]
+
+
+def test_a_status_that_begins_anew_leaves_no_gap():
+    inbox = Inbox([keys.status("d3")], ["d3"], keep_late=True, sparse=[keys.status("d3")])
+    assert inbox.may_skip
+    for gate, seq in ((4, 7), (9, 8), (11, 0), (12, 1)):
+        inbox.put(keys.status("d3"), status(gate * GATE_NS, seq, 1))
+        assert inbox.next_gate_ns() == gate * GATE_NS
+        assert inbox.missing(gate * GATE_NS) is None
+        inbox.take(gate * GATE_NS)
+
+
+def test_the_world_s_messages_of_a_gate_do_not_close_it_for_an_external_drone():
+    d1, d3 = keys.status("d1"), keys.status("d3")
+    table = key_table(["d1", "d3"])
+    inbox = Inbox([d1, d3], ["d1", "d3"], keep_late=True, sparse=[d3])
+    for gate in range(3):
+        t_ns = gate * GATE_NS
+        of_world = [(d1, messages.encode(status(t_ns, gate, 1)))]
+        inbox.put(keys.GATE, GateMessages.of(t_ns, gate, table, of_world))
+        assert inbox.missing(t_ns) == (d3 if gate == 2 else None)
+        if gate < 2:
+            inbox.take(t_ns)
+        inbox.put(d3, status(t_ns, gate, 1))
+    assert inbox.missing(2 * GATE_NS) is None
