@@ -26,8 +26,8 @@ class TiltShares(NamedTuple):
 class TiltControl:
     """A velocity loop about the aircraft's own tilt loop.
 
-    The velocity follows a reference that answers with a lag; where it is not as that reference was when the aircraft got
-    the commands that led there, that is wind, and is integrated.
+    The velocity follows a reference that answers with a lag. What it is beside the reference of the time when the
+    aircraft got its commands is wind, and is integrated.
 
     Args:
         tilt_rad, climb_m_s, yaw_rate_rad_s: limits that its configuration has, which a share of 1 means.

@@ -66,6 +66,7 @@ class VehicleState:
         self.is_estimated = False
         self.sigma_m = (0.0, 0.0)
         self.samples: dict[str, Any] = {}
+        self._arrived: dict[str, list[Any]] = {}
         self.home_m: Vector | None = None
         self.origin = (origin.latitude_deg, origin.longitude_deg, origin.height_m)
         self._anchor = anchor(*self.origin)
@@ -91,10 +92,19 @@ class VehicleState:
             case flight_messages.Estimate():
                 self._on_estimate(message)
             case messages.Imu():
-                self.samples[name] = message
+                self._on_sample(name, message)
                 self.rate_rad_s = message.gyro_rad_s
             case _:
-                self.samples[name] = message
+                self._on_sample(name, message)
+
+    def _on_sample(self, name: str, sample: Any) -> None:
+        self.samples[name] = sample
+        self._arrived.setdefault(name, []).append(sample)
+
+    def take_arrived(self) -> dict[str, list[Any]]:
+        """Return the samples that came since the last call, by sensor."""
+        arrived, self._arrived = self._arrived, {}
+        return arrived
 
     def _on_truth(self, truth: flight_messages.Truth) -> None:
         if truth.t_ns - self._estimate_ns <= ESTIMATE_AGE_MAX_NS:

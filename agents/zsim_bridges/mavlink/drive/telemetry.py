@@ -10,7 +10,7 @@ from typing import Any
 from zsim.math.frames import geodetic_to_enu, heading
 from zsim.math.rotation import LEVEL, Vector
 from zsim.schema.quantities import G_M_S2
-from zsim_bridges.mavlink.ned_frames import attitude_turned, flipped, swapped
+from zsim_bridges.mavlink.autopilot import axes
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.vehicle_links.clock_offset import ClockOffset
 from zsim_bridges.vehicle_links.standard_atmosphere import FieldBarometer
@@ -84,16 +84,16 @@ class Telemetry:
     # State
 
     def _on_attitude(self, m: Any, now_ns: int) -> None:
-        q = attitude_turned((m.q1, m.q2, m.q3, m.q4))
+        q = axes.attitude_ned((m.q1, m.q2, m.q3, m.q4))
         length = math.hypot(*q)
         if length > 0.5:  # else it is no attitude at all
             w, x, y, z = (part / length for part in q)
-            self._q_WB, self._w_WB_B = (w, x, y, z), flipped((m.rollspeed, m.pitchspeed, m.yawspeed))
+            self._q_WB, self._w_WB_B = (w, x, y, z), axes.frd((m.rollspeed, m.pitchspeed, m.yawspeed))
 
     def _on_position(self, m: Any, now_ns: int) -> None:
-        x, y, z = swapped((m.x, m.y, m.z))
+        x, y, z = axes.ned((m.x, m.y, m.z))
         ox, oy, oz = self._local_origin_m
-        velocity = swapped((m.vx, m.vy, m.vz))
+        velocity = axes.ned((m.vx, m.vy, m.vz))
         taken_ns = self._boot(m, now_ns)
         self.pose = Pose(taken_ns, (x + ox, y + oy, z + oz), velocity, self._q_WB, self._w_WB_B)
         if taken_ns - max(self._measured_flow_ns + FLOW_LOST_NS, self._flow_ns + FLOW_NS) >= 0:
@@ -115,9 +115,9 @@ class Telemetry:
     def _on_imu(self, m: Any, now_ns: int) -> None:
         taken_ns, updated = self._unix(m, now_ns), m.fields_updated
         if updated & ACCEL_GYRO == ACCEL_GYRO:
-            self._read("imu", taken_ns, flipped((m.xacc, m.yacc, m.zacc)), flipped((m.xgyro, m.ygyro, m.zgyro)))
+            self._read("imu", taken_ns, axes.frd((m.xacc, m.yacc, m.zacc)), axes.frd((m.xgyro, m.ygyro, m.zgyro)))
         if updated & MAG == MAG:
-            self._read("mag", taken_ns, flipped([UT_PER_GAUSS * field for field in (m.xmag, m.ymag, m.zmag)]))
+            self._read("mag", taken_ns, axes.frd(_scaled(UT_PER_GAUSS, m)))
         if updated & PRESSURE:
             self._on_static_pressure(taken_ns, PA_PER_HPA * m.abs_pressure)
 
@@ -125,9 +125,9 @@ class Telemetry:
         """Take what ArduPilot sends: mg, mrad/s, mgauss."""
         taken_ns, g = self._boot(m, now_ns), G_M_S2 / 1e3
         accel, gyro = (g * m.xacc, g * m.yacc, g * m.zacc), (m.xgyro / 1e3, m.ygyro / 1e3, m.zgyro / 1e3)
-        self._read("imu", taken_ns, flipped(accel), flipped(gyro))
+        self._read("imu", taken_ns, axes.frd(accel), axes.frd(gyro))
         if m.xmag or m.ymag or m.zmag:
-            self._read("mag", taken_ns, flipped([UT_PER_GAUSS * field / 1e3 for field in (m.xmag, m.ymag, m.zmag)]))
+            self._read("mag", taken_ns, axes.frd(_scaled(UT_PER_GAUSS / 1e3, m)))
 
     def _on_pressure(self, m: Any, now_ns: int) -> None:
         self._on_static_pressure(self._boot(m, now_ns), PA_PER_HPA * m.press_abs)
@@ -187,6 +187,11 @@ def _taken(clock: ClockOffset, stamp_ns: int, now_ns: int) -> int:
     """Return when a message that arrives now was made, by the clock of this process."""
     clock.add(stamp_ns, now_ns)
     return min(now_ns, clock.to_local(stamp_ns))
+
+
+def _scaled(unit: float, m: Any) -> Vector:
+    """Return the magnetic field of a message."""
+    return unit * m.xmag, unit * m.ymag, unit * m.zmag
 
 
 def _floats(message: Any) -> Iterable[float]:

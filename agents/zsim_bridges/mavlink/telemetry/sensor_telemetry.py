@@ -1,6 +1,7 @@
 """Messages with what a vehicle measures, each made of it at a gate; None where the sensor has failed."""
 
 import math
+from typing import Any
 
 from zsim.schema.quantities import G_M_S2
 from zsim_bridges.mavlink.autopilot import axes
@@ -11,6 +12,7 @@ from zsim_bridges.mavlink.wire.message import Message
 
 UNKNOWN_16, UNKNOWN_8 = 65535, 255
 GAUSS_PER_UT, MILLIGAUSS_PER_UT = 0.01, 10.0
+INERTIAL = 0x3F  # HIGHRES_IMU_UPDATED_FLAGS: accelerometer and gyroscope; 0x1C0 the magnetometer, 0xA00 the barometer
 MG_PER_M_S2 = 1000.0 / G_M_S2
 
 
@@ -71,6 +73,12 @@ def raw_imu(s: TelemetrySource) -> Message | None:
     return dialect.RawImu(s.boot_us, m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro, m.xmag, m.ymag, m.zmag)
 
 
+def inertial(imu: Any) -> Message:
+    """Return HIGHRES_IMU of a sample of the inertial unit alone."""
+    t_us = imu.t_sample_ns // 1000
+    return dialect.HighresImu(t_us, *axes.frd(imu.accel_m_s2), *axes.frd(imu.gyro_rad_s), fields_updated=INERTIAL)
+
+
 def highres_imu(s: TelemetrySource) -> Message | None:
     imu = s.state.samples.get("imu")
     if imu is None or s.state.has_failed("imu"):
@@ -80,7 +88,7 @@ def highres_imu(s: TelemetrySource) -> Message | None:
     wx, wy, wz = axes.frd(imu.gyro_rad_s)
     mx, my, mz = (GAUSS_PER_UT * b for b in axes.frd(mag.field_ut)) if mag else (0.0, 0.0, 0.0)
     pressure, height = (baro.pressure_pa / 100.0, baro.altitude_m) if baro else (0.0, 0.0)
-    updated = 0x3F | (0x1C0 if mag else 0) | (0xA00 if baro else 0)  # HIGHRES_IMU_UPDATED_FLAGS
+    updated = INERTIAL | (0x1C0 if mag else 0) | (0xA00 if baro else 0)
     t_us = imu.t_sample_ns // 1000
     return dialect.HighresImu(
         t_us, ax, ay, az, wx, wy, wz, mx, my, mz, pressure, 0.0, height, 0.0, fields_updated=updated

@@ -1,7 +1,7 @@
 """Which messages of telemetry a vehicle sends, and how often; what clients change of that."""
 
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
 
 from zsim_bridges.mavlink.telemetry import sensor_telemetry, state_telemetry
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource
@@ -11,6 +11,8 @@ from zsim_bridges.mavlink.wire.message import LAYOUTS, Message
 Level = Literal["normal", "full"]
 SECOND_NS = 1_000_000_000
 RATE_MAX_HZ = 50.0  # Hz; one of each with a gate of 20 ms
+IMU_RATE_MAX_HZ = 200.0  # Hz; each sample of the inertial unit
+GATE_NS = round(SECOND_NS / RATE_MAX_HZ)
 
 Builder = Callable[[TelemetrySource], Message | None]
 BUILDERS: dict[type[Message], Builder] = {
@@ -42,6 +44,13 @@ BUILDERS: dict[type[Message], Builder] = {
     dialect.FenceStatus: state_telemetry.fence_status,
     dialect.Vibration: sensor_telemetry.vibration,
 }
+SAMPLED: dict[type[Message], str] = {
+    dialect.HighresImu: "imu",
+    dialect.GpsRawInt: "gps",
+    dialect.OpticalFlow: "flow",
+    dialect.DistanceSensor: "sonar",
+}
+"""Messages that are of a sample of a sensor, and are sent when there is one."""
 Rates = dict[type[Message], tuple[float, float]]
 """Rates at the levels normal and full [Hz of simulated time]."""
 
@@ -112,21 +121,30 @@ class Telemetry:
         if rate_hz <= 0:
             self._interval_ns.pop(kind, None)
             return
-        self._interval_ns[kind] = round(SECOND_NS / min(rate_hz, RATE_MAX_HZ))
+        most_hz = IMU_RATE_MAX_HZ if kind is dialect.HighresImu else RATE_MAX_HZ
+        self._interval_ns[kind] = round(SECOND_NS / min(rate_hz, most_hz))
         self._due_ns[kind] = 0
 
     def due(self, t_ns: int) -> list[Message]:
         """Return the messages that are due at a gate."""
         self._source.advance()
-        messages = []
+        arrived = self._source.state.take_arrived()
+        messages: list[Message] = []
         for kind, interval_ns in self._interval_ns.items():
             due_ns = self._due_ns[kind]
-            if t_ns < due_ns:
-                continue
-            self._due_ns[kind] = max(due_ns + interval_ns, t_ns + interval_ns // 2)
-            if (message := BUILDERS[kind](self._source)) is not None:
-                messages.append(message)
+            if t_ns >= due_ns + _waits_ns(kind, interval_ns, arrived):
+                self._due_ns[kind] = max(due_ns + interval_ns, t_ns + interval_ns // 2)
+                messages += self._made(kind, interval_ns, arrived)
         return messages
+
+    def _made(self, kind: type[Message], interval_ns: int, arrived: Mapping[str, Sequence[Any]]) -> list[Message]:
+        """Return what is sent of a message at a gate: more than one of an inertial unit that samples more often."""
+        message = BUILDERS[kind](self._source)
+        if message is None:
+            return []
+        if kind is not dialect.HighresImu or interval_ns >= GATE_NS:
+            return [message]
+        return [*map(sensor_telemetry.inertial, arrived.get("imu", ())[:-1]), message]
 
     def build(self, message_id: int) -> Message | None:
         """Return a message now; None for one that this vehicle has not."""
@@ -160,3 +178,11 @@ class Telemetry:
                 for kind in kinds:
                     if kind in self._defaults:
                         self._put(kind, rate_hz)
+
+
+def _waits_ns(kind: type[Message], interval_ns: int, arrived: Mapping[str, Sequence[Any]]) -> int:
+    """Return how long after it is due a message waits: one of a sample comes with it, or two intervals later."""
+    sensor = SAMPLED.get(kind)
+    if sensor is None:
+        return 0
+    return -interval_ns // 2 if arrived.get(sensor) else 2 * interval_ns

@@ -11,9 +11,9 @@ from fake_autopilot import ARDUPILOT, HOLD, PX4, STEP_NS, FakeAutopilot
 from scipy.spatial.transform import Rotation
 
 from zsim.math.frames import heading
+from zsim_bridges.mavlink.autopilot import axes
 from zsim_bridges.mavlink.drive.autopilot_session import AutopilotSession
 from zsim_bridges.mavlink.drive.telemetry import Telemetry
-from zsim_bridges.mavlink.ned_frames import attitude_turned, flipped, heading_to_ned, swapped
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Link, Parser
 from zsim_bridges.vehicle_links.failsafe import Demand
@@ -223,17 +223,17 @@ def test_attitudes_agree_with_scipys_rotations(seed: int):
         Rotation.from_matrix(np.diag([1, -1, -1])),
     )
     expected = (ned_to_enu * q_NF * flu_to_frd).as_matrix()
-    turned = attitude_turned((w, x, y, z))
+    turned = axes.attitude_ned((w, x, y, z))
     found = Rotation.from_quat([*turned[1:], turned[0]]).as_matrix()
     assert found == pytest.approx(expected, abs=1e-12)
-    assert np.abs(attitude_turned(turned)) == pytest.approx(np.abs([w, x, y, z]), abs=1e-12)
+    assert np.abs(axes.attitude_ned(turned)) == pytest.approx(np.abs([w, x, y, z]), abs=1e-12)
 
 
 def test_vectors_and_headings():
-    assert swapped((1, 2, 3)) == (2, 1, -3)
-    assert flipped((1, 2, 3)) == (1, -2, -3)
-    assert heading_to_ned(math.pi / 2) == pytest.approx(0.0)
-    assert heading_to_ned(heading_to_ned(0.7)) == pytest.approx(0.7)
+    assert axes.ned((1, 2, 3)) == (2, 1, -3)
+    assert axes.frd((1, 2, 3)) == (1, -2, -3)
+    assert axes.yaw_ned(math.pi / 2) == pytest.approx(0.0)
+    assert axes.yaw_ned(axes.yaw_ned(0.7)) == pytest.approx(0.7)
 
 
 def test_a_pose_stands_in_w_where_the_vehicles_own_origin_is():
