@@ -44,7 +44,7 @@ class ObserverProcess:
         self.end_reason = ""
         self._process = link.host, os.getpid()
         self._incarnation = secrets.randbits(62)
-        self._admitted = self._superseded = False
+        self._admitted = self._superseded = self._has_left = False
         self._must_join = self._was_link_lost = False
         self._done_ns = -1
 
@@ -112,8 +112,9 @@ class ObserverProcess:
         return self._superseded
 
     def leave(self, reason: str) -> None:
-        """Publish bye, unless another process has taken over the name."""
-        if not self._superseded:
+        """Publish bye once, unless another process has taken over the name."""
+        if not (self._superseded or self._has_left):
+            self._has_left = True
             self._link.put(keys.process(self.name, "bye"), run_messages.Bye(self.now_ns, 0, reason))
 
     def _on_event(self, sample: RawSample) -> None:

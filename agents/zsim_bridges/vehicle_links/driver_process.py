@@ -93,7 +93,6 @@ class DriverProcess:
         await self._open(loop)
         try:
             self._subscribe(loop)
-            self._observer.announce()
             while not (stopped() or self._observer.end_reason):
                 self._tick()
                 await asyncio.sleep(TICK_S)
@@ -252,14 +251,18 @@ class DriverProcess:
         self._link.put(keys.link(self._drone), message)
 
     async def _land_and_leave(self, interrupted: bool) -> None:
-        """Land what still flies for this driver, and wait for it."""
+        """Land what still flies for this driver, and wait for it; another driver that took its place has it already."""
+        if self._observer.superseded:
+            return
         reason = "its driver is stopped" if interrupted else self._observer.end_reason or RUN_ENDED
+        if not interrupted:
+            self._observer.leave(reason)  # the run is over for everybody; the aircraft may still be on its way down
         self._failsafe.land(reason, self._clock.now_ns())
         until_s = time.monotonic() + LANDING_S
         if self._failsafe.phase == "landing":
             self._say(f"{self._observer.name}: {reason}; it lands")
         while self._failsafe.phase == "landing" and time.monotonic() < until_s:
-            self._send()
+            self._tick()
             await asyncio.sleep(TICK_S)
         if self._session.state.state in AIRBORNE and self._failsafe.armed:
             self._say(f"{self._observer.name}: it is still in the air; take it over by hand")

@@ -10,7 +10,7 @@ from fake_link import FakeLink
 
 from zsim.contract import flight_messages, keys, messages
 from zsim.contract.messages import DroneInfo, Info, Origin
-from zsim.contract.run_messages import Clock
+from zsim.contract.run_messages import Clock, Event
 from zsim.errors import RunError
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.driver_options import DriverOptions, position, udp_channel
@@ -98,6 +98,7 @@ class Flight:
         loop = asyncio.get_running_loop()
         self._transport, self.aircraft = await loop.create_datagram_endpoint(Aircraft, local_addr=("127.0.0.1", 0))
         observer = ObserverProcess(self.link, info(), ME)  # type: ignore[arg-type]
+        observer.announce()
         options = DriverOptions("drone2", armed=self.armed)
         link: Any = self.link
         process = DriverProcess(
@@ -200,6 +201,19 @@ def test_kill_reaches_the_aircraft_at_once_and_shows():
             await flight.aircraft.until("kill")
             await flight.gate()
             assert flight.link.published_on(keys.status("drone2"))[-1].state == "emergency"
+
+    fly(test)
+
+
+def test_a_driver_whose_place_another_has_taken_does_not_land_the_aircraft():
+    async def test() -> None:
+        async with Flight(armed=True) as flight:
+            flight.aircraft.state = "flying"
+            await flight.aircraft.until("hold")
+            data = {"incarnation": 7, "host": flight.link.host, "pid": 1}
+            flight.link.deliver(keys.EVENT, Event(0, 0, "superseded", ME, ME, "", data))
+            await asyncio.wait_for(flight.task, 30)
+            assert flight.aircraft.demands[-1] == "hold"
 
     fly(test)
 
