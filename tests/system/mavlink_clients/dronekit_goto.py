@@ -1,3 +1,5 @@
+# pyright: reportMissingImports=false, reportOptionalMemberAccess=false, reportOptionalOperand=false
+# pyright: reportCallIssue=false, reportArgumentType=false
 """A flight as users of DroneKit write it: arm in GUIDED, take off, go somewhere, upload a mission, land.
 
 Knows nothing of zsim. Run: python dronekit_goto.py CONNECTION; prints what it saw as JSON.

@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false, reportOptionalMemberAccess=false
 """Two vehicles at once as users of MAVSDK write it: arm, take off, fly a square offboard, land.
 
 Knows nothing of zsim. Run: python mavsdk_square.py PORT1 PORT2; prints what it saw as JSON.

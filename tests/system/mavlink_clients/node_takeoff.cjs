@@ -1,6 +1,6 @@
 // A flight as users of node-mavlink write it: arm, take off, watch the height, land.
 //
-// Knows nothing of zsim. Run: NODE_PATH=… node node_takeoff.cjs PORT; prints what it saw as JSON.
+// Knows nothing of zsim. Run: NODE_PATH=… node node_takeoff.cjs PORT SYSTEM; prints what it saw as JSON.
 
 const dgram = require('node:dgram')
 const { PassThrough } = require('node:stream')
@@ -9,6 +9,7 @@ const { minimal, standard, common, ardupilotmega } = require('mavlink-mappings')
 
 const REGISTRY = { ...minimal.REGISTRY, ...(standard ? standard.REGISTRY : {}), ...common.REGISTRY, ...ardupilotmega.REGISTRY }
 const PATIENCE_MS = 60000
+const SYSTEM = Number(process.argv[3])
 const [TAKEOFF, ARM, LAND] = [22, 400, 21] // MAV_CMD
 
 const socket = dgram.createSocket('udp4')
@@ -26,7 +27,7 @@ function send (message) {
 
 function command (id, params = {}) {
   const message = new common.CommandLong()
-  Object.assign(message, { command: id, targetSystem: 1, targetComponent: 1, confirmation: 0, ...params })
+  Object.assign(message, { command: id, targetSystem: SYSTEM, targetComponent: 1, confirmation: 0, ...params })
   send(message)
 }
 

@@ -57,7 +57,7 @@ class VehicleState:
     """
 
     def __init__(self, drone: Drone, origin: Origin) -> None:
-        self.t_ns = 0
+        self.t_ns = self._first_ns = 0
         self.status: flight_messages.Status | None = None
         self.position_m: Vector = drone.position_m
         self.velocity_m_s: Vector = (0.0, 0.0, 0.0)
@@ -84,6 +84,8 @@ class VehicleState:
         """
         match message:
             case flight_messages.Status():
+                if self.status is None:
+                    self._first_ns = message.t_ns
                 self.status, self.t_ns = message, message.t_ns
                 if self.home_m is None:
                     self.home_m = self.position_m
@@ -153,7 +155,7 @@ class VehicleState:
     def has_failed(self, sensor: str) -> bool:
         """Return whether a sensor has been silent for too long."""
         sample = self.samples.get(sensor)
-        return self.t_ns - (sample.t_ns if sample else 0) > self._silence_max_ns[sensor]
+        return self.t_ns - (sample.t_ns if sample else self._first_ns) > self._silence_max_ns[sensor]
 
     def failed_sensors(self) -> list[str]:
         """Return the names of the sensors that are silent."""

@@ -13,6 +13,8 @@ K_POSITION_1_S = 0.8  # 1/s; that of the firmware's own hold
 K_YAW_1_S = 1.5  # 1/s, chosen: a turn of 90 deg in 2 s
 YAW_RATE_MAX_RAD_S = 1.0  # rad/s, chosen: half of MC_YAWRAUTO_MAX's 60 deg/s would be slow at this gain
 
+PLACE_MAX_M = 1e6  # m; farther away is no place to fly to
+
 Axes = tuple[float | None, float | None, float | None]
 NOWHERE: Axes = (None, None, None)
 
@@ -98,6 +100,11 @@ def _yaw_rate(target: Target, yaw_rad: float) -> float:
         return target.yaw_rate_rad_s
     rate = K_YAW_1_S * wrapped(target.yaw_rad - yaw_rad)
     return max(-YAW_RATE_MAX_RAD_S, min(YAW_RATE_MAX_RAD_S, rate))
+
+
+def is_place(position_m: Axes) -> bool:
+    """Return whether a position is finite and not beyond all bounds."""
+    return all(p is None or (math.isfinite(p) and abs(p) < PLACE_MAX_M) for p in position_m)
 
 
 def distance_m(target: Target, position_m: Vector) -> float:

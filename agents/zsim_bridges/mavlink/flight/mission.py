@@ -66,11 +66,12 @@ class MissionStep(NamedTuple):
 def place_of(item: MissionItem, state: VehicleState) -> Vector:
     """Return p_W [m] of an item; without a place of its own it is above or below the vehicle."""
     home = state.home_m or state.position_m
+    z = item.z if math.isfinite(item.z) else 0.0
     if item.frame == Frame.LOCAL_NED:
-        return axes.ned((item.x, item.y, item.z))
+        return axes.ned((item.x, item.y, z))
     if item.frame == Frame.LOCAL_ENU:
-        return item.x, item.y, item.z
-    height_m = item.z if item.frame in ABSOLUTE else state.to_global(home)[2] + item.z
+        return item.x, item.y, z
+    height_m = z if item.frame in ABSOLUTE else state.to_global(home)[2] + z
     if item.has_place:
         return state.to_local(item.x, item.y, height_m)
     x, y, _ = state.position_m

@@ -250,6 +250,7 @@ REASONS = {
     "bad_signature": "a frame with a wrong signature",
     "replayed": "a signed frame that was sent before",
     "noise": "bytes that are no frame",
+    "unsent": "a message of its own whose values do not fit into their fields",
     "stranger": "a datagram of who is not the configured peer",
 }
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -78,6 +79,7 @@ class VehiclePorts:
     def __init__(self, ports: Sequence[VehiclePort], link: Link) -> None:
         self._ports = ports
         self._link = link
+        self._unsent = 0
 
     def open(self, loop: asyncio.AbstractEventLoop, wall_s: Callable[[], float]) -> None:
         """Read from now on."""
@@ -91,15 +93,24 @@ class VehiclePorts:
 
     def send(self, messages: Sequence[Message]) -> None:
         """Send messages to all peers, many in a datagram."""
-        if not messages:
+        frames = [frame for message in messages if (frame := self._packed(message))]
+        if not frames:
             return
-        datagrams = list(_batches([self._link.pack(message) for message in messages]))
+        datagrams = _batches(frames)
         for port in self._ports:
             port.send(datagrams)
 
+    def _packed(self, message: Message) -> bytes:
+        """Return a frame; empty, and counted, where a value does not fit into its field."""
+        try:
+            return self._link.pack(message)
+        except (struct.error, OverflowError, ValueError):
+            self._unsent += 1
+            return b""
+
     def refused(self) -> Counter[str]:
         """Return how much was refused so far, by reason."""
-        counts: Counter[str] = Counter()
+        counts = Counter({"unsent": self._unsent})
         for port in self._ports:
             counts += port.parser.refused
             counts["stranger"] += port.peers.refused

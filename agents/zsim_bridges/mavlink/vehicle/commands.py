@@ -14,7 +14,7 @@ from zsim_bridges.mavlink.autopilot.parameters import Parameters
 from zsim_bridges.mavlink.autopilot.personality import Mode, Personality, Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.flight import Flight
-from zsim_bridges.mavlink.flight.guidance import Target
+from zsim_bridges.mavlink.flight.guidance import Target, is_place
 from zsim_bridges.mavlink.flight.mission import ABSOLUTE, FRAMES, LOCAL, MissionItem, place_of
 from zsim_bridges.mavlink.telemetry.telemetry import Telemetry
 from zsim_bridges.mavlink.vehicle.mission_protocol import DEGREES, LOCAL_M
@@ -170,7 +170,8 @@ class Commands:
         if not math.isfinite(item.z):
             absolute = self._state.to_global(own)[2]
             item = item._replace(z=absolute, frame=ABSOLUTE[0]) if request.frame not in LOCAL else item._replace(z=0.0)
-        return place_of(item, self._state)
+        place = place_of(item, self._state)
+        return place if is_place(place) else None
 
     def _pause(self, request: Request) -> Answer:
         if request.params[0] == 0.0:

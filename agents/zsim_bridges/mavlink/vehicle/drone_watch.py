@@ -46,8 +46,13 @@ class DroneWatch:
             self._report(severity, f"Fault {event.data.get('kind')}{FAULTS[event.kind]}")
         elif event.kind == "collision" and self._drone in (event.subject, *map(str, event.data.values())):
             self._report(Severity.CRITICAL, "Collision")
-        elif event.kind == "refused" and event.source == self._own and f"/{self._drone}/" in event.subject:
+        elif self._is_refusal(event):
             self._report(Severity.WARNING, f"Refused: {event.data.get('reason', event.text)}")
+
+    def _is_refusal(self, event: Event) -> bool:
+        """Return whether a command of ours was refused that is still meant: not a setpoint that a landing overtook."""
+        ours = event.kind == "refused" and event.source == self._own and f"/{self._drone}/" in event.subject
+        return ours and (event.subject.endswith("/mode") or self._seen.flight.target is not None)
 
     def look(self) -> None:
         """Report what has changed since the last gate."""

@@ -15,6 +15,7 @@ from zsim_bridges.mavlink.autopilot.enums import (
     Frame,
     MissionResult,
 )
+from zsim_bridges.mavlink.flight.guidance import is_place
 from zsim_bridges.mavlink.flight.mission import COMMANDS, FRAMES, LOCAL, MissionItem
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.message import Message
@@ -188,13 +189,16 @@ def item_fault(item: MissionItem, type_: int) -> MissionResult | None:
         return MissionResult.UNSUPPORTED
     if item.frame not in FRAMES:
         return MissionResult.UNSUPPORTED_FRAME
-    if not math.isfinite(item.z) and item.command != Cmd.NAV_LAND:
-        return MissionResult.INVALID
-    if item.frame not in LOCAL and (abs(item.x) > 90.0 or abs(item.y) > 180.0):
-        return MissionResult.INVALID
-    if not (math.isfinite(item.x) and math.isfinite(item.y)) and type_ == FENCE:
-        return MissionResult.INVALID
-    return None
+    return None if _has_good_place(item) and (type_ != FENCE or item.has_place) else MissionResult.INVALID
+
+
+def _has_good_place(item: MissionItem) -> bool:
+    """Return whether the place of an item is left out, or is one."""
+    z = 0.0 if math.isnan(item.z) and item.command == Cmd.NAV_LAND else item.z
+    x, y = (0.0 if math.isnan(value) else value for value in (item.x, item.y))
+    if item.frame in LOCAL:
+        return is_place((x, y, z))
+    return is_place((None, None, z)) and abs(x) <= 90.0 and abs(y) <= 180.0
 
 
 def message_of(item: MissionItem, request: Any, sender: tuple[int, int], as_int: bool) -> Message:

@@ -10,7 +10,7 @@ from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.autopilot import axes
 from zsim_bridges.mavlink.autopilot.enums import AttitudeMask, Frame, TypeMask
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.guidance import NOWHERE, AttitudeTarget, Axes, Target
+from zsim_bridges.mavlink.flight.guidance import NOWHERE, AttitudeTarget, Axes, Target, is_place
 from zsim_bridges.mavlink.flight.mission import ABSOLUTE, RELATIVE
 from zsim_bridges.mavlink.wire import dialect
 
@@ -20,8 +20,7 @@ ALONG_HEADING = (Frame.BODY_NED, Frame.BODY_OFFSET_NED, Frame.BODY_FRD)
 FROM_HERE = (Frame.LOCAL_OFFSET_NED, Frame.BODY_NED, Frame.BODY_OFFSET_NED, Frame.BODY_FRD)
 LOCAL_FRAMES = (Frame.LOCAL_NED, *FROM_HERE)
 HOVER_THRUST = 0.5  # of the thrust of a setpoint; MPC_THR_HOVER
-PLACE_MAX_M = 1e6  # m; farther away is no place to fly to
-SPEED_MAX_M_S = 1e3  # m/s; likewise
+SPEED_MAX_M_S = 1e3  # m/s; beyond it nothing flies here
 
 Setpoint = Target | AttitudeTarget
 
@@ -110,8 +109,7 @@ def _turned(v_H: Vector, yaw_rad: float) -> Vector:
 
 
 def _is_sane(position: Axes, velocity: Vector) -> bool:
-    near = all(p is None or abs(p) < PLACE_MAX_M for p in position)
-    return near and all(abs(v) < SPEED_MAX_M_S for v in velocity)
+    return is_place(position) and all(abs(v) < SPEED_MAX_M_S for v in velocity)
 
 
 def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: VehicleState) -> tuple[float | None, float]:

@@ -32,6 +32,7 @@ DO_GO_TO = 2  # MISSION_ITEM.current: fly there now, of ArduPilot's older client
 HEARTBEAT_NS = 1_000_000_000  # ns of wall time
 STICK = 1000.0  # of MANUAL_CONTROL, all the way
 STICKS_UNUSED = 32767
+NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 
 
 class Options(NamedTuple):
@@ -174,7 +175,7 @@ class Vehicle:
             case dialect.ParamRequestList():
                 self.outbox += self._parameters.messages()
             case dialect.ParamRequestRead() | dialect.ParamSet():
-                self._parameter(message)
+                self._parameter(message, sender)
             case dialect.RequestDataStream():
                 self._telemetry.put_stream(message.req_stream_id, message.req_message_rate * message.start_stop)
             case dialect.MissionSetCurrent():
@@ -209,13 +210,16 @@ class Vehicle:
         velocity = (level * forward, -level * right, 2.0 * climb * up)
         self.flight.steer_by_sticks(Target(velocity_m_s=velocity, yaw_rate_rad_s=-turn, along_heading=True))
 
-    def _parameter(self, message: dialect.ParamRequestRead | dialect.ParamSet) -> None:
+    def _parameter(self, message: dialect.ParamRequestRead | dialect.ParamSet, sender: tuple[int, int]) -> None:
         if isinstance(message, dialect.ParamSet):
             self._answer(self._parameters.put(message.param_id, self._parameters.decoded(message)) or "")
-            name = self._parameters.find(message.param_id, -1)
+            index = -1
         else:
-            name = self._parameters.find(message.param_id, message.param_index)
-        if name is not None:
+            index = message.param_index
+        name = self._parameters.find(message.param_id, index)
+        if name is None:
+            self.outbox.append(dialect.ParamError(*sender, message.param_id, index, NO_SUCH_PARAMETER))
+        else:
             self.outbox.append(self._parameters.message(name))
 
     def _set_current(self, number: int) -> None:

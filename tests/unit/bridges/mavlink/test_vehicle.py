@@ -1,0 +1,407 @@
+"""A vehicle as its clients see it: arming, modes, setpoints, missions, fence, parameters, what is refused."""
+
+import math
+from typing import Any
+
+import pytest
+from mavlink_drone import FlownDrone
+
+from zsim.contract.flight_messages import Mode as ModeCommand
+from zsim.contract.flight_messages import Velocity
+from zsim.contract.run_messages import Event
+from zsim_bridges.mavlink.autopilot.enums import FENCE, FORCE, Cmd, Frame, Result, TypeMask
+from zsim_bridges.mavlink.autopilot.personality import COPTER_MODES, PX4_MODES, Mode
+from zsim_bridges.mavlink.wire import dialect
+
+NAN = math.nan
+VELOCITY_ONLY = TypeMask.X | TypeMask.Y | TypeMask.Z | TypeMask.AX | TypeMask.AY | TypeMask.AZ | TypeMask.YAW
+POSITION_ONLY = 0x1F8 | TypeMask.YAW | TypeMask.YAW_RATE
+AUTOPILOTS = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+
+
+def flying(autopilot: str = "px4", altitude_m: float = 3.0) -> FlownDrone:
+    """Return a vehicle that holds at a height."""
+    drone = FlownDrone(autopilot)
+    if autopilot == "ardupilot":
+        set_mode(drone, COPTER_MODES[Mode.OFFBOARD])
+        height = altitude_m
+    else:
+        height = 400.0 + altitude_m
+    assert drone.command(Cmd.COMPONENT_ARM_DISARM, 1) == Result.ACCEPTED
+    assert drone.command(Cmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, height) == Result.ACCEPTED
+    drone.until(lambda: drone.position[2] > altitude_m - 0.25)
+    drone.step(50)
+    return drone
+
+
+def set_mode(drone: FlownDrone, custom: int) -> int:
+    if drone.vehicle._options.personality.name == "px4":
+        return drone.command(Cmd.DO_SET_MODE, 1, custom >> 16 & 0xFF, custom >> 24)
+    return drone.command(Cmd.DO_SET_MODE, 1, custom)
+
+
+def heartbeat(drone: FlownDrone) -> dialect.Heartbeat:
+    drone.vehicle.tick(drone.t_ns + 10**12)
+    drone.vehicle._heartbeat_ns = None
+    drone.sent += drone.vehicle.take()
+    return drone.all(dialect.Heartbeat)[-1]
+
+
+def velocity_setpoint(
+    vx: float, vy: float, vz: float, frame: int = Frame.LOCAL_NED
+) -> dialect.SetPositionTargetLocalNed:
+    mask = VELOCITY_ONLY | TypeMask.YAW_RATE
+    return dialect.SetPositionTargetLocalNed(0, 1, 1, frame, mask, vx=vx, vy=vy, vz=vz)
+
+
+@AUTOPILOTS
+def test_it_arms_takes_off_holds_lands_and_is_disarmed(autopilot: str) -> None:
+    drone = flying(autopilot)
+    assert heartbeat(drone).base_mode & 128
+    assert abs(drone.position[2] - 3.0) < 0.3
+    assert [c.mode for c in drone.commands if isinstance(c, ModeCommand)] == ["takeoff"]
+    assert drone.command(Cmd.NAV_LAND) == Result.ACCEPTED
+    drone.until(lambda: drone.state == "landed")
+    drone.step()
+    assert not heartbeat(drone).base_mode & 128
+    assert drone.texts() == ["Armed", "Landed; disarmed"]
+
+
+def test_a_landed_vehicle_that_is_not_armed_does_not_take_off() -> None:
+    drone = FlownDrone()
+    assert drone.command(Cmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 403.0) == Result.DENIED
+    assert drone.texts() == ["Denied: not armed"]
+    assert drone.commands == []
+
+
+def test_who_arms_and_does_not_take_off_is_disarmed() -> None:
+    drone = FlownDrone()
+    drone.command(Cmd.COMPONENT_ARM_DISARM, 1)
+    drone.step(510)
+    assert drone.texts()[-1] == "Disarmed: no take-off"
+
+
+def test_in_flight_it_disarms_only_by_force_which_is_an_emergency() -> None:
+    drone = flying()
+    assert drone.command(Cmd.COMPONENT_ARM_DISARM, 0) == Result.DENIED
+    assert drone.texts()[-1] == "Denied: in flight; land first, or force"
+    assert drone.command(Cmd.COMPONENT_ARM_DISARM, 0, FORCE) == Result.ACCEPTED
+    assert drone.commands[-1].mode == "emergency"
+    drone.step(2)
+    assert drone.command(Cmd.COMPONENT_ARM_DISARM, 1) == Result.DENIED
+    assert drone.command(Cmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == Result.ACCEPTED
+    drone.step(2)
+    assert drone.state == "landed"
+    assert drone.command(Cmd.COMPONENT_ARM_DISARM, 1) == Result.ACCEPTED
+
+
+def test_px4_begins_offboard_only_with_a_stream_and_holds_without_it() -> None:
+    drone = flying()
+    assert set_mode(drone, PX4_MODES[Mode.OFFBOARD]) == Result.DENIED
+    drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
+    assert set_mode(drone, PX4_MODES[Mode.OFFBOARD]) == Result.ACCEPTED
+    for _ in range(50):
+        drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
+        drone.step()
+    assert drone.position[1] > 0.8  # north is y of W
+    assert heartbeat(drone).custom_mode == PX4_MODES[Mode.OFFBOARD]
+    drone.step(40)
+    assert heartbeat(drone).custom_mode == PX4_MODES[Mode.HOLD]
+    assert drone.texts()[-1] == "Offboard lost: no setpoints; holding"
+    drone.step(200)
+    assert drone._velocity == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
+
+
+def test_guided_velocity_of_ardupilot_stops_after_three_seconds() -> None:
+    drone = flying("ardupilot")
+    drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
+    drone.step(140)
+    assert drone._velocity[1] == 1.0
+    drone.step(60)
+    assert abs(drone._velocity[1]) < 0.7
+    assert heartbeat(drone).custom_mode == COPTER_MODES[Mode.OFFBOARD]
+
+
+def test_a_new_setpoint_is_sent_at_once() -> None:
+    drone = flying("ardupilot")
+    before = len(drone.commands)
+    drone.receive(velocity_setpoint(0.5, 0.0, 0.0))
+    drone.receive(velocity_setpoint(0.0, 0.5, 0.0))
+    assert [c.velocity_m_s for c in drone.commands[before:]] == [(0.0, 0.5, 0.0), (0.5, 0.0, 0.0)]
+
+
+def test_a_setpoint_that_holds_is_repeated() -> None:
+    drone = flying("ardupilot")
+    drone.receive(velocity_setpoint(0.5, 0.0, 0.0))
+    before = len(drone.commands)
+    drone.step(50)
+    assert len(drone.commands) - before == 10
+
+
+def test_a_flood_of_setpoints_does_not_use_up_what_the_world_takes() -> None:
+    drone = flying("ardupilot")
+    before = len(drone.commands)
+    for i in range(2000):
+        drone.receive(velocity_setpoint(0.5, 0.0, 1e-4 * (i % 2)))
+    assert len(drone.commands) - before < 500
+    drone.receive(velocity_setpoint(0.25, 0.0, 0.0))
+    drone.step()
+    assert drone.commands[-1].velocity_m_s == (0.0, 0.25, 0.0)
+
+
+def test_a_velocity_along_the_body_is_forward_and_left_of_the_heading() -> None:
+    drone = flying("ardupilot")
+    drone.receive(velocity_setpoint(0.5, 0.25, -0.1, Frame.BODY_NED))
+    last = drone.commands[-1]
+    assert isinstance(last, Velocity)
+    assert (last.frame, last.velocity_m_s) == ("heading", (0.5, -0.25, 0.1))
+
+
+def test_a_position_is_flown_to_and_held() -> None:
+    drone = flying("ardupilot")
+    drone.receive(dialect.SetPositionTargetLocalNed(0, 1, 1, Frame.LOCAL_NED, POSITION_ONLY, x=4.0, y=-2.0, z=-5.0))
+    drone.step(600)
+    assert drone.position == pytest.approx([-2.0, 4.0, 5.0], abs=0.1)
+
+
+def test_a_setpoint_upwards_takes_off_an_armed_vehicle() -> None:
+    drone = FlownDrone()
+    drone.command(Cmd.COMPONENT_ARM_DISARM, 1)
+    up = dialect.SetPositionTargetLocalNed(0, 1, 1, Frame.LOCAL_NED, POSITION_ONLY, z=-2.0)
+    drone.receive(up)
+    set_mode(drone, PX4_MODES[Mode.OFFBOARD])
+    for _ in range(300):
+        drone.receive(up)
+        drone.step()
+    assert abs(drone.position[2] - 2.0) < 0.2
+
+
+@pytest.mark.parametrize("frame", [Frame.MISSION, Frame.LOCAL_ENU, 200])
+def test_a_frame_that_is_not_flown_is_refused_once(frame: int) -> None:
+    drone = flying("ardupilot")
+    before = len(drone.commands)
+    for _ in range(5):
+        drone.receive(velocity_setpoint(1.0, 0.0, 0.0, frame))
+    assert len(drone.commands) == before
+    assert drone.texts()[-1].startswith(f"Denied: frame {int(frame)}")
+    assert sum(text.startswith("Denied: frame") for text in drone.texts()) == 1
+
+
+@AUTOPILOTS
+def test_it_returns_home_and_lands(autopilot: str) -> None:
+    drone = flying(autopilot)
+    drone.position[0] = 20.0
+    assert drone.command(Cmd.NAV_RETURN_TO_LAUNCH) == Result.ACCEPTED
+    drone.until(lambda: drone.position[2] > 9.0)
+    drone.until(lambda: drone.state == "landed", gates=3000)
+    assert abs(drone.position[0]) < 1.0
+
+
+def upload(drone: FlownDrone, items: list[dialect.MissionItemInt], type_: int = 0) -> int:
+    drone.receive(dialect.MissionCount(1, 1, len(items), mission_type=type_))
+    for item in items:
+        drone.receive(item)
+    return drone.all(dialect.MissionAck)[-1].type
+
+
+def item(seq: int, command: int, north_m: float = 0.0, up_m: float = 0.0, *params: float, type_: int = 0):
+    fields: dict[str, Any] = {f"param{i + 1}": value for i, value in enumerate(params)}
+    lat = round(1e7 * (47.4 + north_m / 111_170.0))
+    frame = Frame.GLOBAL_RELATIVE_ALT_INT
+    return dialect.MissionItemInt(
+        1, 1, seq, frame, command, autocontinue=1, x=lat, y=round(8.5e7), z=up_m, mission_type=type_, **fields
+    )
+
+
+def test_a_mission_takes_off_visits_its_waypoints_and_lands() -> None:
+    drone = FlownDrone()
+    items = [
+        item(0, Cmd.NAV_TAKEOFF, 0, 3),
+        item(1, Cmd.NAV_WAYPOINT, 5, 4, 0, 0, 0, NAN),
+        item(2, Cmd.DO_CHANGE_SPEED, 0, 0, 1, 1.0),
+        item(3, Cmd.NAV_WAYPOINT, 8, 4, 1.0, 0, 0, NAN),
+        dialect.MissionItemInt(1, 1, 4, Frame.GLOBAL_RELATIVE_ALT_INT, Cmd.NAV_LAND),
+    ]
+    assert upload(drone, items) == 0
+    assert [request.seq for request in drone.all(dialect.MissionRequestInt)] == [0, 1, 2, 3, 4]
+    drone.command(Cmd.COMPONENT_ARM_DISARM, 1)
+    assert drone.command(Cmd.MISSION_START, 0, 0) == Result.ACCEPTED
+    drone.until(lambda: drone.state == "landed" and drone.position[1] > 5.0)
+    assert [reached.seq for reached in drone.all(dialect.MissionItemReached)] == [1, 3]
+    assert abs(drone.position[1] - 8.0) < 1.2
+
+
+def test_a_mission_is_downloaded_as_it_was_uploaded() -> None:
+    drone = FlownDrone()
+    items = [item(0, Cmd.NAV_WAYPOINT, 5, 4), item(1, Cmd.NAV_RETURN_TO_LAUNCH)]
+    upload(drone, items)
+    drone.receive(dialect.MissionRequestList(1, 1))
+    assert drone.all(dialect.MissionCount)[-1].count == 2
+    drone.receive(dialect.MissionRequestInt(1, 1, 0))
+    got = drone.all(dialect.MissionItemInt)[-1]
+    assert (got.seq, got.command, got.x, got.y, got.z) == (0, Cmd.NAV_WAYPOINT, items[0].x, items[0].y, 4.0)
+    drone.receive(dialect.MissionRequestInt(1, 1, 7))
+    assert drone.all(dialect.MissionAck)[-1].type == 13
+    drone.receive(dialect.MissionClearAll(1, 1))
+    drone.receive(dialect.MissionRequestList(1, 1))
+    assert drone.all(dialect.MissionCount)[-1].count == 0
+
+
+def test_an_item_that_is_not_flown_ends_an_upload() -> None:
+    drone = FlownDrone()
+    assert upload(drone, [item(0, 206)]) == 3  # DO_SET_CAM_TRIGG_DIST: unsupported
+    assert set_mode(drone, PX4_MODES[Mode.MISSION]) == Result.DENIED
+
+
+def test_an_item_that_does_not_come_is_requested_again_and_in_the_end_given_up() -> None:
+    drone = FlownDrone()
+    drone.receive(dialect.MissionCount(1, 1, 2))
+    for i in range(1, 13):
+        drone.vehicle.tick(drone.t_ns + i * 600_000_000)
+    drone.sent += drone.vehicle.take()
+    asked = len(drone.all(dialect.MissionRequestInt)) + len(drone.all(dialect.MissionRequest))
+    assert asked == 11
+    assert drone.all(dialect.MissionAck)[-1].type == 15
+
+
+def test_a_go_to_of_older_clients_is_flown() -> None:
+    drone = flying("ardupilot")
+    drone.receive(
+        dialect.MissionItem(
+            1, 1, 0, Frame.GLOBAL_RELATIVE_ALT, Cmd.NAV_WAYPOINT, current=2, x=47.4 + 5 / 111_170.0, y=8.5, z=3.0
+        )
+    )
+    assert drone.all(dialect.MissionAck)[-1].type == 0
+    drone.step(500)
+    assert abs(drone.position[1] - 5.0) < 0.6  # degrees in 32 bits are steps of 0.4 m
+
+
+def test_beyond_the_fence_it_holds_and_says_so() -> None:
+    drone = flying()
+    drone.receive(dialect.ParamSet(1, 1, "GF_MAX_HOR_DIST", 5.0, 9))
+    drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
+    set_mode(drone, PX4_MODES[Mode.OFFBOARD])
+    for _ in range(400):
+        drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
+        drone.step()
+    assert "Geofence breached: hold" in drone.texts()
+    assert abs(drone.position[1] - 5.0) < 0.5
+
+
+def test_an_uploaded_circle_is_a_fence() -> None:
+    drone = flying()
+    circle = item(0, Cmd.FENCE_CIRCLE_INCLUSION, 0, 0, 2.0, type_=FENCE)
+    assert upload(drone, [circle], FENCE) == 0
+    drone.position[1] = 3.0
+    drone.step(2)
+    assert "Geofence breached: hold" in drone.texts()
+
+
+def test_parameters_are_listed_read_set_within_their_range_and_kept() -> None:
+    drone = FlownDrone("ardupilot")
+    drone.receive(dialect.ParamRequestList(1, 1))
+    listed = drone.all(dialect.ParamValue)
+    assert [value.param_index for value in listed] == list(range(listed[0].param_count))
+    assert {"SYSID_THISMAV", "WPNAV_SPEED", "FENCE_ENABLE"} <= {value.param_id for value in listed}
+    for asked, kept in ((300.0, 300.0), (1e9, 500.0), (-1.0, 10.0), (NAN, 10.0)):
+        drone.receive(dialect.ParamSet(1, 1, "WPNAV_SPEED", asked, 9))
+        assert drone.all(dialect.ParamValue)[-1].param_value == kept
+    drone.receive(dialect.ParamSet(1, 1, "SYSID_THISMAV", 9.0, 4))
+    assert drone.all(dialect.ParamValue)[-1].param_value == 1.0
+    drone.receive(dialect.ParamRequestRead(1, 1, "NO_SUCH", -1))
+    assert drone.all(dialect.ParamError)[-1].param_id == "NO_SUCH"
+
+
+def test_integers_of_px4_travel_as_their_bytes() -> None:
+    import struct
+
+    drone = FlownDrone()
+    drone.receive(dialect.ParamRequestRead(1, 1, "SYS_AUTOSTART", -1))
+    value = drone.all(dialect.ParamValue)[-1]
+    assert struct.unpack("<i", struct.pack("<f", value.param_value)) == (4001,)
+
+
+def test_every_command_is_answered_unknown_ones_with_unsupported() -> None:
+    drone = FlownDrone()
+    for command in range(0, 3000, 7):
+        drone.command(command, 0.0)
+    acks = drone.all(dialect.CommandAck)
+    assert [ack.command for ack in acks] == list(range(0, 3000, 7))
+    assert drone.command(2000) == Result.UNSUPPORTED
+
+
+def test_who_is_flown_by_somebody_else_denies_and_shows_it() -> None:
+    drone = flying()
+    drone.commander = "controller.main"
+    drone.step(2)
+    before = len(drone.commands)
+    assert drone.command(Cmd.NAV_LAND) == Result.DENIED
+    assert drone.texts()[-1] == "Denied: flown by controller.main"
+    assert heartbeat(drone).custom_mode == PX4_MODES[Mode.MISSION]
+    drone.step(100)
+    assert len(drone.commands) == before
+
+
+def test_a_sensor_that_fails_is_reported_and_keeps_it_from_arming() -> None:
+    drone = FlownDrone()
+    drone.step(100)
+    drone.silent = {"gps"}
+    drone.step(100)
+    assert "GPS lost" in drone.texts()
+    assert drone.all(dialect.GpsRawInt)[-1].fix_type == 1
+    assert not drone.all(dialect.SysStatus)[-1].onboard_control_sensors_health & 0x20
+    assert drone.command(Cmd.COMPONENT_ARM_DISARM, 1) == Result.DENIED
+    assert drone.command(Cmd.COMPONENT_ARM_DISARM, 1, FORCE) == Result.ACCEPTED
+    drone.silent = set()
+    drone.step(2)
+    assert drone.texts()[-1] == "GPS back"
+
+
+def test_events_about_the_drone_are_texts() -> None:
+    drone = FlownDrone()
+    event = Event(0, 0, "fault", "tester", "drone1", "", {"kind": "rotor_efficiency", "target": "drone1"})
+    drone.vehicle.on_event(event)
+    drone.vehicle.on_event(Event(0, 0, "fault", "tester", "drone2", "", {"kind": "x", "target": "drone2"}))
+    drone.vehicle.on_event(Event(0, 0, "collision", "world", "drone2", "", {"other": "drone1"}))
+    refused = Event(0, 0, "refused", "mavlink.main", "drone/drone1/cmd/mode", "", {"reason": "it is cold"})
+    drone.vehicle.on_event(refused)
+    drone.sent += drone.vehicle.take()
+    assert drone.texts() == ["Fault rotor_efficiency", "Collision", "Refused: it is cold"]
+
+
+def test_a_low_battery_is_a_text_and_a_state() -> None:
+    drone = FlownDrone()
+    drone.battery_percent = 15.0
+    drone.step(100)
+    assert "Low battery: 15 %" in drone.texts()
+    assert drone.all(dialect.SysStatus)[-1].battery_remaining == 15
+
+
+def test_rates_are_as_asked() -> None:
+    drone = FlownDrone()
+    assert drone.command(Cmd.SET_MESSAGE_INTERVAL, 30, 20_000) == Result.ACCEPTED
+    assert drone.command(Cmd.SET_MESSAGE_INTERVAL, 32, -1) == Result.ACCEPTED
+    assert drone.command(Cmd.SET_MESSAGE_INTERVAL, 9999, 0) == Result.UNSUPPORTED
+    drone.step()
+    drone.sent.clear()
+    drone.step(50)
+    assert len(drone.all(dialect.Attitude)) == 50
+    assert drone.all(dialect.LocalPositionNed) == []
+    assert drone.command(Cmd.GET_MESSAGE_INTERVAL, 30) == Result.ACCEPTED
+    assert drone.all(dialect.MessageInterval)[-1].interval_us == 20_000
+
+
+def test_messages_for_others_are_left_to_them() -> None:
+    drone = FlownDrone()
+    drone.receive(dialect.CommandLong(command=400, param1=1.0, target_system=2, target_component=1))
+    drone.receive(dialect.CommandLong(command=400, param1=1.0, target_system=1, target_component=154))
+    assert drone.all(dialect.CommandAck) == []
+    assert not drone.vehicle.flight.is_armed
+
+
+def test_time_and_ping_are_answered() -> None:
+    drone = FlownDrone()
+    drone.receive(dialect.Timesync(tc1=0, ts1=77))
+    assert drone.all(dialect.Timesync) == [dialect.Timesync(drone.t_ns, 77)]
+    drone.receive(dialect.Ping(5, 6, 0, 0))
+    assert drone.all(dialect.Ping) == [dialect.Ping(5, 6, 255, 190)]
