@@ -12,6 +12,7 @@ from zsim_bridges.ardrone.aircraft.configuration import Configuration, Configura
 from zsim_bridges.ardrone.aircraft.flight_control import IN_THE_AIR, FlightControl
 from zsim_bridges.ardrone.aircraft.navdata_content import NavdataContent
 from zsim_bridges.ardrone.aircraft.navdata_sender import NavdataSender, Send
+from zsim_bridges.ardrone.aircraft.setpoint_sender import SetpointSender
 from zsim_bridges.ardrone.wire import at_commands, configuration_text
 from zsim_bridges.ardrone.wire.at_commands import Command
 from zsim_bridges.ardrone.wire.navdata import ControlState, Hovering, StateBit
@@ -80,7 +81,8 @@ class Aircraft:
         self._state = OnboardState(drone.sensors.imu.mount, drone.sensors.mag.mount)
         self.configuration = _configuration(drone)
         sender = CommandSender(drone.name, source, outlets.put)
-        self._flight = FlightControl(sender, source, drone.limits, self.configuration, self._refuse)
+        self._setpoints = SetpointSender(sender, drone.limits, self.configuration)
+        self._flight = FlightControl(sender, self._setpoints, source, self._refuse)
         self._content = NavdataContent(self._state, drone.rotor_max_rad_s)
         parts = self._content, self.configuration, outlets.send_navdata, self._state_bits, self._ctrl_state
         self._navdata = NavdataSender(*parts, self._refuse)
@@ -116,8 +118,8 @@ class Aircraft:
 
     def _on_status(self, status: flight_messages.Status) -> None:
         self._now_ns = status.t_ns
-        self._flight.altitude_m = self._state.altitude_m
-        self._flight.heading_rad = math.radians(self._content.heading_deg)
+        self._setpoints.altitude_m = self._state.altitude_m
+        self._setpoints.heading_rad = math.radians(self._content.heading_deg)
         self._watch()
         self._flight.on_status(status)
         self._navdata.on_gate()
