@@ -22,6 +22,7 @@ from zsim_bridges.vehicle_links.onboard_state import OnboardState
 WATCHDOG_NS = 50_000_000  # ns without an AT command until the watchdog's bit (Developer Guide 6.6, COMWDG)
 LAND_AFTER_NS = 2_000_000_000  # ns of hovering without a pilot's program before it lands, chosen
 SECOND_NS = 1_000_000_000
+MALFORMED_SHOWN = 20  # parts of datagrams that are no commands, chosen; more are counted alone
 LOW_BATTERY_PERCENT = 10.0  # %, below it zsim's firmware does not take off; below 5 % it lands
 RANGE_COSINE = math.cos(math.radians(75.0))  # of the tilt at which the firmware cuts the motors
 ALWAYS = int(
@@ -93,6 +94,7 @@ class Aircraft:
         self._is_lost = self._ack = False
         self._ids: at_commands.ConfigIds | None = None
         self._channel = 0
+        self._malformed = 0
 
     @property
     def camera(self) -> str:
@@ -158,7 +160,8 @@ class Aircraft:
         """Obey the AT commands of a datagram."""
         commands, refusals = at_commands.parse(datagram)
         for refusal in refusals:
-            self._refuse(refusal)
+            self._malformed += 1
+            self._refuse(refusal if self._malformed <= MALFORMED_SHOWN else "more is sent that is no AT command")
         for command in commands:
             if self._is_in_sequence(command.sequence):
                 self._command_ns, self._is_lost = self._now_ns, False
