@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from zsim_bridges.ardrone.wire.navdata import Navdata, StateBit
 
 SCRIPTS = Path(__file__).parent / "ardrone_clients"
 NODE_PACKAGES = ("ar-drone@0.3.3", "ardrone-autonomy@0.1.2")
+AGAIN_S = 1.0  # wall time without navdata after which it is asked for again (ARDroneLib)
 INSTALLS_S = 120.0  # wall time of npm, on a slow network
 
 
@@ -121,7 +123,7 @@ class PlainPilot:
         self._sequence = 0
         self._at = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._navdata = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._navdata.settimeout(PATIENCE_S)
+        self._navdata.settimeout(AGAIN_S)
 
     def __enter__(self) -> "PlainPilot":
         return self
@@ -158,8 +160,14 @@ class PlainPilot:
         self.until(lambda packet: StateBit.COMMAND_ACK not in packet.state)
 
     def receive(self) -> tuple[bytes, tuple[str, int]]:
-        """Return the next datagram of navdata, and who sent it."""
-        return self._navdata.recvfrom(65_536)
+        """Return the next datagram of navdata, and who sent it; ask again where none comes, as the SDK does."""
+        until_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until_s:
+            try:
+                return self._navdata.recvfrom(65_536)
+            except TimeoutError:
+                self.request()
+        return pytest.fail("no navdata comes")
 
     def until(self, wanted, act=lambda: None) -> Navdata:
         """Return the next packet that is wanted; do something at each packet before."""

@@ -181,6 +181,62 @@ def test_a_drone_that_another_process_flies_is_shown_and_not_obeyed(fleet: Fleet
         assert fleet.client.request("world/control", "release", source="tester.one", drone="drone6")["ok"]
 
 
+def test_the_emergency_stops_the_motors_and_is_left_again(fleet: Fleet) -> None:
+    emergency = StateBit.EMERGENCY | StateBit.USER_EMERGENCY
+    with PlainPilot(fleet.addresses[5]) as pilot:
+
+        def send(takes_off: bool, toggles: bool = False) -> None:
+            pilot.send(at_commands.ref(0, takes_off, toggles), at_commands.Pcmd(0, 0, 0.0, 0.0, 0.0, 0.0))
+
+        pilot.request()
+        pilot.config("general:navdata_demo", "FALSE")
+        send(takes_off=False)
+        pilot.until(lambda packet: packet.options[0].altitude_mm > 300, lambda: send(takes_off=True))
+        stopped = pilot.until(lambda packet: emergency in packet.state, lambda: send(takes_off=True, toggles=True))
+        assert stopped.options[0].ctrl_state >> 16 == 0
+        pilot.until(lambda packet: packet.options[9].motor == (0, 0, 0, 0), lambda: send(takes_off=False))
+        pilot.until(lambda packet: packet.options[0].altitude_mm < 120, lambda: send(takes_off=False))
+        left = pilot.until(
+            lambda packet: StateBit.EMERGENCY not in packet.state, lambda: send(takes_off=False, toggles=True)
+        )
+        assert left.options[0].ctrl_state >> 16 == 2
+        pilot.config("general:navdata_demo", "TRUE")
+
+
+@pytest.mark.soak
+def test_a_pilot_who_goes_silent_leaves_a_drone_that_lands(fleet: Fleet) -> None:
+    statuses = fleet.client.subscribe("drone/drone6/sensor/status")
+    with PlainPilot(fleet.addresses[5]) as pilot:
+        pilot.request()
+        pilot.config("general:navdata_demo", "TRUE")
+        pilot.send(at_commands.ref(0, takes_off=True))
+        pilot.until(
+            lambda packet: packet.options[0].ctrl_state >> 16 == 4, lambda: pilot.send(at_commands.ResetWatchdog(0))
+        )
+        pilot.send(at_commands.Pcmd(0, 1, 0.0, -0.5, 0.0, 0.0))
+        flying = statuses.until(lambda status: status["state"] == "flying").message
+        hovering = statuses.until(lambda status: status["state"] == "hovering").message
+        landing = statuses.until(lambda status: status["state"] == "landing").message
+        statuses.until(lambda status: status["state"] == "landed")
+    assert 1.9 < (hovering["t_ns"] - flying["t_ns"]) / 1e9 < 2.4
+    assert 1.9 < (landing["t_ns"] - hovering["t_ns"]) / 1e9 < 2.4
+
+
+def test_one_run_is_served_after_the_other(federation: Federation) -> None:
+    first = addresses(30)[-1]
+    server = serve(federation, first)
+    for number in (1, 2):
+        world = federation.world(ONE, "--rate", "1", "--duration", "3600")
+        server.line(f"drone1 is an AR.Drone 2.0 at {first}", number=number)
+        with PlainPilot(first) as pilot:
+            pilot.request()
+            pilot.config("general:navdata_demo", "TRUE")
+            assert b"general:navdata_demo = TRUE" in pilot.configuration()
+            assert federation.client().request("world/control", "stop")["ok"]
+            world.ends(with_code=0)
+    server.line("left, the run ended")
+
+
 def test_a_run_as_fast_as_possible_is_refused_or_paced(federation: Federation) -> None:
     federation.world(ONE, "--expect", "nobody.yet")
     first = addresses(20)[-1]

@@ -12,6 +12,7 @@ from zsim_bridges.ardrone.aircraft.configuration import Configuration, Configura
 from zsim_bridges.ardrone.aircraft.flight_control import IN_THE_AIR, FlightControl
 from zsim_bridges.ardrone.aircraft.navdata_content import NavdataContent
 from zsim_bridges.ardrone.aircraft.navdata_sender import NavdataSender, Send
+from zsim_bridges.ardrone.aircraft.setpoint_sender import SetpointSender
 from zsim_bridges.ardrone.wire import at_commands, configuration_text
 from zsim_bridges.ardrone.wire.at_commands import Command
 from zsim_bridges.ardrone.wire.navdata import ControlState, Hovering, StateBit
@@ -21,9 +22,10 @@ from zsim_bridges.vehicle_links.onboard_state import OnboardState
 WATCHDOG_NS = 50_000_000  # ns without an AT command until the watchdog's bit (Developer Guide 6.6, COMWDG)
 LAND_AFTER_NS = 2_000_000_000  # ns of hovering without a pilot's program before it lands, chosen
 SECOND_NS = 1_000_000_000
+MALFORMED_SHOWN = 20  # parts of datagrams that are no commands, chosen; more are counted alone
 LOW_BATTERY_PERCENT = 10.0  # %, below it zsim's firmware does not take off; below 5 % it lands
 RANGE_COSINE = math.cos(math.radians(75.0))  # of the tilt at which the firmware cuts the motors
-ALWAYS = (
+ALWAYS = int(
     StateBit.ALTITUDE_CONTROL
     | StateBit.PIC_VERSION_OK
     | StateBit.AT_THREAD
@@ -80,7 +82,8 @@ class Aircraft:
         self._state = OnboardState(drone.sensors.imu.mount, drone.sensors.mag.mount)
         self.configuration = _configuration(drone)
         sender = CommandSender(drone.name, source, outlets.put)
-        self._flight = FlightControl(sender, source, drone.limits, self.configuration, self._refuse)
+        self._setpoints = SetpointSender(sender, drone.limits, self.configuration)
+        self._flight = FlightControl(sender, self._setpoints, source, self._refuse)
         self._content = NavdataContent(self._state, drone.rotor_max_rad_s)
         parts = self._content, self.configuration, outlets.send_navdata, self._state_bits, self._ctrl_state
         self._navdata = NavdataSender(*parts, self._refuse)
@@ -91,6 +94,7 @@ class Aircraft:
         self._is_lost = self._ack = False
         self._ids: at_commands.ConfigIds | None = None
         self._channel = 0
+        self._malformed = 0
 
     @property
     def camera(self) -> str:
@@ -116,8 +120,8 @@ class Aircraft:
 
     def _on_status(self, status: flight_messages.Status) -> None:
         self._now_ns = status.t_ns
-        self._flight.altitude_m = self._state.altitude_m
-        self._flight.heading_rad = math.radians(self._content.heading_deg)
+        self._setpoints.altitude_m = self._state.altitude_m
+        self._setpoints.heading_rad = math.radians(self._content.heading_deg)
         self._watch()
         self._flight.on_status(status)
         self._navdata.on_gate()
@@ -156,7 +160,8 @@ class Aircraft:
         """Obey the AT commands of a datagram."""
         commands, refusals = at_commands.parse(datagram)
         for refusal in refusals:
-            self._refuse(refusal)
+            self._malformed += 1
+            self._refuse(refusal if self._malformed <= MALFORMED_SHOWN else "more is sent that is no AT command")
         for command in commands:
             if self._is_in_sequence(command.sequence):
                 self._command_ns, self._is_lost = self._now_ns, False
@@ -243,28 +248,24 @@ class Aircraft:
 
     def _state_bits(self) -> int:
         is_silent = self._command_ns is None or self._silent_ns() > WATCHDOG_NS
-        bits = ALWAYS
-        for bit, is_set in (
+        bits = (
             (StateBit.FLYING, self._flight.state in (*IN_THE_AIR, "landing")),
             (StateBit.COMMAND_ACK, self._ack),
             (StateBit.CAMERA_READY, self._has_camera),
             (StateBit.COM_WATCHDOG, is_silent),
             (StateBit.COM_LOST, self._is_lost),
             (StateBit.ULTRASOUND_DEAF, self._content.is_sonar_deaf),
-        ):
-            bits |= bit if is_set else 0
-        return int(bits | self._fault_bits())
+        )
+        return sum((bit for bit, is_set in bits if is_set), ALWAYS + self._fault_bits())  # a flag's `|` is slow
 
     def _fault_bits(self) -> int:
         status = self._state.status
-        bits = 0
-        if status is not None and status.battery_percent < LOW_BATTERY_PERCENT:
-            bits |= StateBit.BATTERY_LOW
+        is_low = status is not None and status.battery_percent < LOW_BATTERY_PERCENT
+        bits = int(StateBit.BATTERY_LOW) if is_low else 0
         if self._flight.state == "emergency":
-            bits |= StateBit.EMERGENCY
-            bits |= StateBit.USER_EMERGENCY if self._flight.stopped_by_pilot else StateBit.CUTOUT
+            bits += StateBit.EMERGENCY + (StateBit.USER_EMERGENCY if self._flight.stopped_by_pilot else StateBit.CUTOUT)
             if float(rotations.rotation_matrix(self._state.attitude)[2, 2]) < RANGE_COSINE:
-                bits |= StateBit.ANGLES_OUT_OF_RANGE
+                bits += StateBit.ANGLES_OUT_OF_RANGE
         return bits
 
 

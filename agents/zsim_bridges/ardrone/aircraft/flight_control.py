@@ -5,67 +5,44 @@ Source: AR.Drone Developer Guide SDK 2.0, 6.6; what clients of it send.
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 from zsim.contract.flight_messages import Status
-from zsim.vehicles.vehicle import Limits
-from zsim_bridges.ardrone.aircraft.configuration import Configuration
+from zsim_bridges.ardrone.aircraft.setpoint_sender import Setpoint, SetpointSender, share
 from zsim_bridges.ardrone.wire import at_commands
 from zsim_bridges.ardrone.wire.at_commands import Pcmd, PcmdMag, Ref
 from zsim_bridges.vehicle_links.command_sender import CommandSender, ModeName
 
-REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
 AGAIN_NS = 500_000_000  # ns, chosen: a mode that is not entered is asked for again, as the pilot's REF is repeated
 ASKED_MAX = 3  # times that a mode is asked for before it is given up, chosen
 PER_GATE = 3  # setpoints that are sent at once within a gate, chosen: the world takes one at each
-NO_ALTITUDE_LIMIT_MM = 100_000  # altitude_max that means none (ARDroneLib)
-CLIMB_1_S = 1.5  # 1/s, as the firmware nears its own greatest height
 AIRBORNE = ("hovering", "flying")
 IN_THE_AIR = ("taking_off", *AIRBORNE)
-CALIBRATION_YAW_RAD_S = 1.0  # rad/s, chosen: a turn takes 6 s, as on the aircraft
-
-
-class Setpoint(NamedTuple):
-    """A PCMD within its limits: shares of the largest tilt, climb and yaw rate.
-
-    Attributes:
-        hover: in place, whatever the shares are.
-        right, back, up, clockwise: in [-1, 1].
-        pilot_heading_rad: clockwise from north, where right and back are those of the pilot, not of the drone.
-    """
-
-    hover: bool
-    right: float = 0.0
-    back: float = 0.0
-    up: float = 0.0
-    clockwise: float = 0.0
-    pilot_heading_rad: float | None = None
 
 
 class FlightControl:
     """The pilot of one drone.
 
     Args:
-        sender: of commands to it.
-        source: name under which they are sent.
-        limits: what zsim's shares of 1 mean.
-        configuration: what the pilot's shares of 1 mean.
+        sender: of modes to it.
+        setpoints: sends what it is to fly.
+        source: name under which both are sent.
         refuse: counts a command that is not obeyed, with the reason.
+
+    Attributes:
+        has_flown: whether the flight is this pilot's.
+        stopped_by_pilot: whether the emergency is.
     """
 
     def __init__(
         self,
         sender: CommandSender,
+        setpoints: SetpointSender,
         source: str,
-        limits: Limits,
-        configuration: Configuration,
         refuse: Callable[[str], None],
     ) -> None:
         self._sender = sender
+        self._setpoints = setpoints
         self._source = source
-        self._tilt_slope = math.tan(math.radians(limits.tilt_deg))
-        self._climb_m_s, self._yaw_rad_s = limits.vertical_speed_m_s, math.radians(limits.yaw_rate_deg_s)
-        self._configuration = configuration
         self._refuse = refuse
         self._status: Status | None = None
         self._held_take_off = self._held_emergency = False  # bits of the last REF
@@ -78,8 +55,6 @@ class FlightControl:
         self._calibrated_ns: int | None = None  # until then it turns
         self.has_flown = False
         self.stopped_by_pilot = False
-        self.altitude_m = 0.0
-        self.heading_rad = 0.0  # clockwise from magnetic north
 
     @property
     def calibrates(self) -> bool:
@@ -123,7 +98,7 @@ class FlightControl:
         self._held_take_off, self._held_emergency = ref.takes_off, ref.emergency
         if not (rises or toggles or (not ref.takes_off and self.state in IN_THE_AIR)):
             if not ref.takes_off and self._mode == "takeoff":
-                self._mode = None
+                self._withdraw()
             return
         if self._is_refused("REF"):
             return
@@ -136,10 +111,16 @@ class FlightControl:
         elif not ref.takes_off and self._mode != "land":
             self._ask("land")
 
+    def _withdraw(self) -> None:
+        """Take back a take-off; one that is on its way is followed by a landing."""
+        if self._mode_count:
+            self._sender.mode(self._now_ns, "land")
+        self._mode = None
+
     def on_pcmd(self, pcmd: Pcmd | PcmdMag) -> None:
         """Fly it from now on, until another PCMD."""
         if isinstance(pcmd, PcmdMag):
-            self._psi_rad = math.pi * _share(pcmd.psi)
+            self._psi_rad = math.pi * share(pcmd.psi)
         if self.state not in IN_THE_AIR or self._mode in ("land", "emergency") or self._is_refused("PCMD"):
             return
         setpoint = self._setpoint_of(pcmd)
@@ -152,7 +133,7 @@ class FlightControl:
         if not pcmd.flag & at_commands.PROGRESSIVE:
             return Setpoint(hover=True)
         absolute = bool(pcmd.flag & at_commands.ABSOLUTE)
-        shares = map(_share, (pcmd.roll, pcmd.pitch, pcmd.gaz, pcmd.yaw))
+        shares = map(share, (pcmd.roll, pcmd.pitch, pcmd.gaz, pcmd.yaw))
         return Setpoint(False, *shares, pilot_heading_rad=self._psi_rad if absolute else None)
 
     def calibrate(self) -> None:
@@ -161,7 +142,7 @@ class FlightControl:
             self._refuse(f"CALIB is not obeyed: the drone is {self.state}; must be in the air")
         elif not self._is_refused("CALIB"):
             self._follow(Setpoint(hover=True))
-            self._calibrated_ns = self._now_ns + round(2e9 * math.pi / min(CALIBRATION_YAW_RAD_S, self._yaw_rad_s))
+            self._calibrated_ns = self._now_ns + self._setpoints.turn_ns
 
     def hover(self) -> None:
         """Hover in place: the pilot's program is silent."""
@@ -181,13 +162,14 @@ class FlightControl:
     def on_status(self, status: Status) -> None:
         """Do what is due at a gate."""
         self._status = status
-        if status.state == "emergency":
-            self._mode = None if self._mode == "takeoff" else self._mode
-        else:
+        if status.state == "emergency" and self._mode == "takeoff":
+            self._mode = None
+        if status.state != "emergency" and self._mode != "emergency":
             self.stopped_by_pilot = False
         if status.state in ("landed", "emergency", "landing"):
             self._setpoint = self._calibrated_ns = None
-            self.has_flown = self.has_flown and status.state == "landing"
+        if status.state in ("landed", "emergency") and self._mode != "takeoff":
+            self.has_flown = False
         if self._mode is not None:
             self._pursue(self._mode)
         if self.calibrates and status.t_ns >= (self._calibrated_ns or 0):
@@ -235,56 +217,10 @@ class FlightControl:
         now_ns = self._now_ns
         if now_ns != self._gate_ns:
             self._gate_ns, self._gate_count = now_ns, 0
-        is_late = self._sent_ns is None or now_ns - self._sent_ns >= self._repeat_ns(self._setpoint)
+        is_late = self._sent_ns is None or now_ns - self._sent_ns >= self._setpoints.repeat_ns(self._setpoint)
         if is_late and self._gate_count < PER_GATE:
             self._sent_ns, self._gate_count, self.has_flown = now_ns, self._gate_count + 1, True
-            self._send(self._setpoint)
-
-    def _repeat_ns(self, setpoint: Setpoint) -> int:
-        """Return after how long a setpoint is sent again: what depends on height or heading is, at every gate."""
-        turns = setpoint.pilot_heading_rad is not None
-        return 0 if turns or (setpoint.up > 0.0 and self._is_near_top()) else REPEAT_NS
-
-    def _is_near_top(self) -> bool:
-        return self._climb_left_m_s() < self._configuration.number("control:control_vz_max") / 1e3
-
-    def _climb_left_m_s(self) -> float:
-        """Return how fast it may climb below altitude_max."""
-        highest_mm = self._configuration.number("control:altitude_max")
-        if highest_mm >= NO_ALTITUDE_LIMIT_MM:
-            return math.inf
-        return CLIMB_1_S * (highest_mm / 1e3 - self.altitude_m)
-
-    def _send(self, setpoint: Setpoint) -> None:
-        if self.calibrates:
-            yaw_rate = min(CALIBRATION_YAW_RAD_S, self._yaw_rad_s)
-            self._sender.velocity(self._now_ns, (0.0, 0.0, 0.0), -yaw_rate)
-        elif setpoint.hover:
-            self._sender.tilt(self._now_ns, 0.0, 0.0, 0.0, 0.0, hover=True)
-        else:
-            right, back = self._across(setpoint)
-            self._sender.tilt(self._now_ns, -back, -right, self._up(setpoint), self._yaw_left(setpoint), hover=False)
-
-    def _across(self, setpoint: Setpoint) -> tuple[float, float]:
-        """Return the shares of zsim's tilt to the drone's right and back."""
-        right, back = setpoint.right, setpoint.back
-        if setpoint.pilot_heading_rad is not None:
-            turn = setpoint.pilot_heading_rad - self.heading_rad
-            sine, cosine = math.sin(turn), math.cos(turn)
-            right, back = cosine * right - sine * back, sine * right + cosine * back
-        tilt_rad = self._configuration.number("control:euler_angle_max")
-        return self._tilt_share(right * tilt_rad), self._tilt_share(back * tilt_rad)
-
-    def _tilt_share(self, tilt_rad: float) -> float:
-        return _share(math.tan(tilt_rad) / self._tilt_slope)
-
-    def _up(self, setpoint: Setpoint) -> float:
-        climb_m_s = setpoint.up * self._configuration.number("control:control_vz_max") / 1e3
-        return _share(min(climb_m_s, self._climb_left_m_s()) / self._climb_m_s)
-
-    def _yaw_left(self, setpoint: Setpoint) -> float:
-        return _share(-setpoint.clockwise * self._configuration.number("control:control_yaw") / self._yaw_rad_s)
-
-
-def _share(value: float) -> float:
-    return min(1.0, max(-1.0, value))
+            if self.calibrates:
+                self._setpoints.send_turn(now_ns)
+            else:
+                self._setpoints.send(now_ns, self._setpoint)

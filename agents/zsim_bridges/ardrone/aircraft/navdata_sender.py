@@ -105,7 +105,7 @@ class NavdataSender:
         except (struct.error, ArithmeticError, ValueError) as error:
             self._refuse(f"navdata has a value beyond what its field can hold ({error})")
         self._sequence += 1
-        return self._template.packet(self._state_bits() | self._mode_bits(), self._sequence & 0xFFFF_FFFF, 0)
+        return self._template.packet(self._state_bits() + self._mode_bits(), self._sequence & 0xFFFF_FFFF, 0)
 
     def _fill(self, t_ns: int) -> None:
         if self._is_gate_new:
@@ -120,7 +120,7 @@ class NavdataSender:
 
     def _mode_bits(self) -> int:
         if self.is_bootstrap:
-            return navdata.StateBit.NAVDATA_BOOTSTRAP | navdata.StateBit.NAVDATA_DEMO
+            return navdata.StateBit.NAVDATA_BOOTSTRAP + navdata.StateBit.NAVDATA_DEMO
         return navdata.StateBit.NAVDATA_DEMO if self._configuration.flag("general:navdata_demo") else 0
 
     def _tags(self) -> tuple[int, ...]:

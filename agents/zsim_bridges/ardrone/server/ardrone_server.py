@@ -136,7 +136,9 @@ class ArdroneServer:
         for arrived in intake.arrivals():
             for key, payload in arrived:
                 self.forward(key, payload)
-            await asyncio.sleep(0)  # other tasks run
+                if keys.is_status(key):  # a gate of a fleet takes long: what pilots send meanwhile comes first
+                    await asyncio.sleep(0)
+            await asyncio.sleep(0)
 
     def forward(self, key: str, payload: bytes) -> None:
         """Hand a message that has passed the world to its aircraft."""

@@ -74,7 +74,7 @@ class FileServer:
         return _FIXED.get(verb, "502 not implemented")
 
     async def _open_data(self, writer: asyncio.StreamWriter, verb: str) -> "tuple[StreamPort, asyncio.Queue]":
-        """Listen for a connection for data, and say where."""
+        """Listen for a connection for data, and reply with its place."""
         waiting: asyncio.Queue[bytes | None] = asyncio.Queue(1)
 
         async def send(_: asyncio.StreamReader, to: asyncio.StreamWriter) -> None:

@@ -3,11 +3,15 @@
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 from zsim.contract.camera_messages import CameraImage
 from zsim_bridges.ardrone.server.addresses import Peers
 from zsim_bridges.ardrone.server.stream_port import StreamPort, read_until_end
 from zsim_bridges.ardrone.wire.pave import FrameType, PaveHeader
+
+if TYPE_CHECKING:
+    from zsim_bridges.ardrone.server.video_encoder import Frame, VideoEncoder
 
 BACKLOG_MAX = 500_000  # bytes that a connection may be behind, chosen: some seconds; then it waits for an IDR frame
 
@@ -29,7 +33,7 @@ class VideoServer:
         self._ready: set[asyncio.StreamWriter] = set()  # have had an IDR frame, and all since
         self._newest: CameraImage | None = None
         self._busy: asyncio.Task[None] | None = None
-        self._encoder = None
+        self._encoder: VideoEncoder | None = None
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="video")
         self._frames = self._sent = 0
 
@@ -62,24 +66,24 @@ class VideoServer:
             while self._newest is not None and self.is_watched:
                 image, self._newest = self._newest, None
                 begins = any(writer not in self._ready for writer in self.port.writers)
-                frame = await loop.run_in_executor(self._thread, self._encode, image, begins)
+                try:
+                    frame = await loop.run_in_executor(self._thread, self._encode, image, begins)
+                except ValueError as error:
+                    self._refuse(f"a picture cannot be streamed: {error}")
+                    continue
                 if frame is not None:
                     self._send(image, frame)
         finally:
             self._busy = None
 
-    def _encode(self, image: CameraImage, begins: bool):
+    def _encode(self, image: CameraImage, begins: bool) -> "Frame | None":
         """Return the picture as a frame, in the encoder's thread."""
-        from zsim_bridges.ardrone.server.video_encoder import PictureError, VideoEncoder
+        from zsim_bridges.ardrone.server.video_encoder import VideoEncoder
 
         self._encoder = self._encoder or VideoEncoder()
-        try:
-            return self._encoder.encode(image.data, begins)
-        except PictureError as error:
-            self._refuse(f"a picture cannot be streamed: {error}")
-            return None
+        return self._encoder.encode(image.data, begins)
 
-    def _send(self, image: CameraImage, frame) -> None:
+    def _send(self, image: CameraImage, frame: "Frame") -> None:
         kind = FrameType.IDR if frame.is_idr else FrameType.P
         header = PaveHeader(
             len(frame.data),

@@ -224,6 +224,13 @@ class TestRefusals:
         assert len(played.refusals) == 2
 
 
+def test_there_is_an_end_to_texts_about_what_is_no_command(played: PlayedAircraft):
+    for k in range(1000):
+        played.aircraft.on_at(b"AT*NAME%d=1\r" % k)
+    assert len(played.refusals) == 1000
+    assert len(set(played.refusals)) == 21
+
+
 def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
     cr, sr, cp, sp = math.cos(roll / 2), math.sin(roll / 2), math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)

@@ -48,7 +48,7 @@ class TestTakeOffAndLanding:
         played.ref(takes_off=True)
         played.ref(takes_off=False)
         played.flown_gates(100, "landed")
-        assert played.modes() == ["takeoff"]
+        assert played.modes() == ["takeoff", "land"]  # the first one is on its way
 
     def test_a_take_off_while_it_lands_waits_for_the_ground(self, airborne: PlayedAircraft):
         airborne.ref(takes_off=False)
@@ -113,6 +113,7 @@ class TestEmergency:
     def test_the_state_word_has_who_caused_it(self, airborne: PlayedAircraft):
         airborne.listen()
         airborne.ref(takes_off=False, emergency=True)
+        airborne.gates(1, "hovering")  # it is on its way
         airborne.gates(5, "emergency")
         assert StateBit.EMERGENCY | StateBit.USER_EMERGENCY in airborne.packet().state
         assert StateBit.CUTOUT not in airborne.packet().state
@@ -265,6 +266,14 @@ class TestSilence:
         airborne._sequence = 1  # it has begun again
         airborne.pcmd(pitch=-1.0)
         assert len(airborne.tilts()) == 1
+
+    def test_a_drone_that_only_took_off_lands_too(self, played: PlayedAircraft):
+        played.gates()
+        played.ref(takes_off=True)
+        played.gates(1, "landed")  # it is on its way
+        played.gates(60, "taking_off")
+        played.gates(145, "hovering")
+        assert played.modes() == ["takeoff", "land"]
 
     def test_a_drone_that_nobody_on_this_wire_flew_is_let_be(self, played: PlayedAircraft):
         played.at(at_commands.ResetWatchdog(0))
