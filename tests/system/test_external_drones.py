@@ -49,8 +49,8 @@ def driver(federation: Federation) -> Iterator[Start]:
         words = [
             sys.executable,
             str(ROOT / "examples/external_drone.py"),
-            DRONE,
             federation.endpoint,
+            DRONE,
             "2",
             "-2",
             "0.05",
