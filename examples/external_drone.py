@@ -2,7 +2,7 @@
 
 Where this file computes a body, a driver of yours talks to an aircraft. Give the drone `body: external` in a scenario:
 
-    zsim run SCENARIO --realtime          then          python examples/external_drone.py drone3 [ENDPOINT]
+    zsim run SCENARIO --realtime          then          python examples/external_drone.py drone3 X Y Z
 """
 
 import math
@@ -13,8 +13,10 @@ from typing import Any
 import msgpack
 import zenoh
 
-DRONE, ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else "", sys.argv[2] if len(sys.argv) > 2 else "tcp/127.0.0.1:7447"
-_ = DRONE or sys.exit("usage: python examples/external_drone.py DRONE [ENDPOINT]")
+WORDS = sys.argv[1:]
+ENDPOINT = WORDS.pop(0) if WORDS and "/" in WORDS[0] else "tcp/127.0.0.1:7447"
+_ = len(WORDS) in (1, 4) or sys.exit("usage: python examples/external_drone.py [ENDPOINT] DRONE [X Y Z]")
+DRONE, PLACE = WORDS[0], [float(x) for x in WORDS[1:]] or [0.0, 0.0, 0.05]
 ME, G_M_S2, LAG_S, TAKEOFF_M, CLIMB_M_S = f"driver.{DRONE}", 9.80665, 0.3, 1.0, 0.7
 HOVER_S, LAND_S = 0.5, 2.0  # after which silence it hovers, and then lands
 

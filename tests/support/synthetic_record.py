@@ -86,7 +86,10 @@ def info(scenario) -> messages.Info:
         command_delay_ns=GATE_NS,
         seed=scenario.seed,
         origin=messages.Origin(-34.6, -58.4, 25.0),
-        drones=tuple(messages.DroneInfo(drone.name, drone.model) for drone in scenario.drones),
+        drones=tuple(
+            messages.DroneInfo(drone.name, drone.model, body="external" if drone.is_external else messages.UNSET)
+            for drone in scenario.drones
+        ),
         clusters=tuple(messages.ClusterInfo(c.name, tuple(c.drones)) for c in scenario.clusters),
         scenario=scenario_file.to_text(scenario),
         scenario_sha256=scenario_file.sha256(scenario_file.to_text(scenario)),

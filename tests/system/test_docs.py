@@ -256,7 +256,12 @@ PORTS = ("7447", "7448", "8000", "7470", "11311")  # as printed: world, router, 
 LEADERS = r"zsim (run|world|replay|router|gateway|ros1|ros2|camera|detect)\b"
 ANSWERED = ("estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2", "camera", "detect",
             "fault (?:add|clear|list)")  # fmt: skip
-FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take the endpoint as an argument
+FOREIGN = (
+    "plain_client.py",
+    "foreign_estimator.py",
+    "range_sensor.py",
+    "external_drone.py",
+)  # take the endpoint as an argument
 OURS = ("fly_square.py",)
 
 

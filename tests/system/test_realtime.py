@@ -40,14 +40,15 @@ def test_it_keeps_pace(federation: Federation, rate: int) -> None:
 
 
 def test_nobody_is_waited_for(federation: Federation) -> None:
-    """A stopped estimator does not hold time; it is a deadline missed at every gate."""
+    """A stopped estimator holds neither time nor its controller; it is a deadline missed at every gate."""
     run = federation.run(PAIR, "--realtime", "--rate", "2", *FOR_LONG)
     client = federation.client()
-    clock = client.subscribe("clock")
+    clock, states = client.subscribe("clock"), client.subscribe("cluster/main/state")
     clock.until(lambda m: m["t_ns"] > 2e9)
     federation.kill("estimator.drone1", signal.SIGSTOP)
     stopped_ns = client.get("clock")["clock"]["t_ns"]
     clock.until(lambda m: m["t_ns"] > stopped_ns + 4e9)
+    assert states.until(lambda m: m["t_ns"] > stopped_ns + 3e9, within_s=30).message["reason"]
     federation.kill("estimator.drone1", signal.SIGCONT)
     stop(client, run)
     end = federation.record().end()

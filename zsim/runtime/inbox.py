@@ -36,6 +36,7 @@ class Inbox:
     Attributes:
         duplicates: messages that came again before their gate was taken.
         late: messages that came when their gate had been taken.
+        taken_ns: the gate that was taken last, below 0 before the first.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class Inbox:
         self._pulse = next((key for key in gate_keys if key in of_world), None)
         self._beats: dict[int, int] = {}
         self._last_beat: tuple[int, int] | None = None
-        self._taken_ns = self._former_ns = -1  # the gates that were taken last
+        self.taken_ns = self._former_ns = -1  # the gates that were taken last
         self._keep_late = keep_late
         self._uncounted = frozenset(uncounted)
         self._belated: dict[tuple[str, int], tuple[str, Any]] = {}
@@ -79,7 +80,7 @@ class Inbox:
         if key in self._sparse:
             _, newest_ns = last = self._sparse[key]
             self._sparse[key] = (newest_ns, t_ns) if t_ns > newest_ns else last
-        if t_ns <= self._taken_ns:
+        if t_ns <= self.taken_ns:
             self.late += 1
             return self._put_late(key, message)
         stamped = self._waiting.get(t_ns)
@@ -154,7 +155,7 @@ class Inbox:
         last_ns, last_seq = self._last_beat
         gates = self._beats[t_ns] - last_seq
         next_ns = last_ns + (t_ns - last_ns) // gates if 1 < gates <= GAP_MAX + 1 else -1
-        return next_ns if next_ns > self._taken_ns else None
+        return next_ns if next_ns > self.taken_ns else None
 
     def latest_gate_ns(self) -> int | None:
         """Return the latest gate for which a closing message has come."""
@@ -177,6 +178,13 @@ class Inbox:
                 return key
         return self.missing(t_ns)
 
+    def awaited_last(self) -> str | None:
+        """Return the last of the closing keys that the next gate is going to wait for, None if it waits for none."""
+        t_ns = self.taken_ns + 1
+        return next(
+            (key for key in reversed(self._closing) if self._expects(key, t_ns) and self._comes_along(key)), None
+        )
+
     def lost(self, t_ns: int) -> str | None:
         """Return a missing key whose message will not come any more: its publisher has gone on without it."""
         key = self.missing(t_ns)
@@ -190,7 +198,7 @@ class Inbox:
     def _comes_along(self, key: str) -> bool:
         """Tell whether a message of a key has come for both of the gates that were taken last, if it may skip any."""
         former_ns, newest_ns = self._sparse.get(key, (NEVER_NS, NEVER_NS))
-        return newest_ns >= self._taken_ns and former_ns >= self._former_ns
+        return newest_ns >= self.taken_ns and former_ns >= self._former_ns
 
     def take(self, t_ns: int) -> list[tuple[str, Any]]:
         """Return all inputs stamped up to t_ns in order of (t_ns, key, seq), and forget them."""
@@ -207,7 +215,7 @@ class Inbox:
         for meter in self._meters.values():
             if meter.partial or meter.counts or meter.came:
                 meter.forget(t_ns)
-        self._former_ns, self._taken_ns = self._taken_ns, t_ns
+        self._former_ns, self.taken_ns = self.taken_ns, t_ns
         return _once(ready) if len(ready) > 1 else ready
 
     def _with_belated(self, ready: list[tuple[str, Any]]) -> list[tuple[str, Any]]:

@@ -1,5 +1,6 @@
 """What reaches an agent's process: subscriptions, taken apart into an inbox, and what other threads of Zenoh bring."""
 
+import contextlib
 from collections import deque
 from collections.abc import Callable, Container, Iterator
 from operator import itemgetter
@@ -40,9 +41,11 @@ class RunnerInputs:
         self._agent = agent
         self._health = health
         self._say = say
+        self._is_realtime, self._gate_ns = info.mode == "realtime", info.gate_ns
+        self._blocking: Subscription | None = None  # where `wait` waits
         self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         of_drivers = [key for key in agent.gate_keys if keys.thing(key) in self._external]
-        self.inbox = Inbox(agent.gate_keys, agent.counted, info.mode == "realtime", agent.uncounted, of_drivers)
+        self.inbox = Inbox(agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers)
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}
@@ -66,6 +69,8 @@ class RunnerInputs:
                 self._subscriptions[subscribed] = self._link.subscribe(subscribed)
         self._link.declare_subscriber(keys.EVENT, self._on_event)
         self._link.declare_subscriber(keys.FAULTS, lambda sample: self._on_faults(sample.payload))
+        if self._is_realtime:
+            self._link.declare_subscriber(keys.CLOCK, self._on_clock)
         self._link.on_link(self._on_link)
         for key in self._agent.control_keys():
             self._link.declare_queryable(key, self._on_query)
@@ -78,7 +83,9 @@ class RunnerInputs:
         Raises:
             SessionError: the session was closed meanwhile.
         """
-        sample = self._subscriptions[self._blocking_expression()].receive()
+        self._blocking = self._subscriptions[self._blocking_expression()]
+        sample = self._blocking.receive()
+        self._blocking = None
         if sample is not None:
             self._open(sample)
 
@@ -148,7 +155,7 @@ class RunnerInputs:
     def _blocking_expression(self) -> str:
         """Return the subscription from which the next missing message comes."""
         t_ns = self.inbox.next_gate_ns()
-        missing = self.inbox.missing_last(t_ns) if t_ns is not None else None
+        missing = self.inbox.missing_last(t_ns) if t_ns is not None else self.inbox.awaited_last()
         wanted = missing or self._agent.gate_keys[-1]
         expression = self._agent.reads[self._expressions.readers(wanted)[0]]
         return expression if expression in self._subscriptions else self._gate_key
@@ -176,6 +183,16 @@ class RunnerInputs:
         if read is not None:
             self.notices.append(read)
             self.wake()
+
+    def _on_clock(self, sample: RawSample) -> None:
+        """Wake who waits, in realtime, for a gate behind which the world is: what it lacks may never come."""
+        blocking = self._blocking
+        if blocking is None:
+            return
+        with contextlib.suppress(DecodeError):
+            clock: run_messages.Clock = messages.decode(keys.CLOCK, sample.payload)
+            if clock.t_ns >= self.inbox.taken_ns + 2 * self._gate_ns:
+                blocking.wake()
 
     def _on_faults(self, payload: bytes) -> None:
         try:

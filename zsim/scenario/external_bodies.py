@@ -2,6 +2,7 @@
 
 from zsim.errors import ScenarioError
 from zsim.scenario.fault_check import listed
+from zsim.scenario.rights import DRIVER
 from zsim.scenario.scenario import Scenario
 
 
@@ -18,9 +19,14 @@ def check_pace(scenario: Scenario, mode: str) -> None:
         raise ScenarioError([f"{scenario.name}: body of {who}, and the run is in {mode}; {needed}"])
 
 
+def drivers_of(scenario: Scenario) -> list[str]:
+    """Return the names of the processes that publish the external drones."""
+    return [f"{DRIVER}.{drone}" for drone in scenario.external()]
+
+
 def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
     """Return what to tell whoever starts a run of the drivers that are to be started beside it; a line, or none."""
-    drivers, expected = [f"driver.{drone}" for drone in scenario.external()], scenario.expected()
+    drivers, expected = drivers_of(scenario), scenario.expected()
     awaited, others = (listed([d for d in drivers if (d in expected) is wanted]) for wanted in (True, False))
     waits = [f"the run waits for {awaited}"] if awaited else []
     waits += [f"{others} may come at any time"] if others else []

@@ -1,17 +1,17 @@
-"""What the console shows of the newest views: tables as HTML, and plain data for programs.
+"""What the console shows of the newest views, as tables.
 
-Order of this file: HTML, which is pure and in which all texts of other processes are escaped; rows; plain data.
+Order of this file: HTML, which is pure and in which all texts of other processes are escaped; rows.
 """
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from zsim.contract.run_messages import Clock, Event, Fault
-from zsim.contract.views import EstimateView, ViewCluster, ViewDrones
-from zsim_bridges.console.page.picture import FormationShape
-from zsim_bridges.console.view_buffer import Counts, ReceivedEstimate, SensorRates, TimeMonitor, ViewBuffer
+from zsim.contract.views import EstimateView
+from zsim_bridges.console.sensor_rates import Counts, SensorRates
+from zsim_bridges.console.view_buffer import ReceivedEstimate, ReceivedLink, ViewBuffer
 
 LATE_MS = 200.0  # of an estimator: ten gates of 20 ms
 LOW_PERCENT = 20.0  # of a battery; the AR.Drone warns there
@@ -35,10 +35,10 @@ EVENT_COLOURS = {
     "fault_end": AMBER,
     "fault_clear": AMBER,
 }
+LINK_COLOURS = {"waiting": AMBER, "connected": BLUE, "armed": GREEN, "lost": RED}
+LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
-EVENTS_MAX = 20  # in the plain data
-SILENT = "silent"  # in place of the clock's state, where the world answers nothing
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
 
 
@@ -52,6 +52,7 @@ class DroneRow(NamedTuple):
     commander: str | None
     gps: str
     faults: tuple[str, ...]
+    link: tuple[str, str] = ("", "")  # of a driver, in words, and their colour
 
 
 def drone_table(rows: Sequence[DroneRow]) -> str:
@@ -74,10 +75,25 @@ def _drone_cells(row: DroneRow) -> str:
     late = row.lag_ms is not None and row.lag_ms > LATE_MS
     cells = (escape(row.name), state, battery, _coloured(lag, AMBER if late else "inherit"), escape(row.gps))
     line = _cells((*cells, escape(row.commander or "nobody")))
-    if row.faults:
-        faults = escape(", ".join(row.faults))
-        line += f"<tr><td colspan=6 style='color:{AMBER};padding:0 4px 2px 12px'>⚠ {faults}</td></tr>"
+    faults = f"⚠ {', '.join(row.faults)}" if row.faults else ""
+    for note, colour in ((faults, AMBER), row.link):
+        if note:
+            line += f"<tr><td colspan=6 style='color:{colour};padding:0 4px 2px 12px'>{escape(note)}</td></tr>"
     return line
+
+
+def link_note(link: ReceivedLink | None) -> tuple[str, str]:
+    """Return what is known of the link to an external drone, and its colour; None before its driver has published."""
+    if link is None:
+        return "external; no driver yet", AMBER
+    state = link.state
+    if link.age_s > LINK_SILENT_S:
+        return f"external; its driver has been silent for {link.age_s:.0f} s", RED
+    age, loss, round_trip = state.age_ms, state.loss_percent, state.round_trip_ms
+    figures = (("age {:.0f} ms", age), ("loss {:.0f} %", loss), ("round trip {:.0f} ms", round_trip))
+    known = [text.format(value) for text, value in figures if value is not None]
+    known += [f"{state.refused} refused"] if state.refused else []
+    return f"external; {state.state}: {', '.join([state.peer, *known])}", LINK_COLOURS[state.state]
 
 
 def sensor_table(
@@ -199,7 +215,8 @@ class TableRows:
             fixes = "–" if gps is None else f"{gps[0]} / {gps[1]}"
             lag = self._lag_ms(received, view.t_ns) if received else None
             row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, fixes, own_faults)
-            rows.append(DroneRow(*row))
+            external = drone.name in self._views.external
+            rows.append(DroneRow(*row, link_note(self._views.link_of(drone.name)) if external else ("", "")))
         return rows
 
     def active_faults(self) -> list[str]:
@@ -247,53 +264,3 @@ def sigma_m(estimate: EstimateView) -> float:
     """Return the root of the mean variance of the position over its axes; 0 where that is negative, so none."""
     xx, _, _, yy, _, zz = estimate.covariance_m2
     return math.sqrt(max(0.0, xx + yy + zz) / 3)
-
-
-def console_state(
-    run_id: str, views: ViewBuffer, time_monitor: TimeMonitor, shapes: Mapping[str, FormationShape | None]
-) -> dict[str, Any]:
-    """Return what is shown of a run, as plain data; called in another thread than that which draws.
-
-    Args:
-        run_id: of the run.
-        views: the newest ones.
-        time_monitor: of the run's clock.
-        shapes: the formations as they truly stand.
-    """
-    view, clock, clusters = views.drones, time_monitor.clock, dict(views.clusters)
-    silent_s = time_monitor.silent_s
-    return {
-        "run_id": run_id,
-        "t_s": view.t_ns / 1e9 if view else 0.0,
-        "clock": SILENT if silent_s else clock.state if clock else None,
-        "silent_s": silent_s,
-        "drones": _drones(view, views) if view else [],
-        "clusters": [_cluster(name, each, shapes.get(name)) for name, each in clusters.items()],
-        "faults": [_fault(fault) for fault in views.faults],
-        "events": [{"t_s": e.t_ns / 1e9, "kind": e.kind, "text": e.text} for e in list(views.events)[:EVENTS_MAX]],
-    }
-
-
-def _drones(view: ViewDrones, views: ViewBuffer) -> list[dict[str, Any]]:
-    sigmas = {name: sigma_m(received.estimate) for name, received in views.estimates().items() if received.fresh}
-    return [
-        {"name": d.name, "position_m": list(d.position_m), "state": d.state, "sigma_m": sigmas.get(d.name)}
-        for d in view.drones
-    ]
-
-
-def _fault(fault: Fault) -> dict[str, Any]:
-    until_s = None if fault.until_ns is None else fault.until_ns / 1e9
-    about = {"id": fault.id, "kind": fault.kind, "target": fault.target}
-    return {**about, "from_s": fault.from_ns / 1e9, "until_s": until_s}
-
-
-def _cluster(name: str, view: ViewCluster, true_shape: FormationShape | None) -> dict[str, Any]:
-    return {
-        "name": name,
-        "phase": view.phase,
-        "reason": view.reason,
-        "desired": dict(zip(view.names, view.desired, strict=True)),
-        "value": dict(zip(view.names, view.value, strict=True)),
-        "true": {} if true_shape is None else dict(zip(view.names, true_shape.c.tolist(), strict=True)),
-    }

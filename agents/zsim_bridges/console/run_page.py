@@ -25,7 +25,7 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
-from zsim_bridges.console.console_tables import TableRows, console_state
+from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.console_page import ConsolePage
 from zsim_bridges.console.page.page_camera import CameraFollow
@@ -40,6 +40,7 @@ from zsim_bridges.console.page.picture import (
     ghosts,
 )
 from zsim_bridges.console.page.scene_nodes import SceneNodes
+from zsim_bridges.console.run_state import console_state
 from zsim_bridges.console.view_buffer import TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 

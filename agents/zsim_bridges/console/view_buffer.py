@@ -8,7 +8,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+from msgspec import UNSET
+
 from zsim.contract import keys, messages, run_messages
+from zsim.contract.flight_messages import LinkState
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
@@ -21,10 +24,6 @@ FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an o
 POLL_S = 0.25  # wall; rarely, since a message of each gate costs the world time
 ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
 SILENT_S = 1.7  # wall; without an answer for so long what is shown may be long past: a stop is shown within 2 s
-SPAN_NS = 1_000_000_000  # simulated, over which at least a rate is taken
-
-Counts = Mapping[str, tuple[int, int]]
-"""Measurements (used, refused) by sensor."""
 
 
 class ReceivedEstimate(NamedTuple):
@@ -40,6 +39,13 @@ class ReceivedEstimate(NamedTuple):
     t_ns: int
     estimate: EstimateView
     fresh: bool
+
+
+class ReceivedLink(NamedTuple):
+    """The state of a driver's link to its drone, as last received, and how long ago that is [s; wall]."""
+
+    state: LinkState
+    age_s: float
 
 
 class ViewBuffer:
@@ -58,6 +64,7 @@ class ViewBuffer:
         clusters: the newest view of each formation.
         estimators: the newest view of each estimator, by its process.
         healths: the newest of each process.
+        external: names of the drones whose bodies are external.
         faults: injected ones, planned and active.
         events: newest first.
     """
@@ -85,12 +92,15 @@ class ViewBuffer:
         self.clusters: dict[str, ViewCluster] = {}
         self.estimators: dict[str, ViewEstimates] = {}
         self.healths: dict[str, Health] = {}
+        self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
+        self._links: dict[str, LinkState] = {}
         self.faults: tuple[Fault, ...] = ()
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
 
     def open(self) -> None:
         """Subscribe, and read the last values of before."""
-        for expression in ("view/**", keys.FAULTS, "process/*/health"):
+        of_drivers = map(keys.link, sorted(self.external))
+        for expression in ("view/**", keys.FAULTS, "process/*/health", *of_drivers):
             self._link.declare_subscriber(expression, self._on_publication)
         self._link.declare_subscriber(keys.EVENT, self._on_event)
         samples = self._link.get(keys.FAULTS)
@@ -123,6 +133,11 @@ class ViewBuffer:
                 newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in names}
         return newest
 
+    def link_of(self, drone: str) -> ReceivedLink | None:
+        """Return the newest state of the link to an external drone, None before the first."""
+        key = keys.link(drone)
+        return ReceivedLink(self._links[key], self._wall_s() - self._received_s[key]) if key in self._links else None
+
     def _is_fresh(self, process: str, ahead_ns: int) -> bool:
         """Return whether an estimator's view is of the time of the drones' view; both skip gates."""
         seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
@@ -150,6 +165,8 @@ class ViewBuffer:
         elif isinstance(message, ViewEstimates):
             self._received_s[key] = self._wall_s()
             self.estimators[key.rpartition("/")[2]] = message
+        elif isinstance(message, LinkState):
+            self._links[key], self._received_s[key] = message, self._wall_s()
         elif isinstance(message, Health):
             self.healths[keys.thing(key)] = message
         elif isinstance(message, run_messages.Faults):
@@ -180,36 +197,6 @@ class ViewBuffer:
 def _drone(event: Event) -> str:
     """Return the drone that a command was for: of a refused one, the subject is the key."""
     return keys.thing(event.subject) if event.kind == "refused" and "/" in event.subject else event.subject
-
-
-class SensorRates:
-    """Sensor rates of one drone at a time, from counts that are sampled now and then."""
-
-    def __init__(self) -> None:
-        self._drone = ""
-        self._samples: list[tuple[int, Counts]] = []
-
-    def update(self, drone: str, t_ns: int, counts: Counts) -> dict[str, float]:
-        """Add the counts (used, refused) of a drone's sensors at an instant; return the latest rates [Hz]."""
-        if drone != self._drone or self._has_restarted(t_ns, counts):
-            self._drone, self._samples = drone, []
-        if self._samples and self._samples[-1][0] == t_ns:
-            self._samples.pop()  # the run stands still
-        self._samples.append((t_ns, dict(counts)))
-        while len(self._samples) > 2 and t_ns - self._samples[1][0] >= SPAN_NS:
-            self._samples.pop(0)
-        since_ns, before = self._samples[0]
-        span_ns = t_ns - since_ns
-        if span_ns <= 0:
-            return {}
-        return {kind: (sum(now) - sum(before.get(kind, now))) * 1e9 / span_ns for kind, now in counts.items()}
-
-    def _has_restarted(self, t_ns: int, counts: Counts) -> bool:
-        """Return whether a replay has gone back, or an estimator has restarted."""
-        if not self._samples:
-            return False
-        last_ns, last = self._samples[-1]
-        return t_ns < last_ns or any(sum(counts.get(kind, (0, 0))) < sum(before) for kind, before in last.items())
 
 
 class TimeMonitor:

@@ -17,6 +17,7 @@ from typing import Any
 from zsim.contract import keys
 from zsim.errors import InventoryError, RunError
 from zsim.scenario import rights
+from zsim.scenario.external_bodies import drivers_of
 from zsim.scenario.rights import OPERATOR, ROUTER, WORLD, Rights
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import AUTHORITY, KEY
@@ -102,7 +103,9 @@ class Enrolment:
         return f"{OPERATOR}.{name}", host or None
 
     def _movable(self) -> list[str]:
-        return [name for name in self._places if name != WORLD]
+        """Return the processes that may run on any host: the scenario's, and drivers, which it need not expect."""
+        drivers = [name for name in drivers_of(self._scenario) if name not in self._places]
+        return [*(name for name in self._places if name != WORLD), *drivers]
 
     def _addresses(self, host: str) -> tuple[str, ...]:
         return (self._inventory.hosts[host].address,) if host in self._inventory.hosts else ()

@@ -55,6 +55,7 @@ def step(estimator: Estimator, gate: int, *drones: str) -> dict[str, Estimate]:
 
 
 def test_it_estimates_one_only_where_its_driver_has_brought_a_status(estimator: Estimator):
+    estimates: dict[str, Estimate] = {}
     for gate in range(100):
         coming = ("d0", "d1") if gate < 30 or gate > 60 else ("d0",)
         estimates = step(estimator, gate, *coming)

@@ -197,6 +197,32 @@ def test_a_flight_whose_recorder_came_late_lacks_its_beginning(tmp_path):
     assert summary.real_time_factor == pytest.approx(20.0)
 
 
+def test_nobody_knows_the_truth_of_a_cluster_with_an_external_drone(tmp_path):
+    """Its figures against truth are null, with the reason; the hash is that of the others, and the map has all."""
+    flown = Flown(amplitude=AMPLITUDE, est_amplitude=AMPLITUDE, overrides=("drones.drone2.body=external",))
+    synthetic_record.write(tmp_path / "run.mcap", flown)
+    flight, formations, summary = judge(tmp_path / "run.mcap")
+    (formation,) = formations
+    for name in NAMES:
+        errors = summary.clusters["main"].errors[name]
+        assert errors.true_std is errors.true_rms is errors.true_mean is None
+        assert errors.est_std is not None
+    assert any("drone2" in note and "external" in note for note in summary.notes)
+    assert np.isnan(formation.true).all()
+    simulated = judge_of(tmp_path / "plain", replace(flown, overrides=()))
+    assert summary.min_separation_m == simulated.min_separation_m
+    assert summary.record.truth_instants * 3 == simulated.record.truth_instants * 2
+    assert summary.record.truth_missing == 0
+    assert summary.record.truth_sha256 != simulated.record.truth_sha256
+    assert [len(track.t_ns) > 0 for track in flight.tracks] == [True] * 3
+
+
+def judge_of(directory: Path, flown: Flown):
+    directory.mkdir()
+    synthetic_record.write(directory / "run.mcap", flown)
+    return judge(directory / "run.mcap")[-1]
+
+
 def test_separation_is_the_closest_pair_in_truth(tmp_path):
     summary = report_of(tmp_path, flown(amplitude=np.zeros(12), offset=np.zeros(12)))
     assert summary.min_separation_m == pytest.approx(8 * math.sin(math.pi / 8), rel=1e-9)  # 2 p sin(beta / 2)

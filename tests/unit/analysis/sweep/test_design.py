@@ -242,3 +242,11 @@ def test_a_sweep_is_the_same_under_the_short_name_of_a_field() -> None:
     one = plan("seed", "wind.gust_m_s=0,1", runs=4)
     assert difference(one, plan("seed", f"{GUST}=0,1", runs=4)) is None
     assert difference(one, plan("seed", f"{GUST}=0,2", runs=4)) is not None
+
+
+def test_external_drones_cannot_be_swept() -> None:
+    body = {"drones": [{"name": "d1", "position_m": [0, 0, 0], "body": "external"}]}
+    document = {"name": "t", "duration_s": 1, **body}
+    with pytest.raises(ScenarioError) as caught:
+        make_plan("t.yaml", document, ["seed"], 2)
+    assert has_terms(str(caught.value), "d1", "external", "lockstep")

@@ -32,7 +32,7 @@ from zsim_bridges.console.page.picture import (
     CanvasTrails,
     VariableHistory,
 )
-from zsim_bridges.console.view_buffer import SensorRates
+from zsim_bridges.console.sensor_rates import SensorRates
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 LEVEL = (1.0, 0.0, 0.0, 0.0)

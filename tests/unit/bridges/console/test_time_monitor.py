@@ -8,10 +8,13 @@ import pytest
 from refused import has_terms, without_tags
 
 from zsim.contract import keys, messages
+from zsim.contract.flight_messages import LinkState
+from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health
 from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
 from zsim_bridges.console import console_tables
-from zsim_bridges.console.console_tables import TableRows, console_state, sigma_m
+from zsim_bridges.console.console_tables import TableRows, sigma_m
+from zsim_bridges.console.run_state import console_state
 from zsim_bridges.console.view_buffer import SILENT_S, TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
@@ -58,7 +61,9 @@ class MonitoredRun:
         self.link: Any = Link()
         self.refused: list[Event] = []
         names = ("drone1", "drone2")
-        info: Any = SimpleNamespace(run_id="r1", drones=[SimpleNamespace(name=name) for name in names])
+        info: Any = SimpleNamespace(
+            run_id="r1", drones=[DroneInfo(names[0], ""), DroneInfo(names[1], "", body="external")]
+        )
         self.observer = ObserverProcess(self.link, info, "console.1")
         self.monitor = TimeMonitor(self.link, self.observer, stamp_age_s, lambda: self.wall_s)
         self.views = ViewBuffer(self.link, info, self.observer, {}, self.refused.append, lambda: self.wall_s)
@@ -267,3 +272,34 @@ def test_the_console_hears_what_is_refused_of_its_own():
         monitored.link.tell(sample(keys.EVENT, event))
     assert [(event.kind, event.source) for event in monitored.refused] == [("refused", "console.1")]
     assert monitored.views.answered_commands("drone1") == 2
+
+
+# Links of drivers to external drones
+
+
+def link(state: Any, **figures: float | None) -> tuple[str, LinkState]:
+    unknown = dict.fromkeys(("age_ms", "loss_percent", "round_trip_ms", "clock_offset_ms"))
+    numbers: Any = {**unknown, **figures}
+    return keys.link("drone2"), LinkState(0, 0, "driver.drone2", "<10.0.0.7>", state, **numbers, refused=3)
+
+
+def test_of_an_external_drone_the_link_of_its_driver_is_shown():
+    monitored = MonitoredRun()
+    monitored.deliver(drones(1 * S))
+    plain, external = monitored.words.drone_rows()
+    assert plain.link == ("", "")
+    assert external.link[1] == console_tables.AMBER
+    for state, colour in (
+        ("connected", console_tables.BLUE),
+        ("armed", console_tables.GREEN),
+        ("lost", console_tables.RED),
+    ):
+        monitored.deliver(link(state, age_ms=12.3, loss_percent=0.4))
+        text, shown = monitored.words.drone_rows()[1].link
+        assert shown == colour
+        assert has_terms(text, state, "12 ms", "0 %", "3")
+    html = console_tables.drone_table(monitored.words.drone_rows())
+    assert "&lt;10.0.0.7&gt;" in html
+    monitored.wall_s += 10.0
+    text, shown = monitored.words.drone_rows()[1].link
+    assert (shown, "10 s" in text) == (console_tables.RED, True)

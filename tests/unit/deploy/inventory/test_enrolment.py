@@ -76,6 +76,19 @@ def test_world_and_routers_have_one_certificate_and_who_may_move_has_one_for_eve
     ]
 
 
+def test_the_driver_of_an_external_drone_has_a_certificate_and_is_let_in(folder: Path) -> None:
+    """It runs wherever its aircraft can be reached, and the scenario need not expect it."""
+    external = SCENARIO.replace("position_m: [2, 0, 0]", "position_m: [2, 0, 0], body: external")
+    (folder / "scenario.yaml").write_text(external)
+    wanted = [each for each in enrolment(folder).certificates() if each.process.startswith("driver.")]
+    assert [(each.host, each.process) for each in wanted] == [
+        (host, "driver.drone2") for host in ("lab", "onboard1", "onboard2", "hut")
+    ]
+    assert all("driver.drone2" in lets_in(rules) for _, _, rules in enrolment(folder).access())
+    (folder / "scenario.yaml").write_text(SCENARIO)
+    assert not any("driver.drone2" in lets_in(rules) for _, _, rules in enrolment(folder).access())
+
+
 def lets_in(rules: dict[str, Any]) -> set[str]:
     return {name for subject in rules["subjects"] for name in subject.get("cert_common_names", ())}
 

@@ -95,13 +95,13 @@ def test_the_world_publishes_nothing_of_it():
     for bodies in (("simulated", "external"), ("external", "simulated", "external", "simulated")):
         fleet = fleet_of(*bodies)
         publication, simulated = GatePublication(fleet), {f"d{i}" for i, b in enumerate(bodies) if b == "simulated"}
-        for _ in range(20):
+        for number in range(20):
             fleet.advance()
             gate = publication.gate([None] * fleet.count)
+            assert gate.seq == number
             assert {keys.thing(key) for key, _ in gate.pairs} == simulated
             gate.check()
             assert {key for key, _ in gate.decoded() if key.endswith("status")} == {keys.status(d) for d in simulated}
-        assert gate.seq == 19
 
 
 def test_a_fleet_of_external_drones_alone_goes_on():

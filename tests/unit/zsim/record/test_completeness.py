@@ -59,6 +59,13 @@ def test_a_record_without_gaps(tmp_path: Path) -> None:
     assert str(found) == "complete: 10 gates"
 
 
+def test_what_drivers_publish_is_not_counted(tmp_path: Path) -> None:
+    """A driver begins anew after a death, and what it publishes may be dropped on its way."""
+    external = replace(INFO, drones=(DroneInfo("d1", "any", body="external"),))
+    assert judged(tmp_path / "external.mcap", whole(5), (0, 1, 7, 0, 1), external).messages_missing == 0
+    assert judged(tmp_path / "simulated.mcap", whole(5), (0, 1, 7)).messages_missing == 5
+
+
 def test_gates_that_are_missing(tmp_path: Path) -> None:
     on_clock = [clock for clock in whole(20) if clock.step not in (0, 1, 7, 12, 13, 14)]
     found = judged(tmp_path / "run.mcap", on_clock)
