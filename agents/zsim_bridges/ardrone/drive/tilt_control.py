@@ -7,8 +7,8 @@ from typing import NamedTuple
 from zsim.math.rotation import Vector
 from zsim.schema.quantities import G_M_S2
 
-VELOCITY_1_S = 2.5  # chosen: 49 deg of phase with 0.14 s of delay and 0.14 s of tilt lag
-INTEGRAL_1_S2 = 1.5  # chosen: as fast as that phase allows; gusts last some seconds
+VELOCITY_1_S = 2.5  # chosen: 46 deg of phase with 0.14 s of delay and 0.14 s of tilt lag
+INTEGRAL_1_S2 = 2.0  # chosen: as fast as that phase allows; gusts last some seconds
 DRAG_1_S = 0.58  # 1/s, of speed (tum_ardrone's flight-fitted model)
 STEP_S_MAX = 0.1  # s; over longer pauses no more is integrated
 ANSWER_NS = 240_000_000  # command delay and tilt lag (tum_ardrone: 0.1 s and 0.14 s)
