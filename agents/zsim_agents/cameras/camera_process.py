@@ -17,10 +17,11 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import camera_matrix, camera_pose, lens_of
 from zsim.transport.session import Query, RawSample, ReceivedSample, Session
+from zsim.vehicles.vehicle import ROTORS_MIN
 from zsim_agents.cameras.presence import Bell, Presence
 from zsim_agents.cameras.rendering.renderer import Renderer
 from zsim_agents.cameras.rendering.scene import Scene, scene_of
-from zsim_agents.cameras.truths import TruthHistory
+from zsim_agents.cameras.truths import TruthHistory, standing
 
 # gates that it may be behind the world, which may be ahead of everybody by the command delay, before it leaves pictures
 # out: what arrives in a heap is no reason yet, and more than the slack of cameras that gate
@@ -95,7 +96,9 @@ class CameraProcess:
         self._eyes = [self._eye(drone, name, each, scene) for drone in drones for name, each in cameras[drone].items()]
         longest_ns = max((eye.latency_ns for eye in self._eyes), default=0)
         self._behind_ns = BEHIND_MAX * info.gate_ns + info.command_delay_ns
-        self._truths = TruthHistory(len(info.drones), info.gate_ns, longest_ns + 2 * self._behind_ns)
+        rotors = [len(drone.rotors) or ROTORS_MIN for drone in info.drones]
+        external = {i: standing(drone, rotors[i]) for i, drone in enumerate(scenario.drones) if drone.is_external}
+        self._truths = TruthHistory(len(info.drones), info.gate_ns, longest_ns + 2 * self._behind_ns, external)
         self._arrived: deque[RawSample | ReceivedSample] = deque()
         self._numbers_drawn = count()
         self._info_seq = 0

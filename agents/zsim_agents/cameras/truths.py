@@ -1,27 +1,37 @@
 """The true states of all drones at the last gates, and where they were between two of them. Pure."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from operator import attrgetter
 
 import numpy as np
+from msgspec.structs import replace
 
 from zsim.contract.flight_messages import Truth
 from zsim.math.interpolation import pose_between
+from zsim.scenario.external_bodies import moved_on, truth_fault
+from zsim.scenario.scenario import Drone
 from zsim_agents.cameras.rendering.scene import DroneStates
 
 PENDING_MAX = 64  # gates of which the truth of a drone may be lacking
 
 
 class TruthHistory:
-    """The last gates of which the truth of every drone is there.
+    """The last gates of which the truth of every simulated drone is there.
+
+    An external drone, whose driver may skip gates, is where its last pose leads to.
 
     Args:
         drones: how many there are.
         gate_ns: time between two gates.
         span_ns: how far back it reaches, at least.
+        external: of the drones by their numbers, with where each stands until its driver publishes.
     """
 
-    def __init__(self, drones: int, gate_ns: int, span_ns: int) -> None:
+    def __init__(self, drones: int, gate_ns: int, span_ns: int, external: Mapping[int, Truth] = {}) -> None:
         self._drones, self._gate_ns = drones, gate_ns
+        self._external = dict(external)
+        self._simulated = frozenset(range(drones)) - external.keys()
         self._kept = 2 + span_ns // gate_ns
         self._pending: dict[int, dict[int, Truth]] = {}
         self._whole: dict[int, list[Truth]] = {}  # by gate, in order
@@ -30,12 +40,16 @@ class TruthHistory:
     def add(self, drone: int, truth: Truth) -> None:
         """Take the truth of a drone, by its number."""
         t_ns = truth.t_ns
+        if drone in self._external:
+            if truth_fault(truth, len(self._external[drone].rotor_rad_s)):
+                return  # which the world refuses
+            self._external[drone] = max(self._external[drone], truth, key=attrgetter("t_ns"))
         if t_ns <= self.newest_ns:
             return
         states = self._pending.setdefault(t_ns, {})
         states[drone] = truth
-        if len(states) == self._drones:
-            self._whole[t_ns] = [states[i] for i in range(self._drones)]
+        if states.keys() >= self._simulated:
+            self._whole[t_ns] = [states.get(i) or _at(self._external[i], t_ns) for i in range(self._drones)]
             self.newest_ns = t_ns
             self._pending = {t: left for t, left in self._pending.items() if t > t_ns}
             while len(self._whole) > self._kept:
@@ -52,6 +66,18 @@ class TruthHistory:
         if t_ns == before_ns:
             after = before
         return None if after is None else _between((t_ns - before_ns) / 1e9, self._gate_ns / 1e9, before, after)
+
+
+def standing(drone: Drone, rotors: int) -> Truth:
+    """Return where the scenario puts a drone, its rotors at rest."""
+    half = 0.5 * math.radians(drone.yaw_deg)
+    still, q_WB = (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half))
+    return Truth(0, 0, drone.position_m, still, q_WB, still, still, (0.0,) * rotors)
+
+
+def _at(last: Truth, t_ns: int) -> Truth:
+    """Return the truth at a gate of an external drone, by the last one of its driver."""
+    return replace(last, t_ns=t_ns, position_m=moved_on(last.position_m, last.velocity_m_s, t_ns - last.t_ns))
 
 
 def _between(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence[Truth]) -> DroneStates:

@@ -5,7 +5,6 @@ as a pose may be trusted; then it stands where that led to.
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,15 +12,10 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState, Status, Truth
 from zsim.contract.snapshot import State
+from zsim.scenario.external_bodies import POSE_AGE_MAX_NS, moved_on, truth_fault
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.fleet.state_rules import state_refusal
 from zsim_world.state.fleet_arrays import STATE, VEHICLE
-
-POSE_AGE_MAX_NS = 500_000_000  # chosen: 25 gates, as an estimate that is flown on; 1 m at 2 m/s
-DISTANCE_MAX_M = 100_000.0  # of each coordinate, as places in a scenario: beyond it a tangent plane is no map
-SPEED_MAX_M_S = 200.0  # chosen: twice the fastest racing drones
-RATE_MAX_RAD_S = 100.0  # chosen: twice what a gyroscope of 2000 deg/s measures, and more
-UNIT_SLACK = 0.01  # of a quaternion's length; single precision is within 1e-6
 
 
 class Pose(NamedTuple):
@@ -138,34 +132,12 @@ class ExternalDrones:
 
 def ahead(pose: Pose, t_ns: int) -> NDArray[np.float64]:
     """Return the state at t_ns of what was at a pose: at constant velocity, at rest once the pose is too old."""
-    row, age_ns = pose.row.copy(), max(0, t_ns - pose.t_ns)
+    row, age_ns = pose.row.copy(), t_ns - pose.t_ns
     p, v = slice(STATE.p_WB, STATE.p_WB + 3), slice(STATE.v_WB, STATE.v_WB + 3)
-    row[p] += row[v] * (min(age_ns, POSE_AGE_MAX_NS) * 1e-9)
+    row[p] = moved_on(row[p].tolist(), row[v].tolist(), age_ns)
     if age_ns >= POSE_AGE_MAX_NS:
         row[v] = row[STATE.w_WB_B : STATE.w_WB_B + 3] = 0.0
     return row
-
-
-def truth_fault(truth: Truth, rotors: int) -> str | None:
-    """Return what is absurd about a truth whose numbers are finite, None if nothing is."""
-    limits = (
-        ("position_m", DISTANCE_MAX_M, "m"),
-        ("velocity_m_s", SPEED_MAX_M_S, "m/s"),
-        ("angular_velocity_rad_s", RATE_MAX_RAD_S, "rad/s"),
-    )
-    for name, most, unit in limits:
-        values: Sequence[float] = getattr(truth, name)
-        if max(map(abs, values)) > most:
-            return f"{name} is {_shown(values)}; each must be within {most:g} {unit}"
-    if abs(math.hypot(*truth.orientation_wxyz) - 1.0) > UNIT_SLACK:
-        return f"orientation_wxyz is {_shown(truth.orientation_wxyz)}; must be a quaternion of length 1"
-    if len(truth.rotor_rad_s) != rotors:
-        return f"rotor_rad_s has {len(truth.rotor_rad_s)} speeds; must have {rotors}, as the drone has rotors"
-    return None
-
-
-def _shown(values: Sequence[float]) -> str:
-    return f"[{', '.join(f'{value:g}' for value in values)}]"
 
 
 def _fields(status: Status) -> tuple[Any, ...]:

@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from zsim.contract.flight_messages import Truth
-from zsim_agents.cameras.truths import PENDING_MAX, TruthHistory
+from zsim.scenario.scenario_file import resolve
+from zsim_agents.cameras.truths import PENDING_MAX, TruthHistory, standing
 
 GATE_NS = 20_000_000
 
@@ -20,6 +22,10 @@ def truth(gate: int, x: float = 0.0, rotor: float = 100.0) -> Truth:
         (0.0, 0.0, 0.0),
         (rotor + gate,) * 4,
     )
+
+
+PLACED = resolve({"name": "t", "duration_s": 1, "drones": [{"name": "d2", "position_m": [7, 0, 0], "yaw_deg": 90}]})
+STANDING = standing(PLACED.drones[0], 4)
 
 
 def history(gates: int, span_gates: int = 5) -> TruthHistory:
@@ -65,3 +71,32 @@ def test_a_gate_that_stays_incomplete_is_passed_over_and_forgotten() -> None:
     assert kept.newest_ns == (last + 1) * GATE_NS
     assert kept.bodies(2 * GATE_NS) is None
     assert np.isfinite(kept.bodies(last * GATE_NS + 1).p_WB).all()  # type: ignore[union-attr]
+
+
+def test_an_external_drone_is_drawn_where_its_last_pose_leads_to() -> None:
+    """Its driver may skip gates, and be away; nothing waits for it."""
+    kept = TruthHistory(2, GATE_NS, 50 * GATE_NS, {1: STANDING})
+    for gate in range(5):
+        kept.add(0, truth(gate))
+    assert kept.newest_ns == 4 * GATE_NS
+    standing = kept.bodies(4 * GATE_NS)
+    assert standing is not None
+    assert standing.p_WB[:, 0] == pytest.approx([0.16, 7.0])
+    kept.add(1, truth(5, 10.0))
+    kept.add(1, replace(truth(5, 30.0), rotor_rad_s=(1.0,) * 6))
+    kept.add(1, replace(truth(5, 30.0), orientation_wxyz=(0.0,) * 4))
+    kept.add(0, truth(5))
+    for gate in range(6, 46):
+        kept.add(0, truth(gate))
+    for gate, x in ((5, 10.2), (15, 10.6), (30, 11.2), (45, 11.2)):
+        bodies = kept.bodies(gate * GATE_NS)
+        assert bodies is not None
+        assert bodies.p_WB[1, 0] == pytest.approx(x)
+
+
+def test_external_drones_alone_are_drawn_at_the_gates_of_their_drivers() -> None:
+    kept = TruthHistory(2, GATE_NS, 5 * GATE_NS, {0: STANDING, 1: STANDING})
+    kept.add(1, truth(3, 10.0))
+    bodies = kept.bodies(3 * GATE_NS)
+    assert bodies is not None
+    assert bodies.p_WB[:, 0] == pytest.approx([7.0, 10.12])
