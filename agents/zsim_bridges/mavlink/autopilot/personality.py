@@ -11,10 +11,25 @@ from typing import Literal, NamedTuple
 from zsim.scenario.scenario import Drone
 from zsim_bridges.mavlink.autopilot.enums import Autopilot, ParamType
 from zsim_bridges.mavlink.autopilot.parameters import Parameters, ParameterSpec
-from zsim_bridges.mavlink.flight.guidance import SpeedLimits
 
 REAL, INT, BYTE = ParamType.REAL32, ParamType.INT32, ParamType.INT8
 CM = 0.01  # m; ArduPilot's parameters of places and speeds
+
+
+class SpeedLimits(NamedTuple):
+    """Of what is asked of the drone [m/s]."""
+
+    horizontal_m_s: float
+    up_m_s: float
+    down_m_s: float
+
+
+class Steering(NamedTuple):
+    """A velocity in W, or forward, left, up [m/s], and a yaw rate [rad/s]."""
+
+    velocity_m_s: Vector
+    yaw_rate_rad_s: float
+    along_heading: bool
 
 
 class Mode(Enum):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from zsim.math.rotation import Quaternion, Vector
 from zsim_bridges.mavlink.autopilot.axes import wrapped
+from zsim_bridges.mavlink.autopilot.personality import SpeedLimits
 
 K_POSITION_1_S = 0.8  # 1/s; that of the firmware's own hold
 K_YAW_1_S = 1.5  # 1/s, chosen: a turn of 90 deg in 2 s
@@ -64,22 +65,6 @@ class AttitudeTarget(NamedTuple):
     def leads_up(self, z_m: float) -> bool:
         """No take-off begins with a tilt."""
         return False
-
-
-class SpeedLimits(NamedTuple):
-    """Of what is asked of the drone [m/s]."""
-
-    horizontal_m_s: float
-    up_m_s: float
-    down_m_s: float
-
-
-class Steering(NamedTuple):
-    """A velocity in W, or forward, left, up [m/s], and a yaw rate [rad/s]."""
-
-    velocity_m_s: Vector
-    yaw_rate_rad_s: float
-    along_heading: bool
 
 
 def steer(target: Target, position_m: Vector, yaw_rad: float, limits: SpeedLimits) -> Steering:

@@ -1,0 +1,140 @@
+"""Test 1 of the paper with every drone behind its own wire, as good as without; and what a cut link does."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from federation import Federation
+from mixed_formation import AT_AND_NAVDATA, SECOND_NS, Hardware, Mixed, Radio, true_rms
+
+from zsim_analysis.reading.flight import read_flight
+from zsim_analysis.reading.formation import formations_of
+
+pytestmark = [pytest.mark.soak, pytest.mark.slow]
+
+STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
+WINDOW_S = (120.0, 320.0)
+DRONES = ("drone1", "drone2", "drone3")
+MOST = 1.3  # of the errors without a wire
+AS_ONE = {"p": ("p", "q"), "x_c": ("x_c", "y_c"), "roll": ("roll", "pitch")}  # of one kind, judged together
+JUDGED = ("x_c", "z_c", "roll", "yaw", "p", "beta")
+RADIO = {"a wire": (0.0, 0.0, 0.0), "a radio": (20.0, 10.0, 0.02)}  # delay and jitter of simulated ms, share lost
+
+
+def kinds(rms: dict[str, float]) -> dict[str, float]:
+    """Return the errors that are judged."""
+    return {name: math.hypot(*(rms[each] for each in AS_ONE.get(name, (name,)))) for name in JUDGED}
+
+
+@pytest.fixture(scope="module")
+def direct(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> dict[str, float]:
+    """The RMS errors of Test 1 without a wire."""
+    with Federation(tmp_path_factory.mktemp("direct")) as federation:
+        federation.run(STEP.read_text(), "--in-process").ends(with_code=0)
+        (formation,) = formations_of(read_flight(federation.out / "run.mcap"))
+    rows = formation.true_error[formation.within(WINDOW_S)]
+    return kinds(dict(zip(formation.names, np.sqrt(np.mean(rows**2, axis=0)).tolist(), strict=True)))
+
+
+@pytest.mark.parametrize("external", [("drone3",), DRONES], ids=["one", "all"])
+@pytest.mark.parametrize("radio", RADIO)
+@pytest.mark.parametrize("wire", ["px4", "ardrone"])
+def test_test_1_is_flown_as_well_as_without(
+    tmp_path: Path, direct: dict[str, float], wire: str, radio: str, external: tuple[str, ...]
+) -> None:
+    rate = 1.0 if len(external) == 1 else 2.0
+    pace = ("--realtime", "--rate", f"{rate:g}")
+    delay_ms, jitter_ms, loss = RADIO[radio]
+    hardware = Hardware(tmp_path / "hardware", STEP.read_text(), (*pace, "--duration", "3600"))
+    sets = [word for drone in external for word in ("--set", f"drones.{drone}.body=external")]
+    with hardware.federation, Federation(tmp_path) as federation:
+        served = hardware.serve(wire)
+        link, ports = through_radio(wire, served, (delay_ms / rate, jitter_ms / rate, loss))
+        mixed = Mixed(federation, STEP.read_text(), (*pace, *sets))
+        for drone in external:
+            mixed.drive(drone, wire, ports[DRONES.index(drone)])
+        mixed.run.ends(with_code=0, within_s=600)
+        hardware.ends()
+        link.close()
+        rms = kinds(true_rms(mixed, hardware, external, WINDOW_S, rate))
+    ratios = {name: rms[name] / direct[name] for name in JUDGED}
+    print({name: f"{rms[name]:.4f} ({ratios[name]:.2f})" for name in JUDGED})
+    assert max(ratios.values()) <= MOST, ratios
+
+
+def through_radio(
+    wire: str, served: list[list[str]], radio: tuple[float, float, float]
+) -> tuple[Radio, list[list[str]]]:
+    """Return a radio link to some aircraft, and their ports behind it."""
+    if wire == "ardrone":
+        ports = [[f"127.200.{i + 1}.2:{port}" for port in AT_AND_NAVDATA] for i in range(len(served))]
+    else:
+        from mavlink_programs import free_udp_ports
+
+        first = free_udp_ports(len(served))
+        ports = [[f"127.0.0.1:{first + i}"] for i in range(len(served))]
+    pairs = [
+        f"{here}={there}"
+        for own, others in zip(ports, served, strict=True)
+        for here, there in zip(own, others, strict=True)
+    ]
+    return Radio(pairs, *radio), ports
+
+
+class Flight:
+    """A mixed formation that is engaged, its drone3 behind a radio."""
+
+    def __init__(self, mixed: Mixed, hardware: Hardware, radio: Radio) -> None:
+        self.mixed, self.radio = mixed, radio
+        self.aircraft = hardware.federation.client().subscribe("drone/drone3/sensor/status")
+
+    def states(self) -> list[str]:
+        """Return the states of the aircraft since the last call, each once in a row."""
+        seen: list[str] = []
+        for received in self.aircraft.now():
+            if seen[-1:] != [received.message["state"]]:
+                seen.append(received.message["state"])
+        self.aircraft.received.clear()
+        return seen
+
+
+@pytest.fixture
+def flown(tmp_path: Path, compiled: None, request: Any) -> Iterator[Flight]:
+    hardware = Hardware(tmp_path / "hardware")
+    with hardware.federation, Federation(tmp_path) as federation:
+        served = hardware.serve(request.param)
+        radio, ports = through_radio(request.param, served, (0.0, 0.0, 0.0))
+        mixed = Mixed(federation)
+        mixed.drive("drone3", request.param, ports[2])
+        mixed.engaged_ns(mixed.engaged_ns() + 5 * SECOND_NS)
+        yield Flight(mixed, hardware, radio)
+        radio.close()
+
+
+@pytest.mark.parametrize("flown", ["px4", "ardupilot"], indirect=True)
+@pytest.mark.parametrize("cut_s", [1.0, 3.0, 10.0])
+def test_a_mavlink_vehicle_holds_while_its_link_is_cut_and_flies_on(flown: Flight, cut_s: float) -> None:
+    flown.states()
+    flown.radio.cut(cut_s / 2)
+    now_ns = flown.mixed.formation.until(lambda m: True).message["t_ns"]
+    flown.mixed.engaged_ns(now_ns + 5 * SECOND_NS)
+    assert set(flown.states()) <= {"flying", "hovering"}
+    assert flown.mixed.links.now()[-1].message["state"] == "armed"
+    flown.mixed.ends()
+
+
+@pytest.mark.parametrize("flown", ["ardrone"], indirect=True)
+@pytest.mark.parametrize("cut_s", [1.0, 3.0, 10.0])
+def test_an_ardrone_hovers_while_its_link_is_cut_and_lands_after_two_seconds(flown: Flight, cut_s: float) -> None:
+    flown.states()
+    flown.radio.cut(cut_s / 2)
+    if cut_s < 2.0:
+        now_ns = flown.mixed.formation.until(lambda m: True).message["t_ns"]
+        flown.mixed.engaged_ns(now_ns + 5 * SECOND_NS)
+        assert set(flown.states()) <= {"flying", "hovering"}
+    else:
+        flown.mixed.until("landed", flown.mixed.status.now()[-1].message["t_ns"])
+        assert flown.states()[-2:] == ["landing", "landed"]
