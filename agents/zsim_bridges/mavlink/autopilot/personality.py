@@ -24,14 +24,6 @@ class SpeedLimits(NamedTuple):
     down_m_s: float
 
 
-class Steering(NamedTuple):
-    """A velocity in W, or forward, left, up [m/s], and a yaw rate [rad/s]."""
-
-    velocity_m_s: Vector
-    yaw_rate_rad_s: float
-    along_heading: bool
-
-
 class Mode(Enum):
     """What a vehicle is to do, in words of its own."""
 

@@ -67,6 +67,14 @@ class AttitudeTarget(NamedTuple):
         return False
 
 
+class Steering(NamedTuple):
+    """A velocity in W, or forward, left, up [m/s], and a yaw rate [rad/s]."""
+
+    velocity_m_s: Vector
+    yaw_rate_rad_s: float
+    along_heading: bool
+
+
 def steer(target: Target, position_m: Vector, yaw_rad: float, limits: SpeedLimits) -> Steering:
     """Return what to ask of the drone now."""
     x, y, z = (
