@@ -67,8 +67,8 @@ class Hardware:
 
     def __init__(self, folder: Path, scenario: str = SIMULATED, pace: tuple[str, ...] = PACE) -> None:
         self.federation = Federation(folder)
-        folder.mkdir(parents=True, exist_ok=True)
         alone = ("--set", "clusters=[]", "--set", "processes.expect=[recorder]")
+        folder.mkdir(parents=True, exist_ok=True)
         self.world = self.federation.world(scenario, *pace, *alone)
         self.recorder = self.federation.role("record", "--out", str(self.federation.out))
 

@@ -18,11 +18,11 @@ def hardware(tmp_path: Path, compiled: None) -> Iterator[Hardware]:
 
 @pytest.fixture
 def mixed(tmp_path: Path, compiled: None) -> Iterator[Mixed]:
-    with Federation(tmp_path / "mixed") as federation:
+    with Federation(tmp_path) as federation:
         yield Mixed(federation)
 
 
-@pytest.mark.parametrize("wire", ["px4", "ardupilot", "ardrone"])
+@pytest.mark.parametrize("wire", ["px4", pytest.param("ardupilot", marks=pytest.mark.soak), "ardrone"])
 def test_two_simulated_drones_and_one_of_hardware_fly_in_formation(hardware: Hardware, mixed: Mixed, wire: str) -> None:
     driver = mixed.drive("drone3", wire, hardware.serve(wire)[2])
     engaged_ns = mixed.engaged_ns()
