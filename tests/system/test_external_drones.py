@@ -89,6 +89,7 @@ def test_a_formation_of_simulated_and_external_drones(federation: Federation, dr
     first = driver()
     arm(client, link)
     run.line(f"join: {DRIVER}")
+    run.line(f"link of {DRONE}: armed")
     states.until(lambda m: m["phase"] == "engaged" and abs(m["value"][2] - 2.5) < 0.2)
     first.send_signal(signal.SIGKILL)
     events.until(lambda m: (m["kind"], m["subject"]) == ("death", DRIVER))

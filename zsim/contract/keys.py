@@ -87,6 +87,12 @@ def accepted(drone: str, kind: str) -> str:
     return f"drone/{drone}/accepted/{kind}"
 
 
+def is_accepted(key: str) -> bool:
+    """Tell whether a key has commands to an external drone as the world repeats them."""
+    kind, _, what = parts(key)
+    return kind == "drone" and what.startswith("accepted/")
+
+
 def link(drone: str) -> str:
     """Return the key on which a driver publishes the state of its link to an external drone."""
     return f"drone/{drone}/link"

@@ -210,4 +210,4 @@ def _is_numbered(key: str, external: Container[str]) -> bool:
     group, drone, what = keys.parts(key)
     if group != "drone":
         return key == keys.EVENT
-    return what.startswith("accepted/") or (drone not in external and (what == "truth" or what.startswith("sensor/")))
+    return keys.is_accepted(key) or (drone not in external and (what == "truth" or what.startswith("sensor/")))

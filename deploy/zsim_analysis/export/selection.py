@@ -122,6 +122,8 @@ class TableSurvey:
         counts = reader.topics()
         chosen = selection.keys(reader)
         self.pictures = sum(counts[key] for key in chosen if messages.type_of(key) is CameraImage)
+        if not selection.expressions:
+            chosen = [key for key in chosen if not keys.is_accepted(key)]  # repeats of commands that are rows already
         self.wanted = [key for key in chosen if messages.type_of(key) is not CameraImage]
         if (info := reader.last(keys.INFO)) is not None:
             decode_or_none(info)  # from here on the messages of users' sensors are known

@@ -82,7 +82,7 @@ def command_age_ms(path: Path) -> dict[str, float] | None:
     its own figures; None when no command answers a status on record.
     """
     with RecordReader(path) as reader:
-        wanted = {key for key in reader.topics() if keys.leaf(key) in ("status", "velocity")}
+        wanted = {k for k in reader.topics() if keys.leaf(k) in ("status", "velocity") and not keys.is_accepted(k)}
         status_wall_ns: dict[tuple[str, int], int] = {}
         ages_ns = []
         for message in reader.messages(wanted, by_time=False):

@@ -105,6 +105,7 @@ def world_progress(show: ProgressSink) -> Callable[[str, Any, str], None]:
     """Return what the world calls with its clocks, its events, and what passes it."""
     throttle, reasons = Throttle(), HoldReasons()
     shown = [0]
+    links: dict[str, str] = {}  # states by drone
     healths: defaultdict[str, Throttle] = defaultdict(lambda: Throttle(HEALTH_PERIOD_S))
 
     def show_line(kind: str, message: Any, about: str) -> None:
@@ -114,6 +115,11 @@ def world_progress(show: ProgressSink) -> Callable[[str, Any, str], None]:
             show.say(line)
         elif kind == "health" and healths[about].passes():
             show.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
+        elif kind == "link":
+            if message.state != links.get(about) and shown[0] < SHOWN_EVENTS:
+                shown[0] += 1
+                show.say(f"  {message.t_ns / 1e9:8.2f} s  link of {about}: {message.state}, {message.peer}")
+            links[about] = message.state
         elif kind == "resumed":
             show.say(f"{about}: goes on at t = {message / 1e9:.2f} s")
         elif kind == "event" and (message.kind in VITAL or shown[0] < SHOWN_EVENTS):

@@ -54,11 +54,13 @@ class Coordinator(ABC):
         statistics: of the run so far.
         refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
         external: names of the drones of which drivers publish sensors, truth and status.
+        unpaced: names of the processes that step when a driver publishes, and not at every gate.
         diverged: what is to be raised once the end is published, None for a run that ended well.
     """
 
     refused_queries: tuple[str, ...] = ()
     external: frozenset[str] = frozenset()
+    unpaced: frozenset[str] = frozenset()
 
     def __init__(
         self,
@@ -299,6 +301,8 @@ class Coordinator(ABC):
 
     def must_wait_for(self, participant: Participant) -> bool:
         """Tell whether the scenario has a process that is waited for however long its first step takes."""
+        if participant.served_names <= self.unpaced:
+            return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)
 
     def waiting_for(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:

@@ -65,6 +65,7 @@ class World(Coordinator):
         self.fleet = Fleet(scenario)
         self.drivers = ExternalDrones(self.fleet)
         self.external = self.drivers.names
+        self.unpaced = frozenset(f"estimator.{drone}" for drone in self.external)
         self._simulated = [i for i in range(self.fleet.count) if i not in self.drivers]
         self.queue = CommandQueue(self.names)
         self.faults = FaultInjector(scenario, clock, barrier, outbox, self.fleet.impairment)
@@ -197,9 +198,8 @@ class World(Coordinator):
         return True
 
     def _paced(self) -> list[Participant]:
-        """Return who has a deadline at every gate: not who does nothing but estimate drones that have none."""
-        unpaced = {f"estimator.{drone}" for drone in self.external}
-        return [p for p in self.barrier.participants.values() if not p.served_names <= unpaced]
+        """Return who has a deadline at every gate."""
+        return [p for p in self.barrier.participants.values() if not p.served_names <= self.unpaced]
 
     def _publish_collisions(self) -> None:
         for i, j in self.fleet.collisions():

@@ -37,7 +37,7 @@ OWN = keys.process(WORLD, "")
 
 ProgressCallback = Callable[[str, Any, str], None]
 """Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), every tenth ("state",
-message, cluster), and ("resumed", simulated time in ns, process); shows progress."""
+message, cluster), ("link", message, drone), and ("resumed", simulated time in ns, process); shows progress."""
 
 
 class WorldInputs(ABC):
@@ -301,6 +301,8 @@ class MessageIntake:
             if refusal is not None:
                 raise DecodeError(refusal)
             self.history.add(key, payload, message.t_ns)
+            if type(message) is flight_messages.LinkState:
+                self.progress("link", message, drone)
         except DecodeError as error:
             self.history.add_foreign(key, payload)
             self._refuse(f"driver.{drone}", key, error)

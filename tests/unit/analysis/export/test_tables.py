@@ -57,12 +57,12 @@ def messages_on(run: Path, key: str) -> list[Any]:
 
 
 def counts(run: Path) -> dict[str, int]:
-    """Return how many messages of each table are on record."""
+    """Return how many messages of each table are on record, repeats of commands for drivers left out."""
     found: dict[str, int] = {}
     with RecordReader(run / "run.mcap") as reader:
         for key, count in reader.topics().items():
             kind = messages.type_of(key)
-            if kind is CameraImage:
+            if kind is CameraImage or "/accepted/" in key:
                 continue
             kind = Sighting if kind is Sightings else kind  # each has one hat here
             name = table_name(kind) if kind else "foreign"

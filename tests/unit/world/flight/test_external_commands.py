@@ -215,3 +215,10 @@ def test_a_done_of_its_estimator_counts(world: World):
     world.handle(keys.process(name, "join"), Join(0, 0, "run1", 1, "estimator", "h", 1, GATE_NS), 0)
     world.handle(keys.process(name, "done"), Done(world.now_ns, 0, "run1", 1, world.now_ns, 0), 0)
     assert world.barrier.participants[name].done_ns == world.now_ns
+
+
+def test_its_estimator_may_wait_for_the_driver_as_long_as_it_takes(world: World):
+    for name in ("estimator.d1", "estimator.d2"):
+        world.handle(keys.process(name, "join"), Join(0, 0, "run1", 1, "estimator", "h", 1, GATE_NS), 0)
+    waits = {name: world.must_wait_for(p) for name, p in world.barrier.participants.items()}
+    assert (waits["estimator.d1"], waits["estimator.d2"]) == (False, True)
