@@ -1,6 +1,7 @@
 """Test 1 of the paper with every drone behind its own wire, as good as without; and what a cut link does."""
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from federation import Federation
-from mixed_formation import AT_AND_NAVDATA, SECOND_NS, Hardware, Mixed, Radio, true_rms
+from mavlink_programs import free_udp_ports
+from mixed_formation import SECOND_NS, Hardware, Mixed, Radio, true_rms
 
 from zsim_analysis.reading.flight import read_flight
 from zsim_analysis.reading.formation import formations_of
@@ -70,10 +72,8 @@ def through_radio(
 ) -> tuple[Radio, list[list[str]]]:
     """Return a radio link to some aircraft, and their ports behind it."""
     if wire == "ardrone":
-        ports = [[f"127.200.{i + 1}.2:{port}" for port in AT_AND_NAVDATA] for i in range(len(served))]
+        ports = [[re.sub(r"^127\.(\d+)", lambda m: f"127.{int(m[1]) + 100}", each) for each in own] for own in served]
     else:
-        from mavlink_programs import free_udp_ports
-
         first = free_udp_ports(len(served))
         ports = [[f"127.0.0.1:{first + i}"] for i in range(len(served))]
     pairs = [

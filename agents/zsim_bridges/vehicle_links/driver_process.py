@@ -6,6 +6,7 @@ sockets, keys, and the event loop.
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,9 +17,11 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED, ControlAnswer
 from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Drone
 from zsim.transport.session import Query, RawSample, Session
+from zsim.vehicles.vehicle import ROTORS_MIN
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.vehicle_links.clock_offset import ClockOffset
+from zsim_bridges.vehicle_links.driver_clock import DriverClock
 from zsim_bridges.vehicle_links.driver_options import DriverOptions
 from zsim_bridges.vehicle_links.external_drone import ExternalDrone
 from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe
@@ -29,30 +32,6 @@ TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
 REPORT_S = 1.0  # s, wall; of the link's figures
 LANDING_S = 30.0  # s, wall; how long it waits for the aircraft to be down before it leaves
 Say = Callable[[str], None]
-
-
-class DriverClock:
-    """The clock of the driver, which goes as fast as the run's, and what the run's shows.
-
-    Args:
-        rate: simulated per wall seconds.
-        wall_ns: monotonic wall time.
-    """
-
-    def __init__(self, rate: float, wall_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._rate, self._wall_ns = rate, wall_ns
-        self._offset = ClockOffset()
-
-    def now_ns(self) -> int:
-        return round(self._wall_ns() * self._rate)
-
-    def on_gate(self, t_ns: int) -> None:
-        """A clock of the run has just arrived."""
-        self._offset.add(t_ns, self.now_ns())
-
-    def to_simulated(self, now_ns: int) -> int:
-        """Return simulated time at a time of this clock."""
-        return self._offset.to_remote(now_ns)
 
 
 class DriverProcess:
@@ -79,9 +58,11 @@ class DriverProcess:
         self._link, self._observer, self._session, self._say = link, observer, session, say
         self._drone = options.drone
         self._clock = DriverClock(info.rate or 1.0)
-        silence = scenario_file.from_text(info.scenario).silence
-        self._failsafe = Failsafe(silence, options.limits, options.armed)
-        self._external = ExternalDrone(options.drone, self._clock.to_simulated)
+        scenario = scenario_file.from_text(info.scenario)
+        self._failsafe = Failsafe(scenario.silence, options.limits, options.armed)
+        rotors = next(len(drone.rotors) for drone in info.drones if drone.name == options.drone) or ROTORS_MIN
+        hover_rad_s = hover_speed(scenario.drone(options.drone), rotors, scenario.environment.gravity_m_s2)
+        self._external = ExternalDrone(options.drone, self._clock.to_simulated, (hover_rad_s,) * rotors)
         self._sockets: list[asyncio.DatagramTransport] = []
         self._reported_s = 0.0
         self._reported: tuple[Connection, str, str] | None = None
@@ -294,6 +275,11 @@ def check_external(info: Info, drone: str) -> None:
         raise RunError(f"{drone} is simulated; a driver needs `body: external` of it in the scenario")
     if info.mode != "realtime":
         raise RunError("the run is in lockstep; a driver needs one that is started with --realtime")
+
+
+def hover_speed(drone: Drone, rotors: int, gravity_m_s2: float) -> float:
+    """Return the speed [rad/s] of each of so many rotors that carries a drone."""
+    return math.sqrt(drone.mass_kg * gravity_m_s2 / (rotors * drone.thrust_n_s2))
 
 
 def _local(channel: Channel) -> tuple[str, int] | None:

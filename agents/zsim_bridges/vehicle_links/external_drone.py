@@ -10,7 +10,7 @@ from zsim_bridges.vehicle_links.vehicle_state import STILL, Pose, Reading, Vehic
 
 WAITING_MAX = 4000  # readings, 10 s of an IMU at 200 Hz and all else; then the oldest go
 EXTRAPOLATED_NS = 500_000_000  # chosen: how old a pose may be; it then says where the aircraft was, not where it is
-NO_ROTORS = (0.0, 0.0, 0.0, 0.0)  # rad/s; no wire tells how fast they turn
+STANDING = ("landed", "emergency")  # states in which no rotor turns
 
 
 class ExternalDrone:
@@ -19,9 +19,14 @@ class ExternalDrone:
     Args:
         drone: its name.
         to_simulated: simulated time at a time of this process's clock.
+        hover_rad_s: speed of each rotor at which the drone hovers: no wire tells how fast they turn, and others fly in
+            their downwash.
     """
 
-    def __init__(self, drone: str, to_simulated: Callable[[int], int]) -> None:
+    def __init__(
+        self, drone: str, to_simulated: Callable[[int], int], hover_rad_s: tuple[float, ...] = (0.0,) * 4
+    ) -> None:
+        self._hover_rad_s = hover_rad_s
         self._drone = drone
         self._to_simulated = to_simulated
         self._readings: deque[Reading] = deque(maxlen=WAITING_MAX)
@@ -37,7 +42,7 @@ class ExternalDrone:
         if t_ns <= self._gate_ns or vehicle.pose is None:
             return []
         self._gate_ns = t_ns
-        samples, truth = self._samples(t_ns), self._truth(t_ns, vehicle.pose)
+        samples, truth = self._samples(t_ns), self._truth(t_ns, vehicle.pose, turning=vehicle.state not in STANDING)
         return [*samples, truth, self._status(t_ns, vehicle, commander, len(samples) + 1)]
 
     def _status(self, t_ns: int, vehicle: VehicleState, commander: str | None, count: int) -> tuple[str, Any]:
@@ -56,12 +61,13 @@ class ExternalDrone:
         key = keys.sensor(self._drone, reading.sensor)
         return key, STOCK[reading.sensor].message(t_ns, self._next(key), t_sample_ns, *reading.values)
 
-    def _truth(self, t_ns: int, pose: Pose) -> tuple[str, Any]:
+    def _truth(self, t_ns: int, pose: Pose, turning: bool) -> tuple[str, Any]:
         """Return the pose as it is at the gate, carried on with its velocity."""
         age_ns = max(0, min(EXTRAPOLATED_NS, t_ns - self._to_simulated(pose.taken_ns)))
         x, y, z = (p + age_ns * 1e-9 * v for p, v in zip(pose.position_m, pose.velocity_m_s, strict=True))
         key = keys.truth(self._drone)
-        motion = ((x, y, z), pose.velocity_m_s, pose.q_WB, pose.w_WB_B, STILL, NO_ROTORS)
+        rotors = self._hover_rad_s if turning else (0.0,) * len(self._hover_rad_s)
+        motion = ((x, y, z), pose.velocity_m_s, pose.q_WB, pose.w_WB_B, STILL, rotors)
         return key, flight_messages.Truth(t_ns, self._next(key), *motion)
 
     def _next(self, key: str) -> int:

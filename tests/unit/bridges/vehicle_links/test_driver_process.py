@@ -12,9 +12,10 @@ from zsim.contract import flight_messages, keys, messages
 from zsim.contract.messages import DroneInfo, Info, Origin
 from zsim.contract.run_messages import Clock, Event
 from zsim.errors import RunError
+from zsim.scenario import scenario_file
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.driver_options import DriverOptions, position, udp_channel
-from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external
+from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external, hover_speed
 from zsim_bridges.vehicle_links.failsafe import Demand
 from zsim_bridges.vehicle_links.vehicle_session import Channel, LinkFigures
 from zsim_bridges.vehicle_links.vehicle_state import Pose, Reading, VehicleState
@@ -266,3 +267,8 @@ def test_the_link_is_a_message_of_the_contract():
             assert (first.source, first.loss_percent, first.round_trip_ms) == (ME, 1.0, None)
 
     fly(test)
+
+
+def test_four_rotors_carry_an_ardrone_at_the_speed_of_its_hover():
+    drone = scenario_file.from_text(SCENARIO).drone("drone2")
+    assert hover_speed(drone, 4, 9.80665) == pytest.approx(361.6, abs=0.5)  # rad/s, of 0.429 kg (Li, MSc thesis)

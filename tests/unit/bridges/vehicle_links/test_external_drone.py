@@ -1,6 +1,7 @@
 """Readings become messages of a gate: counted, numbered, stamped, and closed by a status."""
 
 import random
+from typing import Any
 
 import pytest
 
@@ -69,6 +70,15 @@ def test_a_gate_is_published_once_and_none_without_a_pose():
     assert drone.gate(40 * MS, vehicle(0), None)
     assert drone.gate(40 * MS, vehicle(0), None) == []
     assert drone.gate(20 * MS, vehicle(0), None) == []
+
+
+@pytest.mark.parametrize(
+    ("state", "turns"), [("landed", 0.0), ("taking_off", 400.0), ("flying", 400.0), ("emergency", 0.0)]
+)
+def test_rotors_turn_as_in_hover_while_it_is_in_the_air(state: Any, turns: float):
+    drone = ExternalDrone("drone2", lambda now_ns: now_ns - BEGUN_NS, (400.0,) * 6)
+    (_, truth), _ = drone.gate(20 * MS, vehicle(0)._replace(state=state), None)
+    assert truth.rotor_rad_s == (turns,) * 6
 
 
 def test_an_old_pose_is_carried_on_for_half_a_second():
