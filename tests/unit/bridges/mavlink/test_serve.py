@@ -143,7 +143,7 @@ def test_endpoints_are_hosts_and_ports_that_can_be_reached() -> None:
     for text in ("14550", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:70000", ":5"):
         with pytest.raises(typer.BadParameter, match="must be HOST:PORT"):
             _endpoint("--gcs", text, "127.0.0.1")
-    with pytest.raises(typer.BadParameter, match="which 127[.]0[.]0[.]1 does not reach; give --listen"):
+    with pytest.raises(typer.BadParameter, match=r"which 127[.]0[.]0[.]1 does not reach; give --listen"):
         _endpoint("--gcs", "192.0.2.7:14550", "127.0.0.1")
 
 
