@@ -47,6 +47,10 @@ class Server:
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - open as long as the process
         self._process = _started(command, self._errors, stdin=subprocess.PIPE)
 
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
     def ask(self, question: dict[str, Any], timeout_s: float) -> dict[str, Any]:
         """Return the answer.
 

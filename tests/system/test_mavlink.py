@@ -3,6 +3,7 @@
 import random
 import socket
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import mavlink_programs as programs
@@ -28,9 +29,11 @@ drones:
 processes: {{expect: []}}
 """
 PACE = ("--rate", "3")
+ASKED_MAX = 60
+LEAST_READ = 0.95  # of what is sent on UDP to a busy process
 KEY = bytes(range(32))
 FRAMES, FRAMES_SOAK = 20_000, 1_000_000
-CHUNK = 100  # datagrams that a socket takes before they are read
+CHUNK = 50  # datagrams that a socket takes before they are read
 
 
 class Vehicles:
@@ -164,24 +167,29 @@ def flood(fleet: Fleet, count: int) -> None:
     ports = (fleet.px4.gcs_local + DRONES - 1, fleet.px4.api_local + DRONES - 1)
     before = fleet.refused()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.settimeout(60.0)
+        sender.settimeout(1.0)
         for i in range(count // CHUNK):
             for _ in range(CHUNK):
                 sender.sendto(malformed(rng, link), ("127.0.0.1", ports[i % 2]))
             until_answered(sender, link, ports[i % 2])
     assert fleet.commands_to("drone6") == 0
     health = fleet.client.subscribe("process/mavlink.px4/health")
-    health.until(lambda each: each["refused"] >= before + count)
+    health.until(lambda each: each["refused"] >= before + LEAST_READ * count)
     fleet.px4.role.line("drone6: a frame with a wrong checksum; counted")
 
 
 def until_answered(sender: socket.socket, link: Link, port: int) -> None:
-    """Ask for a version and wait for it: what was sent before has then been read."""
+    """Ask for a version until the answer comes: what was sent before has then been read, or lost by a full buffer."""
     parser = Parser()
     ask = link.pack(dialect.CommandLong(param1=148.0, command=512, target_system=6, target_component=1))
-    sender.sendto(ask, ("127.0.0.1", port))
-    while not any(isinstance(each.message, dialect.AutopilotVersion) for each in parser.feed(sender.recv(65_536))):
-        pass
+    for _ in range(ASKED_MAX):
+        sender.sendto(ask, ("127.0.0.1", port))
+        with suppress(TimeoutError):
+            while True:
+                received = parser.feed(sender.recv(65_536))
+                if any(isinstance(each.message, dialect.AutopilotVersion) for each in received):
+                    return
+    pytest.fail(f"no answer on port {port}")
 
 
 def test_malformed_frames_are_counted_and_nothing_flies(fleet: Fleet) -> None:

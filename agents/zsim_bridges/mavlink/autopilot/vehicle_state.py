@@ -185,7 +185,12 @@ class VehicleState:
     @property
     def altitude_m(self) -> float:
         """Height over home."""
-        return self.position_m[2] - (self.home_m[2] if self.home_m else 0.0)
+        return self.position_m[2] - self.home_z_m
+
+    @property
+    def home_z_m(self) -> float:
+        """Of home in W; where it is now, before home is known."""
+        return (self.home_m or self.position_m)[2]
 
     @property
     def rpy_ned_rad(self) -> Vector:

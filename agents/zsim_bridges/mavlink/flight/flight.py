@@ -128,7 +128,7 @@ class Flight:
         if Mode.TAKEOFF in self._personality.modes:
             self.mode = Mode.TAKEOFF
         self._is_armed = True
-        self._control.climb(self._home_z_m + altitude_m)
+        self._control.climb(self._state.home_z_m + altitude_m)
         return None
 
     def set_mode(self, mode: Mode) -> str | None:
@@ -221,7 +221,7 @@ class Flight:
             self._return.step()
         elif self.mode is Mode.LAND:
             self._control.ask("land")
-        elif self.mode is Mode.OFFBOARD or self._is_moving:
+        elif self.mode is Mode.OFFBOARD or self._control.is_moving:
             self._watch_stream()
 
     def _on_climbed(self) -> None:
@@ -251,7 +251,7 @@ class Flight:
         if self.mode is Mode.OFFBOARD and self._personality.needs_stream:
             self._report(Severity.WARNING, "Offboard lost: no setpoints; holding")
             self._enter(Mode.HOLD)
-        elif self._is_moving:
+        elif self._control.is_moving:
             self._control.hold_here()
 
     # Parts
@@ -259,15 +259,6 @@ class Flight:
     def _not_ready(self) -> str | None:
         """Return why it cannot take off now."""
         return "landing" if self._state.state == "landing" else None if self.is_armed else "not armed"
-
-    @property
-    def _home_z_m(self) -> float:
-        return (self._state.home_m or self._state.position_m)[2]
-
-    @property
-    def _is_moving(self) -> bool:
-        """Whether what it holds leads on for ever."""
-        return self.target is not None and self.target.is_moving
 
     def _enter(self, mode: Mode) -> str | None:
         if mode is Mode.OFFBOARD and self._personality.needs_stream and self._stream.is_silent:
@@ -295,7 +286,7 @@ class Flight:
 
     def _begin_mission_on_ground(self) -> None:
         z_m = self.mission.takeoff_height_m(self._state)
-        self._control.climb(self._home_z_m + self._settings["takeoff_altitude_m"] if z_m is None else z_m)
+        self._control.climb(self._state.home_z_m + self._settings["takeoff_altitude_m"] if z_m is None else z_m)
 
     def _take_off_for(self, target: Target | AttitudeTarget) -> None:
         """Take off where a setpoint leads up from the ground."""

@@ -35,6 +35,11 @@ class FlightControl:
         return self._climb_to_m is not None
 
     @property
+    def is_moving(self) -> bool:
+        """Whether what is held leads on for ever."""
+        return self.target is not None and self.target.is_moving
+
+    @property
     def is_asking(self) -> bool:
         """Whether the firmware has yet to do what was asked."""
         return self._asked is not None

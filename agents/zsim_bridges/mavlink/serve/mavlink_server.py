@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -27,6 +28,7 @@ from zsim_bridges.vehicle_links.command_sender import CommandSender
 
 POLL_S = 0.1  # how often a stop is looked for
 TICK_S = 0.1  # wall time between two looks at what wall time brings
+SWITCH_S = 5e-4  # s after which the thread that takes in a gate lets a setpoint pass; Python's own is 5 ms
 SYSTEM_IDS = 254  # 255 is the ground station's by custom
 PORTS = 65535
 Say = Callable[[str], None]
@@ -80,6 +82,7 @@ def serve(
         RunError: the run keeps no pace, has too many drones, or a port cannot be opened.
     """
     set_pace(link, info, observer.name, options.rate)
+    sys.setswitchinterval(SWITCH_S)
     server = MavlinkServer(link, info, observer, say, options)
     asyncio.run(server.run(stopped))
 
@@ -157,7 +160,7 @@ class MavlinkServer:
             while not (stopped() or self._observer.end_reason):
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(intake.news.wait(), POLL_S)
-                self._take_in(intake)
+                await self._take_in(intake)
                 self._observer.tick()
         finally:
             ticking.cancel()
@@ -175,7 +178,7 @@ class MavlinkServer:
             own = f"{local}" if not last else f"{local} to {local + last}"
             self._say(f"{self._observer.name}: {what}: UDP {host}:{to}, from {options.listen}:{own}")
 
-    def _take_in(self, intake: MessageIntake) -> None:
+    async def _take_in(self, intake: MessageIntake) -> None:
         """Take in what has come; of a drone's messages the newest of each."""
         newest: dict[str, bytes] = {}
         for arrived in intake.arrivals():
@@ -186,9 +189,13 @@ class MavlinkServer:
                     self._observer.update_clock(payload)
                 elif key == keys.EVENT:
                     self._on_event(payload)
-        self._update(newest)
+        for served in self._updated(newest):
+            served.vehicle.step()
+            self._flush(served)
+            await asyncio.sleep(0)  # setpoints that have come meanwhile go first
 
-    def _update(self, newest: dict[str, bytes]) -> None:
+    def _updated(self, newest: dict[str, bytes]) -> list[Served]:
+        """Bring the states of the drones up to date; return those that have reached a gate."""
         stepping: dict[str, Served] = {}
         for key, payload in newest.items():
             message = self._decoded(key, payload)
@@ -199,9 +206,7 @@ class MavlinkServer:
             served.vehicle.state.update(name, message)
             if name == "status":
                 stepping[drone] = served
-        for served in stepping.values():
-            served.vehicle.step()
-            self._flush(served)
+        return list(stepping.values())
 
     def _decoded(self, key: str, payload: bytes) -> Any:
         try:

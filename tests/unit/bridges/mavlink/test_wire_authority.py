@@ -127,3 +127,24 @@ def test_signatures_are_the_authority_s() -> None:
     assert ours == theirs
     (received,) = frame.Parser(Signing(key)).feed(theirs)
     assert received.signed
+
+
+def read_by_the_authority(count: int) -> None:
+    """Let the authority's parser read a stream of random messages, cut anywhere; each is there once, in order."""
+    rng, ours, theirs = random.Random(SEED), frame.Link(7, 1), their_link(dialect_2)
+    while count > 0:
+        layouts = rng.choices(LAYOUTS, k=min(count, 500))
+        data = b"".join(ours.pack(random_message(layout.kind, rng)) for layout in layouts)
+        cut = rng.randrange(len(data))
+        read = [message for part in (data[:cut], data[cut:]) for message in theirs.parse_buffer(part) or []]
+        assert [message.get_msgId() for message in read] == [layout.id for layout in layouts]
+        count -= len(layouts)
+
+
+def test_the_authority_reads_ten_thousand_messages() -> None:
+    read_by_the_authority(10_000)
+
+
+@pytest.mark.soak
+def test_the_authority_reads_a_million_messages() -> None:
+    read_by_the_authority(1_000_000)

@@ -1,0 +1,162 @@
+"""The process: who is obeyed, what goes into a datagram, whose pace, which options."""
+
+import asyncio
+import socket
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import typer
+
+from zsim.contract.run_messages import ControlAnswer
+from zsim.errors import RunError
+from zsim_bridges.mavlink.serve.mavlink_server import set_pace
+from zsim_bridges.mavlink.serve.peers import LEARNT_MAX, SILENT_S, Peers
+from zsim_bridges.mavlink.serve.vehicle_ports import DATAGRAM_MAX, VehiclePort, VehiclePorts
+from zsim_bridges.mavlink.wire import dialect
+from zsim_bridges.mavlink.wire.frame import Link, Parser, Received
+from zsim_deploy.cli.mavlink_commands import _endpoint, _key
+
+GCS = ("192.0.2.7", 14550)
+
+
+def test_off_loopback_only_the_configured_peer_is_obeyed() -> None:
+    peers = Peers(GCS)
+    assert peers.accepts(GCS, 0.0)
+    for address in (("192.0.2.7", 14551), ("192.0.2.8", 14550), ("0.0.0.0", 14550)):
+        assert not peers.accepts(address, 0.0)
+    assert peers.refused == 3
+    assert peers.addresses(0.0) == [GCS]
+
+
+def test_programs_on_this_machine_become_peers_until_they_are_silent() -> None:
+    peers = Peers(GCS)
+    for i in range(LEARNT_MAX):
+        assert peers.accepts(("127.0.0.1", 5000 + i), 0.0)
+    assert not peers.accepts(("127.0.0.1", 6000), 0.0)
+    assert len(peers.addresses(1.0)) == 1 + LEARNT_MAX
+    assert peers.accepts(("127.0.0.1", 5000), SILENT_S)
+    assert peers.addresses(SILENT_S + 1.0) == [GCS, ("127.0.0.1", 5000)]
+
+
+class OpenPort:
+    """A vehicle's port, and a program that has spoken to it."""
+
+    def __init__(self) -> None:
+        self.received: list[Received] = []
+        self.program = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.program.bind(("127.0.0.1", 0))
+        self.program.settimeout(10.0)
+        self.port = VehiclePort(("127.0.0.1", 0), self.program.getsockname(), None, self.received.append)
+        self.ports = VehiclePorts([self.port], Link(1, 1))
+
+    def close(self) -> None:
+        self.port.close(asyncio.get_running_loop())
+        self.program.close()
+
+
+def test_messages_go_together_in_datagrams_of_a_frame_of_ethernet() -> None:
+    async def send() -> None:
+        opened = OpenPort()
+        opened.ports.open(asyncio.get_running_loop(), time.monotonic)
+        many = [dialect.Statustext(6, f"{i:050}") for i in range(50)]
+        opened.ports.send(many)
+        parser, read = Parser(), []
+        while len(read) < len(many):
+            data = opened.program.recv(65_536)
+            assert len(data) <= DATAGRAM_MAX
+            read += [each.message for each in parser.feed(data)]
+        assert read == many
+        opened.close()
+
+    asyncio.run(send())
+
+
+def test_a_message_that_cannot_be_packed_is_counted_and_the_others_are_sent() -> None:
+    async def send() -> None:
+        opened = OpenPort()
+        opened.ports.open(asyncio.get_running_loop(), time.monotonic)
+        opened.ports.send([dialect.Heartbeat(type=300), dialect.Heartbeat(type=2)])
+        assert [each.message for each in Parser().feed(opened.program.recv(65_536))] == [dialect.Heartbeat(type=2)]
+        assert opened.ports.refused()["unsent"] == 1
+        opened.close()
+
+    asyncio.run(send())
+
+
+def test_what_a_program_sends_is_read_and_what_is_damaged_is_counted() -> None:
+    async def receive() -> None:
+        opened = OpenPort()
+        opened.ports.open(asyncio.get_running_loop(), time.monotonic)
+        local = opened.port._socket.getsockname()
+        good = Link(255, 190).pack(dialect.Heartbeat(type=6))
+        opened.program.sendto(good[:-1] + bytes([good[-1] ^ 1]), local)
+        opened.program.sendto(good, local)
+        async with asyncio.timeout(10.0):
+            while not opened.received:
+                await asyncio.sleep(0)
+        assert opened.received == [Received(dialect.Heartbeat(type=6), 255, 190, 0, False)]
+        assert opened.ports.refused()["bad_crc"] == 1
+        opened.close()
+
+    asyncio.run(receive())
+
+
+def test_a_port_that_is_taken_is_told() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        with pytest.raises(RunError, match=f"UDP 127.0.0.1:{port} cannot be opened .*; give other ports"):
+            VehiclePort(("127.0.0.1", port), GCS, None, lambda _: None)
+
+
+def run(mode: str, rate: float) -> Any:
+    return SimpleNamespace(mode=mode, rate=rate)
+
+
+def world(ok: bool, asked: list[Any]) -> Any:
+    def request(key: str, op: str, source: str, args: dict[str, Any]) -> ControlAnswer:
+        asked.append((op, source, args))
+        return ControlAnswer(ok=ok, error="" if ok else "not now")
+
+    return SimpleNamespace(request=request)
+
+
+def test_a_run_without_a_pace_is_refused_unless_one_is_set() -> None:
+    asked: list[Any] = []
+    with pytest.raises(RunError, match="as fast as possible"):
+        set_pace(world(True, asked), run("lockstep", 0.0), "mavlink.main", None)
+    for mode, rate in (("lockstep", 2.0), ("realtime", 1.0)):
+        set_pace(world(True, asked), run(mode, rate), "mavlink.main", None)
+    assert asked == []
+    set_pace(world(True, asked), run("lockstep", 0.0), "mavlink.main", 3.0)
+    assert asked == [("rate", "mavlink.main", {"value": 3.0})]
+    with pytest.raises(RunError, match="does not set the pace to 3: not now"):
+        set_pace(world(False, asked), run("lockstep", 0.0), "mavlink.main", 3.0)
+
+
+def test_endpoints_are_hosts_and_ports_that_can_be_reached() -> None:
+    assert _endpoint("--gcs", "127.0.0.1:14550", "127.0.0.1") == ("127.0.0.1", 14550)
+    assert _endpoint("--gcs", "192.0.2.7:14550", "0.0.0.0") == GCS
+    for text in ("14550", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:70000", ":5"):
+        with pytest.raises(typer.BadParameter, match="must be HOST:PORT"):
+            _endpoint("--gcs", text, "127.0.0.1")
+    with pytest.raises(typer.BadParameter, match=r"which 127[.]0[.]0[.]1 does not reach; give --listen"):
+        _endpoint("--gcs", "192.0.2.7:14550", "127.0.0.1")
+
+
+def test_a_key_is_bytes_digits_or_a_passphrase(tmp_path: Path) -> None:
+    path, key = tmp_path / "key", bytes(range(32))
+    path.write_bytes(key)
+    assert _key(path) == key
+    path.write_text(f"{key.hex()}\n")
+    assert _key(path) == key
+    path.write_text("open sesame\n")
+    assert _key(path).hex().startswith("41ef4bb0")  # sha256sum of it
+    path.write_text("\n")
+    with pytest.raises(RunError, match="is empty"):
+        _key(path)
+    with pytest.raises(RunError, match="cannot be read"):
+        _key(tmp_path / "none")
