@@ -12,11 +12,13 @@ from concurrent.futures import ThreadPoolExecutor
 from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.action import Action
 from mavsdk.plugins.offboard import Offboard, PositionNedYaw, VelocityBodyYawspeed
+from mavsdk.plugins.param import Param
 from mavsdk.plugins.telemetry import Telemetry
 
 PATIENCE_S = 40.0
 TAKEOFF_M = 3.0
 SIDE_M = 3.0
+SILENCE_S = 5.0  # of setpoints, in simulated time, which may go faster than the wall clock by which they are sent
 
 
 class Watch:
@@ -63,6 +65,7 @@ class Pilot:
         self.battery.until(lambda b: b.remaining_percent > 10, "a battery")
         self.home.until(lambda h: abs(h.latitude_deg) > 0, "a home")
         here = self.place.until(lambda _: True, "a position").position
+        Param(self.system).set_param_float("COM_OF_LOSS_T", SILENCE_S)
         self.action.set_takeoff_altitude(TAKEOFF_M)
         self.action.arm()
         self.action.takeoff()

@@ -232,7 +232,7 @@ def _px4(drone: Drone, system_id: int) -> list[ParameterSpec]:
         ParameterSpec("MIS_TAKEOFF_ALT", REAL, 2.5, 0.5, most.altitude_m),
         ParameterSpec("NAV_ACC_RAD", REAL, 1.0, 0.2, 200.0),
         ParameterSpec("RTL_RETURN_ALT", REAL, 10.0, 0.5, most.altitude_m),
-        ParameterSpec("COM_OF_LOSS_T", REAL, 0.5, 0.1, 60.0),
+        ParameterSpec("COM_OF_LOSS_T", REAL, 1.0, 0.1, 60.0),
         ParameterSpec("COM_DISARM_PRFLT", REAL, 10.0, -1.0, 600.0),
         ParameterSpec("GF_ACTION", INT, 2, 0, 5),
         ParameterSpec("GF_MAX_HOR_DIST", REAL, 0.0, 0.0, 10000.0),

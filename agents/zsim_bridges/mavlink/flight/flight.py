@@ -254,8 +254,6 @@ class Flight:
         elif self._control.is_moving:
             self._control.hold_here()
 
-    # Parts
-
     def _not_ready(self) -> str | None:
         """Return why it cannot take off now."""
         return "landing" if self._state.state == "landing" else None if self.is_armed else "not armed"

@@ -105,7 +105,7 @@ def test_px4_begins_offboard_only_with_a_stream_and_holds_without_it() -> None:
         drone.step()
     assert drone.position[1] > 0.8  # north is y of W
     assert heartbeat(drone).custom_mode == PX4_MODES[Mode.OFFBOARD]
-    drone.step(40)
+    drone.step(52)
     assert heartbeat(drone).custom_mode == PX4_MODES[Mode.HOLD]
     assert drone.texts()[-1] == "Offboard lost: no setpoints; holding"
     drone.step(200)
