@@ -11,6 +11,9 @@ from test_cameras import FOREVER, PAIR, PICTURES, SEEN, Flown, sha256_alone
 NAMED = ("silent", "death")  # the second where its link, which takes nothing, is closed before
 
 
+pytestmark = pytest.mark.xdist_group("cameras_amiss")  # one flight for all
+
+
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Any:
     """A flight with a second detector of drone1, whose camera is stopped for a while and goes on."""

@@ -22,7 +22,9 @@ def mixed(tmp_path: Path, compiled: None) -> Iterator[Mixed]:
         yield Mixed(federation)
 
 
-@pytest.mark.parametrize("wire", ["px4", pytest.param("ardupilot", marks=pytest.mark.soak), "ardrone"])
+@pytest.mark.parametrize(
+    "wire", ["px4", *(pytest.param(wire, marks=pytest.mark.soak) for wire in ("ardupilot", "ardrone"))]
+)
 def test_two_simulated_drones_and_one_of_hardware_fly_in_formation(hardware: Hardware, mixed: Mixed, wire: str) -> None:
     driver = mixed.drive("drone3", wire, hardware.serve(wire)[2])
     engaged_ns = mixed.engaged_ns()

@@ -99,6 +99,7 @@ def test_a_broken_ssh_session_is_the_death_of_its_roles(deployment: Deployment) 
     assert {event["subject"] for event in record.events("death")} == {"controller.main", "estimator.drone2"}
 
 
+@pytest.mark.soak  # test_kill has it on one host
 def test_the_death_of_the_world_costs_no_bit(deployment: Deployment, tmp_path: Path) -> None:
     run = deployment.up("--rate", "8", "--duration", "30")
     in_flight(run)

@@ -44,7 +44,7 @@ class RunnerInputs:
         self._is_realtime, self._gate_ns = info.mode == "realtime", info.gate_ns
         self._blocking: Subscription | None = None  # where `wait` waits
         self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
-        of_drivers = [key for key in agent.gate_keys if keys.thing(key) in self._external]
+        of_drivers = [key for key in agent.gate_keys if keys.parts(key)[1] in self._external]
         self.inbox = Inbox(agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers)
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}

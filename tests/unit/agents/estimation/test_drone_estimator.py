@@ -72,7 +72,7 @@ def test_a_flight_is_followed_to_the_sensors_limits():
         {"estimation": {"madgwick_beta": 0.1}},
         {"estimation": {"madgwick_beta": 0.0}},
         {"estimation": {"flow": False}},
-        {"estimation": {"magnetometer": False}},
+        pytest.param({"estimation": {"magnetometer": False}}, marks=pytest.mark.soak),
     ],
     ids=["beta .1", "gyro alone", "no flow", "no magnetometer"],
 )

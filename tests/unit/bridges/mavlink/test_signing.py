@@ -12,7 +12,7 @@ RADIO_STATUS = 109
 
 
 def test_a_key_has_32_bytes() -> None:
-    with pytest.raises(ValueError, match="has 5 bytes; must have 32"):
+    with pytest.raises(ValueError, match=r"5.*32"):
         Signing(b"short")
 
 

@@ -75,7 +75,7 @@ def test_a_fault_names_a_rotor_that_the_vehicle_has():
             assert part in line
 
 
-@pytest.mark.parametrize("model", ["ardrone", "no_such.module", "3d", "a/b"])
+@pytest.mark.parametrize("model", ["ardrone_9", "no_such.module", "3d", "a/b"])
 def test_an_unknown_model_is_a_line_with_drone_value_and_what_is_allowed(model: str):
     line = fault_of(model=model)
     for part in ("drones[0].model", repr(model), "ardrone2, crazyflie2", "(drone 'a')"):
