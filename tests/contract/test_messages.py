@@ -528,7 +528,7 @@ def test_random_bytes_are_a_message_or_refused(shape: str, payload: bytes):
 
 
 @every_message
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_a_damaged_message_is_a_message_or_refused(shape: str, data: st.DataObject):
     damaged = bytearray(pack(example(shape)))

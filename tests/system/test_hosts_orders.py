@@ -115,6 +115,7 @@ def test_a_pipe_that_nobody_reads_any_more_ends_the_run_and_fetches_its_record(l
         nothing_stays(deployment)
 
 
+@pytest.mark.soak
 def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:
     """Whoever flies next is told of the record and how to fetch it; a second that cannot be fetched fails its run."""
     with closing(Deployment(lab, ROLES)) as deployment:

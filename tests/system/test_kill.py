@@ -296,7 +296,8 @@ def test_a_stopped_recorder(federation: Federation) -> None:
     check_whole(check_end(federation, whole=True))
 
 
-@pytest.mark.parametrize("options", [(), pytest.param(("--hosted",), marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("options", [(), ("--hosted",)])
 def test_a_world_that_is_killed_again_and_again_costs_no_bit(
     federation: Federation, undisturbed: dict[str, np.ndarray], options: tuple[str, ...]
 ) -> None:
