@@ -6,14 +6,13 @@ import logging
 import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
-from ipaddress import ip_address
 from typing import Any, NamedTuple, TypeVar
-from urllib.parse import urlsplit
 
 from aiohttp import web
 
 from zsim.errors import RunError
 from zsim_bridges.http_connections import HttpConnections
+from zsim_bridges.loopback import is_loopback
 
 BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own
 Resource = TypeVar("Resource")
@@ -63,23 +62,6 @@ def check_token(process: str, host: str, token: str | None) -> None:
         raise RunError(f"{process}: the token is empty; give it one, or leave --token and ZSIM_TOKEN away")
     if token is None and not is_loopback(host):
         raise RunError(f"{process}: {host} can be reached by others; give it a --token, or --listen 127.0.0.1")
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether a host name or address is this machine alone."""
-    try:
-        return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def is_loopback_authority(authority: str) -> bool:
-    """Return whether a Host header, or the host and port of an origin, name this machine alone.
-
-    Raises:
-        ValueError: it cannot be parsed.
-    """
-    return is_loopback(urlsplit(f"//{authority}").hostname or "")
 
 
 def tokens_match(received: str, token: str) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Link, Parser
+from zsim_bridges.mavlink.wire.signing import Signing
 
 PX4, ARDUPILOT = 12, 3
 ON_GROUND, IN_AIR, TAKING_OFF, LANDING = 1, 2, 3, 4
@@ -26,9 +27,9 @@ class FakeAutopilot:
         deaf: whether nothing reaches it any more.
     """
 
-    def __init__(self, autopilot: int = PX4, system: int = 1) -> None:
+    def __init__(self, autopilot: int = PX4, system: int = 1, signing: Signing | None = None) -> None:
         self.autopilot, self.system = autopilot, system
-        self._link, self._parser = Link(system, 1), Parser()
+        self._link, self._parser = Link(system, 1, signing), Parser(signing)
         self.position, self.velocity = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
         self.armed, self.mode, self.landed = False, HOLD if autopilot == PX4 else 0, ON_GROUND
         self.commands: list[int] = []

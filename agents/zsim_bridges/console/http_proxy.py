@@ -14,10 +14,10 @@ from aiohttp import ClientError, ClientSession, WSMsgType, web
 
 from zsim.errors import RunError
 from zsim_bridges.console import page_html
+from zsim_bridges.loopback import is_loopback_authority
 from zsim_bridges.web_server import (
     ServedSite,
     check_token,
-    is_loopback_authority,
     open_on_thread,
     start_site,
     tokens_match,

@@ -7,7 +7,6 @@ from zsim.contract.messages import Info
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges.mavlink.drive.autopilot_session import AutopilotSession
-from zsim_bridges.mavlink.wire.signing import Signing
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.driver_options import DriverOptions
 from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external
@@ -23,7 +22,7 @@ def drive(
     options: DriverOptions,
     channel: Channel,
     system: int = 0,
-    signing: Signing | None = None,
+    key: bytes | None = None,
 ) -> None:
     """Drive one vehicle in one run until that is over.
 
@@ -36,7 +35,7 @@ def drive(
         options: of the driver.
         channel: UDP port of the vehicle.
         system: its system id; 0 for the first autopilot that shows itself.
-        signing: of both ways, None for none.
+        key: of signatures; None for none.
 
     Raises:
         RunError: the drone is not external, or the run does not keep the pace of the wall clock.
@@ -44,5 +43,5 @@ def drive(
     check_external(info, options.drone)
     drone = scenario_file.from_text(info.scenario).drone(options.drone)
     origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
-    session = AutopilotSession(channel, origin, drone.takeoff_height_m, system, options.origin_m, signing)
+    session = AutopilotSession(channel, origin, drone.takeoff_height_m, system, options.origin_m, key)
     asyncio.run(DriverProcess(link, info, observer, options, session, say).run(stopped))

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from zsim_deploy.arguments import WorldAccess, participant_options, positive
+from zsim_deploy.cli.mavlink_commands import read_key
 
 if TYPE_CHECKING:
-    from zsim_bridges.mavlink.wire.signing import Signing
     from zsim_bridges.vehicle_links.driver_options import DriverOptions
     from zsim_deploy.roles.roles import Serve
 
@@ -30,7 +30,9 @@ def drive_mavlink(
     address: Annotated[str, typer.Argument(help="UDP port of the vehicle: udp://HOST:PORT.")],
     local_port: Annotated[int, typer.Option(min=0, max=65535, help="UDP port here; 0 for any.")] = 0,
     system: Annotated[int, typer.Option(min=0, max=255, help="Its system id; 0 for the first that shows itself.")] = 0,
-    signing_key: Annotated[Path | None, typer.Option(help="File with the 32 bytes of a MAVLink 2 signing key.")] = None,
+    signing_key: Annotated[
+        Path | None, typer.Option(help="File with the key of MAVLink 2 signatures; unsigned messages are refused.")
+    ] = None,
     origin: Annotated[
         str | None, typer.Option(help="Where its local frame begins, X,Y,Z m in W (default: as it says).")
     ] = None,
@@ -47,8 +49,8 @@ def drive_mavlink(
 
     options = _options(drone, (speed, climb), (radius, ceiling), armed, origin, None)
     channel = udp_channel(address, local_port)
-    signing = _signing(signing_key)
-    _serve(partial(drive, options=options, channel=channel, system=system, signing=signing), reach, drone, name)
+    key = read_key(signing_key) if signing_key else None
+    _serve(partial(drive, options=options, channel=channel, system=system, key=key), reach, drone, name)
 
 
 @participant_options
@@ -98,24 +100,3 @@ def _serve(drive: "Serve", reach: WorldAccess, drone: str, name: str) -> None:
     from zsim_deploy.roles.roles import serve_runs
 
     serve_runs(process_name("driver", name, reach.who, drone), drive, reach)
-
-
-def _signing(path: Path | None) -> "Signing | None":
-    """Return what signs with the key of a file.
-
-    Raises:
-        RunError: there is no such key.
-    """
-    if path is None:
-        return None
-    from zsim.errors import RunError
-    from zsim_bridges.mavlink.wire.signing import KEY_BYTES, Signing
-
-    try:
-        key = path.read_bytes()
-    except OSError as error:
-        why = f"cannot be read ({error.strerror}); give --signing-key a file of {KEY_BYTES} bytes"
-        raise RunError(f"{path}: {why}") from error
-    if len(key) != KEY_BYTES:
-        raise RunError(f"{path}: has {len(key)} bytes; a signing key has {KEY_BYTES}")
-    return Signing(key)

@@ -62,7 +62,7 @@ def serve(
         gcs_local=gcs_local,
         api=_endpoint("--api", api, listen),
         api_local=api_local,
-        key=_key(signing_key) if signing_key else None,
+        key=read_key(signing_key) if signing_key else None,
         version=1 if protocol == 1 else 2,
         rate=rate,
     )
@@ -76,7 +76,7 @@ def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
     """Return the address of HOST:PORT."""
     from socket import gaierror, gethostbyname
 
-    from zsim_bridges.web_server import is_loopback
+    from zsim_bridges.loopback import is_loopback
 
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) <= PORT_MAX:
@@ -90,7 +90,7 @@ def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
     return address, int(port)
 
 
-def _key(path: Path) -> bytes:
+def read_key(path: Path) -> bytes:
     """Return the key in a file: 32 bytes, 64 hexadecimal digits, or a passphrase, whose SHA-256 it is.
 
     Raises:

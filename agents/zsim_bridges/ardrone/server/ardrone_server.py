@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import DecodeError, RunError
+from zsim.errors import DecodeError
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges.ardrone.server.addresses import Peers, drone_addresses
@@ -17,6 +17,7 @@ from zsim_bridges.message_intake import MessageIntake
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.picture_intake import PictureIntake
 from zsim_bridges.vehicle_links import onboard_state
+from zsim_bridges.vehicle_links.run_pace import set_pace
 
 POLL_S = 0.1  # how often a stop is looked for
 REPORTED_MAX = 1000  # texts remembered, so that each is printed once
@@ -56,24 +57,6 @@ def serve(
     set_pace(link, info, observer.name, options.rate)
     onboard_state.warm_up()
     asyncio.run(ArdroneServer(link, info, observer, say, options).run(stopped))
-
-
-def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
-    """Let a run keep the pace of the wall clock.
-
-    Raises:
-        RunError: it has none and none is given, or the world refuses.
-    """
-    if rate is None:
-        if info.mode == "lockstep" and not info.rate:
-            raise RunError(
-                f"{name}: run {info.run_id} is flown as fast as possible, and programs for the AR.Drone go by the wall "
-                "clock; give --rate 1 here, or fly the run with --rate 1 or --realtime"
-            )
-        return
-    answer = link.request(keys.CONTROL, "rate", name, {"value": rate})
-    if not answer.ok:
-        raise RunError(f"{name}: --rate {rate:g}: {answer.error}")
 
 
 class ArdroneServer:

@@ -3,7 +3,8 @@
 Source: https://mavlink.io/en/services/ (heartbeat, command, timesync, message intervals).
 """
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from zsim.math.rotation import Vector
@@ -52,7 +53,8 @@ class AutopilotSession:
         takeoff_height_m: over the ground.
         system: its system id; 0 for the first autopilot that shows itself.
         local_origin_m: where its local frame begins [m; W], None: as it says.
-        signing: of both ways, None for none.
+        key: of signatures, both ways; None for none.
+        unix_s: wall time since 1970, which signatures carry.
 
     Attributes:
         channels, texts: see `VehicleSession`.
@@ -65,7 +67,8 @@ class AutopilotSession:
         takeoff_height_m: float,
         system: int = 0,
         local_origin_m: Vector | None = None,
-        signing: Signing | None = None,
+        key: bytes | None = None,
+        unix_s: Callable[[], float] = time.time,
     ) -> None:
         self.channels: tuple[Channel, ...] = (channel,)
         self.texts: list[str] = []
@@ -73,7 +76,9 @@ class AutopilotSession:
         self._takeoff_height_m = takeoff_height_m
         self._telemetry = Telemetry(origin, local_origin_m)
         self._sequence = DemandSequence(takeoff_height_m)
-        self._link, self._parser = Link(SYSTEM, COMPONENT, signing), Parser(signing)
+        self._signing = Signing(key) if key else None
+        self._unix_s = unix_s
+        self._link, self._parser = Link(SYSTEM, COMPONENT, self._signing), Parser(self._signing)
         self._autopilot: AutopilotState | None = None
         self._loss = StreamLoss(256)
         self._received_ns: int | None = None
@@ -158,6 +163,8 @@ class AutopilotSession:
         self._answers = []
         if now_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = now_ns
+            if self._signing:
+                self._signing.advance(self._unix_s())
             yield dialect.Heartbeat(ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE, 3)
         autopilot = self._autopilot
         if autopilot is None:

@@ -25,12 +25,12 @@ from zsim_bridges.mavlink.wire.signing import Signing
 from zsim_bridges.message_intake import MessageIntake
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.command_sender import CommandSender
+from zsim_bridges.vehicle_links.run_pace import set_pace
 
 POLL_S = 0.1  # how often a stop is looked for
 TICK_S = 0.1  # wall time between two looks at what wall time brings
 SWITCH_S = 5e-4  # s after which the thread that takes in a gate lets a setpoint pass; Python's own is 5 ms
 SYSTEM_IDS = 254  # 255 is the ground station's by custom
-PORTS = 65535
 Say = Callable[[str], None]
 
 
@@ -85,22 +85,6 @@ def serve(
     sys.setswitchinterval(SWITCH_S)
     server = MavlinkServer(link, info, observer, say, options)
     asyncio.run(server.run(stopped))
-
-
-def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
-    """Ask the world for a pace, where one is given; refuse a run that has none.
-
-    Raises:
-        RunError: the run goes as fast as possible, or the world refuses the pace.
-    """
-    if rate is None:
-        if info.mode == "lockstep" and not info.rate:
-            why = "clients of MAVLink time by the wall clock"
-            raise RunError(f"{name}: the run goes as fast as possible, and {why}; give --rate, or run it with --rate")
-        return
-    answer = link.request(keys.CONTROL, "rate", name, {"value": rate})
-    if not answer.ok:
-        raise RunError(f"{name}: the world does not set the pace to {rate:g}: {answer.error}")
 
 
 class Served(NamedTuple):

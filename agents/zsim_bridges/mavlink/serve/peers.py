@@ -1,27 +1,11 @@
 """Who a vehicle talks with: the configured peers, and programs on this machine that speak to it."""
 
-from ipaddress import ip_address
-from typing import NamedTuple
+from zsim_bridges.loopback import is_loopback
 
 LEARNT_MAX = 8  # programs at once, on one port
 SILENT_S = 30.0  # wall time after which one that learnt nothing new is forgotten
 
 Address = tuple[str, int]
-
-
-class Endpoint(NamedTuple):
-    """A host and a port."""
-
-    host: str
-    port: int
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether an address is this machine alone."""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 class Peers:

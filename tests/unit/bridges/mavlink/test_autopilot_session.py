@@ -16,12 +16,14 @@ from zsim_bridges.mavlink.drive.autopilot_session import AutopilotSession
 from zsim_bridges.mavlink.drive.telemetry import Telemetry
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Link, Parser
+from zsim_bridges.mavlink.wire.signing import Signing
 from zsim_bridges.vehicle_links.failsafe import Demand
 from zsim_bridges.vehicle_links.vehicle_session import Channel
 from zsim_bridges.vehicle_links.vehicle_state import Pose
 
 ORIGIN = (-34.603, -58.368, 25.0)
 S = 1_000_000_000
+KEY = bytes(range(32))
 AUTOPILOTS = pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
 
 
@@ -176,6 +178,20 @@ def test_a_system_that_was_asked_for_alone_is_the_vehicle():
         session.receive(0, Link(system, 1).pack(dialect.Heartbeat(2, PX4, 0, 0, 3, 3)), 0)
     assert session.figures(0).refused == 1
     assert session.state.received_ns == 0
+
+
+@pytest.mark.parametrize(("key", "flies"), [(KEY, True), (bytes(32), False)], ids=["the same key", "another"])
+def test_with_a_key_both_sides_sign(key: bytes, flies: bool):
+    now_s = 1.8e9
+    signing = Signing(KEY, link_id=1)
+    signing.advance(now_s)
+    loop = Loop(PX4)
+    loop.vehicle = FakeAutopilot(PX4, signing=signing)
+    loop.session = AutopilotSession(Channel("127.0.0.1", 1), ORIGIN, 2.0, key=key, unix_s=lambda: now_s)
+    loop._parser = Parser(Signing(key, accepts_unsigned=True))
+    loop.run(8, Demand("take_off"))
+    assert (loop.session.state.state == "hovering") is flies
+    assert (loop.session.figures(loop.now_ns).refused > 100) is not flies
 
 
 def test_loss_round_trip_and_offset_are_measured():

@@ -12,12 +12,12 @@ import typer
 
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import RunError
-from zsim_bridges.mavlink.serve.mavlink_server import set_pace
 from zsim_bridges.mavlink.serve.peers import LEARNT_MAX, SILENT_S, Peers
 from zsim_bridges.mavlink.serve.vehicle_ports import DATAGRAM_MAX, VehiclePort, VehiclePorts
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Link, Parser, Received
-from zsim_deploy.cli.mavlink_commands import _endpoint, _key
+from zsim_bridges.vehicle_links.run_pace import set_pace
+from zsim_deploy.cli.mavlink_commands import _endpoint, read_key
 
 GCS = ("192.0.2.7", 14550)
 
@@ -113,7 +113,7 @@ def test_a_port_that_is_taken_is_told() -> None:
 
 
 def run(mode: str, rate: float) -> Any:
-    return SimpleNamespace(mode=mode, rate=rate)
+    return SimpleNamespace(run_id="r", mode=mode, rate=rate)
 
 
 def world(ok: bool, asked: list[Any]) -> Any:
@@ -150,13 +150,13 @@ def test_endpoints_are_hosts_and_ports_that_can_be_reached() -> None:
 def test_a_key_is_bytes_digits_or_a_passphrase(tmp_path: Path) -> None:
     path, key = tmp_path / "key", bytes(range(32))
     path.write_bytes(key)
-    assert _key(path) == key
+    assert read_key(path) == key
     path.write_text(f"{key.hex()}\n")
-    assert _key(path) == key
+    assert read_key(path) == key
     path.write_text("open sesame\n")
-    assert _key(path).hex().startswith("41ef4bb0")  # sha256sum of it
+    assert read_key(path).hex().startswith("41ef4bb0")  # sha256sum of it
     path.write_text("\n")
     with pytest.raises(RunError, match="is empty"):
-        _key(path)
+        read_key(path)
     with pytest.raises(RunError, match="cannot be read"):
-        _key(tmp_path / "none")
+        read_key(tmp_path / "none")
