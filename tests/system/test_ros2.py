@@ -25,7 +25,7 @@ from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_deploy.inventory.enrolment import access_control
 
 TWIST, EMPTY = "geometry_msgs/msg/Twist", "std_msgs/msg/Empty"
-IMAGE, CAMERAS = "sensor_msgs/msg/CompressedImage", ("", "front/", "bottom/")
+IMAGE, CAMERAS = "sensor_msgs/msg/CompressedImage", ("ardrone/", "ardrone/front/", "ardrone/bottom/")
 TAKEN = ("cmd_vel", "takeoff", "land", "reset")
 NEVER = """
 name: never
@@ -133,7 +133,7 @@ def test_two_participants_find_and_receive_every_topic_and_request(federation: F
     assert after.until("topics", lambda found: found == topics) == topics
     services = after.request("services")
     assert services == {f"/cluster/main/{op}": [TRIGGER["kind"]] for op in ("takeoff", "engage", "hold", "land")} | {
-        f"/drone{n}/{service}": [TRIGGER["kind"]] for n in (1, 2) for service in ("release", "togglecam")
+        f"/drone{n}/{service}": [TRIGGER["kind"]] for n in (1, 2) for service in ("release", "ardrone/togglecam")
     }
     after.request("subscribe", topic="/cluster/main/state", kind=kinds["/cluster/main/state"])
     engaged = after.receive("/cluster/main/state", lambda m: m["phase"] == "engaged")
@@ -157,20 +157,20 @@ def test_pictures_are_as_a_camera_publishes_them(federation: Federation, ros: RO
     bridge(federation)
     peer = ros[0](port_of(federation.endpoint))
     for leaf, kind in (("image_raw/compressed", IMAGE), ("camera_info", "sensor_msgs/msg/CameraInfo")):
-        for base in ("/drone1/front", "/drone1"):
+        for base in ("/drone1/ardrone/front", "/drone1/ardrone"):
             peer.request("subscribe", topic=f"{base}/{leaf}", kind=kind)
     with pumping(camera, "drone/drone1/camera/front"), pumping(camera, "drone/drone1/camera/bottom"):
-        for base in ("/drone1/front", "/drone1"):
+        for base in ("/drone1/ardrone/front", "/drone1/ardrone"):
             image = peer.receive(f"{base}/image_raw/compressed")
             assert image["header"]["frame_id"] == "drone1/front_camera_optical_frame"
             number = round(seconds(image["header"]) * 1e3)
             assert (image["format"], bytes(image["data"])) == ("jpeg", shaded(number))
             info = peer.receive(f"{base}/camera_info")
             assert (info["k"], info["d"]) == (calibration()["K"], calibration()["D"])
-        answer = peer.request("call", service="/drone1/togglecam", **TRIGGER)
+        answer = peer.request("call", service="/drone1/ardrone/togglecam", **TRIGGER)
         assert answer["success"], answer
         frame = "drone1/bottom_camera_optical_frame"
-        peer.receive("/drone1/image_raw/compressed", lambda m: m["header"]["frame_id"] == frame)
+        peer.receive("/drone1/ardrone/image_raw/compressed", lambda m: m["header"]["frame_id"] == frame)
 
 
 def check_sensors(received: dict[str, Any]) -> None:

@@ -19,6 +19,7 @@ from zsim_bridges.ros2.topics import Topic
 from zsim_bridges.ros_frames import DISTORTION_MODEL, projection
 
 IMAGE, INFO = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
+DRIVER = "ardrone"  # under which ardrone_autonomy has its topics and services
 NOT_ROTATED = np.eye(3).ravel()  # of a camera that is no part of a stereo pair
 
 
@@ -42,8 +43,8 @@ class DroneCameras:
     def topics(self) -> Iterator[Topic]:
         """Yield the topics of each camera, and of the active one."""
         for camera in CAMERAS:
-            yield from self._topics(f"/{self._name}/{camera}", (camera,))
-        yield from self._topics(f"/{self._name}", CAMERAS)
+            yield from self._topics(f"/{self._name}/{DRIVER}/{camera}", (camera,))
+        yield from self._topics(f"/{self._name}/{DRIVER}", CAMERAS)
 
     def _topics(self, base: str, cameras: tuple[str, ...]) -> Iterator[Topic]:
         images = tuple(keys.camera(self._drone, camera) for camera in cameras)

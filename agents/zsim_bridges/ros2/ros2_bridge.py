@@ -24,7 +24,7 @@ from zsim.transport.session import RawSample, Session
 from zsim.transport.tls import Identity
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
-from zsim_bridges.ros2.camera_topics import DroneCameras
+from zsim_bridges.ros2.camera_topics import DRIVER, DroneCameras
 from zsim_bridges.ros2.rmw_zenoh import Ros2Node, RosContext, ros_names
 from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.source_keys import SAMPLES_MAX, BridgedTopic, CallbackQueue, SourceSubscriptions
@@ -200,7 +200,7 @@ class Ros2Bridge:
             self._advertise(node, topics.drone_topics(drone, name, sensors[drone], types))
             cameras = DroneCameras(drone, name)
             self._advertise(node, cameras.topics())
-            node.service(f"/{name}/togglecam", TRIGGER, partial(cameras.toggle, response))
+            node.service(f"/{name}/{DRIVER}/togglecam", TRIGGER, partial(cameras.toggle, response))
             self._accept_commands(node, drone, name, commands)
         for cluster, name in self.names.clusters.items():
             node = ros.node(f"/cluster/{name}", NODE)

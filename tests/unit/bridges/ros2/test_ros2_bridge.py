@@ -381,27 +381,27 @@ def published(bench: Bench, topic: str, kind: str) -> list[Any]:
 
 def test_a_picture_is_on_its_camera_s_topic_with_its_bytes_and_the_time_of_exposure() -> None:
     bench = Bench()
-    bench.reader("/drone_1/front/image_raw/compressed", IMAGE)
+    bench.reader("/drone_1/ardrone/front/image_raw/compressed", IMAGE)
     assert not bench.link.hearing.get(BOTTOM)
     bench.link.deliver(FRONT, messages.encode(image(20_000_000)))
     bench.turn()
-    (got,) = published(bench, "/drone_1/front/image_raw/compressed", IMAGE)
+    (got,) = published(bench, "/drone_1/ardrone/front/image_raw/compressed", IMAGE)
     assert (got.header.stamp.sec, got.header.stamp.nanosec) == (0, 16_000_000)
     assert got.header.frame_id == "drone_1/front_camera_optical_frame"
     assert (got.format, bytes(got.data)) == ("jpeg", jpeg())
-    bench.reader("/drone_1/front/image_raw/compressed", IMAGE, alive=False)
+    bench.reader("/drone_1/ardrone/front/image_raw/compressed", IMAGE, alive=False)
     assert not bench.link.hearing[FRONT]
 
 
 def test_how_a_camera_sees_was_said_before_anybody_asked_and_comes_with_each_picture() -> None:
     bench = Bench()
     bench.link.last[FRONT_INFO] = messages.encode(info())
-    bench.reader("/drone_1/front/camera_info", CAMERA_INFO)
+    bench.reader("/drone_1/ardrone/front/camera_info", CAMERA_INFO)
     bench.turn()
     for number in (1, 2):
         bench.link.deliver(FRONT, messages.encode(image(number * 20_000_000)))
     bench.turn()
-    first, second = published(bench, "/drone_1/front/camera_info", CAMERA_INFO)
+    first, second = published(bench, "/drone_1/ardrone/front/camera_info", CAMERA_INFO)
     assert (tuple(first.k), tuple(first.d), first.distortion_model) == (info().K, info().D, "plumb_bob")
     assert (first.width, first.height, tuple(first.p[[0, 5, 10]])) == (info().width, info().height, (50.0, 51.0, 1.0))
     assert [m.header.stamp.nanosec for m in (first, second)] == [16_000_000, 36_000_000]
@@ -409,26 +409,26 @@ def test_how_a_camera_sees_was_said_before_anybody_asked_and_comes_with_each_pic
 
 def test_togglecam_makes_the_other_camera_the_active_one() -> None:
     bench = Bench()
-    bench.reader("/drone_1/image_raw/compressed", IMAGE)
+    bench.reader("/drone_1/ardrone/image_raw/compressed", IMAGE)
     for _ in range(2):
         for key in (FRONT, BOTTOM):
             bench.link.deliver(key, messages.encode(image(20_000_000)))
         bench.turn()
-        (reply,) = bench.ask("/drone_1/togglecam").replies
+        (reply,) = bench.ask("/drone_1/ardrone/togglecam").replies
         assert TYPES.decode(reply[1], f"{TRIGGER}_Response").success
-    frames = [m.header.frame_id for m in published(bench, "/drone_1/image_raw/compressed", IMAGE)]
+    frames = [m.header.frame_id for m in published(bench, "/drone_1/ardrone/image_raw/compressed", IMAGE)]
     assert frames == ["drone_1/front_camera_optical_frame", "drone_1/bottom_camera_optical_frame"]
 
 
 @pytest.mark.parametrize("payload", [b"\xc1", messages.encode(image(0, 0, NO_JPEG)), messages.encode(info())])
 def test_what_is_no_picture_is_refused_and_the_next_is_passed_on(payload: bytes) -> None:
     bench = Bench()
-    bench.reader("/drone_1/front/image_raw/compressed", IMAGE)
+    bench.reader("/drone_1/ardrone/front/image_raw/compressed", IMAGE)
     bench.link.deliver(FRONT, payload)
     bench.link.deliver(FRONT, messages.encode(image(0)))
     bench.turn()
     assert bench.observer.health.refused == 1
-    assert len(published(bench, "/drone_1/front/image_raw/compressed", IMAGE)) == 1
+    assert len(published(bench, "/drone_1/ardrone/front/image_raw/compressed", IMAGE)) == 1
 
 
 def test_the_cameras_of_the_scenario_are_among_the_frames_that_never_move() -> None:
