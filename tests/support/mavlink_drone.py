@@ -6,10 +6,10 @@ from zsim.contract import flight_messages
 from zsim.contract.messages import Origin
 from zsim.scenario import scenario_file
 from zsim_bridges.mavlink.autopilot.personality import PERSONALITIES
-from zsim_bridges.mavlink.vehicle.vehicle import Options, Vehicle
+from zsim_bridges.mavlink.vehicle.mavlink_vehicle import Options, Vehicle
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Received
-from zsim_bridges.mavlink.wire.message import Message
+from zsim_bridges.mavlink.wire.wire_message import Message
 from zsim_bridges.vehicle_links.command_sender import CommandSender
 
 GATE_NS = 20_000_000

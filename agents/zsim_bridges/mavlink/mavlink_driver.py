@@ -10,7 +10,7 @@ from zsim_bridges.mavlink.drive.autopilot_session import AutopilotSession
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.driver_options import DriverOptions
 from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external
-from zsim_bridges.vehicle_links.vehicle_session import Channel
+from zsim_bridges.vehicle_links.vehicle_session import UdpChannel
 
 
 def drive(
@@ -20,7 +20,7 @@ def drive(
     stopped: Callable[[], bool],
     say: Callable[[str], None],
     options: DriverOptions,
-    channel: Channel,
+    channel: UdpChannel,
     system: int = 0,
     key: bytes | None = None,
 ) -> None:

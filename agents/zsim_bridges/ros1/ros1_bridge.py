@@ -11,12 +11,12 @@ from zsim.contract.messages import Info
 from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
-from zsim_bridges.message_intake import MessageIntake
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.picture_intake import PictureIntake
 from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics, ros1_name
 from zsim_bridges.ros1.node import Ros1Node
+from zsim_bridges.traffic_intake import TrafficIntake
 from zsim_bridges.vehicle_links import onboard_state
 
 POLL_S = 0.1  # how often a stop is looked for
@@ -81,7 +81,7 @@ class Ros1Bridge:
         for sample in self._link.get(keys.camera_info("*", "*")):
             self.forward(sample.key, sample.payload)
         pictures = PictureIntake(self._link, asyncio.get_running_loop(), self.forward)
-        intake = MessageIntake(self._link, self._info, self._observer.health, asyncio.get_running_loop())
+        intake = TrafficIntake(self._link, self._info, self._observer.health, asyncio.get_running_loop())
         try:
             async with self._node.running():
                 while not (stopped() or self._observer.end_reason or self._node.shutdown_reason):
@@ -99,7 +99,7 @@ class Ros1Bridge:
         for name, drone in self._drones.items():
             yield from (keys.camera(name, camera) for camera in drone.cameras.wanted())
 
-    async def _forward_all(self, intake: MessageIntake) -> None:
+    async def _forward_all(self, intake: TrafficIntake) -> None:
         for arrived in intake.arrivals():
             for key, payload in arrived:
                 self.forward(key, payload)

@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 from zsim.errors import RunError
 from zsim.math.rotation import Vector
 from zsim_bridges.vehicle_links.flight_limits import FlightLimits
-from zsim_bridges.vehicle_links.vehicle_session import Channel
+from zsim_bridges.vehicle_links.vehicle_session import UdpChannel
 
 _POSITION = re.compile(r"\s*,\s*")
 
@@ -30,7 +30,7 @@ class DriverOptions(NamedTuple):
     yaw_deg: float | None = None
 
 
-def udp_channel(address: str, local_port: int = 0) -> Channel:
+def udp_channel(address: str, local_port: int = 0) -> UdpChannel:
     """Return the channel of `udp://HOST:PORT`.
 
     Raises:
@@ -43,7 +43,7 @@ def udp_channel(address: str, local_port: int = 0) -> Channel:
         parts, port = urlsplit(""), None
     if parts.scheme != "udp" or not parts.hostname or not port:
         raise RunError(f"the address is {address!r}; must be udp://HOST:PORT, such as udp://192.168.1.20:14580")
-    return Channel(parts.hostname, port, local_port)
+    return UdpChannel(parts.hostname, port, local_port)
 
 
 def position(text: str) -> Vector:

@@ -21,12 +21,12 @@ from zsim.scenario.scenario import Drone
 from zsim.transport.session import Query, RawSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
 from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.vehicle_links.aircraft_state import AIRBORNE, AircraftState
 from zsim_bridges.vehicle_links.driver_clock import DriverClock
 from zsim_bridges.vehicle_links.driver_options import DriverOptions
 from zsim_bridges.vehicle_links.external_drone import ExternalDrone
 from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe
-from zsim_bridges.vehicle_links.vehicle_session import Channel, LinkFigures, VehicleSession
-from zsim_bridges.vehicle_links.vehicle_state import AIRBORNE, VehicleState
+from zsim_bridges.vehicle_links.vehicle_session import LinkFigures, UdpChannel, VehicleSession
 
 TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
 REPORT_S = 1.0  # s, wall; of the link's figures
@@ -130,7 +130,7 @@ class DriverProcess:
             for key, message in self._external.gate(clock.t_ns, vehicle, self._failsafe.commander):
                 self._link.put(key, message)
 
-    def _vehicle(self) -> VehicleState:
+    def _vehicle(self) -> AircraftState:
         """Return what is known of the aircraft; one whose motors were stopped is in an emergency."""
         vehicle = self._session.state
         return vehicle._replace(state="emergency") if self._failsafe.phase == "killed" else vehicle
@@ -282,5 +282,5 @@ def hover_speed(drone: Drone, rotors: int, gravity_m_s2: float) -> float:
     return math.sqrt(drone.mass_kg * gravity_m_s2 / (rotors * drone.thrust_n_s2))
 
 
-def _local(channel: Channel) -> tuple[str, int] | None:
+def _local(channel: UdpChannel) -> tuple[str, int] | None:
     return ("0.0.0.0", channel.local_port) if channel.local_port else None

@@ -6,7 +6,7 @@ from typing import Any
 
 from zsim.contract import flight_messages, keys
 from zsim.sensors.sensor_catalogue import STOCK
-from zsim_bridges.vehicle_links.vehicle_state import STILL, Pose, Reading, VehicleState
+from zsim_bridges.vehicle_links.aircraft_state import STILL, AircraftPose, AircraftState, Reading
 
 WAITING_MAX = 4000  # readings, 10 s of an IMU at 200 Hz and all else; then the oldest go
 EXTRAPOLATED_NS = 500_000_000  # chosen: how old a pose may be; it then says where the aircraft was, not where it is
@@ -37,7 +37,7 @@ class ExternalDrone:
         """Keep readings for the next gate."""
         self._readings.extend(readings)
 
-    def gate(self, t_ns: int, vehicle: VehicleState, commander: str | None) -> list[tuple[str, Any]]:
+    def gate(self, t_ns: int, vehicle: AircraftState, commander: str | None) -> list[tuple[str, Any]]:
         """Return keys and messages of a gate in order: samples by time, truth, and status; nothing for an old gate."""
         if t_ns <= self._gate_ns or vehicle.pose is None:
             return []
@@ -45,7 +45,7 @@ class ExternalDrone:
         samples, truth = self._samples(t_ns), self._truth(t_ns, vehicle.pose, turning=vehicle.state not in STANDING)
         return [*samples, truth, self._status(t_ns, vehicle, commander, len(samples) + 1)]
 
-    def _status(self, t_ns: int, vehicle: VehicleState, commander: str | None, count: int) -> tuple[str, Any]:
+    def _status(self, t_ns: int, vehicle: AircraftState, commander: str | None, count: int) -> tuple[str, Any]:
         key = keys.status(self._drone)
         state, battery = vehicle.state, vehicle.battery_percent
         return key, flight_messages.Status(t_ns, self._next(key), state, battery, False, commander, count)
@@ -61,7 +61,7 @@ class ExternalDrone:
         key = keys.sensor(self._drone, reading.sensor)
         return key, STOCK[reading.sensor].message(t_ns, self._next(key), t_sample_ns, *reading.values)
 
-    def _truth(self, t_ns: int, pose: Pose, turning: bool) -> tuple[str, Any]:
+    def _truth(self, t_ns: int, pose: AircraftPose, turning: bool) -> tuple[str, Any]:
         """Return the pose as it is at the gate, carried on with its velocity."""
         age_ns = max(0, min(EXTRAPOLATED_NS, t_ns - self._to_simulated(pose.taken_ns)))
         x, y, z = (p + age_ns * 1e-9 * v for p, v in zip(pose.position_m, pose.velocity_m_s, strict=True))

@@ -15,8 +15,8 @@ from zsim.contract import flight_messages
 from zsim.math.frames import heading
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Silence
+from zsim_bridges.vehicle_links.aircraft_state import AIRBORNE, STILL, AircraftState
 from zsim_bridges.vehicle_links.flight_limits import FlightLimits
-from zsim_bridges.vehicle_links.vehicle_state import AIRBORNE, STILL, VehicleState
 
 TAKEOFF_S = 20.0  # chosen: four times what an AR.Drone takes; then it is given up
 LINK_LOST_S = 1.0  # chosen: heartbeats come once a second, telemetry ten times as often
@@ -67,7 +67,7 @@ class Failsafe:
 
     # Operators
 
-    def arm(self, now_ns: int, vehicle: VehicleState) -> str | None:
+    def arm(self, now_ns: int, vehicle: AircraftState) -> str | None:
         """Obey from now on; return None, or why not."""
         if vehicle.received_ns is None or now_ns - vehicle.received_ns > LINK_LOST_S * 1e9:
             return "nothing comes from the aircraft; check its address, and that it is switched on"
@@ -76,7 +76,7 @@ class Failsafe:
             self._enter("idle", now_ns)
         return None
 
-    def disarm(self, vehicle: VehicleState) -> str | None:
+    def disarm(self, vehicle: AircraftState) -> str | None:
         """Obey no longer; return None, or why not."""
         if vehicle.state not in ("landed", "emergency"):
             return f"the aircraft is {vehicle.state}; land first, or kill"
@@ -101,7 +101,7 @@ class Failsafe:
         """The world is there."""
         self._clock_ns = now_ns
 
-    def on_command(self, command: flight_messages.Command, now_ns: int, vehicle: VehicleState) -> str | None:
+    def on_command(self, command: flight_messages.Command, now_ns: int, vehicle: AircraftState) -> str | None:
         """Take an accepted command; return None, or why it is not obeyed."""
         if not self.armed:
             return "its driver is not armed; an operator asks `arm` of it"
@@ -117,7 +117,7 @@ class Failsafe:
             case _:
                 return f"a driver does not take {type(command).__name__}; send velocity"
 
-    def _on_mode(self, mode: str, now_ns: int, vehicle: VehicleState) -> str | None:
+    def _on_mode(self, mode: str, now_ns: int, vehicle: AircraftState) -> str | None:
         if mode == "takeoff":
             if vehicle.state != "landed":
                 return f"the aircraft is {vehicle.state}; a take-off needs it landed"
@@ -133,7 +133,7 @@ class Failsafe:
 
     # What is asked of the aircraft
 
-    def demand(self, now_ns: int, vehicle: VehicleState) -> Demand:
+    def demand(self, now_ns: int, vehicle: AircraftState) -> Demand:
         """Return what the aircraft is to do now."""
         self._advance(now_ns, vehicle)
         match self.phase:
@@ -148,7 +148,7 @@ class Failsafe:
             case _:
                 return Demand("none")
 
-    def _advance(self, now_ns: int, vehicle: VehicleState) -> None:
+    def _advance(self, now_ns: int, vehicle: AircraftState) -> None:
         """Go on to the next phase where the aircraft has reached it, or somebody is silent."""
         airborne = vehicle.state in AIRBORNE
         if self.phase == "taking_off" and airborne:
@@ -166,7 +166,7 @@ class Failsafe:
         """Tell whether an aircraft has had the time to show that it obeys."""
         return now_ns - self._began_ns > LINK_LOST_S * 1e9
 
-    def _watch(self, now_ns: int, vehicle: VehicleState) -> None:
+    def _watch(self, now_ns: int, vehicle: AircraftState) -> None:
         if vehicle.state == "landed" and self._settled(now_ns):
             self._enter("idle", now_ns)
         elif vehicle.pose is not None and self._limits.is_breached(vehicle.pose.position_m):
@@ -176,7 +176,7 @@ class Failsafe:
         elif now_ns - max(self._clock_ns, self._began_ns) > self._land_ns:
             self.land("the world is silent", now_ns)
 
-    def _airborne(self, now_ns: int, vehicle: VehicleState) -> Demand:
+    def _airborne(self, now_ns: int, vehicle: AircraftState) -> Demand:
         setpoint, pose = self._setpoint, vehicle.pose
         if setpoint is None or pose is None or now_ns - self._setpoint_ns > self._hover_ns:
             return Demand("hold")

@@ -3,11 +3,11 @@
 from collections.abc import Iterable
 from typing import NamedTuple, Protocol
 
+from zsim_bridges.vehicle_links.aircraft_state import AircraftState, Reading
 from zsim_bridges.vehicle_links.failsafe import Demand
-from zsim_bridges.vehicle_links.vehicle_state import Reading, VehicleState
 
 
-class Channel(NamedTuple):
+class UdpChannel(NamedTuple):
     """A UDP port of an aircraft, and the port here; 0 for any."""
 
     host: str
@@ -40,11 +40,11 @@ class VehicleSession(Protocol):
         texts: lines for people, taken by the process.
     """
 
-    channels: tuple[Channel, ...]
+    channels: tuple[UdpChannel, ...]
     texts: list[str]
 
     @property
-    def state(self) -> VehicleState: ...
+    def state(self) -> AircraftState: ...
 
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
         """Take a datagram from one of its ports."""

@@ -31,11 +31,11 @@ def serve(
 ) -> None:
     """Offer each drone as an AR.Drone 2.0 on an address of its own."""
     from zsim_bridges.ardrone.server.addresses import peer_addresses
-    from zsim_bridges.ardrone.server.ardrone_server import ServeOptions
+    from zsim_bridges.ardrone.server.ardrone_server import ArdroneOptions
     from zsim_bridges.ardrone.server.ardrone_server import serve as serve_run
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import lower_priority, serve_runs
 
     lower_priority()
-    options = ServeOptions(addresses, peer_addresses(peer or ()), rate)
+    options = ArdroneOptions(addresses, peer_addresses(peer or ()), rate)
     serve_runs(process_name("ardrone", name, reach.who), partial(serve_run, options=options), reach)

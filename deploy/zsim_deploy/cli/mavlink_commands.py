@@ -49,12 +49,12 @@ def serve(
     name: Annotated[str, typer.Option(help="Process name (default mavlink.main, or the certificate's).")] = "",
 ) -> None:
     """Offer each drone as a vehicle: QGroundControl, MAVSDK, DroneKit, MAVProxy fly it."""
-    from zsim_bridges.mavlink.serve.mavlink_server import ServeOptions
+    from zsim_bridges.mavlink.serve.mavlink_server import MavlinkOptions
     from zsim_bridges.mavlink.serve.mavlink_server import serve as serve_vehicles
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import lower_priority, serve_runs
 
-    options = ServeOptions(
+    options = MavlinkOptions(
         autopilot=autopilot,
         level=telemetry,
         listen=listen,

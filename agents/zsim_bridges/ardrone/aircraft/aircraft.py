@@ -9,9 +9,9 @@ from zsim.math import frames as rotations
 from zsim.scenario.scenario import Drone
 from zsim.sensors.camera import CAMERAS
 from zsim_bridges.ardrone.aircraft.configuration import Configuration, ConfigurationError
-from zsim_bridges.ardrone.aircraft.flight_control import IN_THE_AIR, FlightControl
 from zsim_bridges.ardrone.aircraft.navdata_content import NavdataContent
 from zsim_bridges.ardrone.aircraft.navdata_sender import NavdataSender, Send
+from zsim_bridges.ardrone.aircraft.pilot_commands import IN_THE_AIR, PilotCommands
 from zsim_bridges.ardrone.aircraft.setpoint_sender import SetpointSender
 from zsim_bridges.ardrone.wire import at_commands, configuration_text
 from zsim_bridges.ardrone.wire.at_commands import Command
@@ -83,7 +83,7 @@ class Aircraft:
         self.configuration = _configuration(drone)
         sender = CommandSender(drone.name, source, outlets.put)
         self._setpoints = SetpointSender(sender, drone.limits, self.configuration)
-        self._flight = FlightControl(sender, self._setpoints, source, self._refuse)
+        self._flight = PilotCommands(sender, self._setpoints, source, self._refuse)
         self._content = NavdataContent(self._state, drone.rotor_max_rad_s)
         parts = self._content, self.configuration, outlets.send_navdata, self._state_bits, self._ctrl_state
         self._navdata = NavdataSender(*parts, self._refuse)

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 
-from zsim_bridges.ardrone.aircraft.configuration_entries import ENTRIES, LIMITS, TEXT_MAX, Category, Entry
+from zsim_bridges.ardrone.aircraft.configuration_entries import ENTRIES, LIMITS, TEXT_MAX, Category, ConfigurationEntry
 from zsim_bridges.ardrone.wire.configuration_text import CustomList
 
 DEFAULT_ID = "00000000"  # of each level (Developer Guide 8.1)
@@ -88,7 +88,7 @@ class Configuration:
         self._values(entry)[key] = _checked(key, entry, value)
         self._follow_sets(key)
 
-    def _values(self, entry: Entry) -> dict[str, str]:
+    def _values(self, entry: ConfigurationEntry) -> dict[str, str]:
         if entry.category == "common":
             return self._common
         return self._kept[entry.category][self._current[entry.category]]
@@ -140,7 +140,7 @@ class Configuration:
             self._current[level] = DEFAULT_ID
 
 
-def _checked(key: str, entry: Entry, value: str) -> str:
+def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
     """Return a value as it is kept: a number within its range."""
     if entry.kind == "fixed":
         raise ConfigurationError(f"{key} is read only")

@@ -13,7 +13,7 @@ CLIMB_1_S = 1.5  # 1/s, as the firmware nears its own greatest height
 CALIBRATION_YAW_RAD_S = 1.0  # rad/s, chosen: a turn takes 6 s, as on the aircraft
 
 
-class Setpoint(NamedTuple):
+class TiltSetpoint(NamedTuple):
     """A PCMD within its limits: shares of the largest tilt, climb and yaw rate.
 
     Attributes:
@@ -54,12 +54,12 @@ class SetpointSender:
         self.altitude_m = 0.0
         self.heading_rad = 0.0
 
-    def repeat_ns(self, setpoint: Setpoint) -> int:
+    def repeat_ns(self, setpoint: TiltSetpoint) -> int:
         """Return after how long a setpoint is sent again: what depends on height or heading is, at every gate."""
         turns = setpoint.pilot_heading_rad is not None
         return 0 if turns or (setpoint.up > 0.0 and self._is_near_top()) else REPEAT_NS
 
-    def send(self, t_ns: int, setpoint: Setpoint) -> None:
+    def send(self, t_ns: int, setpoint: TiltSetpoint) -> None:
         """Send a setpoint."""
         if setpoint.hover:
             self._sender.tilt(t_ns, 0.0, 0.0, 0.0, 0.0, hover=True)
@@ -81,7 +81,7 @@ class SetpointSender:
             return math.inf
         return CLIMB_1_S * (highest_mm / 1e3 - self.altitude_m)
 
-    def _across(self, setpoint: Setpoint) -> tuple[float, float]:
+    def _across(self, setpoint: TiltSetpoint) -> tuple[float, float]:
         """Return the shares of zsim's tilt to the drone's right and back."""
         right, back = setpoint.right, setpoint.back
         if setpoint.pilot_heading_rad is not None:
@@ -94,11 +94,11 @@ class SetpointSender:
     def _tilt_share(self, tilt_rad: float) -> float:
         return share(math.tan(tilt_rad) / self._tilt_slope)
 
-    def _up(self, setpoint: Setpoint) -> float:
+    def _up(self, setpoint: TiltSetpoint) -> float:
         climb_m_s = setpoint.up * self._configuration.number("control:control_vz_max") / 1e3
         return share(min(climb_m_s, self._climb_left_m_s()) / self._climb_m_s)
 
-    def _yaw_left(self, setpoint: Setpoint) -> float:
+    def _yaw_left(self, setpoint: TiltSetpoint) -> float:
         return share(-setpoint.clockwise * self._configuration.number("control:control_yaw") / self._yaw_rad_s)
 
 

@@ -15,10 +15,10 @@ from zsim_bridges.ardrone.wire import at_commands, navdata
 from zsim_bridges.ardrone.wire.at_commands import Command, Config, Control, ResetWatchdog
 from zsim_bridges.ardrone.wire.navdata import ControlState, Navdata, NavdataError, StateBit
 from zsim_bridges.ardrone.wire.navdata_options import FULL_TAGS, GPS_TAG
+from zsim_bridges.vehicle_links.aircraft_state import AircraftState, Reading
 from zsim_bridges.vehicle_links.failsafe import Demand
 from zsim_bridges.vehicle_links.stream_loss import StreamLoss
-from zsim_bridges.vehicle_links.vehicle_session import Channel, LinkFigures
-from zsim_bridges.vehicle_links.vehicle_state import Reading, VehicleState
+from zsim_bridges.vehicle_links.vehicle_session import LinkFigures, UdpChannel
 
 NAVDATA, AT = 0, 1  # channels
 REQUEST_NS = 100_000_000  # chosen as npm ar-drone: navdata is asked for again after as long
@@ -73,7 +73,7 @@ class AircraftSession:
         limits: AircraftLimits = AircraftLimits(),  # noqa: B008
         ports: tuple[int, int] = (navdata.PORT, at_commands.PORT),
     ) -> None:
-        self.channels: tuple[Channel, ...] = Channel(host, ports[0]), Channel(host, ports[1])
+        self.channels: tuple[UdpChannel, ...] = UdpChannel(host, ports[0]), UdpChannel(host, ports[1])
         self.texts: list[str] = []
         self._readings = readings
         self._commands = FlightCommands(TiltControl(limits.tilt_rad, limits.climb_m_s, limits.yaw_rate_rad_s))
@@ -164,9 +164,9 @@ class AircraftSession:
     # What is known
 
     @property
-    def state(self) -> VehicleState:
+    def state(self) -> AircraftState:
         """What is known of the aircraft."""
-        return VehicleState(self._state, self._battery, self._readings.pose, self._received_ns)
+        return AircraftState(self._state, self._battery, self._readings.pose, self._received_ns)
 
     def take_readings(self) -> list[Reading]:
         """Return what has been measured since the last call."""

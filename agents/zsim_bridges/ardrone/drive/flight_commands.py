@@ -10,8 +10,8 @@ from zsim.math.frames import heading
 from zsim_bridges.ardrone.drive.tilt_control import TiltControl
 from zsim_bridges.ardrone.wire import at_commands
 from zsim_bridges.ardrone.wire.at_commands import Command, Pcmd
+from zsim_bridges.vehicle_links.aircraft_state import AircraftPose
 from zsim_bridges.vehicle_links.failsafe import Demand
-from zsim_bridges.vehicle_links.vehicle_state import Pose
 
 PERIOD_NS = 30_000_000  # Developer Guide 6.3: at most 30 ms between commands
 CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller commands once
@@ -31,7 +31,7 @@ class FlightCommands:
         self._last: Demand | None = None
         self._toggles = False
 
-    def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: Pose | None) -> Iterator[Command]:
+    def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
         """Yield the commands that are due, without their numbers; none where nothing is demanded.
 
         Args:
@@ -60,7 +60,7 @@ class FlightCommands:
         self._toggles = emergency != wanted and not self._toggles
         return at_commands.ref(0, takes_off=False, emergency=self._toggles)
 
-    def _pcmd(self, now_ns: int, demand: Demand, pose: Pose | None) -> Command:
+    def _pcmd(self, now_ns: int, demand: Demand, pose: AircraftPose | None) -> Command:
         if demand.action != "fly" or pose is None:
             self._control.reset()
             return Pcmd(0, HOVER, 0.0, 0.0, 0.0, 0.0)

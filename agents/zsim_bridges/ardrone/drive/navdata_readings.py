@@ -12,9 +12,9 @@ from zsim.math.rotation import Vector
 from zsim.schema.quantities import G_M_S2
 from zsim_bridges.ardrone.wire.navdata import Navdata
 from zsim_bridges.ardrone.wire.navdata_options import GPS_TAG, TAG_OF
+from zsim_bridges.vehicle_links.aircraft_state import AircraftPose, Reading
 from zsim_bridges.vehicle_links.clock_offset import ClockOffset
 from zsim_bridges.vehicle_links.standard_atmosphere import FieldBarometer
-from zsim_bridges.vehicle_links.vehicle_state import Pose, Reading
 
 DEMO, TIME, PHYS, ALTITUDE = (TAG_OF[name] for name in ("demo", "time", "phys_measures", "altitude"))
 PRESSURE, MAGNETO = TAG_OF["pressure_raw"], TAG_OF["magneto"]
@@ -55,7 +55,7 @@ class NavdataReadings:
         self._north_rad = math.atan2(field_ut[1], field_ut[0])
         self._stated_yaw_rad = yaw_rad
         self._yaw_offset_rad: float | None = None
-        self.pose: Pose | None = None
+        self.pose: AircraftPose | None = None
         self.clock = ClockOffset()
         self.readings: list[Reading] = []
         self._last: dict[str, tuple] = {}
@@ -110,7 +110,7 @@ class NavdataReadings:
         w, x, y, z = quaternion_from_rpy((roll, pitch, yaw)).tolist()
         position = self._x, self._y, self._ground_m + max(0, demo.altitude_mm) / 1e3
         rate = self._last.get("imu", ((), (0.0, 0.0, 0.0)))[1]
-        self.pose = Pose(taken_ns, position, velocity, (w, x, y, z), rate)
+        self.pose = AircraftPose(taken_ns, position, velocity, (w, x, y, z), rate)
         self._read_new("flow", taken_ns, own, 1.0)
 
     def _magnetic_yaw(self, roll: float, pitch: float, m: Vector) -> float:

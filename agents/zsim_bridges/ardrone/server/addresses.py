@@ -65,7 +65,7 @@ def peer_addresses(hosts: Iterable[str]) -> frozenset[str]:
     return frozenset(found)
 
 
-class Peers:
+class AllowedHosts:
     """Who is obeyed on an address: on loopback every program of this host, elsewhere the hosts that were named.
 
     Args:

@@ -11,11 +11,11 @@ from zsim.contract.messages import Info
 from zsim.errors import DecodeError
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
-from zsim_bridges.ardrone.server.addresses import Peers, drone_addresses
+from zsim_bridges.ardrone.server.addresses import AllowedHosts, drone_addresses
 from zsim_bridges.ardrone.server.drone_server import DroneServer
-from zsim_bridges.message_intake import MessageIntake
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.picture_intake import PictureIntake
+from zsim_bridges.traffic_intake import TrafficIntake
 from zsim_bridges.vehicle_links import onboard_state
 from zsim_bridges.vehicle_links.run_pace import set_pace
 
@@ -24,7 +24,7 @@ REPORTED_MAX = 1000  # texts remembered, so that each is printed once
 Say = Callable[[str], None]
 
 
-class ServeOptions(NamedTuple):
+class ArdroneOptions(NamedTuple):
     """How the drones are offered.
 
     Attributes:
@@ -39,7 +39,7 @@ class ServeOptions(NamedTuple):
 
 
 def serve(
-    link: Session, info: Info, observer: ObserverProcess, stopped: Callable[[], bool], say: Say, options: ServeOptions
+    link: Session, info: Info, observer: ObserverProcess, stopped: Callable[[], bool], say: Say, options: ArdroneOptions
 ) -> None:
     """Serve one run until it is over.
 
@@ -62,7 +62,7 @@ def serve(
 class ArdroneServer:
     """One run's drones."""
 
-    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: ServeOptions) -> None:
+    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: ArdroneOptions) -> None:
         self._link = link
         self._info = info
         self._observer = observer
@@ -74,7 +74,7 @@ class ArdroneServer:
             name: DroneServer(
                 drones[name],
                 address,
-                Peers(address, options.peers),
+                AllowedHosts(address, options.peers),
                 observer.name,
                 info.gate_ns,
                 link.put,
@@ -94,7 +94,7 @@ class ArdroneServer:
                 for line in await drone.open():
                     self._say(f"{self._observer.name}: {line}")
                 self._say(f"{self._observer.name}: {name} is an AR.Drone 2.0 at {drone.address}")
-            intake = MessageIntake(self._link, self._info, self._observer.health, loop)
+            intake = TrafficIntake(self._link, self._info, self._observer.health, loop)
             stack.callback(intake.close)
             stack.callback(pictures.follow, ())
             while not (stopped() or self._observer.end_reason):
@@ -115,7 +115,7 @@ class ArdroneServer:
             self._refuse("video: av is not installed, no pictures are streamed; pip install 'zsim[video]'")
         return self._has_encoder
 
-    async def _forward_all(self, intake: MessageIntake) -> None:
+    async def _forward_all(self, intake: TrafficIntake) -> None:
         for arrived in intake.arrivals():
             for key, payload in arrived:
                 self.forward(key, payload)

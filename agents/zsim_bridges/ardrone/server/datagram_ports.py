@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
-from zsim_bridges.ardrone.server.addresses import Peers
+from zsim_bridges.ardrone.server.addresses import AllowedHosts
 
 AUTHENTICATION_PORT = 5552  # UDP, where programs look for drones (ARDroneLib, config.h)
 QUESTION, ANSWER = b"PARROT AUTH", b"PARROT AUTH OK"  # ARDroneLib, ardrone_auth.c
@@ -20,7 +20,9 @@ class DatagramPort(asyncio.DatagramProtocol):
         refuse: counts what others send, with the reason.
     """
 
-    def __init__(self, peers: Peers, take: Callable[[bytes, Address], None], refuse: Callable[[str], None]) -> None:
+    def __init__(
+        self, peers: AllowedHosts, take: Callable[[bytes, Address], None], refuse: Callable[[str], None]
+    ) -> None:
         self._peers = peers
         self._take = take
         self._refuse = refuse

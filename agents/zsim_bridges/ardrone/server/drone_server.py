@@ -8,7 +8,7 @@ from zsim.errors import RunError
 from zsim.scenario.scenario import Drone
 from zsim_bridges.ardrone.aircraft.aircraft import Aircraft, Outlets
 from zsim_bridges.ardrone.server import datagram_ports, file_server
-from zsim_bridges.ardrone.server.addresses import Peers
+from zsim_bridges.ardrone.server.addresses import AllowedHosts
 from zsim_bridges.ardrone.server.datagram_ports import Address, DatagramPort, open_datagram_port
 from zsim_bridges.ardrone.server.file_server import FileServer
 from zsim_bridges.ardrone.server.stream_port import StreamPort, read_until_end
@@ -35,7 +35,7 @@ class DroneServer:
         self,
         drone: Drone,
         address: str,
-        peers: Peers,
+        peers: AllowedHosts,
         source: str,
         gate_ns: int,
         put: Callable[[str, Any], None],

@@ -6,7 +6,7 @@ Source: RFC 959; ARDroneLib, ardrone_ftp.c and its check of the firmware's versi
 import asyncio
 from collections.abc import Callable
 
-from zsim_bridges.ardrone.server.addresses import Peers
+from zsim_bridges.ardrone.server.addresses import AllowedHosts
 from zsim_bridges.ardrone.server.stream_port import StreamPort
 
 VERSION_PORT, FILES_PORT = 5551, 21  # TCP (ARDroneLib, config.h): of the version, and of videos
@@ -37,7 +37,9 @@ class FileServer:
         refuse: counts what is not served, with the reason.
     """
 
-    def __init__(self, address: str, peers: Peers, files: dict[str, bytes], refuse: Callable[[str], None]) -> None:
+    def __init__(
+        self, address: str, peers: AllowedHosts, files: dict[str, bytes], refuse: Callable[[str], None]
+    ) -> None:
         self._address = address
         self._peers = peers
         self._files = files

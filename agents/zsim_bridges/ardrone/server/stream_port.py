@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
 
-from zsim_bridges.ardrone.server.addresses import Peers
+from zsim_bridges.ardrone.server.addresses import AllowedHosts
 
 CONNECTIONS_MAX = 8  # at once, chosen: a pilot's program has one
 LINE_MAX = 512  # bytes of a line that is read, chosen
@@ -25,7 +25,7 @@ class StreamPort:
         writers: of the connections that are served.
     """
 
-    def __init__(self, peers: Peers, serve: Serve, refuse: Callable[[str], None]) -> None:
+    def __init__(self, peers: AllowedHosts, serve: Serve, refuse: Callable[[str], None]) -> None:
         self._peers = peers
         self._serve = serve
         self._refuse = refuse

@@ -20,7 +20,7 @@ class PictureError(ValueError):
     """A picture cannot be read."""
 
 
-class Frame(NamedTuple):
+class VideoFrame(NamedTuple):
     """A frame: its NAL units with start codes.
 
     Attributes:
@@ -48,7 +48,7 @@ class VideoEncoder:
         self._codec = codec
         self._count = 0
 
-    def encode(self, jpeg: bytes, begins: bool) -> Frame | None:
+    def encode(self, jpeg: bytes, begins: bool) -> VideoFrame | None:
         """Return the frame of a picture.
 
         Args:
@@ -77,9 +77,9 @@ def _picture(jpeg: bytes) -> Any:
     return pictures[0]
 
 
-def _frame(data: bytes) -> Frame:
+def _frame(data: bytes) -> VideoFrame:
     sizes = {kind: size for kind, size in nal_units(data) if kind in (IDR, SPS, PPS)}
-    return Frame(data, IDR in sizes, sizes.get(SPS, 0), sizes.get(PPS, 0))
+    return VideoFrame(data, IDR in sizes, sizes.get(SPS, 0), sizes.get(PPS, 0))
 
 
 def nal_units(data: bytes) -> Iterator[tuple[int, int]]:

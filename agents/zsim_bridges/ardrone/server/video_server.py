@@ -6,12 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from zsim.contract.camera_messages import CameraImage
-from zsim_bridges.ardrone.server.addresses import Peers
+from zsim_bridges.ardrone.server.addresses import AllowedHosts
 from zsim_bridges.ardrone.server.stream_port import StreamPort, read_until_end
 from zsim_bridges.ardrone.wire.pave import FrameType, PaveHeader
 
 if TYPE_CHECKING:
-    from zsim_bridges.ardrone.server.video_encoder import Frame, VideoEncoder
+    from zsim_bridges.ardrone.server.video_encoder import VideoEncoder, VideoFrame
 
 BACKLOG_MAX = 500_000  # bytes that a connection may be behind, chosen: some seconds; then it waits for an IDR frame
 
@@ -27,7 +27,7 @@ class VideoServer:
         port: to be opened.
     """
 
-    def __init__(self, peers: Peers, refuse: Callable[[str], None]) -> None:
+    def __init__(self, peers: AllowedHosts, refuse: Callable[[str], None]) -> None:
         self._refuse = refuse
         self.port = StreamPort(peers, self._serve, refuse)
         self._ready: set[asyncio.StreamWriter] = set()  # have had an IDR frame, and all since
@@ -76,14 +76,14 @@ class VideoServer:
         finally:
             self._busy = None
 
-    def _encode(self, image: CameraImage, begins: bool) -> "Frame | None":
+    def _encode(self, image: CameraImage, begins: bool) -> "VideoFrame | None":
         """Return the picture as a frame, in the encoder's thread."""
         from zsim_bridges.ardrone.server.video_encoder import VideoEncoder
 
         self._encoder = self._encoder or VideoEncoder()
         return self._encoder.encode(image.data, begins)
 
-    def _send(self, image: CameraImage, frame: "Frame") -> None:
+    def _send(self, image: CameraImage, frame: "VideoFrame") -> None:
         kind = FrameType.IDR if frame.is_idr else FrameType.P
         header = PaveHeader(
             len(frame.data),

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zsim_bridges.ardrone.wire.navdata_options import CHECKSUM_TAG, HEADER, LAYOUTS, Layout
+from zsim_bridges.ardrone.wire.navdata_options import CHECKSUM_TAG, HEADER, LAYOUTS, OptionLayout
 
 PORT = 5554  # UDP (ARDroneLib, config.h)
 REQUEST_UNICAST = b"\x01\x00\x00\x00"  # what a program sends to be sent navdata (ARDroneLib, navdata client)
@@ -193,7 +193,7 @@ class NavdataTemplate:
         self._packet = bytearray(pack(0, 0, 0, ((tag, LAYOUTS[tag].zeros()) for tag in tags)))
         self._end = len(self._packet) - _SUM.size
         self._body = np.frombuffer(self._packet, np.uint8)[: self._end]
-        self._layouts: dict[int, tuple[Layout, int]] = {}
+        self._layouts: dict[int, tuple[OptionLayout, int]] = {}
         at = _START.size
         for tag in tags:
             self._layouts[tag] = LAYOUTS[tag], at + HEADER.size

@@ -18,7 +18,7 @@ GPS_TAG = 27  # zimmu_3000 of 12 bytes in older SDKs
 _FIELD = re.compile(r"(\w+):(\d*)([bBhHiIfd])")
 
 
-class Layout(NamedTuple):
+class OptionLayout(NamedTuple):
     """The layout of an option.
 
     Attributes:
@@ -57,12 +57,12 @@ class Layout(NamedTuple):
         return self.values(*values)
 
 
-def _layout(tag: int, name: str, fields: str) -> Layout:
+def _layout(tag: int, name: str, fields: str) -> OptionLayout:
     parts = _FIELD.findall(fields)
     kind = namedtuple(name, [field for field, _, _ in parts])
     codec = struct.Struct("<" + "".join(f"{count}{code}" for _, count, code in parts))
     counts = tuple(int(count) if count else 0 for _, count, _ in parts)
-    return Layout(tag, name, kind, counts, codec, HEADER.size + codec.size)
+    return OptionLayout(tag, name, kind, counts, codec, HEADER.size + codec.size)
 
 
 _TABLE = (

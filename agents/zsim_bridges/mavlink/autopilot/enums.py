@@ -78,7 +78,7 @@ class MissionResult(IntEnum):
     OPERATION_CANCELLED = 15
 
 
-class Frame(IntEnum):
+class MavFrame(IntEnum):
     """MAV_FRAME."""
 
     GLOBAL = 0
@@ -134,7 +134,7 @@ class LandedState(IntEnum):
     LANDING = 4
 
 
-class Health(IntFlag):
+class SensorBit(IntFlag):
     """MAV_SYS_STATUS_SENSOR: sensors and parts of a vehicle."""
 
     GYRO = 0x01

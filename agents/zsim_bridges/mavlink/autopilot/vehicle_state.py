@@ -11,8 +11,8 @@ from zsim.math import frames
 from zsim.math.geodetic import anchor, geodetic
 from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Drone
-from zsim_bridges.mavlink.autopilot import axes
-from zsim_bridges.mavlink.autopilot.enums import Health
+from zsim_bridges.mavlink.autopilot import ned_axes
+from zsim_bridges.mavlink.autopilot.enums import SensorBit
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an estimator that is silent for longer is not flown by
 SAMPLES_MISSED = 5  # periods of a sensor without a sample: it has failed
@@ -20,21 +20,21 @@ UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone m
 LOW_BATTERY_PERCENT = 20.0  # chosen: BAT_CRIT_THR and its like are below; the pilot is to know earlier
 AIRBORNE = ("taking_off", "hovering", "flying", "landing")
 SENSORS = {
-    "imu": Health.GYRO | Health.ACCEL,
-    "mag": Health.MAG,
-    "baro": Health.BARO,
-    "gps": Health.GPS,
-    "sonar": Health.LASER_POSITION,
-    "flow": Health.FLOW,
+    "imu": SensorBit.GYRO | SensorBit.ACCEL,
+    "mag": SensorBit.MAG,
+    "baro": SensorBit.BARO,
+    "gps": SensorBit.GPS,
+    "sonar": SensorBit.LASER_POSITION,
+    "flow": SensorBit.FLOW,
 }
 CONTROLS = (
-    Health.RATE_CONTROL
-    | Health.ATTITUDE_CONTROL
-    | Health.YAW_POSITION
-    | Health.ALTITUDE_CONTROL
-    | Health.POSITION_CONTROL
-    | Health.MOTORS
-    | Health.AHRS
+    SensorBit.RATE_CONTROL
+    | SensorBit.ATTITUDE_CONTROL
+    | SensorBit.YAW_POSITION
+    | SensorBit.ALTITUDE_CONTROL
+    | SensorBit.POSITION_CONTROL
+    | SensorBit.MOTORS
+    | SensorBit.AHRS
 )
 
 
@@ -161,15 +161,15 @@ class VehicleState:
         """Return the names of the sensors that are silent."""
         return [name for name in SENSORS if self.has_failed(name)]
 
-    def health(self) -> Health:
+    def health(self) -> SensorBit:
         """Return what of the vehicle is healthy."""
-        healthy = CONTROLS | Health.BATTERY | Health.PREARM_CHECK
+        healthy = CONTROLS | SensorBit.BATTERY | SensorBit.PREARM_CHECK
         for name, part in SENSORS.items():
-            healthy |= Health(0) if self.has_failed(name) else part
+            healthy |= SensorBit(0) if self.has_failed(name) else part
         if self.is_battery_low:
-            healthy &= ~Health.BATTERY
+            healthy &= ~SensorBit.BATTERY
         if self.state == "emergency":
-            healthy &= ~Health.PREARM_CHECK
+            healthy &= ~SensorBit.PREARM_CHECK
         return healthy
 
     def to_global(self, position_m: Vector) -> Vector:
@@ -194,6 +194,6 @@ class VehicleState:
 
     @property
     def rpy_ned_rad(self) -> Vector:
-        """Roll, pitch and yaw in MAVLink's axes."""
-        roll, pitch, yaw = frames.rpy_from_quaternion(axes.attitude_ned(self.q_WB)).tolist()
+        """Roll, pitch and yaw in MAVLink's ned_axes."""
+        roll, pitch, yaw = frames.rpy_from_quaternion(ned_axes.attitude_ned(self.q_WB)).tolist()
         return roll, pitch, yaw

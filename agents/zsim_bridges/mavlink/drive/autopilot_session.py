@@ -11,15 +11,15 @@ from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.drive.autopilot_modes import ARDUPILOT, CONTROL, PX4
 from zsim_bridges.mavlink.drive.autopilot_state import CLIMBED, IN_AIR, AutopilotState
 from zsim_bridges.mavlink.drive.demand_sequence import DemandSequence
-from zsim_bridges.mavlink.drive.telemetry import Telemetry
+from zsim_bridges.mavlink.drive.telemetry_readings import TelemetryReadings
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Link, Parser, Received
-from zsim_bridges.mavlink.wire.message import LAYOUTS
 from zsim_bridges.mavlink.wire.signing import Signing
+from zsim_bridges.mavlink.wire.wire_message import LAYOUTS
+from zsim_bridges.vehicle_links.aircraft_state import AircraftState, Reading
 from zsim_bridges.vehicle_links.failsafe import Demand
 from zsim_bridges.vehicle_links.stream_loss import StreamLoss
-from zsim_bridges.vehicle_links.vehicle_session import Channel, LinkFigures
-from zsim_bridges.vehicle_links.vehicle_state import Reading, VehicleState
+from zsim_bridges.vehicle_links.vehicle_session import LinkFigures, UdpChannel
 
 SYSTEM, COMPONENT = 245, 191  # of this driver; MAV_COMP_ID_ONBOARD_COMPUTER
 ONBOARD_CONTROLLER, NO_AUTOPILOT, ACTIVE = 18, 8, 4  # MAV_TYPE, MAV_AUTOPILOT_INVALID, MAV_STATE
@@ -62,7 +62,7 @@ class AutopilotSession:
 
     def __init__(
         self,
-        channel: Channel,
+        channel: UdpChannel,
         origin: tuple[float, float, float],
         takeoff_height_m: float,
         system: int = 0,
@@ -70,11 +70,11 @@ class AutopilotSession:
         key: bytes | None = None,
         unix_s: Callable[[], float] = time.time,
     ) -> None:
-        self.channels: tuple[Channel, ...] = (channel,)
+        self.channels: tuple[UdpChannel, ...] = (channel,)
         self.texts: list[str] = []
         self._system = system
         self._takeoff_height_m = takeoff_height_m
-        self._telemetry = Telemetry(origin, local_origin_m)
+        self._telemetry = TelemetryReadings(origin, local_origin_m)
         self._sequence = DemandSequence(takeoff_height_m)
         self._signing = Signing(key) if key else None
         self._unix_s = unix_s
@@ -190,12 +190,12 @@ class AutopilotSession:
     # What is known
 
     @property
-    def state(self) -> VehicleState:
+    def state(self) -> AircraftState:
         """What is known of the vehicle."""
         if self._autopilot is None:
-            return VehicleState(received_ns=self._received_ns)
+            return AircraftState(received_ns=self._received_ns)
         pose, battery = self._telemetry.pose, self._telemetry.battery_percent
-        return VehicleState(self._autopilot.state(self._flies, self._climbed()), battery, pose, self._received_ns)
+        return AircraftState(self._autopilot.state(self._flies, self._climbed()), battery, pose, self._received_ns)
 
     def _climbed(self) -> bool:
         """Tell whether the vehicle has reached the height of its take-off since it stood on the ground last."""

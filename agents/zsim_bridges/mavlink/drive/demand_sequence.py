@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from zsim.math.rotation import Vector
-from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.drive.autopilot_modes import (
     ARM_DISARM,
     FORCED,
@@ -101,7 +101,7 @@ _HERE = (0.0, 0.0, 0.0, math.nan, math.nan, math.nan)  # the first parameters of
 def setpoint(demand: Demand, autopilot: AutopilotState) -> dialect.SetPositionTargetLocalNed:
     """Return the setpoint of a velocity and a yaw rate."""
     velocity = demand.velocity_m_s if demand.action == "fly" else STANDING
-    vx, vy, vz = axes.ned(velocity)
+    vx, vy, vz = ned_axes.ned(velocity)
     system, component = autopilot.address
     return dialect.SetPositionTargetLocalNed(
         target_system=system,

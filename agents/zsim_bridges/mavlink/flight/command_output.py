@@ -1,6 +1,6 @@
 """The setpoints that a vehicle sends to its drone: at once while few are sent, and never more than the world takes."""
 
-from zsim_bridges.mavlink.flight.guidance import AttitudeTarget, Steering
+from zsim_bridges.mavlink.flight.position_guidance import AttitudeTarget, Steering
 from zsim_bridges.vehicle_links.command_sender import CommandSender, ModeName
 
 BURST = 500  # commands at once: half of what the world records of a source that is not in the lockstep

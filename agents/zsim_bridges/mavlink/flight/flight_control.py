@@ -5,7 +5,7 @@ from typing import Literal
 from zsim_bridges.mavlink.autopilot.personality import Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.command_output import CommandOutput
-from zsim_bridges.mavlink.flight.guidance import NOWHERE, AttitudeTarget, Target, distance_m, steer
+from zsim_bridges.mavlink.flight.position_guidance import NOWHERE, AttitudeTarget, Target, distance_m, steer
 
 ANSWER_NS = 1_000_000_000  # ns within which the drone is to begin a take-off or a landing
 ARRIVED_M = 0.3  # m of the height at which a climb is over

@@ -8,22 +8,22 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from zsim.math.rotation import Vector
-from zsim_bridges.mavlink.autopilot import axes
-from zsim_bridges.mavlink.autopilot.enums import Cmd, Frame
+from zsim_bridges.mavlink.autopilot import ned_axes
+from zsim_bridges.mavlink.autopilot.enums import Cmd, MavFrame
 from zsim_bridges.mavlink.autopilot.personality import Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.guidance import Target, distance_m
+from zsim_bridges.mavlink.flight.position_guidance import Target, distance_m
 
 JUMPS_MAX = 1000  # at once without a waypoint between them: a circle of jumps
-ABSOLUTE = (Frame.GLOBAL, Frame.GLOBAL_INT)
+ABSOLUTE = (MavFrame.GLOBAL, MavFrame.GLOBAL_INT)
 RELATIVE = (
-    Frame.GLOBAL_RELATIVE_ALT,
-    Frame.GLOBAL_RELATIVE_ALT_INT,
-    Frame.GLOBAL_TERRAIN_ALT,  # the ground of zsim is level
-    Frame.GLOBAL_TERRAIN_ALT_INT,
+    MavFrame.GLOBAL_RELATIVE_ALT,
+    MavFrame.GLOBAL_RELATIVE_ALT_INT,
+    MavFrame.GLOBAL_TERRAIN_ALT,  # the ground of zsim is level
+    MavFrame.GLOBAL_TERRAIN_ALT_INT,
 )
-LOCAL = (Frame.LOCAL_NED, Frame.LOCAL_ENU)
-FRAMES = (*ABSOLUTE, *RELATIVE, *LOCAL, Frame.MISSION)
+LOCAL = (MavFrame.LOCAL_NED, MavFrame.LOCAL_ENU)
+FRAMES = (*ABSOLUTE, *RELATIVE, *LOCAL, MavFrame.MISSION)
 PLACES = (Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME)
 COMMANDS = (
     *PLACES,
@@ -67,9 +67,9 @@ def place_of(item: MissionItem, state: VehicleState) -> Vector:
     """Return p_W [m] of an item; without a place of its own it is above or below the vehicle."""
     home = state.home_m or state.position_m
     z = item.z if math.isfinite(item.z) else 0.0
-    if item.frame == Frame.LOCAL_NED:
-        return axes.ned((item.x, item.y, z))
-    if item.frame == Frame.LOCAL_ENU:
+    if item.frame == MavFrame.LOCAL_NED:
+        return ned_axes.ned((item.x, item.y, z))
+    if item.frame == MavFrame.LOCAL_ENU:
         return item.x, item.y, z
     height_m = z if item.frame in ABSOLUTE else state.to_global(home)[2] + z
     if item.has_place:
@@ -180,7 +180,7 @@ class Mission:
 
     def _visit(self, item: MissionItem, state: VehicleState, settings: Settings) -> MissionStep | None:
         yaw_deg = item.params[3]
-        yaw = axes.yaw_ned(math.radians(yaw_deg)) if self._turns and math.isfinite(yaw_deg) else None
+        yaw = ned_axes.yaw_ned(math.radians(yaw_deg)) if self._turns and math.isfinite(yaw_deg) else None
         target = Target(place_of(item, state), yaw_rad=yaw, speed_m_s=self._speed_m_s)
         if self._since_ns is None:
             radius_m = item.params[1] if item.command == Cmd.NAV_WAYPOINT and item.params[1] > 0 else None

@@ -3,7 +3,7 @@
 from zsim_bridges.mavlink.autopilot.personality import Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.flight_control import FlightControl
-from zsim_bridges.mavlink.flight.guidance import Target
+from zsim_bridges.mavlink.flight.position_guidance import Target
 
 
 class ReturnCourse:

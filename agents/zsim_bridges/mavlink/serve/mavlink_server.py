@@ -19,11 +19,11 @@ from zsim_bridges.mavlink.autopilot.personality import PERSONALITIES
 from zsim_bridges.mavlink.serve.peers import Address
 from zsim_bridges.mavlink.serve.vehicle_ports import VehiclePort, VehiclePorts
 from zsim_bridges.mavlink.telemetry.telemetry import Level
-from zsim_bridges.mavlink.vehicle.vehicle import Options, Vehicle
+from zsim_bridges.mavlink.vehicle.mavlink_vehicle import Options, Vehicle
 from zsim_bridges.mavlink.wire.frame import Link, Received, Version
 from zsim_bridges.mavlink.wire.signing import Signing
-from zsim_bridges.message_intake import MessageIntake
 from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.traffic_intake import TrafficIntake
 from zsim_bridges.vehicle_links.command_sender import CommandSender
 from zsim_bridges.vehicle_links.run_pace import set_pace
 
@@ -34,7 +34,7 @@ SYSTEM_IDS = 254  # 255 is the ground station's by custom
 Say = Callable[[str], None]
 
 
-class ServeOptions(NamedTuple):
+class MavlinkOptions(NamedTuple):
     """How the drones are offered.
 
     Attributes:
@@ -66,7 +66,7 @@ def serve(
     observer: ObserverProcess,
     stopped: Callable[[], bool],
     say: Say,
-    options: ServeOptions,
+    options: MavlinkOptions,
 ) -> None:
     """Serve one run until it is over.
 
@@ -97,7 +97,7 @@ class Served(NamedTuple):
 class MavlinkServer:
     """One run on UDP."""
 
-    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: ServeOptions) -> None:
+    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: MavlinkOptions) -> None:
         self._link = link
         self._info = info
         self._observer = observer
@@ -135,7 +135,7 @@ class MavlinkServer:
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Serve until the run is over or a stop is requested."""
         loop = asyncio.get_running_loop()
-        intake = MessageIntake(self._link, self._info, self._observer.health, loop)
+        intake = TrafficIntake(self._link, self._info, self._observer.health, loop)
         for served in self._served.values():
             served.ports.open(loop, time.monotonic)
         self._announce()
@@ -162,7 +162,7 @@ class MavlinkServer:
             own = f"{local}" if not last else f"{local} to {local + last}"
             self._say(f"{self._observer.name}: {what}: UDP {host}:{to}, from {options.listen}:{own}")
 
-    async def _take_in(self, intake: MessageIntake) -> None:
+    async def _take_in(self, intake: TrafficIntake) -> None:
         """Take in what has come; of a drone's messages the newest of each."""
         newest: dict[str, bytes] = {}
         for arrived in intake.arrivals():

@@ -10,8 +10,8 @@ from contextlib import suppress
 from zsim.errors import RunError
 from zsim_bridges.mavlink.serve.peers import Address, Peers
 from zsim_bridges.mavlink.wire.frame import Link, Parser, Received
-from zsim_bridges.mavlink.wire.message import Message
 from zsim_bridges.mavlink.wire.signing import Signing
+from zsim_bridges.mavlink.wire.wire_message import Message
 
 DATAGRAM_MAX = 1400  # bytes; fits into a frame of Ethernet
 READ_MAX = 65_536  # bytes

@@ -4,11 +4,11 @@ import math
 from typing import Any
 
 from zsim.schema.quantities import G_M_S2
-from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.autopilot.enums import GpsFix
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource, int16
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.message import Message
+from zsim_bridges.mavlink.wire.wire_message import Message
 
 UNKNOWN_16, UNKNOWN_8 = 65535, 255
 GAUSS_PER_UT, MILLIGAUSS_PER_UT = 0.01, 10.0
@@ -59,9 +59,9 @@ def scaled_imu(s: TelemetrySource) -> Message | None:
     imu, mag = s.state.samples.get("imu"), s.state.samples.get("mag")
     if imu is None or s.state.has_failed("imu"):
         return None
-    accel = (int16(MG_PER_M_S2 * a) for a in axes.frd(imu.accel_m_s2))
-    gyro = (int16(1000 * w) for w in axes.frd(imu.gyro_rad_s))
-    field = (int16(MILLIGAUSS_PER_UT * b) for b in axes.frd(mag.field_ut)) if mag else (0, 0, 0)
+    accel = (int16(MG_PER_M_S2 * a) for a in ned_axes.frd(imu.accel_m_s2))
+    gyro = (int16(1000 * w) for w in ned_axes.frd(imu.gyro_rad_s))
+    field = (int16(MILLIGAUSS_PER_UT * b) for b in ned_axes.frd(mag.field_ut)) if mag else (0, 0, 0)
     return dialect.ScaledImu(s.boot_ms, *accel, *gyro, *field)
 
 
@@ -76,7 +76,9 @@ def raw_imu(s: TelemetrySource) -> Message | None:
 def inertial(imu: Any) -> Message:
     """Return HIGHRES_IMU of a sample of the inertial unit alone."""
     t_us = imu.t_sample_ns // 1000
-    return dialect.HighresImu(t_us, *axes.frd(imu.accel_m_s2), *axes.frd(imu.gyro_rad_s), fields_updated=INERTIAL)
+    return dialect.HighresImu(
+        t_us, *ned_axes.frd(imu.accel_m_s2), *ned_axes.frd(imu.gyro_rad_s), fields_updated=INERTIAL
+    )
 
 
 def highres_imu(s: TelemetrySource) -> Message | None:
@@ -84,9 +86,9 @@ def highres_imu(s: TelemetrySource) -> Message | None:
     if imu is None or s.state.has_failed("imu"):
         return None
     mag, baro = s.state.samples.get("mag"), s.state.samples.get("baro")
-    ax, ay, az = axes.frd(imu.accel_m_s2)
-    wx, wy, wz = axes.frd(imu.gyro_rad_s)
-    mx, my, mz = (GAUSS_PER_UT * b for b in axes.frd(mag.field_ut)) if mag else (0.0, 0.0, 0.0)
+    ax, ay, az = ned_axes.frd(imu.accel_m_s2)
+    wx, wy, wz = ned_axes.frd(imu.gyro_rad_s)
+    mx, my, mz = (GAUSS_PER_UT * b for b in ned_axes.frd(mag.field_ut)) if mag else (0.0, 0.0, 0.0)
     pressure, height = (baro.pressure_pa / 100.0, baro.altitude_m) if baro else (0.0, 0.0)
     updated = INERTIAL | (0x1C0 if mag else 0) | (0xA00 if baro else 0)
     t_us = imu.t_sample_ns // 1000

@@ -3,22 +3,22 @@
 import math
 
 from zsim.math import frames
-from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.autopilot.enums import (
     TYPE_QUADROTOR,
     BaseMode,
     EstimatorFlag,
-    Frame,
-    Health,
     LandedState,
+    MavFrame,
+    SensorBit,
     SystemStatus,
     TypeMask,
 )
 from zsim_bridges.mavlink.autopilot.personality import BY_STICKS, Mode
-from zsim_bridges.mavlink.flight.guidance import Target
+from zsim_bridges.mavlink.flight.position_guidance import Target
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource, int16
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.message import Message
+from zsim_bridges.mavlink.wire.wire_message import Message
 
 MAVLINK_VERSION = 3  # of HEARTBEAT
 NAN = math.nan
@@ -52,7 +52,7 @@ def _system_status(s: TelemetrySource) -> SystemStatus:
 
 
 def sys_status(s: TelemetrySource) -> Message:
-    present = int(Health(0x3FFFFFFF) & _ALL_HEALTH)
+    present = int(SensorBit(0x3FFFFFFF) & _ALL_HEALTH)
     return dialect.SysStatus(
         onboard_control_sensors_present=present,
         onboard_control_sensors_enabled=present,
@@ -63,7 +63,7 @@ def sys_status(s: TelemetrySource) -> Message:
     )
 
 
-_ALL_HEALTH = Health(sum(part.value for part in Health if part is not Health.GEOFENCE))
+_ALL_HEALTH = SensorBit(sum(part.value for part in SensorBit if part is not SensorBit.GEOFENCE))
 
 
 def system_time(s: TelemetrySource) -> Message:
@@ -71,11 +71,13 @@ def system_time(s: TelemetrySource) -> Message:
 
 
 def attitude(s: TelemetrySource) -> Message:
-    return dialect.Attitude(s.boot_ms, *s.rpy_ned_rad, *axes.frd(s.state.rate_rad_s))
+    return dialect.Attitude(s.boot_ms, *s.rpy_ned_rad, *ned_axes.frd(s.state.rate_rad_s))
 
 
 def attitude_quaternion(s: TelemetrySource) -> Message:
-    return dialect.AttitudeQuaternion(s.boot_ms, *axes.attitude_ned(s.state.q_WB), *axes.frd(s.state.rate_rad_s))
+    return dialect.AttitudeQuaternion(
+        s.boot_ms, *ned_axes.attitude_ned(s.state.q_WB), *ned_axes.frd(s.state.rate_rad_s)
+    )
 
 
 def local_position_ned(s: TelemetrySource) -> Message:
@@ -88,12 +90,12 @@ def odometry(s: TelemetrySource) -> Message:
     pose = (level, *(0.0,) * 5, level, *(0.0,) * 4, up, *(0.0,) * 3, NAN, 0.0, 0.0, NAN, 0.0, NAN)
     return dialect.Odometry(
         time_usec=s.boot_us,
-        frame_id=Frame.LOCAL_NED,
-        child_frame_id=Frame.BODY_FRD,
+        frame_id=MavFrame.LOCAL_NED,
+        child_frame_id=MavFrame.BODY_FRD,
         x=s.position_ned_m[0],
         y=s.position_ned_m[1],
         z=s.position_ned_m[2],
-        q=axes.attitude_ned(s.state.q_WB),
+        q=ned_axes.attitude_ned(s.state.q_WB),
         vx=vx,
         vy=vy,
         vz=vz,
@@ -109,7 +111,7 @@ def odometry(s: TelemetrySource) -> Message:
 def _body_velocity(s: TelemetrySource) -> tuple[float, float, float]:
     w, x, y, z = s.state.q_WB
     v = frames.rotate((w, -x, -y, -z), s.state.velocity_m_s).tolist()
-    return axes.frd((v[0], v[1], v[2]))
+    return ned_axes.frd((v[0], v[1], v[2]))
 
 
 def global_position_int(s: TelemetrySource) -> Message:
@@ -171,7 +173,7 @@ def home_position(s: TelemetrySource) -> Message | None:
         round(1e7 * latitude),
         round(1e7 * longitude),
         round(1000 * height),
-        *axes.ned(s.state.home_m),
+        *ned_axes.ned(s.state.home_m),
         (1.0, 0.0, 0.0, 0.0),
         time_usec=s.boot_us,
     )
@@ -186,14 +188,14 @@ def position_target_local_ned(s: TelemetrySource) -> Message | None:
     target = s.flight.target
     if not isinstance(target, Target):
         return None
-    position = axes.ned(tuple(0.0 if p is None else p for p in target.position_m))  # type: ignore[arg-type]
+    position = ned_axes.ned(tuple(0.0 if p is None else p for p in target.position_m))  # type: ignore[arg-type]
     mask = TypeMask.AX | TypeMask.AY | TypeMask.AZ
     for p, bit in zip(target.position_m, (TypeMask.Y, TypeMask.X, TypeMask.Z), strict=True):
         mask |= bit if p is None else TypeMask(0)
     mask |= TypeMask.YAW_RATE if target.yaw_rad is not None else TypeMask.YAW
-    frame = Frame.BODY_NED if target.along_heading else Frame.LOCAL_NED
-    velocity = axes.frd(target.velocity_m_s) if target.along_heading else axes.ned(target.velocity_m_s)
-    yaw = axes.yaw_ned(target.yaw_rad) if target.yaw_rad is not None else 0.0
+    frame = MavFrame.BODY_NED if target.along_heading else MavFrame.LOCAL_NED
+    velocity = ned_axes.frd(target.velocity_m_s) if target.along_heading else ned_axes.ned(target.velocity_m_s)
+    yaw = ned_axes.yaw_ned(target.yaw_rad) if target.yaw_rad is not None else 0.0
     return dialect.PositionTargetLocalNed(
         s.boot_ms, frame, mask, *position, *velocity, 0.0, 0.0, 0.0, yaw, -target.yaw_rate_rad_s
     )

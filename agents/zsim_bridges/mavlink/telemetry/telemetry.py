@@ -6,7 +6,7 @@ from typing import Any, Literal
 from zsim_bridges.mavlink.telemetry import sensor_telemetry, state_telemetry
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.message import LAYOUTS, Message
+from zsim_bridges.mavlink.wire.wire_message import LAYOUTS, Message
 
 Level = Literal["normal", "full"]
 SECOND_NS = 1_000_000_000

@@ -5,11 +5,11 @@ from functools import cached_property
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Drone
 from zsim.vehicles.vehicle_catalogue import vehicle_of
-from zsim_bridges.mavlink.autopilot.axes import ned
+from zsim_bridges.mavlink.autopilot.ned_axes import ned
 from zsim_bridges.mavlink.autopilot.personality import Personality
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.flight import Flight
 from zsim_bridges.mavlink.flight.geofence import BREACH_NONE
+from zsim_bridges.mavlink.flight.vehicle_flight import Flight
 
 
 class TelemetrySource:

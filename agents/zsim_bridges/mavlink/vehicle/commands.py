@@ -8,18 +8,18 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from zsim.math.rotation import Vector
-from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.autopilot.enums import FORCE, Cmd, Result
 from zsim_bridges.mavlink.autopilot.parameters import Parameters
 from zsim_bridges.mavlink.autopilot.personality import Mode, Personality, Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.flight import Flight
-from zsim_bridges.mavlink.flight.guidance import Target, is_place
 from zsim_bridges.mavlink.flight.mission import ABSOLUTE, FRAMES, LOCAL, MissionItem, place_of
+from zsim_bridges.mavlink.flight.position_guidance import Target, is_place
+from zsim_bridges.mavlink.flight.vehicle_flight import Flight
 from zsim_bridges.mavlink.telemetry.telemetry import Telemetry
 from zsim_bridges.mavlink.vehicle.mission_protocol import DEGREES, LOCAL_M
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.message import Message
+from zsim_bridges.mavlink.wire.wire_message import Message
 
 AUTOPILOT_VERSION, PROTOCOL_VERSION = 148, 300  # ids of messages that are sent on request alone
 NAN = math.nan
@@ -157,7 +157,7 @@ class Commands:
         place = self._place(request)
         if place is None:
             return Answer(Result.DENIED, "no place to go to")
-        yaw_rad = axes.yaw_ned(yaw) if math.isfinite(yaw) else None
+        yaw_rad = ned_axes.yaw_ned(yaw) if math.isfinite(yaw) else None
         speed = speed_m_s if math.isfinite(speed_m_s) and speed_m_s > 0 else None
         return answered(self._flight.go_to(Target(place, yaw_rad=yaw_rad, speed_m_s=speed)))
 
@@ -215,7 +215,7 @@ class Commands:
         if not math.isfinite(angle) or not self._state.is_steerable:
             return Answer(Result.DENIED, "not flying" if math.isfinite(angle) else "no angle")
         turn = math.radians(angle) * (-1.0 if direction >= 0 else 1.0)
-        yaw = axes.wrapped(self._state.yaw_rad + turn) if relative == 1.0 else axes.yaw_ned(math.radians(angle))
+        yaw = ned_axes.wrapped(self._state.yaw_rad + turn) if relative == 1.0 else ned_axes.yaw_ned(math.radians(angle))
         return answered(self._flight.go_to(Target(self._state.position_m, yaw_rad=yaw)))
 
     def _reboot(self, request: Request) -> Answer:

@@ -3,8 +3,8 @@
 from zsim.contract.run_messages import Event
 from zsim_bridges.mavlink.autopilot.enums import Severity
 from zsim_bridges.mavlink.autopilot.personality import FenceAction, Mode, Settings
-from zsim_bridges.mavlink.flight.flight import Report
 from zsim_bridges.mavlink.flight.geofence import BREACH_NONE, Geofence
+from zsim_bridges.mavlink.flight.vehicle_flight import Report
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource
 
 FAULTS = {"fault": "", "fault_end": " is over", "fault_clear": " cleared"}

@@ -12,13 +12,13 @@ from zsim_bridges.mavlink.autopilot.enums import (
     FENCE,
     MISSION,
     Cmd,
-    Frame,
+    MavFrame,
     MissionResult,
 )
-from zsim_bridges.mavlink.flight.guidance import is_place
 from zsim_bridges.mavlink.flight.mission import COMMANDS, FRAMES, LOCAL, MissionItem
+from zsim_bridges.mavlink.flight.position_guidance import is_place
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.message import Message
+from zsim_bridges.mavlink.wire.wire_message import Message
 
 ITEMS_MAX = 1000  # chosen: of one mission; autopilots keep some hundreds
 RETRY_NS = 500_000_000  # ns of wall time until an item is requested again
@@ -222,4 +222,4 @@ def message_of(item: MissionItem, request: Any, sender: tuple[int, int], as_int:
 
 def home_item(latitude_deg: float, longitude_deg: float, height_m: float) -> MissionItem:
     """Return item 0 of ArduPilot's missions."""
-    return MissionItem(Frame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), latitude_deg, longitude_deg, height_m)
+    return MissionItem(MavFrame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), latitude_deg, longitude_deg, height_m)

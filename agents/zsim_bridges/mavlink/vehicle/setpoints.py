@@ -7,47 +7,52 @@ import math
 from typing import NamedTuple
 
 from zsim.math.rotation import Vector
-from zsim_bridges.mavlink.autopilot import axes
-from zsim_bridges.mavlink.autopilot.enums import AttitudeMask, Frame, TypeMask
+from zsim_bridges.mavlink.autopilot import ned_axes
+from zsim_bridges.mavlink.autopilot.enums import AttitudeMask, MavFrame, TypeMask
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.guidance import NOWHERE, AttitudeTarget, Axes, Target, is_place
 from zsim_bridges.mavlink.flight.mission import ABSOLUTE, RELATIVE
+from zsim_bridges.mavlink.flight.position_guidance import NOWHERE, AttitudeTarget, Axes, Target, is_place
 from zsim_bridges.mavlink.wire import dialect
 
 POSITION = TypeMask.X | TypeMask.Y | TypeMask.Z
 VELOCITY = TypeMask.VX | TypeMask.VY | TypeMask.VZ
-ALONG_HEADING = (Frame.BODY_NED, Frame.BODY_OFFSET_NED, Frame.BODY_FRD)
-FROM_HERE = (Frame.LOCAL_OFFSET_NED, Frame.BODY_NED, Frame.BODY_OFFSET_NED, Frame.BODY_FRD)
-LOCAL_FRAMES = (Frame.LOCAL_NED, *FROM_HERE)
+ALONG_HEADING = (MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD)
+FROM_HERE = (
+    MavFrame.LOCAL_OFFSET_NED,
+    MavFrame.BODY_NED,
+    MavFrame.BODY_OFFSET_NED,
+    MavFrame.BODY_FRD,
+)
+LOCAL_FRAMES = (MavFrame.LOCAL_NED, *FROM_HERE)
 HOVER_THRUST = 0.5  # of the thrust of a setpoint; MPC_THR_HOVER
 SPEED_MAX_M_S = 1e3  # m/s; beyond it nothing flies here
 
 Setpoint = Target | AttitudeTarget
 
 
-class Refusal(NamedTuple):
+class SetpointRefusal(NamedTuple):
     """Why a setpoint is not flown."""
 
     reason: str
 
 
-def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) -> Setpoint | Refusal:
+def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) -> Setpoint | SetpointRefusal:
     """Return what SET_POSITION_TARGET_LOCAL_NED asks for."""
     if message.coordinate_frame not in LOCAL_FRAMES:
-        return Refusal(f"frame {message.coordinate_frame} of a local setpoint is not flown")
+        return SetpointRefusal(f"frame {message.coordinate_frame} of a local setpoint is not flown")
     place = message.x, message.y, message.z
     along_heading = message.coordinate_frame in ALONG_HEADING
     if message.coordinate_frame in FROM_HERE:
-        position = _from_here(axes.frd(place) if along_heading else axes.ned(place), along_heading, state)
+        position = _from_here(ned_axes.frd(place) if along_heading else ned_axes.ned(place), along_heading, state)
     else:
-        position = axes.ned(place)
+        position = ned_axes.ned(place)
     return _target(message, position, along_heading, state)
 
 
-def from_global(message: dialect.SetPositionTargetGlobalInt, state: VehicleState) -> Setpoint | Refusal:
+def from_global(message: dialect.SetPositionTargetGlobalInt, state: VehicleState) -> Setpoint | SetpointRefusal:
     """Return what SET_POSITION_TARGET_GLOBAL_INT asks for."""
     if message.coordinate_frame not in (*ABSOLUTE, *RELATIVE):
-        return Refusal(f"frame {message.coordinate_frame} of a global setpoint is not flown")
+        return SetpointRefusal(f"frame {message.coordinate_frame} of a global setpoint is not flown")
     if not math.isfinite(message.alt):
         return _target(message, (math.nan, math.nan, math.nan), False, state)
     place = 1e-7 * message.lat_int, 1e-7 * message.lon_int
@@ -72,15 +77,15 @@ def _target(
     position_m: Vector,
     along_heading: bool,
     state: VehicleState,
-) -> Setpoint | Refusal:
+) -> Setpoint | SetpointRefusal:
     mask = TypeMask(message.type_mask)
     position = _axes(mask, position_m)
     given = message.vx, message.vy, message.vz
     velocity = _velocity(mask, given, along_heading)
     if position == NOWHERE and velocity is None:
-        return Refusal("a setpoint without position and velocity is not flown")
+        return SetpointRefusal("a setpoint without position and velocity is not flown")
     if not _is_sane(position, velocity or (0.0, 0.0, 0.0)):
-        return Refusal("a setpoint is beyond all bounds")
+        return SetpointRefusal("a setpoint is beyond all bounds")
     along = along_heading and position == NOWHERE
     if along_heading and not along and velocity is not None:
         velocity = _turned(velocity, state.yaw_rad)
@@ -100,7 +105,7 @@ def _velocity(mask: TypeMask, given: Vector, along_heading: bool) -> Vector | No
     if all(mask & bit or not math.isfinite(v) for v, bit in zip(given, bits, strict=True)):
         return None
     x, y, z = (0.0 if mask & bit or not math.isfinite(v) else v for v, bit in zip(given, bits, strict=True))
-    return axes.frd((x, y, z)) if along_heading else axes.ned((x, y, z))
+    return ned_axes.frd((x, y, z)) if along_heading else ned_axes.ned((x, y, z))
 
 
 def _turned(v_H: Vector, yaw_rad: float) -> Vector:
@@ -117,21 +122,21 @@ def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: Vehicle
     rate = 0.0 if mask & TypeMask.YAW_RATE or not math.isfinite(yaw_rate) else -max(-100.0, min(100.0, yaw_rate))
     if mask & TypeMask.YAW or not math.isfinite(yaw) or abs(yaw) > 1e3:
         return None, rate
-    if frame in (Frame.BODY_OFFSET_NED, Frame.BODY_FRD):
-        return axes.wrapped(state.yaw_rad - yaw), 0.0
-    return axes.yaw_ned(yaw), 0.0
+    if frame in (MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD):
+        return ned_axes.wrapped(state.yaw_rad - yaw), 0.0
+    return ned_axes.yaw_ned(yaw), 0.0
 
 
-def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoint | Refusal:
+def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoint | SetpointRefusal:
     """Return what SET_ATTITUDE_TARGET asks for; half of the thrust carries the weight [N]."""
     mask = AttitudeMask(message.type_mask & 0xFF)
     values = (*message.q, message.thrust, message.body_yaw_rate)
     if mask & AttitudeMask.ATTITUDE:
-        return Refusal("body rates alone are not flown; give an attitude")
+        return SetpointRefusal("body rates alone are not flown; give an attitude")
     length = math.hypot(*message.q)
     if not all(map(math.isfinite, values)) or not 0.5 < length < 2.0:
-        return Refusal("the attitude of a setpoint is no quaternion")
-    w, x, y, z = axes.attitude_ned((message.q[0], message.q[1], message.q[2], message.q[3]))
+        return SetpointRefusal("the attitude of a setpoint is no quaternion")
+    w, x, y, z = ned_axes.attitude_ned((message.q[0], message.q[1], message.q[2], message.q[3]))
     q_WB = w / length, x / length, y / length, z / length
     thrust = HOVER_THRUST if mask & AttitudeMask.THRUST else max(0.0, min(1.0, message.thrust))
     rate = 0.0 if mask & AttitudeMask.YAW_RATE else -max(-10.0, min(10.0, message.body_yaw_rate))

@@ -7,8 +7,8 @@ from collections import Counter
 from typing import Literal, NamedTuple
 
 from zsim_bridges.mavlink.wire.checksum import checksum
-from zsim_bridges.mavlink.wire.message import BY_ID, LAYOUTS, Layout, Message
 from zsim_bridges.mavlink.wire.signing import SIGNATURE_BYTES, Signing
+from zsim_bridges.mavlink.wire.wire_message import BY_ID, LAYOUTS, Message, MessageLayout
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD  # first byte of a frame
 HEADER_1, HEADER_2 = 6, 10  # bytes before the payload
@@ -55,14 +55,14 @@ class Link:
         seq, self._seq = self._seq, self._seq + 1 & 0xFF
         return self._frame_2(layout, payload, seq) if self._version == 2 else self._frame_1(layout, payload, seq)
 
-    def _frame_1(self, layout: Layout, payload: bytes, seq: int) -> bytes:
+    def _frame_1(self, layout: MessageLayout, payload: bytes, seq: int) -> bytes:
         if layout.id > ID_MAX_1:
             raise ValueError(f"{layout.name} has the id {layout.id}; MAVLink 1 has ids up to {ID_MAX_1}")
         payload = payload[: layout.base_size]
         body = bytes((len(payload), seq)) + self._address + bytes([layout.id]) + payload
         return b"\xfe" + body + _crc(body, layout)
 
-    def _frame_2(self, layout: Layout, payload: bytes, seq: int) -> bytes:
+    def _frame_2(self, layout: MessageLayout, payload: bytes, seq: int) -> bytes:
         payload = payload.rstrip(b"\0") or b"\0"  # one byte stays, however empty it is
         flags = SIGNED if self._signing else 0
         head = bytes((len(payload), flags, 0, seq))
@@ -202,5 +202,5 @@ class _Frame:
         return self._data[self._payload_end + CHECKSUM_BYTES : self.end]
 
 
-def _crc(body: bytes, layout: Layout) -> bytes:
+def _crc(body: bytes, layout: MessageLayout) -> bytes:
     return checksum(body + layout.crc_extra_byte).to_bytes(2, "little")

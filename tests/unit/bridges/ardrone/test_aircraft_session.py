@@ -9,8 +9,8 @@ from fake_aircraft import FIELD_UT, STEP_NS, FakeAircraft
 from zsim.math.frames import heading
 from zsim_bridges.ardrone.drive.aircraft_session import AircraftSession
 from zsim_bridges.ardrone.drive.navdata_readings import NavdataReadings
+from zsim_bridges.vehicle_links.aircraft_state import AircraftPose
 from zsim_bridges.vehicle_links.failsafe import Demand
-from zsim_bridges.vehicle_links.vehicle_state import Pose
 
 ORIGIN = (-34.603, -58.368, 25.0)
 S = 1_000_000_000
@@ -40,7 +40,7 @@ class Loop:
                     self.aircraft.receive(channel, datagram)
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> AircraftPose:
         assert self.session.state.pose is not None
         return self.session.state.pose
 

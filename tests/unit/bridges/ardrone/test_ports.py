@@ -9,13 +9,13 @@ import pytest
 from refused import has_terms, refused
 
 from zsim.errors import RunError
-from zsim_bridges.ardrone.server.addresses import Peers, drone_addresses, peer_addresses
+from zsim_bridges.ardrone.server.addresses import AllowedHosts, drone_addresses, peer_addresses
 from zsim_bridges.ardrone.server.datagram_ports import DatagramPort, open_datagram_port
 from zsim_bridges.ardrone.server.stream_port import CONNECTIONS_MAX, StreamPort, read_until_end
 
 HOME = "127.0.0.1"
-ELSEWHERE = Peers("192.0.2.1", frozenset({"192.0.2.9"}))  # as on an address that other hosts reach
-HERE = Peers("127.0.0.2", frozenset())
+ELSEWHERE = AllowedHosts("192.0.2.1", frozenset({"192.0.2.9"}))  # as on an address that other hosts reach
+HERE = AllowedHosts("127.0.0.2", frozenset())
 NAMES = ["drone1", "drone2"]
 
 
@@ -62,7 +62,7 @@ def test_elsewhere_those_that_were_named_alone():
     assert not ELSEWHERE.allow("192.0.2.10")
     assert not ELSEWHERE.allow(HOME)
     with refused(RunError, "192.0.2.1", "--peer"):
-        Peers("192.0.2.1", frozenset())
+        AllowedHosts("192.0.2.1", frozenset())
 
 
 class Refusals(list[str]):

@@ -7,7 +7,7 @@ import pytest
 import synthetic_pictures
 
 from zsim.contract.camera_messages import CameraImage
-from zsim_bridges.ardrone.server.addresses import Peers
+from zsim_bridges.ardrone.server.addresses import AllowedHosts
 from zsim_bridges.ardrone.wire import pave
 from zsim_bridges.ardrone.wire.pave import FrameType, PaveHeader
 
@@ -79,7 +79,7 @@ class Stream:
 def run(test: Callable[[VideoServer, Callable[[], Awaitable[Stream]], list[str]], Awaitable[None]]) -> None:
     async def served() -> None:
         refusals: list[str] = []
-        server = VideoServer(Peers("127.0.0.2", frozenset()), refusals.append)
+        server = VideoServer(AllowedHosts("127.0.0.2", frozenset()), refusals.append)
         number = await server.port.open(HOME, 0)
 
         async def connect() -> Stream:

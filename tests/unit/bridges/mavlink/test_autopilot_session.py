@@ -11,15 +11,15 @@ from fake_autopilot import ARDUPILOT, HOLD, PX4, STEP_NS, FakeAutopilot
 from scipy.spatial.transform import Rotation
 
 from zsim.math.frames import heading
-from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.drive.autopilot_session import AutopilotSession
-from zsim_bridges.mavlink.drive.telemetry import Telemetry
+from zsim_bridges.mavlink.drive.telemetry_readings import TelemetryReadings
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Link, Parser
 from zsim_bridges.mavlink.wire.signing import Signing
+from zsim_bridges.vehicle_links.aircraft_state import AircraftPose
 from zsim_bridges.vehicle_links.failsafe import Demand
-from zsim_bridges.vehicle_links.vehicle_session import Channel
-from zsim_bridges.vehicle_links.vehicle_state import Pose
+from zsim_bridges.vehicle_links.vehicle_session import UdpChannel
 
 ORIGIN = (-34.603, -58.368, 25.0)
 S = 1_000_000_000
@@ -32,7 +32,7 @@ class Loop:
 
     def __init__(self, autopilot: int, height_m: float = 2.0) -> None:
         self.vehicle = FakeAutopilot(autopilot)
-        self.session = AutopilotSession(Channel("127.0.0.1", 1), ORIGIN, height_m)
+        self.session = AutopilotSession(UdpChannel("127.0.0.1", 1), ORIGIN, height_m)
         self.now_ns = 100 * S
         self.sent: list[Any] = []
         self.cut = False
@@ -50,7 +50,7 @@ class Loop:
                     self.vehicle.receive(datagram, self.now_ns)
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> AircraftPose:
         assert self.session.state.pose is not None
         return self.session.state.pose
 
@@ -173,7 +173,7 @@ def test_the_first_autopilot_is_the_vehicle_and_others_are_refused():
 
 
 def test_a_system_that_was_asked_for_alone_is_the_vehicle():
-    session = AutopilotSession(Channel("127.0.0.1", 1), ORIGIN, 2.0, system=3)
+    session = AutopilotSession(UdpChannel("127.0.0.1", 1), ORIGIN, 2.0, system=3)
     for system in (1, 3):
         session.receive(0, Link(system, 1).pack(dialect.Heartbeat(2, PX4, 0, 0, 3, 3)), 0)
     assert session.figures(0).refused == 1
@@ -187,7 +187,7 @@ def test_with_a_key_both_sides_sign(key: bytes, flies: bool):
     signing.advance(now_s)
     loop = Loop(PX4)
     loop.vehicle = FakeAutopilot(PX4, signing=signing)
-    loop.session = AutopilotSession(Channel("127.0.0.1", 1), ORIGIN, 2.0, key=key, unix_s=lambda: now_s)
+    loop.session = AutopilotSession(UdpChannel("127.0.0.1", 1), ORIGIN, 2.0, key=key, unix_s=lambda: now_s)
     loop._parser = Parser(Signing(key, accepts_unsigned=True))
     loop.run(8, Demand("take_off"))
     assert (loop.session.state.state == "hovering") is flies
@@ -223,8 +223,8 @@ def test_garbage_is_counted_and_changes_nothing():
 # Axes and units
 
 
-def telemetry(*messages: Any) -> Telemetry:
-    made = Telemetry(ORIGIN)
+def telemetry(*messages: Any) -> TelemetryReadings:
+    made = TelemetryReadings(ORIGIN)
     for message in messages:
         assert made.receive(message, 50 * S)
     return made
@@ -239,17 +239,17 @@ def test_attitudes_agree_with_scipys_rotations(seed: int):
         Rotation.from_matrix(np.diag([1, -1, -1])),
     )
     expected = (ned_to_enu * q_NF * flu_to_frd).as_matrix()
-    turned = axes.attitude_ned((w, x, y, z))
+    turned = ned_axes.attitude_ned((w, x, y, z))
     found = Rotation.from_quat([*turned[1:], turned[0]]).as_matrix()
     assert found == pytest.approx(expected, abs=1e-12)
-    assert np.abs(axes.attitude_ned(turned)) == pytest.approx(np.abs([w, x, y, z]), abs=1e-12)
+    assert np.abs(ned_axes.attitude_ned(turned)) == pytest.approx(np.abs([w, x, y, z]), abs=1e-12)
 
 
 def test_vectors_and_headings():
-    assert axes.ned((1, 2, 3)) == (2, 1, -3)
-    assert axes.frd((1, 2, 3)) == (1, -2, -3)
-    assert axes.yaw_ned(math.pi / 2) == pytest.approx(0.0)
-    assert axes.yaw_ned(axes.yaw_ned(0.7)) == pytest.approx(0.7)
+    assert ned_axes.ned((1, 2, 3)) == (2, 1, -3)
+    assert ned_axes.frd((1, 2, 3)) == (1, -2, -3)
+    assert ned_axes.yaw_ned(math.pi / 2) == pytest.approx(0.0)
+    assert ned_axes.yaw_ned(ned_axes.yaw_ned(0.7)) == pytest.approx(0.7)
 
 
 def test_a_pose_stands_in_w_where_the_vehicles_own_origin_is():
@@ -312,7 +312,7 @@ IGNORED: dict[str, Callable[[], Any]] = {
 
 @pytest.mark.parametrize("name", IGNORED)
 def test_what_is_no_reading_is_left_out(name: str):
-    made = Telemetry(ORIGIN)
+    made = TelemetryReadings(ORIGIN)
     assert not made.receive(IGNORED[name](), 0)
     assert made.readings == []
     assert made.pose is None

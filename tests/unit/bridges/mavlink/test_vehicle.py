@@ -9,7 +9,7 @@ from mavlink_drone import FlownDrone
 from zsim.contract.flight_messages import Mode as ModeCommand
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Event
-from zsim_bridges.mavlink.autopilot.enums import FENCE, FORCE, Cmd, Frame, Result, TypeMask
+from zsim_bridges.mavlink.autopilot.enums import FENCE, FORCE, Cmd, MavFrame, Result, TypeMask
 from zsim_bridges.mavlink.autopilot.personality import COPTER_MODES, PX4_MODES, Mode
 from zsim_bridges.mavlink.wire import dialect
 
@@ -48,7 +48,7 @@ def heartbeat(drone: FlownDrone) -> dialect.Heartbeat:
 
 
 def velocity_setpoint(
-    vx: float, vy: float, vz: float, frame: int = Frame.LOCAL_NED
+    vx: float, vy: float, vz: float, frame: int = MavFrame.LOCAL_NED
 ) -> dialect.SetPositionTargetLocalNed:
     mask = VELOCITY_ONLY | TypeMask.YAW_RATE
     return dialect.SetPositionTargetLocalNed(0, 1, 1, frame, mask, vx=vx, vy=vy, vz=vz)
@@ -151,7 +151,7 @@ def test_a_flood_of_setpoints_does_not_use_up_what_the_world_takes() -> None:
 
 def test_a_velocity_along_the_body_is_forward_and_left_of_the_heading() -> None:
     drone = flying("ardupilot")
-    drone.receive(velocity_setpoint(0.5, 0.25, -0.1, Frame.BODY_NED))
+    drone.receive(velocity_setpoint(0.5, 0.25, -0.1, MavFrame.BODY_NED))
     last = drone.commands[-1]
     assert isinstance(last, Velocity)
     assert (last.frame, last.velocity_m_s) == ("heading", (0.5, -0.25, 0.1))
@@ -159,7 +159,7 @@ def test_a_velocity_along_the_body_is_forward_and_left_of_the_heading() -> None:
 
 def test_a_position_is_flown_to_and_held() -> None:
     drone = flying("ardupilot")
-    drone.receive(dialect.SetPositionTargetLocalNed(0, 1, 1, Frame.LOCAL_NED, POSITION_ONLY, x=4.0, y=-2.0, z=-5.0))
+    drone.receive(dialect.SetPositionTargetLocalNed(0, 1, 1, MavFrame.LOCAL_NED, POSITION_ONLY, x=4.0, y=-2.0, z=-5.0))
     drone.step(600)
     assert drone.position == pytest.approx([-2.0, 4.0, 5.0], abs=0.1)
 
@@ -167,7 +167,7 @@ def test_a_position_is_flown_to_and_held() -> None:
 def test_a_setpoint_upwards_takes_off_an_armed_vehicle() -> None:
     drone = FlownDrone()
     drone.command(Cmd.COMPONENT_ARM_DISARM, 1)
-    up = dialect.SetPositionTargetLocalNed(0, 1, 1, Frame.LOCAL_NED, POSITION_ONLY, z=-2.0)
+    up = dialect.SetPositionTargetLocalNed(0, 1, 1, MavFrame.LOCAL_NED, POSITION_ONLY, z=-2.0)
     drone.receive(up)
     set_mode(drone, PX4_MODES[Mode.OFFBOARD])
     for _ in range(300):
@@ -176,7 +176,7 @@ def test_a_setpoint_upwards_takes_off_an_armed_vehicle() -> None:
     assert abs(drone.position[2] - 2.0) < 0.2
 
 
-@pytest.mark.parametrize("frame", [Frame.MISSION, Frame.LOCAL_ENU, 200])
+@pytest.mark.parametrize("frame", [MavFrame.MISSION, MavFrame.LOCAL_ENU, 200])
 def test_a_frame_that_is_not_flown_is_refused_once(frame: int) -> None:
     drone = flying("ardupilot")
     before = len(drone.commands)
@@ -207,7 +207,7 @@ def upload(drone: FlownDrone, items: list[dialect.MissionItemInt], type_: int = 
 def item(seq: int, command: int, north_m: float = 0.0, up_m: float = 0.0, *params: float, type_: int = 0):
     fields: dict[str, Any] = {f"param{i + 1}": value for i, value in enumerate(params)}
     lat = round(1e7 * (47.4 + north_m / 111_170.0))
-    frame = Frame.GLOBAL_RELATIVE_ALT_INT
+    frame = MavFrame.GLOBAL_RELATIVE_ALT_INT
     return dialect.MissionItemInt(
         1, 1, seq, frame, command, autocontinue=1, x=lat, y=round(8.5e7), z=up_m, mission_type=type_, **fields
     )
@@ -220,7 +220,7 @@ def test_a_mission_takes_off_visits_its_waypoints_and_lands() -> None:
         item(1, Cmd.NAV_WAYPOINT, 5, 4, 0, 0, 0, NAN),
         item(2, Cmd.DO_CHANGE_SPEED, 0, 0, 1, 1.0),
         item(3, Cmd.NAV_WAYPOINT, 8, 4, 1.0, 0, 0, NAN),
-        dialect.MissionItemInt(1, 1, 4, Frame.GLOBAL_RELATIVE_ALT_INT, Cmd.NAV_LAND),
+        dialect.MissionItemInt(1, 1, 4, MavFrame.GLOBAL_RELATIVE_ALT_INT, Cmd.NAV_LAND),
     ]
     assert upload(drone, items) == 0
     assert [request.seq for request in drone.all(dialect.MissionRequestInt)] == [0, 1, 2, 3, 4]
@@ -268,7 +268,15 @@ def test_a_go_to_of_older_clients_is_flown() -> None:
     drone = flying("ardupilot")
     drone.receive(
         dialect.MissionItem(
-            1, 1, 0, Frame.GLOBAL_RELATIVE_ALT, Cmd.NAV_WAYPOINT, current=2, x=47.4 + 5 / 111_170.0, y=8.5, z=3.0
+            1,
+            1,
+            0,
+            MavFrame.GLOBAL_RELATIVE_ALT,
+            Cmd.NAV_WAYPOINT,
+            current=2,
+            x=47.4 + 5 / 111_170.0,
+            y=8.5,
+            z=3.0,
         )
     )
     assert drone.all(dialect.MissionAck)[-1].type == 0

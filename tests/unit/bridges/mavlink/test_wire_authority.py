@@ -11,7 +11,7 @@ from pymavlink.dialects.v10 import ardupilotmega as dialect_1
 from pymavlink.dialects.v20 import ardupilotmega as dialect_2
 
 from zsim_bridges.mavlink.wire import dialect, frame
-from zsim_bridges.mavlink.wire.message import BY_ID, Layout, Message
+from zsim_bridges.mavlink.wire.wire_message import BY_ID, Message, MessageLayout
 
 SEED = 17
 COMMAND_CANCEL = 80  # in common.xml, not in the authority's release
@@ -45,7 +45,7 @@ def random_message(kind: type[Message], rng: random.Random) -> Message:
     return kind(*(random_value(hints[name].__metadata__[0], rng) for name in kind.__struct_fields__))
 
 
-def their_message(module: Any, layout: Layout, ours: Message) -> Any:
+def their_message(module: Any, layout: MessageLayout, ours: Message) -> Any:
     """Return the authority's message with the same values."""
     kind = module.mavlink_map[layout.id]
     return kind(**{name: their_value(getattr(ours, name)) for name in kind.fieldnames})
@@ -64,7 +64,7 @@ def their_link(module: Any) -> Any:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
-def test_a_definition_is_the_authority_s(layout: Layout) -> None:
+def test_a_definition_is_the_authority_s(layout: MessageLayout) -> None:
     theirs = dialect_2.mavlink_map[layout.id]
     assert (layout.name, layout.crc_extra, layout.size) == (theirs.msgname, theirs.crc_extra, theirs.unpacker.size)
     assert list(layout.kind.__struct_fields__) == theirs.fieldnames
@@ -76,7 +76,7 @@ def test_command_cancel_sums_up_to_the_known_crc_extra() -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
-def test_a_frame_of_mavlink_2_is_the_authority_s_byte_for_byte(layout: Layout) -> None:
+def test_a_frame_of_mavlink_2_is_the_authority_s_byte_for_byte(layout: MessageLayout) -> None:
     rng = random.Random(SEED + layout.id)
     ours, theirs = frame.Link(7, 1), their_link(dialect_2)
     parser, reader = frame.Parser(), their_link(dialect_2)
@@ -90,7 +90,7 @@ def test_a_frame_of_mavlink_2_is_the_authority_s_byte_for_byte(layout: Layout) -
 
 
 @pytest.mark.parametrize("layout", LAYOUTS_1, ids=lambda layout: layout.name)
-def test_a_frame_of_mavlink_1_is_the_authority_s_byte_for_byte(layout: Layout) -> None:
+def test_a_frame_of_mavlink_1_is_the_authority_s_byte_for_byte(layout: MessageLayout) -> None:
     rng = random.Random(SEED + layout.id)
     ours, theirs, parser = frame.Link(7, 1, version=1), their_link(dialect_1), frame.Parser()
     for _ in range(5):

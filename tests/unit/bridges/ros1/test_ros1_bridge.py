@@ -14,12 +14,12 @@ from zsim.errors import RunError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.transport.session import ReceivedSample
-from zsim_bridges import message_intake
-from zsim_bridges.message_intake import MessageIntake
+from zsim_bridges import traffic_intake
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import tcpros
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.ros1_bridge import Ros1Bridge, check_names
+from zsim_bridges.traffic_intake import TrafficIntake
 
 LEVEL, ZERO, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 
@@ -142,7 +142,7 @@ class Link:
 
 
 def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(message_intake, "BACKLOG", 3)
+    monkeypatch.setattr(traffic_intake, "BACKLOG", 3)
     info: Any = type(
         "Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "own_sensors": (), "sightings": False}
     )()
@@ -157,7 +157,7 @@ def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch)
 
     async def run() -> tuple[list[Any], HealthMeter]:
         health = HealthMeter("ros1")
-        intake = MessageIntake(link, info, health, asyncio.get_running_loop())
+        intake = TrafficIntake(link, info, health, asyncio.get_running_loop())
         await asyncio.to_thread(link.emptied.wait, 10.0)
         await asyncio.wait_for(intake.news.wait(), 10.0)
         found = list(intake.arrivals())

@@ -14,11 +14,11 @@ from zsim.contract.run_messages import Clock, Event
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.vehicle_links.aircraft_state import AircraftPose, AircraftState, Reading
 from zsim_bridges.vehicle_links.driver_options import DriverOptions, position, udp_channel
 from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external, hover_speed
 from zsim_bridges.vehicle_links.failsafe import Demand
-from zsim_bridges.vehicle_links.vehicle_session import Channel, LinkFigures
-from zsim_bridges.vehicle_links.vehicle_state import Pose, Reading, VehicleState
+from zsim_bridges.vehicle_links.vehicle_session import LinkFigures, UdpChannel
 
 SCENARIO = """
 name: one
@@ -40,13 +40,13 @@ class Session:
     """Sends its demands by name, and takes what comes for the state that it then has."""
 
     def __init__(self, port: int) -> None:
-        self.channels: tuple[Channel, ...] = (Channel("127.0.0.1", port),)
+        self.channels: tuple[UdpChannel, ...] = (UdpChannel("127.0.0.1", port),)
         self.texts: list[str] = []
-        self.state = VehicleState()
+        self.state = AircraftState()
         self._readings: list[Reading] = []
 
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
-        self.state = VehicleState(datagram.decode(), 50.0, Pose(now_ns, (1.0, 2.0, 3.0)), now_ns)  # type: ignore[arg-type]
+        self.state = AircraftState(datagram.decode(), 50.0, AircraftPose(now_ns, (1.0, 2.0, 3.0)), now_ns)  # type: ignore[arg-type]
         self._readings.append(Reading("sonar", now_ns, (3.0, True)))
 
     def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
@@ -249,7 +249,7 @@ def test_what_cannot_be_driven_is_refused():
 
 
 def test_addresses_and_places():
-    assert udp_channel("udp://192.168.1.20:14580", 14540) == Channel("192.168.1.20", 14580, 14540)
+    assert udp_channel("udp://192.168.1.20:14580", 14540) == UdpChannel("192.168.1.20", 14580, 14540)
     assert position(" 1, -2.5,0") == (1.0, -2.5, 0.0)
     for bad in ("", "192.168.1.20", "tcp://a:1", "udp://a", "udp://:14540", "udp://a:x", "udp://a:99999"):
         with pytest.raises(RunError):

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from zsim.contract import keys, messages
+from zsim_bridges.vehicle_links.aircraft_state import AircraftPose, AircraftState, Reading
 from zsim_bridges.vehicle_links.external_drone import ExternalDrone
 from zsim_bridges.vehicle_links.stream_loss import StreamLoss
-from zsim_bridges.vehicle_links.vehicle_state import Pose, Reading, VehicleState
 
 MS = 1_000_000
 BEGUN_NS = 5_000 * MS  # by the driver's clock
@@ -22,9 +22,9 @@ def imu(t_ms: float) -> Reading:
     return Reading("imu", BEGUN_NS + round(t_ms * MS), ((0.0, 0.0, 9.8), (0.0, 0.0, 0.1)))
 
 
-def vehicle(t_ms: float) -> VehicleState:
-    pose = Pose(BEGUN_NS + round(t_ms * MS), (1.0, 2.0, 3.0), (1.0, 0.0, -1.0))
-    return VehicleState("flying", 80.0, pose, pose.taken_ns)
+def vehicle(t_ms: float) -> AircraftState:
+    pose = AircraftPose(BEGUN_NS + round(t_ms * MS), (1.0, 2.0, 3.0), (1.0, 0.0, -1.0))
+    return AircraftState("flying", 80.0, pose, pose.taken_ns)
 
 
 def test_a_gate_of_messages():
@@ -66,7 +66,7 @@ def test_none_is_of_the_future_nor_of_before_the_run():
 
 def test_a_gate_is_published_once_and_none_without_a_pose():
     drone = external()
-    assert drone.gate(20 * MS, VehicleState(), None) == []
+    assert drone.gate(20 * MS, AircraftState(), None) == []
     assert drone.gate(40 * MS, vehicle(0), None)
     assert drone.gate(40 * MS, vehicle(0), None) == []
     assert drone.gate(20 * MS, vehicle(0), None) == []

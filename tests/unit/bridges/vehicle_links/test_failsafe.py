@@ -8,9 +8,9 @@ import pytest
 from zsim.contract.flight_messages import Ardrone, Mode, Velocity
 from zsim.math.frames import quaternion_from_heading
 from zsim.scenario.scenario import Silence
+from zsim_bridges.vehicle_links.aircraft_state import AircraftPose, AircraftState
 from zsim_bridges.vehicle_links.failsafe import TAKEOFF_S, Failsafe
 from zsim_bridges.vehicle_links.flight_limits import FlightLimits
-from zsim_bridges.vehicle_links.vehicle_state import Pose, VehicleState
 
 S = 1_000_000_000
 LIMITS = FlightLimits(speed_m_s=2.0, radius_m=10.0)
@@ -27,9 +27,9 @@ class Flight:
         self.hears_clock = True
 
     @property
-    def vehicle(self) -> VehicleState:
+    def vehicle(self) -> AircraftState:
         w, x, y, z = quaternion_from_heading(self.yaw).tolist()
-        return VehicleState(self.state, 90.0, Pose(self.now_ns, self.position, q_WB=(w, x, y, z)), self.now_ns)
+        return AircraftState(self.state, 90.0, AircraftPose(self.now_ns, self.position, q_WB=(w, x, y, z)), self.now_ns)
 
     def after(self, seconds: float) -> str:
         """Let time pass; return what is asked of the aircraft then."""
@@ -71,7 +71,7 @@ def test_nothing_is_asked_before_it_is_armed():
 
 def test_it_is_not_armed_without_a_link():
     flight = Flight(armed=False)
-    assert flight.failsafe.arm(flight.now_ns, VehicleState())
+    assert flight.failsafe.arm(flight.now_ns, AircraftState())
     assert flight.failsafe.arm(flight.now_ns, flight.vehicle._replace(received_ns=flight.now_ns - 2 * S))
     assert not flight.failsafe.armed
 

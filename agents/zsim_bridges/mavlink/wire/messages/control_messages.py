@@ -5,7 +5,7 @@ Definitions: https://mavlink.io/en/messages/common.html and ardupilotmega.html; 
 
 from typing import Annotated
 
-from zsim_bridges.mavlink.wire.message import Float, Int16, Int32, Message, UInt8, UInt16, UInt32, UInt64, message
+from zsim_bridges.mavlink.wire.wire_message import Float, Int16, Int32, Message, UInt8, UInt16, UInt32, UInt64, message
 
 
 @message(84)

@@ -3,7 +3,7 @@
 Definitions: https://mavlink.io/en/messages/common.html and ardupilotmega.html; units as written there.
 """
 
-from zsim_bridges.mavlink.wire.message import Float, Int16, Int32, Message, UInt8, UInt16, message
+from zsim_bridges.mavlink.wire.wire_message import Float, Int16, Int32, Message, UInt8, UInt16, message
 
 
 @message(39, extensions=1)

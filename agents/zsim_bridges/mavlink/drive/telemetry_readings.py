@@ -10,11 +10,11 @@ from typing import Any
 from zsim.math.frames import geodetic_to_enu, heading
 from zsim.math.rotation import LEVEL, Vector
 from zsim.schema.quantities import G_M_S2
-from zsim_bridges.mavlink.autopilot import axes
+from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.wire import dialect
+from zsim_bridges.vehicle_links.aircraft_state import STILL, AircraftPose, Reading
 from zsim_bridges.vehicle_links.clock_offset import ClockOffset
 from zsim_bridges.vehicle_links.standard_atmosphere import FieldBarometer
-from zsim_bridges.vehicle_links.vehicle_state import STILL, Pose, Reading
 
 ACCEL_GYRO, MAG, PRESSURE = 0x003F, 0x01C0, 0x0200  # HIGHRES_IMU_UPDATED_FLAGS
 DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
@@ -26,7 +26,7 @@ DOP_M = 2.0  # m for a dilution of 1, usual for a single frequency
 LOCAL_UNKNOWN: Vector = (0.0, 0.0, 0.0)
 
 
-class Telemetry:
+class TelemetryReadings:
     """What a vehicle tells of itself.
 
     Args:
@@ -45,7 +45,7 @@ class Telemetry:
         self._origin = origin
         self._local_origin_m = local_origin_m or LOCAL_UNKNOWN
         self.has_origin = local_origin_m is not None
-        self.pose: Pose | None = None
+        self.pose: AircraftPose | None = None
         self.battery_percent = 0.0
         self.boot_clock, self.unix_clock = ClockOffset(), ClockOffset()
         self.readings: list[Reading] = []
@@ -84,18 +84,18 @@ class Telemetry:
     # State
 
     def _on_attitude(self, m: Any, now_ns: int) -> None:
-        q = axes.attitude_ned((m.q1, m.q2, m.q3, m.q4))
+        q = ned_axes.attitude_ned((m.q1, m.q2, m.q3, m.q4))
         length = math.hypot(*q)
         if length > 0.5:  # else it is no attitude at all
             w, x, y, z = (part / length for part in q)
-            self._q_WB, self._w_WB_B = (w, x, y, z), axes.frd((m.rollspeed, m.pitchspeed, m.yawspeed))
+            self._q_WB, self._w_WB_B = (w, x, y, z), ned_axes.frd((m.rollspeed, m.pitchspeed, m.yawspeed))
 
     def _on_position(self, m: Any, now_ns: int) -> None:
-        x, y, z = axes.ned((m.x, m.y, m.z))
+        x, y, z = ned_axes.ned((m.x, m.y, m.z))
         ox, oy, oz = self._local_origin_m
-        velocity = axes.ned((m.vx, m.vy, m.vz))
+        velocity = ned_axes.ned((m.vx, m.vy, m.vz))
         taken_ns = self._boot(m, now_ns)
-        self.pose = Pose(taken_ns, (x + ox, y + oy, z + oz), velocity, self._q_WB, self._w_WB_B)
+        self.pose = AircraftPose(taken_ns, (x + ox, y + oy, z + oz), velocity, self._q_WB, self._w_WB_B)
         if taken_ns - max(self._measured_flow_ns + FLOW_LOST_NS, self._flow_ns + FLOW_NS) >= 0:
             self._flow_ns = taken_ns
             self._read("flow", taken_ns, self._in_heading(velocity), 1.0)
@@ -115,9 +115,11 @@ class Telemetry:
     def _on_imu(self, m: Any, now_ns: int) -> None:
         taken_ns, updated = self._unix(m, now_ns), m.fields_updated
         if updated & ACCEL_GYRO == ACCEL_GYRO:
-            self._read("imu", taken_ns, axes.frd((m.xacc, m.yacc, m.zacc)), axes.frd((m.xgyro, m.ygyro, m.zgyro)))
+            self._read(
+                "imu", taken_ns, ned_axes.frd((m.xacc, m.yacc, m.zacc)), ned_axes.frd((m.xgyro, m.ygyro, m.zgyro))
+            )
         if updated & MAG == MAG:
-            self._read("mag", taken_ns, axes.frd(_scaled(UT_PER_GAUSS, m)))
+            self._read("mag", taken_ns, ned_axes.frd(_scaled(UT_PER_GAUSS, m)))
         if updated & PRESSURE:
             self._on_static_pressure(taken_ns, PA_PER_HPA * m.abs_pressure)
 
@@ -125,9 +127,9 @@ class Telemetry:
         """Take what ArduPilot sends: mg, mrad/s, mgauss."""
         taken_ns, g = self._boot(m, now_ns), G_M_S2 / 1e3
         accel, gyro = (g * m.xacc, g * m.yacc, g * m.zacc), (m.xgyro / 1e3, m.ygyro / 1e3, m.zgyro / 1e3)
-        self._read("imu", taken_ns, axes.frd(accel), axes.frd(gyro))
+        self._read("imu", taken_ns, ned_axes.frd(accel), ned_axes.frd(gyro))
         if m.xmag or m.ymag or m.zmag:
-            self._read("mag", taken_ns, axes.frd(_scaled(UT_PER_GAUSS / 1e3, m)))
+            self._read("mag", taken_ns, ned_axes.frd(_scaled(UT_PER_GAUSS / 1e3, m)))
 
     def _on_pressure(self, m: Any, now_ns: int) -> None:
         self._on_static_pressure(self._boot(m, now_ns), PA_PER_HPA * m.press_abs)

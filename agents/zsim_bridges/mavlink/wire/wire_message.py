@@ -81,7 +81,7 @@ class WireField(NamedTuple):
         return 1 if self.is_bytes else self.length or 1
 
 
-class Layout:
+class MessageLayout:
     """How messages of one kind lie in a payload.
 
     Attributes:
@@ -134,8 +134,8 @@ class Layout:
         return self.kind(*values)
 
 
-LAYOUTS: dict[type[Message], Layout] = {}
-BY_ID: dict[int, Layout] = {}
+LAYOUTS: dict[type[Message], MessageLayout] = {}
+BY_ID: dict[int, MessageLayout] = {}
 Kind = TypeVar("Kind", bound=type[Message])
 
 
@@ -148,7 +148,7 @@ def message(id_: int, extensions: int = 0) -> Callable[[Kind], Kind]:
     """
 
     def register(kind: Kind) -> Kind:
-        LAYOUTS[kind] = BY_ID[id_] = Layout(kind, id_, extensions)
+        LAYOUTS[kind] = BY_ID[id_] = MessageLayout(kind, id_, extensions)
         return kind
 
     return register

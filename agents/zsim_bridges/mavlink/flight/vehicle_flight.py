@@ -10,8 +10,8 @@ from zsim_bridges.mavlink.autopilot.personality import HOLDING, Mode, Personalit
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.command_output import CommandOutput
 from zsim_bridges.mavlink.flight.flight_control import ARRIVED_M, FlightControl
-from zsim_bridges.mavlink.flight.guidance import AttitudeTarget, Target
 from zsim_bridges.mavlink.flight.mission import Mission
+from zsim_bridges.mavlink.flight.position_guidance import AttitudeTarget, Target
 from zsim_bridges.mavlink.flight.return_course import ReturnCourse
 from zsim_bridges.mavlink.flight.setpoint_stream import SetpointStream
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 
 from zsim.contract.flight_messages import Status
-from zsim_bridges.ardrone.aircraft.setpoint_sender import Setpoint, SetpointSender, share
+from zsim_bridges.ardrone.aircraft.setpoint_sender import SetpointSender, TiltSetpoint, share
 from zsim_bridges.ardrone.wire import at_commands
 from zsim_bridges.ardrone.wire.at_commands import Pcmd, PcmdMag, Ref
 from zsim_bridges.vehicle_links.command_sender import CommandSender, ModeName
@@ -19,7 +19,7 @@ AIRBORNE = ("hovering", "flying")
 IN_THE_AIR = ("taking_off", *AIRBORNE)
 
 
-class FlightControl:
+class PilotCommands:
     """The pilot of one drone.
 
     Args:
@@ -48,7 +48,7 @@ class FlightControl:
         self._held_take_off = self._held_emergency = False  # bits of the last REF
         self._mode: ModeName | None = None  # that is to be entered
         self._mode_ns, self._mode_count = 0, 0
-        self._setpoint: Setpoint | None = None
+        self._setpoint: TiltSetpoint | None = None
         self._sent_ns: int | None = None  # when the setpoint was sent last; None while it is new
         self._gate_ns, self._gate_count = -1, 0
         self._psi_rad: float | None = None  # of the last PCMD_MAG
@@ -66,7 +66,7 @@ class FlightControl:
         return self._status.state if self._status else "landed"
 
     @property
-    def setpoint(self) -> Setpoint | None:
+    def setpoint(self) -> TiltSetpoint | None:
         return self._setpoint
 
     @property
@@ -129,26 +129,26 @@ class FlightControl:
         self._calibrated_ns = None
         self._follow(setpoint)
 
-    def _setpoint_of(self, pcmd: Pcmd | PcmdMag) -> Setpoint:
+    def _setpoint_of(self, pcmd: Pcmd | PcmdMag) -> TiltSetpoint:
         if not pcmd.flag & at_commands.PROGRESSIVE:
-            return Setpoint(hover=True)
+            return TiltSetpoint(hover=True)
         absolute = bool(pcmd.flag & at_commands.ABSOLUTE)
         shares = map(share, (pcmd.roll, pcmd.pitch, pcmd.gaz, pcmd.yaw))
-        return Setpoint(False, *shares, pilot_heading_rad=self._psi_rad if absolute else None)
+        return TiltSetpoint(False, *shares, pilot_heading_rad=self._psi_rad if absolute else None)
 
     def calibrate(self) -> None:
         """Turn once, in place."""
         if self.state not in AIRBORNE:
             self._refuse(f"CALIB is not obeyed: the drone is {self.state}; must be in the air")
         elif not self._is_refused("CALIB"):
-            self._follow(Setpoint(hover=True))
+            self._follow(TiltSetpoint(hover=True))
             self._calibrated_ns = self._now_ns + self._setpoints.turn_ns
 
     def hover(self) -> None:
         """Hover in place: the pilot's program is silent."""
         if self.state in IN_THE_AIR and self.has_flown and not self.flown_by():
             self._calibrated_ns = None
-            self._follow(Setpoint(hover=True))
+            self._follow(TiltSetpoint(hover=True))
 
     def land(self) -> None:
         """Land: the pilot's program stays silent."""
@@ -205,7 +205,7 @@ class FlightControl:
             return self.state not in IN_THE_AIR
         return (self.state == "emergency") == (mode == "emergency")
 
-    def _follow(self, setpoint: Setpoint) -> None:
+    def _follow(self, setpoint: TiltSetpoint) -> None:
         """Take a setpoint, and send it at once if it is another one."""
         if setpoint != self._setpoint:
             self._setpoint, self._sent_ns = setpoint, None

@@ -17,7 +17,7 @@ from zsim.transport.traffic import Passed, Traffic, samples
 BACKLOG = 250  # times that something arrived, some seconds of realtime
 
 
-class MessageIntake:
+class TrafficIntake:
     """Messages in the order in which they passed the world; a reader that is too slow loses the oldest gates.
 
     Args:

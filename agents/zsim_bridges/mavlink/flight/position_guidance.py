@@ -7,7 +7,7 @@ import math
 from typing import NamedTuple
 
 from zsim.math.rotation import Quaternion, Vector
-from zsim_bridges.mavlink.autopilot.axes import wrapped
+from zsim_bridges.mavlink.autopilot.ned_axes import wrapped
 from zsim_bridges.mavlink.autopilot.personality import SpeedLimits
 
 K_POSITION_1_S = 0.8  # 1/s; that of the firmware's own hold

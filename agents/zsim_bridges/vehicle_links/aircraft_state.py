@@ -9,7 +9,7 @@ AIRBORNE: tuple[DroneState, ...] = ("hovering", "flying")
 STILL: Vector = (0.0, 0.0, 0.0)
 
 
-class Pose(NamedTuple):
+class AircraftPose(NamedTuple):
     """Where an aircraft is, and how it moves.
 
     Attributes:
@@ -40,7 +40,7 @@ class Reading(NamedTuple):
     values: tuple
 
 
-class VehicleState(NamedTuple):
+class AircraftState(NamedTuple):
     """What is shown of an aircraft.
 
     Attributes:
@@ -52,5 +52,5 @@ class VehicleState(NamedTuple):
 
     state: DroneState = "landed"
     battery_percent: float = 0.0
-    pose: Pose | None = None
+    pose: AircraftPose | None = None
     received_ns: int | None = None

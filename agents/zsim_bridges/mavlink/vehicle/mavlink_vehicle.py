@@ -11,10 +11,10 @@ from zsim_bridges.mavlink.autopilot.enums import COMPONENT_AUTOPILOT, FENCE, MIS
 from zsim_bridges.mavlink.autopilot.personality import Personality, Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.command_output import CommandOutput
-from zsim_bridges.mavlink.flight.flight import Flight
 from zsim_bridges.mavlink.flight.geofence import Geofence
-from zsim_bridges.mavlink.flight.guidance import Target
 from zsim_bridges.mavlink.flight.mission import MissionItem, place_of
+from zsim_bridges.mavlink.flight.position_guidance import Target
+from zsim_bridges.mavlink.flight.vehicle_flight import Flight
 from zsim_bridges.mavlink.telemetry import state_telemetry
 from zsim_bridges.mavlink.telemetry.telemetry import Level, Telemetry
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource
@@ -24,7 +24,7 @@ from zsim_bridges.mavlink.vehicle.drone_watch import DroneWatch
 from zsim_bridges.mavlink.vehicle.mission_protocol import MissionProtocol, home_item, item_fault, item_of
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Received
-from zsim_bridges.mavlink.wire.message import Message
+from zsim_bridges.mavlink.wire.wire_message import Message
 from zsim_bridges.vehicle_links.command_sender import CommandSender
 
 TEXT_MAX = 50  # characters of a STATUSTEXT
@@ -194,8 +194,8 @@ class Vehicle:
         if reason:
             self.report(Severity.WARNING, f"Denied: {reason}")
 
-    def _set_point(self, setpoint: setpoints.Setpoint | setpoints.Refusal) -> None:
-        reason = setpoint.reason if isinstance(setpoint, setpoints.Refusal) else self.flight.set_point(setpoint)
+    def _set_point(self, setpoint: setpoints.Setpoint | setpoints.SetpointRefusal) -> None:
+        reason = setpoint.reason if isinstance(setpoint, setpoints.SetpointRefusal) else self.flight.set_point(setpoint)
         if reason and reason not in self._refused and len(self._refused) < 100:
             self._refused.add(reason)  # a stream would fill the operator's screen
             self._answer(reason)
