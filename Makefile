@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 SCENARIO ?= scenarios/step.yaml
 PARTS ?=
 WORKERS ?= 4
+COMPILED = @$(MAKE) --no-print-directory $(VENV)/.compiled
 
 .PHONY: run test setup lint soak bench clean help
 
@@ -16,9 +17,11 @@ run: setup       ## fly Test 1 of the paper as real processes and report it
 
 test soak: export PYTHONDONTWRITEBYTECODE = # hundreds of processes import the same files
 test: $(VENV)/.dev ## run the tests
+	$(COMPILED)
 	$(BIN)/pytest -n $(WORKERS) --dist loadgroup -m "not soak"
 
 setup: $(VENV)/.run ## make the environment in .venv
+	$(COMPILED)
 
 lint: $(VENV)/.dev ## style, types, and who may import whom
 	$(BIN)/ruff check .
@@ -27,9 +30,11 @@ lint: $(VENV)/.dev ## style, types, and who may import whom
 	$(BIN)/pyright
 
 soak: $(VENV)/.dev ## repetitions and long runs
+	$(COMPILED)
 	$(BIN)/pytest -n 0 -m soak
 
 bench: $(VENV)/.dev ## measure against others, all or PARTS='a b'; see docs/performance.md
+	$(COMPILED)
 	$(BIN)/python -m benchmarks $(PARTS)
 
 clean:           ## remove the environment and what tools leave behind
@@ -44,17 +49,16 @@ $(VENV)/bin/python:
 
 $(VENV)/.run: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/pip install --disable-pip-version-check -q -e '.[all]'
-	$(COMPILE)
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
-	$(COMPILE)
 	@touch $@ $(VENV)/.run
 
-define COMPILE
+# of its own, so that it can go on beside what needs no kernel
+$(VENV)/.compiled: pyproject.toml
 	@$(BIN)/python -m compileall -q zsim agents world deploy
 	@echo "compiling what flies (once on this machine, about a minute)"
 	@folder=$$(mktemp -d) && $(BIN)/zsim run scenarios/step.yaml --in-process --duration 0.1 --no-report \
 		--out $$folder/run 2>/dev/null && rm -r $$folder
-endef
+	@touch $@
