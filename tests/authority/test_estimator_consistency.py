@@ -56,7 +56,7 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(scope="module", params=["paper", pytest.param("as printed", marks=pytest.mark.soak), "ardrone2"])
 def runs(request: pytest.FixtureRequest) -> Runs:
     return flown(request.param)
 

@@ -173,14 +173,14 @@ def test_gates_of_another_length_give_the_same_physics():
 
 
 def test_adding_a_drone_or_a_sensor_changes_no_other_stream():
-    """Far apart nothing but random streams could couple them."""
+    """Far apart nothing but random streams could couple them; eleven are a block of eight and a part of one."""
     apart: Any = {"spacing": 200.0}
-    alone, pair = Fleet(scenario(1, **apart)), Fleet(scenario(2, **apart))
+    alone, many = Fleet(scenario(1, **apart)), Fleet(scenario(11, **apart))
     alone.takeoff(0)
-    pair.takeoff(0)
+    many.takeoff(0)
     first = gates(alone, 300)
-    assert first == [s for s in gates(pair, 300) if s.drone == 0]
-    for a, b in zip(alone.truth(), pair.truth(), strict=True):
+    assert first == [s for s in gates(many, 300) if s.drone == 0]
+    for a, b in zip(alone.truth(), many.truth(), strict=True):
         np.testing.assert_array_equal(a[0], b[0])
     other = Fleet(scenario(1, sensors={"preset": "paper", "mag": {"rate_hz": 50}}, **apart))
     other_first = [s for s in gates(other, 1) if s.sensor == "gps" or s.sensor == "imu"]

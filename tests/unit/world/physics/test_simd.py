@@ -17,7 +17,8 @@ from zsim_world.state.fleet_arrays import STATE, PerRotor
 DT = 0.0025  # s
 COUNT = 11  # a whole block and a part of one
 
-pytestmark = pytest.mark.xdist_group("simd")  # what is compiled for these tests alone is compiled once
+# what is compiled for these tests alone takes a minute; tests/unit/world/fleet has a drone of a block and one alone
+pytestmark = [pytest.mark.xdist_group("simd"), pytest.mark.soak]
 
 
 @inlined
