@@ -18,7 +18,9 @@ PORTS = (5559, 5551, 5555)  # TCP
 def test_a_stranger_flies_nothing_and_the_peer_does(lab: Lab, federation: Federation) -> None:
     here = lab.prefix("h1")
     scenario = federation.write(ONE)
-    federation.start("world", scenario, "--listen", federation.endpoint, "--rate", "1", prefix=here)
+    federation.start(
+        "world", scenario, "--listen", federation.endpoint, "--rate", "1", "--duration", "600", prefix=here
+    )
     where = ("--connect", federation.endpoint, "--addresses", lab.address("h1"), "--peer", lab.address("h2"))
     server = federation.start("ardrone", "serve", *where, prefix=here)
     server.line(f"drone1 is an AR.Drone 2.0 at {lab.address('h1')}")
