@@ -133,8 +133,10 @@ class Gains(Spec, frozen=True, kw_only=True):
     separation_alarm_m: NonNegative = 1.5  # about three hulls
 
 
-Values = Annotated[dict[str, Real], Meta(max_length=VARIABLES_MAX)]
-"""Numbers by the names of a formation's variables."""
+Value = Annotated[Real | str, Meta(description="a finite number or an expression")]
+"""Of a variable: in metres or radians, in degrees where the name of an angle ends in `_deg`."""
+Values = Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)]
+"""Values by the names of a formation's variables."""
 
 
 class Waypoint(Spec, frozen=True, kw_only=True):
@@ -147,7 +149,7 @@ class Trajectory(Spec, frozen=True, kw_only=True):
 
     start_s: NonNegative = 0.0
     constants: Annotated[dict[str, Real], Meta(max_length=CONSTANTS_MAX)] = {}
-    expressions: Annotated[dict[str, str], Meta(max_length=VARIABLES_MAX)] = {}
+    expressions: Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)] = {}
     waypoints: Annotated[list[Waypoint], Meta(max_length=WAYPOINTS_MAX)] = []
 
 

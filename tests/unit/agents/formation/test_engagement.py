@@ -703,13 +703,13 @@ def test_a_restart_does_not_undo_what_was_asked_after_the_plan(request_, height_
 @pytest.mark.parametrize(
     ("plan", "terms"),
     [
-        ([Scheduled(1.0, MoveTo({"u": 1.0}))], ("step 1", "'u'")),
-        ([Scheduled(1.0, TakeOff()), Scheduled(1.0, Follow({"x_c": "u"}))], ("step 2", "'u'")),
+        ([Scheduled(1.0, MoveTo({"u": 1.0}), "plan.target")], ("plan.target", "'u'")),
+        ([Scheduled(1.0, TakeOff()), Scheduled(1.0, Follow({"x_c": "u"}))], ("plan.x_c", "'u'")),
         (
-            [Scheduled(2.0, TakeOff()), Scheduled(1.0, Engage())],
-            ("step 2", "at_s", "1", "2"),
+            [Scheduled(2.0, TakeOff()), Scheduled(1.0, Engage(), "plan.takeoff_s")],
+            ("plan.takeoff_s", "1", "2"),
         ),
-        ([Scheduled(math.nan, TakeOff())], ("step 1", "at_s", "nan")),
+        ([Scheduled(math.nan, TakeOff(), "plan.takeoff_s")], ("plan.takeoff_s", "nan")),
     ],
 )
 def test_plans_that_can_never_be_flown_are_refused_at_once(plan, terms):
