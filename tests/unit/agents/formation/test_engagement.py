@@ -490,6 +490,7 @@ def test_landing_ends_idle_and_a_second_flight_is_possible():
     assert fleet.engagement.request(Land()) is None
     assert fleet.step().phase == "landing"
     assert all(setpoint is None for setpoint in fleet.output.setpoints)
+    assert (fleet.step().reason, fleet.states) == ("", ["landing"] * 3)
     fleet.fly_until("idle")
     assert fleet.states == ["landed"] * 3
     fleet.modes.clear()
