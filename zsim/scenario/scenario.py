@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
 from zsim.scenario.role_table import OnDeath, OnOverdue, agent_names
+from zsim.scenario.shared_vehicle import SharedVehicle
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
 from zsim.sensors.camera import Hats
@@ -303,6 +304,7 @@ class Document(Scenario, frozen=True, kw_only=True):
     """What a file may say: a scenario, and what all its drones share."""
 
     sensors: Sensors | None = None
+    vehicle: SharedVehicle | None = None
 
 
 def space_name(space: str | None, robots: int, template: bool) -> str:
