@@ -7,6 +7,7 @@ The cluster has no plan of its own there; this program takes it off, engages it,
 """
 
 import argparse
+import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -85,7 +86,7 @@ def show(subscription: Subscription) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--connect", default="tcp/127.0.0.1:7447")
+    parser.add_argument("--connect", default=os.environ.get("ZSIM_CONNECT", "tcp/127.0.0.1:7447"))
     args = parser.parse_args()
     with find_world(args.connect, "zsim", wait_s=60.0, say=print) as (link, _):
         fly(link)

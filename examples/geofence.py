@@ -6,6 +6,7 @@ python examples/geofence.py 4.0 --connect tcp/127.0.0.1:7447                    
 
 import argparse
 import math
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,7 @@ def main() -> None:
     parser.add_argument("radius_m", type=float)
     parser.add_argument("--in-process", type=Path, metavar="SCENARIO")
     parser.add_argument("--duration", type=float, default=60.0)
-    parser.add_argument("--connect", default="tcp/127.0.0.1:7447")
+    parser.add_argument("--connect", default=os.environ.get("ZSIM_CONNECT", "tcp/127.0.0.1:7447"))
     args = parser.parse_args()
     if args.in_process:
         in_process(args.in_process, args.radius_m, args.duration)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from zsim.transport.tls import Identity
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+CONNECT_VARIABLE = "ZSIM_CONNECT"  # of the environment: the endpoint where --connect is not given
 RUN_ID = "{run}"  # in the folder of a record: a recorder that is started again finds the one that it had begun
 CONSOLE_PORT = 8080  # of its page
 RUN, HOSTS = "Run", "On several machines"  # panels of the help
@@ -53,6 +54,13 @@ def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
         raise RunError(f"{command}: {' and '.join(missing)} is not installed; pip install 'zsim[{extras}]'")
 
 
+def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[str, str]) -> str:
+    """Return a refusal of an endpoint with where it comes from, if that is the environment."""
+    value = environment.get(CONNECT_VARIABLE)
+    is_given = any(each.partition("=")[0] == "--connect" for each in arguments)
+    return f"{text} ({value} is from {CONNECT_VARIABLE})" if value and value in text and not is_given else text
+
+
 def check_range(from_: float | None, to: float | None) -> None:
     """Refuse `--to` before `--from`."""
     if from_ is not None and to is not None and to < from_:
@@ -65,7 +73,9 @@ Seed = Annotated[int | None, typer.Option(help="Seed instead of the scenario's."
 Duration = Annotated[float | None, typer.Option(help="Simulated seconds instead of the scenario's.")]
 Realtime = Annotated[bool, typer.Option(REALTIME, help="Pace by the wall clock and wait for nobody.")]
 RateOption = Annotated[float | None, typer.Option(help="Simulated per wall second (realtime 1, lockstep unpaced).")]
-Connect = Annotated[str, typer.Option(help="Where the world (or a router) listens.")]
+Connect = Annotated[
+    str, typer.Option("--connect", envvar=CONNECT_VARIABLE, help="Where the world (or a router) listens.")
+]
 Federation = Annotated[str, typer.Option(help="Name of the federation: the prefix of its keys.")]
 Wait = Annotated[
     float | None,

@@ -40,6 +40,7 @@ from msgspec import inspect as types
 
 from zsim.contract import messages
 from zsim.scenario import scenario, scenario_file
+from zsim.scenario.shared_vehicle import SharedVehicle
 from zsim.schema import quantities
 from zsim.sensors.camera import CAMERAS, BottomCamera, FrontCamera, Hats, SightingModel
 from zsim.sensors.sensor import ErrorModel, Mount, Sensor
@@ -404,7 +405,15 @@ SECTIONS = {
     and section is not scenario.Spec
 } | {
     section.__name__: section
-    for section in (Sensors, Sensor, Mount, ErrorModel, *CAMERA_SECTIONS, *(kind.settings for kind in STOCK.values()))
+    for section in (
+        SharedVehicle,
+        Sensors,
+        Sensor,
+        Mount,
+        ErrorModel,
+        *CAMERA_SECTIONS,
+        *(kind.settings for kind in STOCK.values()),
+    )
 }
 UNITS = {
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_n_s_m": "N s/m", "_nm_s2": "N m s²", "_n_s2": "N s²", "_1_s2": "1/s²",

@@ -4,6 +4,7 @@ A world that a launcher started writes it as JSON lines (`JsonProgress`); otherw
 """
 
 import json
+import math
 import re
 import sys
 import threading
@@ -21,6 +22,7 @@ from zsim.errors import printable
 PERIOD_S = 0.2  # wall time between two updates
 SLOW_S = 3.0  # wall time; what is compiled is loaded within two, unless the machine is busy
 SLOW_NOTICE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
+REPEATED_S = 10.0  # simulated time; as often as the clock is a line where there is no live one
 REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
 _NUMBER = re.compile(r"-?[0-9][0-9.]*")
 DRIVERS, COMINGS = "driver.", ("join", "leave")  # they are started by hand, and whoever does so looks here
@@ -93,6 +95,32 @@ class HoldReasons:
         return f"  {state.t_ns / 1e9:8.2f} s  {cluster}, {state.phase}: {state.reason}"
 
 
+class RepeatedEvents:
+    """Events that come again and again: the first is a line at once, equal ones are one line with their count."""
+
+    def __init__(self) -> None:
+        self._counted: dict[
+            tuple[str, str], tuple[float, float, int]
+        ] = {}  # simulated s of first and last, and how many
+
+    def lines(self, t_s: float, kind: str, text: str) -> list[str]:
+        """Return the lines to show now that an event has come."""
+        lines = self.over(t_s)
+        first = self._counted.get((kind, text))
+        self._counted[kind, text] = (first[0], t_s, first[2] + 1) if first else (t_s, t_s, 1)
+        return lines if first else [*lines, f"  {t_s:8.2f} s  {kind}: {text}"]
+
+    def over(self, t_s: float) -> list[str]:
+        """Return the lines of those that have been counted for REPEATED_S."""
+        ended = [key for key, (first_s, _, _) in self._counted.items() if t_s - first_s >= REPEATED_S]
+        counted = [(*key, *self._counted.pop(key)) for key in ended]
+        return [
+            f"  {last_s:8.2f} s  {kind}: {text} ({count - 1} more since {first_s:.2f} s)"
+            for kind, text, first_s, last_s, count in counted
+            if count > 1
+        ]
+
+
 class JsonProgress:
     """Writes progress as JSON lines for a launcher."""
 
@@ -134,6 +162,7 @@ class Screen:
         self._is_live = self.console.is_terminal
         self._next_plain_s = 0.0
         self._last_plain = ""
+        self._repeated = RepeatedEvents()
 
     def __enter__(self) -> Self:
         if self._is_live:
@@ -142,6 +171,8 @@ class Screen:
 
     def __exit__(self, *_: object) -> None:
         self._live.stop()
+        for text in self._repeated.over(math.inf):
+            self.say(text)
 
     def say(self, text: str) -> None:
         """Show a line that stays."""
@@ -156,6 +187,8 @@ class Screen:
         self.console.quiet = True
 
     def clock(self, line: dict[str, Any]) -> None:
+        for repeated in self._repeated.over(line["t_s"]):
+            self.say(repeated)
         text = describe(line, self._duration_s)
         if self._is_live:
             self._live.update(cell(text))
@@ -168,7 +201,8 @@ class Screen:
 
     def event(self, line: dict[str, Any]) -> None:
         if line["kind"] not in QUIET or (line["kind"] in COMINGS and line["text"].startswith(DRIVERS)):
-            self.say(f"  {line['t_s']:8.2f} s  {line['kind']}: {line['text']}")
+            for text in self._repeated.lines(line["t_s"], line["kind"], line["text"]):
+                self.say(text)
 
     def health(self, line: dict[str, Any]) -> None:
         """One live line has no room for it; `zsim up` has a table."""

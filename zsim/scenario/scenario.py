@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
 from zsim.scenario.role_table import OnDeath, OnOverdue, agent_names
+from zsim.scenario.shared_vehicle import SharedVehicle
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
 from zsim.sensors.camera import Hats
@@ -133,8 +134,10 @@ class Gains(Spec, frozen=True, kw_only=True):
     separation_alarm_m: NonNegative = 1.5  # about three hulls
 
 
-Values = Annotated[dict[str, Real], Meta(max_length=VARIABLES_MAX)]
-"""Numbers by the names of a formation's variables."""
+Value = Annotated[Real | str, Meta(description="a finite number or an expression")]
+"""Of a variable: in metres or radians, in degrees where the name of an angle ends in `_deg`."""
+Values = Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)]
+"""Values by the names of a formation's variables."""
 
 
 class Waypoint(Spec, frozen=True, kw_only=True):
@@ -147,7 +150,7 @@ class Trajectory(Spec, frozen=True, kw_only=True):
 
     start_s: NonNegative = 0.0
     constants: Annotated[dict[str, Real], Meta(max_length=CONSTANTS_MAX)] = {}
-    expressions: Annotated[dict[str, str], Meta(max_length=VARIABLES_MAX)] = {}
+    expressions: Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)] = {}
     waypoints: Annotated[list[Waypoint], Meta(max_length=WAYPOINTS_MAX)] = []
 
 
@@ -301,6 +304,7 @@ class Document(Scenario, frozen=True, kw_only=True):
     """What a file may say: a scenario, and what all its drones share."""
 
     sensors: Sensors | None = None
+    vehicle: SharedVehicle | None = None
 
 
 def space_name(space: str | None, robots: int, template: bool) -> str:

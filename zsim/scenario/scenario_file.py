@@ -13,6 +13,7 @@ from zsim.errors import DocumentError, ScenarioError
 from zsim.scenario import overrides as override
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.scenario import DRONES_MAX, Document, Scenario
+from zsim.scenario.shared_vehicle import shared, upon
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, sound
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
@@ -51,6 +52,7 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
 
 
 def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenario:
+    document = _share_vehicle(document)
     vehicles, unknown = _vehicles(document)
     document, unsound = _separate_sensors(_expand_presets(document, vehicles))
     flaws = chain(faults(document, Document), unknown, unsound, cross_faults(sound(document, Scenario), vehicles))
@@ -58,6 +60,7 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenari
     if found:
         raise ScenarioError(found)
     del document["sensors"]
+    document.pop("vehicle", None)
     return msgspec.convert(document, Scenario)
 
 
@@ -77,6 +80,14 @@ def to_text(scenario: Scenario) -> str:
 def sha256(text: str) -> str:
     """Return the hash that names a resolved scenario, from its text."""
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _share_vehicle(document: dict[str, Any]) -> dict[str, Any]:
+    """Return a document whose drones have what its `vehicle:` says, as far as they say nothing else."""
+    drones, fields = document.get("drones"), shared(document)
+    if not fields or not isinstance(drones, list) or len(drones) > DRONES_MAX:
+        return document
+    return {**document, "drones": [upon(fields, drone) for drone in drones]}
 
 
 def _vehicles(document: dict[str, Any]) -> tuple[dict[str, Vehicle], list[Fault]]:

@@ -100,7 +100,12 @@ def _listening(
     check_listening(endpoints, identity)
     settings = zenoh_settings.common("router", mode) | zenoh_settings.listening(endpoints, identity) | others
     shown = ", ".join(endpoints)
-    with open_session(settings, federation, identity, lambda error: f"cannot listen on {shown} ({error})") as session:
+    remedy = "another is given by --listen, and to the other commands by --connect"
+
+    def refusal(error: object) -> str:
+        return f"cannot listen on {shown} ({error}); {remedy}"
+
+    with open_session(settings, federation, identity, refusal) as session:
         if identity.access is not None:
             _answer_permissions(session, identity)
         yield session

@@ -256,7 +256,7 @@ class Engagement:
         if gate.down and gate.t_s - self._landing_s >= self.limits.resend_s:
             self._phase = "idle"
         modes = self._modes.commands(gate, "land", AIRBORNE | {"taking_off"})
-        return self._output(gate, self.check.state_fault(gate, DOWN) or "", modes=modes)
+        return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
 
     def _judge(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or heal it when all has been well for a while."""

@@ -13,7 +13,7 @@ from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, 
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_check import all_near
 from zsim_agents.formation.flight_data import GateInput
-from zsim_agents.formation.flight_plan import FlightPlan, plan_of
+from zsim_agents.formation.flight_plan import FlightPlan, PlanError, plan_of
 from zsim_agents.formation.robot_limits import guard, load
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, closest_pair, robot_rates
 from zsim_agents.formation.spaces.scenario_space import scenario_space
@@ -28,7 +28,7 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
     Raises:
         RunError: the plan can never be flown, with the reason.
     """
-    with _refusals_of(cluster):
+    with _refusals_of(scenario, cluster):
         space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
         rehearse(space, gains, law)
         return Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
@@ -40,15 +40,17 @@ def check_plan(scenario: Scenario, cluster: Cluster) -> None:
     Raises:
         RunError: the plan can never be flown, with the reason.
     """
-    with _refusals_of(cluster):
+    with _refusals_of(scenario, cluster):
         FlightPlan(scenario_space(scenario, cluster), plan_of(cluster))
 
 
 @contextmanager
-def _refusals_of(cluster: Cluster) -> Iterator[None]:
-    """Raise what is wrong with a cluster as a RunError that names it."""
+def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
+    """Raise what is wrong with a cluster as a RunError that names it, in its plan with the path in the scenario."""
     try:
         yield
+    except PlanError as error:
+        raise RunError(f"clusters[{scenario.clusters.index(cluster)}].{error} (cluster {cluster.name!r})") from error
     except (ValueError, DocumentError) as error:
         raise RunError(f"cluster {cluster.name!r}: {error}") from error
 

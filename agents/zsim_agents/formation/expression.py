@@ -23,7 +23,17 @@ CONSTANTS = {"pi": math.pi, "e": math.e}
 
 
 class ExpressionError(ValueError):
-    """An expression is not allowed or has no finite value; the message names variable, finding and remedy."""
+    """An expression is not allowed or has no finite value; the message names variable, finding and remedy.
+
+    Attributes:
+        name: of the variable, empty where the fault is not one expression's.
+        finding: what is wrong, without the name.
+    """
+
+    def __init__(self, finding: str, name: str = "") -> None:
+        super().__init__(f"{name}: {finding}" if name else finding)
+        self.name = name
+        self.finding = finding
 
 
 class _Node(NamedTuple):
@@ -139,7 +149,7 @@ class Expression:
         return (ast.get_source_segment(self.text.strip(), tree) or "")[:40]
 
     def _error(self, finding: str) -> ExpressionError:
-        return ExpressionError(f"{self.name}: expression {str(self.text)[:60]!r} {finding}")
+        return ExpressionError(f"expression {str(self.text)[:60]!r} {finding}", self.name)
 
     def _allowed(self) -> str:
         return f"t, numbers, + - * / **, {', '.join(self._constants)}, {', '.join(_FUNCTIONS)}"

@@ -19,16 +19,19 @@ from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, Sing
 from zsim_agents.formation.trajectory import (
     ExpressionTrajectory,
     Reference,
-    TrajectoryError,
     WaypointTrajectory,
-    named_values,
 )
+from zsim_agents.formation.variable_values import TrajectoryError, named_values
 
 RETRY_S = 0.5  # between two tries of a request that was refused
 
 
 class RefusalError(ValueError):
     """A request cannot be granted as things stand; the message is the reason."""
+
+
+class PlanError(ValueError):
+    """A plan can never be flown; the message begins with the path of what is wrong, from `plan`."""
 
 
 class RequestError(ValueError):
@@ -59,7 +62,7 @@ class Land:
 class MoveTo:
     """Move the formation to values by name, in over_s or as fast as the limits let it."""
 
-    values: Mapping[str, float] = field(default_factory=dict)
+    values: Mapping[str, str | float] = field(default_factory=dict)
     over_s: float | None = None
 
     def goal(self, space: ClusterSpace, base: Array) -> Array:
@@ -116,6 +119,8 @@ class Scheduled:
 
     at_s: float
     request: FlightRequest
+    path: str = "plan"
+    """Where the request stands in the cluster's section of the scenario."""
 
 
 class FlightPlan:
@@ -127,7 +132,7 @@ class FlightPlan:
         note: why the plan waits, empty where it does not.
 
     Raises:
-        ValueError: a request can never be granted (unknown name, bad expression), or times run backwards.
+        PlanError: a request can never be granted (unknown name, bad expression), or times run backwards.
     """
 
     def __init__(self, space: ClusterSpace, steps: Sequence[Scheduled] = ()) -> None:
@@ -192,9 +197,9 @@ def plan_of(cluster: Cluster) -> list[Scheduled]:
     """Return the steps of a cluster's plan in their order."""
     plan, steps = cluster.plan, []
     if plan.takeoff_s is not None:
-        steps += [Scheduled(plan.takeoff_s, TakeOff()), Scheduled(plan.takeoff_s, Engage())]
+        steps += [Scheduled(plan.takeoff_s, each, "plan.takeoff_s") for each in (TakeOff(), Engage())]
         if plan.target:
-            steps.append(Scheduled(plan.takeoff_s, MoveTo(plan.target, plan.target_over_s)))
+            steps.append(Scheduled(plan.takeoff_s, MoveTo(plan.target, plan.target_over_s), "plan.target"))
         if plan.trajectory is not None:
             trajectory = plan.trajectory
             waypoints = [{"at_s": w.at_s, "values": w.values} for w in trajectory.waypoints]
@@ -204,18 +209,18 @@ def plan_of(cluster: Cluster) -> list[Scheduled]:
                 waypoints=waypoints,
                 start_s=trajectory.start_s,
             )
-            steps.append(Scheduled(plan.takeoff_s, follow))
+            steps.append(Scheduled(plan.takeoff_s, follow, "plan.trajectory"))
     if plan.land_s is not None:
-        steps.append(Scheduled(plan.land_s, Land()))
+        steps.append(Scheduled(plan.land_s, Land(), "plan.land_s"))
     return steps
 
 
 def _check(space: ClusterSpace, steps: Sequence[Scheduled]) -> None:
     base = np.zeros(space.size)
     earlier_s = 0.0
-    for number, step in enumerate(steps, start=1):
+    for step in steps:
         if not earlier_s <= step.at_s < math.inf:
-            raise ValueError(f"plan step {number}: at_s is {step.at_s:g}; allowed: {earlier_s:g} s or later")
+            raise PlanError(f"{step.path} is {step.at_s:g}; allowed: {earlier_s:g} s or later")
         earlier_s = step.at_s
         try:
             if isinstance(step.request, MoveTo):
@@ -223,7 +228,16 @@ def _check(space: ClusterSpace, steps: Sequence[Scheduled]) -> None:
             elif isinstance(step.request, Follow):
                 step.request.trajectory(space, base).value(0.0)
         except REFUSALS as error:
-            raise ValueError(f"plan step {number}: {error}") from None
+            raise PlanError(_located(step.path, error)) from None
+
+
+def _located(path: str, error: ValueError) -> str:
+    """Return the text of a refusal with the path of the value that is refused."""
+    if isinstance(error, TrajectoryError):
+        return f"{path}{error.at}{' ' if error.finding.startswith('is ') else ': '}{error.finding}"
+    if isinstance(error, ExpressionError) and error.name:
+        return f"{path}{'.expressions' if path.endswith('trajectory') else ''}.{error.name}: {error.finding}"
+    return f"{path}: {error}"
 
 
 def read_request(op: object, args: object = None) -> FlightRequest:

@@ -19,10 +19,14 @@ from zsim.math.compiled import portable
 from zsim.scenario.scenario import WAYPOINTS_MAX
 from zsim_agents.formation.expression import Expression, ExpressionError, finite_number
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
-
-
-class TrajectoryError(ValueError):
-    """A trajectory is not possible as written; the message names the place, finding and remedy."""
+from zsim_agents.formation.variable_values import (
+    TrajectoryError,
+    Variable,
+    named_values,
+    refuse_turns,
+    refuse_twice,
+    variable_of,
+)
 
 
 class Reference(Protocol):
@@ -69,7 +73,7 @@ class ExpressionTrajectory:
     """Variables as expressions of t; those without one stay at base (4n,).
 
     Args:
-        expressions: text or a number by variable name, e.g. {"x_c": "5*cos(2*pi*f*t)", "p": 4}.
+        expressions: text or a number by variable name, e.g. {"x_c": "5*cos(2*pi*f*t)", "p": 4, "yaw_deg": "6*t"}.
         constants: user constants by name, e.g. {"f": 0.01}.
         duration_s: end of the motion, None for none.
 
@@ -92,14 +96,19 @@ class ExpressionTrajectory:
             raise TrajectoryError(f"trajectory: duration_s is {duration_s}; allowed: a finite number above 0")
         self.duration_s = duration_s
         self._base = base.copy()
-        self._moving: list[tuple[int, Expression]] = []
+        self._moving: list[tuple[Variable, Expression]] = []
+        given = set[int]()
         for name, text in expressions.items():
-            index = _index(space, name, "expressions")
+            place = f"expressions: {name}", f".expressions.{name}"
+            variable = variable_of(space, name, "expressions", ".expressions")
+            refuse_twice(space, variable, given, place)
             expression = Expression(name, _as_text(name, text), constants)
             if expression.constant:
-                self._base[index] = expression(0.0)[0]
+                value = expression(0.0)[0]
+                refuse_turns(space, variable, value, place)
+                self._base[variable.entry] = value * variable.scale
             else:
-                self._moving.append((index, expression))
+                self._moving.append((variable, expression))
         self.arguments = {
             "expressions": dict(expressions), "base": base.copy(), "constants": dict(constants or {}),
             "duration_s": duration_s,
@@ -109,8 +118,9 @@ class ExpressionTrajectory:
         end = math.inf if self.duration_s is None else self.duration_s
         clamped = min(max(t_s, 0.0), end)
         c, c_dot = self._base.copy(), np.zeros_like(self._base)
-        for index, expression in self._moving:
-            c[index], c_dot[index] = expression(clamped)
+        for (entry, scale), expression in self._moving:
+            value, rate = expression(clamped)
+            c[entry], c_dot[entry] = value * scale, rate * scale
         return c, c_dot if clamped == t_s else np.zeros_like(c)
 
 
@@ -163,10 +173,9 @@ class WaypointTrajectory:
         least = self._times[-1] if self._times else -1e-9
         if at_s is None or not at_s > least:
             value = waypoint.get("at_s") if isinstance(waypoint, Mapping) else waypoint
-            raise TrajectoryError(
-                f"waypoint {number}: at_s is {str(value)[:40]}; allowed: a number of seconds"
-                + (f" above {least:g}, that of the waypoint before" if self._times else ", 0 or more")
-            )
+            more = f" above {least:g}, that of the waypoint before" if self._times else ", 0 or more"
+            finding = f"is {str(value)[:40]}; allowed: a number of seconds{more}"
+            raise TrajectoryError(finding, f"waypoint {number}: at_s", f".waypoints[{number - 1}].at_s")
         return at_s
 
 
@@ -264,36 +273,12 @@ _TRAJECTORIES: dict[str, Any] = {"expressions": ExpressionTrajectory, "waypoints
 _KINDS = {made: kind for kind, made in _TRAJECTORIES.items()}
 
 
-def named_values(space: ClusterSpace, values: object, where: str, base: Array) -> Array:
-    """Return base (4n,) with the values put in by name.
-
-    Raises:
-        TrajectoryError: no mapping, an unknown name, or no finite number.
-    """
-    if not isinstance(values, Mapping):
-        raise TrajectoryError(f"{where}: found {str(values)[:40]!r}; allowed: numbers by name of variable")
-    c = base.copy()
-    for name, value in values.items():
-        number = finite_number(value)
-        index = _index(space, name, where)
-        if number is None:
-            raise TrajectoryError(f"{where}: {name} is {str(value)[:40]}; allowed: a finite number")
-        c[index] = number
-    return c
-
-
 def _waypoint_values(space: ClusterSpace, waypoint: Mapping[str, object], number: int, base: Array) -> Array:
     unknown = sorted(str(key)[:40] for key in waypoint if key not in ("at_s", "values"))
     if unknown:
         raise TrajectoryError(f"waypoint {number}: field {unknown[0]!r} is unknown; allowed: at_s, values")
-    return named_values(space, waypoint.get("values"), f"waypoint {number}", base)
-
-
-def _index(space: ClusterSpace, name: object, where: str) -> int:
-    try:
-        return space.index(str(name))
-    except ValueError as error:
-        raise TrajectoryError(f"{where}: {error}") from None
+    at = f".waypoints[{number - 1}].values"
+    return named_values(space, waypoint.get("values"), f"waypoint {number}", base, at)
 
 
 def _as_text(name: str, text: object) -> str:

@@ -22,6 +22,7 @@ from zsim_deploy.arguments import (
     Insecure,
     ScenarioPath,
     Set,
+    endpoint_origin,
     flight_options,
     load_scenario,
     require,
@@ -242,7 +243,7 @@ def _run() -> NoReturn:
     try:
         code = command()(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
-        print(printable(str(error)), file=sys.stderr)
+        print(printable(endpoint_origin(str(error), sys.argv, os.environ)), file=sys.stderr)
         sys.exit(EXIT_CODES.get(type(error), USER_FAULT))
     except UsageError as error:
         _show_usage(error)

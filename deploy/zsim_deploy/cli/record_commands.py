@@ -37,6 +37,8 @@ def conclude(outcome: Any, out: Path, report: bool) -> None:
             print(printable(f"the record so far is {record}; `zsim report {out}` makes its report"), file=sys.stderr)
         sys.exit(INTERRUPTED)
     record_fault = _judged_at_the_end(out, report, outcome.failed) if record.exists() else "nothing was recorded"
+    if record.exists():
+        print(printable(f"ended: {outcome.reason}; the record is {record}"))
     if fault := outcome.reason if outcome.failed else record_fault:
         if (out / "logs").exists():
             print(printable(f"logs are in {out / 'logs'}"), file=sys.stderr)

@@ -209,13 +209,18 @@ def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
     scenario, listen = options.scenario, options.listen
     if not options.continued:
         _write_scenario(options, in_process=False)
-    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
+    screen.say(_headline(options))
     if options.camera_children() and not options.rate and not scenario.gates("camera"):
         screen.say("as fast as it goes, a lockstep run is faster than its cameras; --rate 1 leaves them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
         if listen:
             return _run_on(options, listen, screen, launcher, signals)
         return _run_on_free_port(options, screen, launcher, signals)
+
+
+def _headline(options: RunOptions) -> str:
+    scenario = options.scenario
+    return f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}"
 
 
 def _interrupt(number: int, _: object) -> None:
@@ -276,6 +281,7 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
 
     if not options.continued:
         _write_scenario(options, in_process=True)
+    screen.say(_headline(options))
     with EndSignals(options.out / "run.log", screen.hang_up) as signals:
         stop = StopChannel()
 

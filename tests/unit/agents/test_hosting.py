@@ -113,8 +113,8 @@ def test_every_class_that_a_scenario_names_is_loaded_before_it_flies():
 
 
 UNFLYABLE = {
-    "x_c=9**9**9": ("x_c", "'9**9**9'"),
-    "x_c=__import__('os')": ("x_c", "calls '__import__'"),
+    "x_c=9**9**9": ("clusters[0].plan.trajectory.expressions.x_c", "'9**9**9'"),
+    "x_c=__import__('os')": ("clusters[0].plan.trajectory.expressions.x_c", "calls '__import__'"),
     "bogus=1+t": ("'bogus'", "x_c"),
 }
 
@@ -131,3 +131,29 @@ def test_a_plan_that_a_controller_refuses_is_refused_in_the_same_words(assignmen
         check_plans(scenario, "trajectory.yaml")
     assert raised.value.faults == [f"trajectory.yaml: {refusal.value}"]
     assert has_terms(str(refusal.value), *UNFLYABLE[assignment])
+
+
+@pytest.mark.parametrize(
+    ("override", "path"),
+    [
+        ("plan.target={yaw: 90}", "plan.target.yaw"),
+        ("plan.target={gap: 9}", "plan.target:"),
+        ("plan.trajectory.expressions.yaw=0.1*w*t", "plan.trajectory.expressions.yaw:"),
+        ("plan.trajectory={waypoints: [{at_s: 0, values: {yaw: 45}}]}", "plan.trajectory.waypoints[0].values.yaw"),
+        ("plan.land_s=5", "plan.land_s"),
+    ],
+)
+def test_a_plan_that_cannot_be_flown_is_refused_with_its_path_in_the_scenario(override: str, path: str):
+    file = Path(__file__).parents[3] / "scenarios" / "trajectory.yaml"
+    scenario = scenario_file.load(file, [f"clusters.main.{override}"])
+    with pytest.raises(ScenarioError) as raised:
+        check_plans(scenario, "trajectory.yaml")
+    assert [line.split(" ")[1] for line in raised.value.faults] == [f"clusters[0].{path}"]
+
+
+def test_a_number_stands_for_an_expression_and_an_expression_for_a_number():
+    file = Path(__file__).parents[3] / "scenarios" / "trajectory.yaml"
+    overrides = ["clusters.main.plan.trajectory.expressions.z_c=6", "clusters.main.plan.target={yaw: pi/2}"]
+    scenario = scenario_file.load(file, overrides)
+    check_plans(scenario, "trajectory.yaml")
+    assert scenario_file.from_text(scenario_file.to_text(scenario)) == scenario

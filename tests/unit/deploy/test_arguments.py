@@ -3,12 +3,20 @@
 from typing import Any
 
 import typer
+from refused import has_terms
 from typer.testing import CliRunner
 
-from zsim_deploy.arguments import DEFAULT_ENDPOINT, LOOK_S, WorldAccess, observer_options, participant_options
+from zsim_deploy.arguments import (
+    DEFAULT_ENDPOINT,
+    LOOK_S,
+    WorldAccess,
+    endpoint_origin,
+    observer_options,
+    participant_options,
+)
 
 
-def given(decorate: Any, *arguments: str) -> tuple[WorldAccess, str, int]:
+def given(decorate: Any, *arguments: str, **environment: str) -> tuple[WorldAccess, str, int]:
     """Return what a command gets of a command line, and the exit code."""
     app, got = typer.Typer(), []
 
@@ -18,7 +26,7 @@ def given(decorate: Any, *arguments: str) -> tuple[WorldAccess, str, int]:
         """Do something."""
         got.append((reach, key, count))
 
-    result = CliRunner().invoke(app, [*arguments])
+    result = CliRunner().invoke(app, [*arguments], env=environment)
     assert result.exit_code == 0, result.output
     return got[0]
 
@@ -38,3 +46,18 @@ def test_options_reach_the_command_beside_its_own():
     assert reach == WorldAccess("tcp/h:1", "f", 2.0, None, True, "lab", "r1")
     assert (key, count) == ("clock", 2)
     assert (reach.who.host, reach.who.insecure) == ("lab", True)
+
+
+def test_the_environment_gives_the_endpoint_where_the_option_does_not():
+    for decorate in (observer_options, participant_options):
+        assert given(decorate, "clock", ZSIM_CONNECT="tcp/h:1")[0].endpoint == "tcp/h:1"
+        assert given(decorate, "clock", ZSIM_CONNECT="")[0].endpoint == DEFAULT_ENDPOINT
+        assert given(decorate, "clock", "--connect", "tcp/o:2", ZSIM_CONNECT="tcp/h:1")[0].endpoint == "tcp/o:2"
+
+
+def test_a_refused_endpoint_is_told_with_the_variable_that_it_comes_from():
+    refusal, environment = "no world on tcp/h:1", {"ZSIM_CONNECT": "tcp/h:1"}
+    assert has_terms(endpoint_origin(refusal, ["zsim", "keys"], environment), refusal, "ZSIM_CONNECT")
+    for option in (["--connect", "tcp/h:1"], ["--connect=tcp/h:1"]):
+        assert endpoint_origin(refusal, option, environment) == refusal
+    assert endpoint_origin("no such file", ["zsim"], environment) == "no such file"

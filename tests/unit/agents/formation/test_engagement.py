@@ -490,6 +490,7 @@ def test_landing_ends_idle_and_a_second_flight_is_possible():
     assert fleet.engagement.request(Land()) is None
     assert fleet.step().phase == "landing"
     assert all(setpoint is None for setpoint in fleet.output.setpoints)
+    assert (fleet.step().reason, fleet.states) == ("", ["landing"] * 3)
     fleet.fly_until("idle")
     assert fleet.states == ["landed"] * 3
     fleet.modes.clear()
@@ -703,13 +704,13 @@ def test_a_restart_does_not_undo_what_was_asked_after_the_plan(request_, height_
 @pytest.mark.parametrize(
     ("plan", "terms"),
     [
-        ([Scheduled(1.0, MoveTo({"u": 1.0}))], ("step 1", "'u'")),
-        ([Scheduled(1.0, TakeOff()), Scheduled(1.0, Follow({"x_c": "u"}))], ("step 2", "'u'")),
+        ([Scheduled(1.0, MoveTo({"u": 1.0}), "plan.target")], ("plan.target", "'u'")),
+        ([Scheduled(1.0, TakeOff()), Scheduled(1.0, Follow({"x_c": "u"}))], ("plan.x_c", "'u'")),
         (
-            [Scheduled(2.0, TakeOff()), Scheduled(1.0, Engage())],
-            ("step 2", "at_s", "1", "2"),
+            [Scheduled(2.0, TakeOff()), Scheduled(1.0, Engage(), "plan.takeoff_s")],
+            ("plan.takeoff_s", "1", "2"),
         ),
-        ([Scheduled(math.nan, TakeOff())], ("step 1", "at_s", "nan")),
+        ([Scheduled(math.nan, TakeOff(), "plan.takeoff_s")], ("plan.takeoff_s", "nan")),
     ],
 )
 def test_plans_that_can_never_be_flown_are_refused_at_once(plan, terms):

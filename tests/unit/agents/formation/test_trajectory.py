@@ -18,12 +18,12 @@ from zsim_agents.formation.trajectory import (
     ExpressionTrajectory,
     Hold,
     Shifted,
-    TrajectoryError,
     WaypointTrajectory,
     ramp_onto,
     reference_of,
     state_of,
 )
+from zsim_agents.formation.variable_values import TrajectoryError, named_values
 
 SPACE = cluster_space(3)
 ZERO = np.zeros(12)
@@ -258,7 +258,8 @@ def test_one_waypoint_is_a_place():
         (waypoints((math.nan, {})), ("waypoint 1", "at_s", "nan")),
         (waypoints((0, {"u": 0})), ("waypoint 1", "'u'", "unknown")),
         (waypoints((0, {"x_c": math.nan})), ("waypoint 1", "x_c", "nan")),
-        (waypoints((0, {"x_c": "1"})), ("waypoint 1", "x_c", "1")),
+        (waypoints((0, {"x_c": "t"})), ("waypoint 1", "x_c", "t")),
+        (waypoints((0, {"x_c": 1, "yaw": 45})), ("waypoint 1", "yaw", "45", "rad", "yaw_deg")),
         (waypoints((0, 5)), ("waypoint 1", "'5'")),
         ([{"values": {}}], ("waypoint 1", "at_s", "None")),
         ([{"at_s": 0, "x_c": 1}], ("waypoint 1", "'x_c'", "unknown")),
@@ -268,6 +269,42 @@ def test_one_waypoint_is_a_place():
 def test_bad_waypoints_are_refused(points, terms):
     with refused(TrajectoryError, *terms):
         WaypointTrajectory(SPACE, points, ZERO)
+
+
+# Angles in degrees
+
+
+def test_an_angle_is_given_in_degrees_by_the_suffix_of_its_name():
+    named = named_values(SPACE, {"yaw_deg": 90, "beta_deg": 45, "p": "2*2"}, "target", ZERO)
+    assert [named[SPACE.index(name)] for name in ("yaw", "beta", "p")] == pytest.approx([math.pi / 2, math.pi / 4, 4])
+    reference = ExpressionTrajectory(SPACE, {"yaw_deg": "6*t", "beta_deg": 45}, ZERO)
+    c, c_dot = reference.value(20.0)
+    assert (c[5], c_dot[5], c[11]) == pytest.approx((math.radians(120), math.radians(6), math.pi / 4))
+    assert WaypointTrajectory(SPACE, waypoints((0, {"yaw_deg": 180})), ZERO).value(0.0)[0][5] == pytest.approx(math.pi)
+
+
+@pytest.mark.parametrize(
+    ("values", "terms"),
+    [
+        ({"yaw": 90}, ("target", "yaw", "90", "rad", "yaw_deg")),
+        ({"beta": 45}, ("target", "beta", "45", "rad", "beta_deg")),
+        ({"yaw_deg": 450}, ("target", "yaw_deg", "450", "deg")),
+        ({"yaw": 1, "yaw_deg": 57}, ("target", "yaw_deg", "yaw")),
+        ({"z_c_deg": 5}, ("target", "'z_c_deg'", "z_c")),
+        ({"yaw": "0.1*t"}, ("target", "yaw", "0.1*t")),
+    ],
+)
+def test_a_target_whose_unit_is_a_slip_is_refused_with_the_unit(values, terms):
+    with refused(TrajectoryError, *terms):
+        named_values(SPACE, values, "target", ZERO)
+
+
+def test_an_expression_may_turn_on_but_not_stand_beyond_one_turn():
+    assert ExpressionTrajectory(SPACE, {"yaw": "0.1*t"}, ZERO).value(900.0)[0][5] == pytest.approx(90.0)
+    with refused(TrajectoryError, "yaw", "90", "rad"):
+        ExpressionTrajectory(SPACE, {"yaw": "90"}, ZERO)
+    with refused(TrajectoryError, "expressions", "yaw_deg", "yaw"):
+        ExpressionTrajectory(SPACE, {"yaw": "0.1*t", "yaw_deg": "6*t"}, ZERO)
 
 
 # Ramps

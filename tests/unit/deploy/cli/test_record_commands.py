@@ -138,6 +138,14 @@ def test_without_a_report_the_same_is_shown(tmp_path: Path, capsys: pytest.Captu
     assert case == "whole" or has_terms(shown.err.splitlines()[-1], *terms)
 
 
+@pytest.mark.parametrize("outcome", [Outcome("over"), DIED])
+def test_every_run_says_why_it_ended_and_where_its_record_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], outcome: Outcome
+):
+    shown = judged(write(tmp_path), capsys, outcome, report=False)
+    assert has_terms(shown.out, "ended", outcome.reason, "record", str(tmp_path / "run.mcap"))
+
+
 @pytest.mark.parametrize("report", [True, False])
 def test_the_last_line_is_why_a_run_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str], report: bool):
     (tmp_path / "logs").mkdir()

@@ -176,6 +176,14 @@ def test_good_endpoints_pass(endpoint: str | None):
     run.check_endpoint(endpoint, insecure=False)
 
 
+def test_a_run_in_one_process_says_where_it_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr("zsim_analysis.in_process.fly", lambda *_: "over")
+    screen = Say()
+    screen.hang_up = lambda: None  # type: ignore[attr-defined]
+    run.run_in_process(options(tmp_path), screen)  # type: ignore[arg-type]
+    assert any(has_terms(line, "into", str(tmp_path)) for line in screen.lines)
+
+
 def test_a_folder_that_takes_no_files_is_a_line(tmp_path: Path):
     made = options(tmp_path)
     (tmp_path / "scenario.yaml").mkdir()

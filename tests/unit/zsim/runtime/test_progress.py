@@ -51,6 +51,26 @@ def test_each_cluster_has_its_own():
     assert [line and line.split()[2] for line in lines] == ["a,", "b,"]
 
 
+def test_equal_events_are_one_line_with_their_count():
+    output = io.StringIO()
+    with progress.Screen(60.0, Console(file=output, width=200)) as screen:
+        for k in range(20):
+            screen.event({"t_s": 1.0 + k / 10, "kind": "collision", "text": "drone1 and drone2"})
+            screen.event({"t_s": 1.0 + k / 10, "kind": "collision", "text": "drone1 and drone3"})
+    lines = [line.split(": ")[1] for line in output.getvalue().splitlines()]
+    assert lines[:2] == ["drone1 and drone2", "drone1 and drone3"]
+    assert len(lines) == 4
+    assert all(has_terms(line, "19", "1.00") for line in lines[2:])
+
+
+def test_events_are_counted_anew_after_a_while():
+    events = progress.RepeatedEvents()
+    times = (0.0, 1.0, progress.REPEATED_S, progress.REPEATED_S + 1.0)
+    shown = [events.lines(t_s, "collision", "a and b") for t_s in times]
+    assert [len(lines) for lines in shown] == [1, 0, 2, 0]
+    assert events.over(progress.REPEATED_S + 1.5) == []
+
+
 ESCAPES = "\x1b]0;title\x07\x1b[2Ka\x9b1m\r\u202eb"
 
 

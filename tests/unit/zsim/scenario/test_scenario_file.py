@@ -834,3 +834,43 @@ def test_any_document_is_a_scenario_or_told(changes: list[tuple[list[Any], Any]]
         assert_lines(error.faults)
     else:
         assert scenario_file.from_text(scenario_file.to_text(scenario)) == scenario
+
+
+# What all drones share of their vehicle
+
+
+def test_a_shared_vehicle_is_what_every_drone_says_itself():
+    file = SCENARIOS / "crazyflie.yaml"
+    written = yaml.safe_load(file.read_text())
+    drones = [{name: value for name, value in each.items() if name != "model"} for each in written["drones"]]
+    shared = {**written, "vehicle": {"model": "crazyflie2"}, "drones": drones}
+    assert scenario_file.to_text(scenario_file.resolve(shared)) == scenario_file.to_text(scenario_file.load(file))
+
+
+def test_a_drone_s_own_field_wins_over_the_shared_vehicle_s():
+    vehicle = {"mass_kg": 0.5, "battery_mah": 1500, "limits": {"tilt_deg": 12, "altitude_m": 30}}
+    drones = [drone("a"), drone("b", 2.0, mass_kg=0.48, limits={"tilt_deg": 9})]
+    a, b = scenario_file.resolve(document(drones=drones, vehicle=vehicle)).drones
+    assert [(each.mass_kg, each.battery_mah) for each in (a, b)] == [(0.5, 1500), (0.48, 1500)]
+    assert [(each.limits.tilt_deg, each.limits.altitude_m) for each in (a, b)] == [(12, 30), (9, 30)]
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "path"),
+    [
+        ({"mass_kg": -1}, "vehicle.mass_kg"),
+        ({"limits": {"tilt_deg": 99}}, "vehicle.limits.tilt_deg"),
+        ({"inertia_kg_m2": [1, 2, -3]}, "vehicle.inertia_kg_m2[2]"),
+        ({"name": "x"}, "vehicle.name"),
+        ([1], "vehicle"),
+    ],
+)
+def test_a_fault_of_the_shared_vehicle_is_told_once_by_its_path(vehicle: Any, path: str):
+    with pytest.raises(ScenarioError) as raised:
+        scenario_file.resolve(document(vehicle=vehicle))
+    assert [line.split()[1] for line in raised.value.faults] == [path]
+
+
+def test_a_field_of_the_shared_vehicle_is_set_by_its_path():
+    scenario = scenario_file.load(SCENARIOS / "step.yaml", ["vehicle.mass_kg=0.5"])
+    assert [each.mass_kg for each in scenario.drones] == [0.5] * 3

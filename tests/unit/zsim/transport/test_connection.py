@@ -98,3 +98,13 @@ def test_connections_that_say_nothing_keep_nobody_out():
             left_open.enter_context(socket.create_connection(("127.0.0.1", port)))
         with connection.connect(endpoint, "zsim", wait_s=PATIENCE_S) as link:
             assert link.links() == 1
+
+
+def test_a_port_that_is_taken_is_refused_with_the_option_that_gives_another() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(SessionError) as caught, connection.listen([endpoint], "zsim", "lockstep"):
+            pass
+    assert has_terms(str(caught.value), endpoint, "--listen")

@@ -84,5 +84,5 @@ def test_the_robots_of_a_template_of_groups_are_their_centroids():
 
 def test_a_variable_of_a_plan_that_the_space_does_not_have_is_told_with_those_it_has():
     made = scenario(8, plan={"takeoff_s": 1, "target": {"rho_4": 3.0}})
-    with refused(RunError, "'c'", "'rho_4'", "unknown", "x_c", "w_18", "32"):
+    with refused(RunError, "clusters[0].plan.target", "'rho_4'", "unknown", "x_c", "w_18", "32", "'c'"):
         engagement_of(made, made.clusters[0])
