@@ -67,6 +67,12 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
+def mark_figure(figure: Figure, text: str) -> None:
+    """Write above a figure that its flight is not what it may be taken for; nothing without a text."""
+    if text:
+        figure.suptitle(text, color=VERMILION, fontsize=10, fontweight="bold")
+
+
 def dress(axes: Axes, label: str = "") -> None:
     """Give axes their grid and the label of their y axis."""
     axes.grid(True, color="#d8dee4", lw=0.6)

@@ -1,6 +1,6 @@
 """The figures of a sweep: a distribution per point of the grid, with the mean's confidence interval upon it."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,8 +20,8 @@ from zsim_analysis.report.pages import (
     legend_above,
     new_figure,
 )
-from zsim_analysis.report.summary import PAPER_TABLE_1
-from zsim_analysis.sweep.points import LEVEL, FormationParameter, SweepResults, mean_interval, share_interval
+from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
+from zsim_analysis.sweep.points import FormationParameter, SweepResults
 
 Samples = NDArray[np.float64]
 
@@ -44,15 +44,15 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
         yield ReportFigure(
             "true_rms.png",
             "How well the formation was flown",
-            "RMS of truth − desired within the window, a sample per run." + _legend(results),
+            f"RMS of truth − desired within the window{_window(results)}, a sample per run." + _legend(results),
             _panels(results, {f"{prefix}.true_rms": each for prefix, each in parameters.items()}, {}),
         )
         yield ReportFigure(
             "est_std.png",
-            "Standard deviations as the controller sees them, beside the paper's Table I",
-            "Standard deviation of estimate − desired within the window, a sample per run; dashed: the paper's figure."
-            + _legend(results),
-            _panels(results, {f"{prefix}.est_std": each for prefix, each in parameters.items()}, PAPER_TABLE_1),
+            f"Standard deviations as the controller sees them{', beside the paper' * bool(results.paper_std)}",
+            f"Standard deviation of estimate − desired within the window{_window(results)}, a sample per run"
+            f"{'; dashed: Table I of the paper' * bool(results.paper_std)}." + _legend(results),
+            _panels(results, {f"{prefix}.est_std": each for prefix, each in parameters.items()}, results.paper_std),
         )
     yield ReportFigure(
         "safety.png",
@@ -72,6 +72,11 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
             )
 
 
+def _window(results: SweepResults) -> str:
+    windows_s = results.windows_s()
+    return " ({:g} to {:g} s)".format(*windows_s) if windows_s else ""
+
+
 def _legend(results: SweepResults) -> str:
     level = f"{100 * LEVEL:g} %"
     if results.design.points == 1:
@@ -81,7 +86,7 @@ def _legend(results: SweepResults) -> str:
     return f" Boxes: quartiles and median, whiskers to 1.5 of the box. Orange: mean with its {level} interval.{more}"
 
 
-def _panels(results: SweepResults, columns: dict[str, FormationParameter], printed: dict[str, float]) -> Figure:
+def _panels(results: SweepResults, columns: dict[str, FormationParameter], printed: Mapping[str, float]) -> Figure:
     """Return a panel for each column and its parameter."""
     across = COLUMNS if results.design.points <= NARROW_MAX else COLUMNS - 1
     rows = -(-len(columns) // across)

@@ -9,6 +9,17 @@ from matplotlib.figure import Figure
 
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.report.comparison import ComparedRun, clusters, parameters
+from zsim_analysis.report.figures.report_figures import (
+    NAMED_MAX,
+    ROWS_MAX,
+    curves,
+    draw_drone_panels,
+    draw_error,
+    draw_path,
+    drone_panel_heights,
+    name_states,
+    parameter_groups,
+)
 from zsim_analysis.report.pages import (
     BLACK,
     ReportFigure,
@@ -20,17 +31,6 @@ from zsim_analysis.report.pages import (
     line,
     new_figure,
     run_style,
-)
-from zsim_analysis.report.report_figures import (
-    NAMED_MAX,
-    ROWS_MAX,
-    curves,
-    draw_drone_panels,
-    draw_error,
-    draw_path,
-    drone_panel_heights,
-    name_states,
-    parameter_groups,
 )
 
 COLUMNS = 3  # runs beside each other in a row of a figure, at most

@@ -4,6 +4,7 @@ The paper's are errors (5), position (6), orientation (7) and shape (8).
 """
 
 from collections.abc import Iterator, Sequence
+from textwrap import shorten
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,11 +35,14 @@ from zsim_analysis.report.pages import (
     label_time,
     legend_above,
     line,
+    mark_figure,
     new_figure,
 )
+from zsim_analysis.report.summary import RunSummary
 
 POSITION = ("x_c", "y_c", "z_c")
 ORIENTATION = ("roll", "pitch", "yaw")
+MARK_MAX = 110  # characters in a line above a figure
 ROWS_MAX = 24  # parameters in one figure; 6 drones
 
 
@@ -268,10 +272,26 @@ def name_states(axes: Axes, tracks: Sequence[Track]) -> None:
         axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.005, 0.5), frameon=False, fontsize=9)
 
 
-def figures(
+def figures(flight: RecordedFlight, formations: Sequence[Formation], summary: RunSummary) -> Iterator[ReportFigure]:
+    """Yield the figures that the record has data for, the first cluster's under the plain names, marked if need be."""
+    mark = shortfall_mark(summary)
+    for figure in _plain(flight, formations, summary.window_s):
+        mark_figure(figure.drawing, mark)
+        yield figure
+
+
+def shortfall_mark(summary: RunSummary) -> str:
+    """Return what every figure of a flight that did not fly its plan says of it; empty for one that did."""
+    failed = [each.text for each in summary.shortfalls if each.fails]
+    if not failed:
+        return ""
+    more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
+    return f"Not as planned: {shorten(failed[0], MARK_MAX, placeholder=' …')}{more}"
+
+
+def _plain(
     flight: RecordedFlight, formations: Sequence[Formation], window_s: tuple[float, float]
 ) -> Iterator[ReportFigure]:
-    """Yield the figures that the record has data for, the first cluster's under the plain names."""
     for i, formation in enumerate(formations):
         yield from _of_cluster(formation, window_s, f"_{formation.name}" if i else "")
     if any(len(track.t_ns) for track in flight.tracks):
