@@ -102,7 +102,7 @@ def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
     axes.plot(*thinned(x, y), **style)
 
 
-def legend_above(figure: Figure, axes: Axes, columns: int = 6) -> None:
+def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
     """Put the legend of some axes above all axes of the figure, where it covers no data."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:

@@ -208,7 +208,7 @@ def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
     largest = [float(np.nanmax(np.abs(np.asarray(line.get_ydata()) - 5.0))) for line in x_true.lines[::2][:3]]
     assert [line.get_label() for line in x_true.lines[::2][:3]] == ["calm", "rough", "calm again"]
     assert largest == pytest.approx([ERRORS[0], 3 * ERRORS[0], ERRORS[0]], rel=1e-3)
-    assert len(x_measured.lines) == 6
+    assert len(x_measured.lines) == 9  # measured, desired, and the engagement of three runs
     assert [axes.get_title() for axes in drawn["plan_view.png"].axes] == [run.name for run in four]
 
 
