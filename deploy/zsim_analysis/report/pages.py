@@ -52,6 +52,12 @@ class ReportFigure(Struct, frozen=True):
     caption: str
     drawing: Figure
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Return width and height of its PNG file, which a page needs to lay itself out before the picture is there."""
+        width, height = self.drawing.get_size_inches() * self.drawing.dpi
+        return round(width), round(height)
+
     def png(self) -> bytes:
         """Return the figure as a PNG file."""
         file = io.BytesIO()

@@ -105,6 +105,10 @@ def _panels(results: SweepResults, columns: dict[str, FormationParameter], print
 
 def _mark(axes: Axes, value: float, upright: bool) -> None:
     draw = axes.axvline if upright else axes.axhline
+    low, high = axes.get_xlim() if upright else axes.get_ylim()
+    room = 0.05 * (high - low)
+    set_range = axes.set_xlim if upright else axes.set_ylim
+    set_range(min(low, value - room), max(high, value + room))
     draw(value, color=PAPER, ls="--", lw=1.2, zorder=4, label="the paper's Table I")
 
 
@@ -120,6 +124,14 @@ def _distribution(axes: Axes, results: SweepResults, column: str, text: str) -> 
     for place in shown:
         _box(axes, _known(results.values(column, place)), place)
     _name_points(axes, results)
+    scale_to_samples(axes, _known(results.values(column)))
+
+
+def scale_to_samples(axes: Axes, samples: Samples) -> None:
+    """Give a y axis the range of its samples: an interval of two runs may be a hundred times as wide."""
+    if len(samples) and samples.max() > samples.min():
+        room = 0.08 * (samples.max() - samples.min())
+        axes.set_ylim(samples.min() - room, samples.max() + room)
 
 
 def _known(samples: Samples) -> Samples:
@@ -138,6 +150,9 @@ def _histogram(axes: Axes, samples: Samples) -> None:
     if np.isfinite(mean.low):
         axes.axvspan(mean.low, mean.high, color=VERMILION, alpha=0.25, lw=0, zorder=3)
     axes.axvline(mean.value, lw=1.4, **MEAN)
+    if samples.max() > samples.min():
+        room = 0.08 * (samples.max() - samples.min())
+        axes.set_xlim(samples.min() - room, samples.max() + room)
 
 
 def _box(axes: Axes, samples: Samples, place: int) -> None:

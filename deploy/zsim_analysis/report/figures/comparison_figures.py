@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.flight import Array
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.report.comparison import ComparedRun, clusters, parameters
@@ -184,29 +185,39 @@ def _share_range(axes: Sequence[Axes]) -> None:
 
 
 def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
+    """Return the RMS errors, a panel for each unit: metres and radians have no axis in common."""
     shown = list(names)[:ROWS_MAX]
-    figure = new_figure(WIDTH_IN, 1.0 + 0.16 * (len(runs) + 1) * len(shown))
-    axes = figure.subplots()
+    groups = {each: [name for name in shown if unit(name) == each] for each in dict.fromkeys(map(unit, shown))}
+    figure = new_figure(WIDTH_IN, 1.0 + len(groups) * 0.4 + 0.16 * (len(runs) + 1) * len(shown))
+    heights = [len(group) for group in groups.values()]
+    panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, (measure, group) in zip(panels, groups.items(), strict=True):
+        _draw_rms_panel(axes, runs, cluster, group)
+        axes.set_xlabel(f"RMS error ({measure})", fontsize=10)
+    for i, run in enumerate(runs):
+        look = run_style(i)
+        panels[0].plot([], [], look.marker, color=look.color, ms=7, label=run.name)
+    legend_above(figure, panels[0])
+    return figure
+
+
+def _draw_rms_panel(axes: Axes, runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> None:
     dress(axes)
     lane = 1.0 / (len(runs) + 1)
     for i, run in enumerate(runs):
         judged, look = run.summary.clusters.get(cluster), run_style(i)
-        for row, name in enumerate(shown):
+        for row, name in enumerate(names):
             errors = judged.errors.get(name) if judged else None
             y = row + (i - (len(runs) - 1) / 2) * lane
             for value, face in ((errors and errors.true_rms, look.color), (errors and errors.est_rms, "white")):
                 if value is not None:
                     axes.plot(value, y, look.marker, color=look.color, mfc=face, ms=7, zorder=3)
-        axes.plot([], [], look.marker, color=look.color, ms=7, label=run.name)
-    axes.set_yticks(range(len(shown)), [label(name) for name in shown])
-    axes.set_ylim(len(shown) - 0.5, -0.5)
+    axes.set_yticks(range(len(names)), [label(name) for name in names])
+    axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlim(left=0)
-    for row in range(1, len(shown)):
+    for row in range(1, len(names)):
         axes.axhline(row - 0.5, color="#d8dee4", lw=0.6, zorder=1)
     axes.grid(False, axis="y")
-    axes.set_xlabel("RMS error (m, rad)", fontsize=10)
-    legend_above(figure, axes)
-    return figure
 
 
 def _draw_errors(

@@ -204,6 +204,8 @@ def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
     for name, figure in drawn.items():
         assert figure.get_size_inches()[0] * figure.dpi >= 1000
         assert any(axes.has_data() for axes in figure.axes), name
+    labels = [axes.get_xlabel() for axes in drawn["rms_main.png"].axes]
+    assert [text.rpartition("(")[2] for text in labels] == ["m)", "rad)"]
     x_true, x_measured = drawn["figure_6_position_main.png"].axes[:2]
     largest = [float(np.nanmax(np.abs(np.asarray(line.get_ydata()) - 5.0))) for line in x_true.lines[::2][:3]]
     assert [line.get_label() for line in x_true.lines[::2][:3]] == ["calm", "rough", "calm again"]

@@ -352,6 +352,7 @@ def test_the_page_asks_nothing_of_the_network_and_runs_nothing(run):
     assert not re.search(r"https?:|@import|url\(", text)
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
     assert 'name="viewport"' in text
+    assert len(re.findall(r'<img src="[^"]+" alt="[^"]+" width="\d+" height="\d+">', text)) == len(FIGURES)
     assert "2 of 600 (estimator.drone1 2)" in text
 
 

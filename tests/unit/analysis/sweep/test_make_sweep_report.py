@@ -17,7 +17,7 @@ from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.make_sweep_report import make_sweep_report, terminal_text
 from zsim_analysis.sweep.make_sweep_report import table as shown_table
 from zsim_analysis.sweep.points import SweepResults
-from zsim_analysis.sweep.sweep_figures import slices
+from zsim_analysis.sweep.sweep_figures import figures, slices
 from zsim_analysis.sweep.sweep_folder import locked, read_table
 from zsim_analysis.sweep.sweep_run import Row
 
@@ -160,6 +160,16 @@ def test_a_sweep_marks_runs_that_left_their_plan_and_shows_window_and_errors(tmp
     assert "target refused" in text
     assert "5 to 9 s" in text
     assert next(line for line in text.splitlines() if "x_c" in line).split()[1:] == ["x_c", "y_c", "beta"]
+
+
+def test_an_axis_is_that_of_its_samples_not_of_an_interval_of_two_runs() -> None:
+    of = plan("seed", "duration_s=1,2", runs=4)
+    results = SweepResults(SweepDesign(of), [well(of, run) for run in range(4)])
+    figure = next(each.drawing for each in figures(results) if each.name == "true_rms.png")
+    samples = results.values("errors.x_c.true_rms")
+    low, high = figure.axes[0].get_ylim()
+    assert samples.min() - np.ptp(samples) < low < samples.min()
+    assert samples.max() < high < samples.max() + np.ptp(samples)
 
 
 def test_slices_of_a_drawn_value_hold_as_many_runs_each() -> None:
