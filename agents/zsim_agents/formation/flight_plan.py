@@ -24,6 +24,7 @@ from zsim_agents.formation.trajectory import (
 from zsim_agents.formation.variable_values import TrajectoryError, named_values
 
 RETRY_S = 0.5  # between two tries of a request that was refused
+WAITS = " of the plan waits: "  # in the note of a plan, between the step and the reason
 
 
 class RefusalError(ValueError):
@@ -151,7 +152,7 @@ class FlightPlan:
             refusal = request(step)
             if refusal:
                 self._try_s = t_s + RETRY_S
-                self.note = f"{_OPS[type(step)]} of the plan waits: {refusal}"
+                self.note = f"{_OPS[type(step)]}{WAITS}{refusal}"
                 return
             flown = self._flown if isinstance(step, MoveTo | Follow) else self._next + 1
             self._go_to(self._next + 1, flown)
@@ -191,6 +192,12 @@ class FlightPlan:
     def _go_to(self, step: int, flown: int | None = None) -> None:
         self._next, self._flown = step, step if flown is None else flown
         self._try_s, self.note = -math.inf, ""
+
+
+def waiting_step(reason: str) -> tuple[str, str] | None:
+    """Return the step that the plan waits with and why, from the reason of a cluster's state; None if it does not."""
+    before, waits, why = reason.rpartition(WAITS)
+    return (before.rpartition("; ")[2], why) if waits else None
 
 
 def plan_of(cluster: Cluster) -> list[Scheduled]:

@@ -61,7 +61,7 @@ class Track:
 
 @dataclass
 class ClusterStates:
-    """What the controller of one cluster published: K instants, n names."""
+    """What the controller of one cluster published: K instants, n names; `reasons` (K,) why it waits or is held."""
 
     name: str
     drones: tuple[str, ...]
@@ -70,6 +70,7 @@ class ClusterStates:
     value: Array = field(default_factory=lambda: np.zeros((0, 0)))
     desired: Array = field(default_factory=lambda: np.zeros((0, 0)))
     phases: list[str] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -152,6 +153,7 @@ class _State(Struct):
     value: tuple[float, ...]
     desired: tuple[float, ...]
     drones: tuple[str, ...] = ()
+    reason: str = ""
 
 
 def read_flight(path: Path) -> RecordedFlight:
@@ -306,4 +308,5 @@ def _states(name: str, drones: tuple[str, ...], states: list[_State]) -> Cluster
         value=np.array([state.value for state in kept]).reshape(-1, len(names)),
         desired=np.array([state.desired for state in kept]).reshape(-1, len(names)),
         phases=[state.phase for state in kept],
+        reasons=[state.reason for state in kept],
     )

@@ -138,6 +138,16 @@ class Formation:
     def column(self, name: str) -> int:
         return self.names.index(name)
 
+    @property
+    def engaged_s(self) -> float | None:
+        """Return when it was engaged first, None where it never was."""
+        return next((float(t_s) for t_s, phase in zip(self.t_s, self.phases, strict=True) if phase == "engaged"), None)
+
+    @property
+    def since_engaged(self) -> NDArray[np.bool_]:
+        """Return which instants (K,) are not before the engagement; all where it never was."""
+        return self.t_s >= (-np.inf if self.engaged_s is None else self.engaged_s)
+
     def within(self, window_s: tuple[float, float]) -> np.ndarray:
         """Return which instants (K,) are in a window."""
         return (self.t_s >= window_s[0]) & (self.t_s <= window_s[1])

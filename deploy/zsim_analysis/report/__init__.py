@@ -3,9 +3,9 @@
     make_report(DIR)     reads DIR/run.mcap and writes DIR/summary.json, DIR/figures/*.png, DIR/report.html
     judge(PATH)          the same without writing anything: flight, formations, summary
     compare(DIRS, OUT)   one page of several runs, side by side
-    table(summary)       the formation's errors beside the paper's Table I, for the terminal
+    terminal_text(summary)   shortfalls and errors of the formations, for the terminal
 
-`summary` and `comparison` compute; `report_figures` and `comparison_figures` draw; `make_report` puts together, on
-`pages` that look and are written alike.
+`summary` and `comparison` compute; `figures` draw; `make_report` puts together, on `pages` that look and are written
+alike.
 Imports zsim_analysis.reading, matplotlib and jinja2.
 """

@@ -135,7 +135,10 @@ def _text(value: Any) -> str:
 def notes(runs: Sequence[ComparedRun]) -> list[str]:
     """Return what a reader has to know before comparing: what only some runs have, and which are the same flight."""
     own = [f"{run.name}: {note}" for run in runs for note in run.summary.notes]
-    return [*_alike(runs), *_drones(runs), *_clusters(runs), *_windows(runs), *own]
+    short = [
+        f"{run.name}: {'not as planned: ' * each.fails}{each.text}" for run in runs for each in run.summary.shortfalls
+    ]
+    return [*short, *_alike(runs), *_drones(runs), *_clusters(runs), *_windows(runs), *own]
 
 
 def _alike(runs: Sequence[ComparedRun]) -> list[str]:

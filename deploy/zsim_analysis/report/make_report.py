@@ -8,9 +8,11 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
-from zsim.errors import RecordError, ReportError
+from zsim.errors import RecordError, ReportError, printable
 from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import cell
 from zsim_agents.formation.spaces.cluster_space import unit
@@ -27,15 +29,18 @@ from zsim_analysis.report.comparison import (
     runs_id,
     scenario_rows,
 )
-from zsim_analysis.report.comparison_figures import comparison_figures
+from zsim_analysis.report.figures.comparison_figures import comparison_figures
+from zsim_analysis.report.figures.report_figures import figures
 from zsim_analysis.report.pages import Picture, sources, template, write_page, write_report
-from zsim_analysis.report.report_figures import figures
-from zsim_analysis.report.summary import PAPER_NOTE, PAPER_TABLE_1, RunSummary, summarise
+from zsim_analysis.report.paper import PAPER_NOTE
+from zsim_analysis.report.summary import ClusterErrors, RunSummary, summarise
 
 STATISTICS = ("est. std", "true std", "true RMS", "true mean")
 NAMED, NAMES_MAX = 3, 100  # runs whose names the page's own name holds, and characters of them
 MARK, MARK_WITHIN = b": comparison</title>", 4_000  # of a page of ours, within its first bytes
-COLUMNS = ("parameter", "paper std", "est. std", "est. mean", "true std", "true RMS", "true mean")
+PAPER_COLUMN = "paper std"
+COLUMNS = ("parameter", PAPER_COLUMN, "est. std", "est. mean", "true std", "true RMS", "true mean")
+NOT_AS_PLANNED = "NOT AS PLANNED"
 
 
 def judge(
@@ -68,25 +73,38 @@ def make_report(directory: Path, progress: Callable[[str], None] = lambda _: Non
         ReportError: the directory cannot be written.
     """
     flight, formations, summary = judge(directory / RECORD, progress)
-    drawings = figures(flight, formations, summary.window_s)
+    drawings = figures(flight, formations, summary)
     write_report(directory, summary.json(), drawings, partial(page, summary), progress)
     return summary
 
 
 def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
     """Return report.html."""
-    tables = {
-        name: [cells(parameter, errors, PAPER_TABLE_1.get(parameter)) for parameter, errors in cluster.errors.items()]
-        for name, cluster in summary.clusters.items()
-    }
     return template("page.html.j2").render(
         summary=summary,
         facts=facts(summary),
-        columns=COLUMNS,
-        tables=tables,
-        paper_note=PAPER_NOTE,
+        paper_column=PAPER_COLUMN,
+        tables={name: (columns(cluster), rows(cluster)) for name, cluster in summary.clusters.items()},
+        paper_note=PAPER_NOTE if any(cluster.paper_std for cluster in summary.clusters.values()) else "",
         figures=sources(pictures),
     )
+
+
+def columns(cluster: ClusterErrors) -> list[str]:
+    """Return the columns of a cluster's table; the paper's stands beside a flight of its Test 1 alone."""
+    return [column for column in COLUMNS if column != PAPER_COLUMN or cluster.paper_std]
+
+
+def rows(cluster: ClusterErrors) -> list[list[str]]:
+    """Return a cluster's table, on the page and on the terminal."""
+    return [_row(cluster, parameter, errors) for parameter, errors in cluster.errors.items()]
+
+
+def _row(cluster: ClusterErrors, parameter: str, errors: ParameterErrors) -> list[str]:
+    printed = cluster.paper_std.get(parameter)
+    paper = ["" if printed is None else f"{printed:g}"] if cluster.paper_std else []
+    values = (errors.est_std, errors.est_mean, errors.true_std, errors.true_rms, errors.true_mean)
+    return [f"{parameter} ({unit(parameter)})", *paper, *("–" if value is None else f"{value:.4f}" for value in values)]
 
 
 def facts(summary: RunSummary) -> list[tuple[str, str]]:
@@ -100,6 +118,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Scenario", f"{summary.scenario or 'not known'}, seed {seed}"),
         ("Mode", summary.mode or "not known"),
         ("Ended", summary.ended),
+        ("Flown as planned", "yes" if summary.as_planned else "no"),
         ("Record", summary.record.state),
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
         ("Deadlines missed", _misses(summary)),
@@ -117,28 +136,35 @@ def _misses(summary: RunSummary) -> str:
     return f"{summary.deadline_misses} of {summary.deadlines or 0}{f' ({by})' if by else ''}"
 
 
-def table(summary: RunSummary, cluster: str | None = None) -> Table:
-    """Return the errors of one cluster, by default of the first, beside the paper's Table I, for the terminal."""
-    name = cluster or next(iter(summary.clusters), None)
-    start, end = summary.window_s
-    whose = f" of {name}" if name else ""
-    title = f"Formation errors{whose} from {start:g} to {end:g} s, beside Table I of the paper"
-    shown = Table(title=cell(title), caption="est. = estimate − desired, true = truth − desired", title_justify="left")
-    for column in COLUMNS:
-        shown.add_column(column, justify="left" if column == "parameter" else "right")
-    for parameter, errors in (summary.clusters[name].errors if name else {}).items():
-        shown.add_row(*map(cell, cells(parameter, errors, summary.paper_table_1.get(parameter))))
-    return shown
+def terminal_text(summary: RunSummary) -> Group:
+    """Return what the flight did not do of its plan, and a table of errors for each cluster, for the terminal."""
+    marks = [Text(mark, style="bold red" if fails else "yellow") for mark, fails in marks_of(summary)]
+    return Group(*marks, *(table(summary, name) for name in summary.clusters))
 
 
-def cells(parameter: str, errors: ParameterErrors, paper_std: float | None) -> list[str]:
-    """Return one row of the table of errors, on the page and on the terminal."""
-    values = (errors.est_std, errors.est_mean, errors.true_std, errors.true_rms, errors.true_mean)
+def marks_of(summary: RunSummary) -> list[tuple[str, bool]]:
+    """Return a line for each shortfall, and whether the flight fails by it."""
     return [
-        f"{parameter} ({unit(parameter)})",
-        "" if paper_std is None else f"{paper_std:g}",
-        *("–" if value is None else f"{value:.4f}" for value in values),
+        (printable(f"{NOT_AS_PLANNED if each.fails else 'note'}: {each.text}"), each.fails)
+        for each in summary.shortfalls
     ]
+
+
+def table(summary: RunSummary, cluster: str) -> Table:
+    """Return the errors of one cluster, with the paper's Table I beside Test 1, for the terminal."""
+    start, end = summary.window_s
+    judged = summary.clusters[cluster]
+    title = f"Formation errors of {cluster} from {start:g} to {end:g} s"
+    beside = ", beside Table I of the paper" if judged.paper_std else ""
+    mark = "" if summary.as_planned else f" ({NOT_AS_PLANNED})"
+    caption = "est. = estimate − desired, true = truth − desired"
+    shown = Table(title=cell(f"{title}{beside}{mark}"), caption=caption, title_justify="left")
+    for column in columns(judged):
+        is_name = column == COLUMNS[0]
+        shown.add_column(column, justify="left" if is_name else "right", no_wrap=is_name, min_width=5)
+    for row in rows(judged):
+        shown.add_row(*map(cell, row))
+    return shown
 
 
 def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) -> str:

@@ -52,6 +52,12 @@ class ReportFigure(Struct, frozen=True):
     caption: str
     drawing: Figure
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Return width and height of its PNG file, which a page needs to lay itself out before the picture is there."""
+        width, height = self.drawing.get_size_inches() * self.drawing.dpi
+        return round(width), round(height)
+
     def png(self) -> bytes:
         """Return the figure as a PNG file."""
         file = io.BytesIO()
@@ -65,6 +71,12 @@ Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 def new_figure(width_in: float, height_in: float) -> Figure:
     """Return an empty figure that lays itself out; nothing of matplotlib's global state is used."""
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+
+
+def mark_figure(figure: Figure, text: str) -> None:
+    """Write above a figure that its flight is not what it may be taken for; nothing without a text."""
+    if text:
+        figure.suptitle(text, color=VERMILION, fontsize=10, fontweight="bold")
 
 
 def dress(axes: Axes, label: str = "") -> None:
@@ -96,7 +108,7 @@ def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
     axes.plot(*thinned(x, y), **style)
 
 
-def legend_above(figure: Figure, axes: Axes, columns: int = 6) -> None:
+def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
     """Put the legend of some axes above all axes of the figure, where it covers no data."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:

@@ -5,38 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 from msgspec import Struct
 
 from zsim import __version__
-from zsim.contract.fingerprint import TruthHash
 from zsim.contract.run_messages import Event
-from zsim_analysis.reading.flight import TRUTH_WIDTH, RecordedFlight, RecordedProcess, Track
+from zsim_analysis.reading.flight import RecordedFlight, RecordedProcess
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m, window
 from zsim_analysis.reading.recorded_run import command_age_ms
+from zsim_analysis.reading.shortfall import Shortfall, shortfalls
+from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
+from zsim_analysis.report.record_facts import RecordFacts, facts_of_record
 
-# I. Mas, S. Curi, R. Sanchez Pena, Open-source Multi-UAV Simulator for the ROS Environment.
-# Table I: standard deviation of the formation parameters for Test 1 after steady state; m and rad.
-PAPER_TABLE_1 = {
-    "x_c": 0.11,
-    "y_c": 0.22,
-    "z_c": 0.13,
-    "roll": 0.004,
-    "pitch": 0.0025,
-    "yaw": 0.044,
-    "p": 0.032,
-    "q": 0.035,
-    "beta": 0.012,
-}
-
-PAPER_NOTE = (
-    "With GPS errors of 2.0 m that are independent from drone to drone, the error of a distance between two "
-    "drones is √6 = 2.45 times the error of a coordinate of their centroid, whatever filter each of them "
-    "uses on its own. In Table I p and q are 0.15 to 0.32 times x_c and y_c. So these figures cannot be "
-    "reached in truth with the set-up that the paper describes; they can be read as deviations of the "
-    "estimate from the desired value, which a controller makes small even when the estimate is wrong. "
-    "Compare the column est. std with the paper, and judge the flight by the columns of the truth."
-)
 EVENTS_PER_KIND = 100  # a flood of refusals must not push a restart out of the list
 EVENTS_MAX = 1000
 
@@ -52,43 +31,19 @@ class EventLine(Struct, frozen=True):
 
 
 class ClusterErrors(Struct, frozen=True):
-    """How one cluster flew within the window."""
+    """How one cluster flew within the window; `paper_std` is Table I beside a flight of Test 1, else empty."""
 
     drones: tuple[str, ...]
     errors: dict[str, ParameterErrors]
-
-
-class RecordFacts(Struct, frozen=True):
-    """What the report was made from.
-
-    Attributes:
-        complete: nothing that the world published is missing, nor the end of the run.
-        state: that, and what is missing, in words.
-        gates: on record.
-        gates_missing: by the clocks.
-        gaps: `gates` that are missing one behind the other, `from_s` the first of them `to_s` the last.
-        messages_missing: of the world, by their numbers.
-        undecoded: messages that are not of the type of their key.
-        truth_instants: truth messages that went into the hash: those of simulated drones.
-        truth_missing: truth messages that a whole run of this length would have besides.
-        truth_sha256: as TruthHash of every one of them, by time, then in the order of the drones.
-    """
-
-    messages: int
-    complete: bool
-    state: str
-    gates: int
-    gates_missing: int
-    gaps: list[dict[str, float]]
-    messages_missing: int
-    undecoded: int
-    truth_instants: int
-    truth_missing: int
-    truth_sha256: str
+    paper_std: dict[str, float] = {}
 
 
 class RunSummary(Struct, frozen=True):
-    """The content of summary.json; None where the record does not show a value."""
+    """The content of summary.json; None where the record does not show a value.
+
+    Attributes:
+        as_planned: the flight did what its plan says; `shortfalls` has what it did not do.
+    """
 
     scenario: str | None
     seed: int | None
@@ -100,6 +55,8 @@ class RunSummary(Struct, frozen=True):
     wall_s: float
     sim_s: float
     ended: str
+    as_planned: bool
+    shortfalls: list[Shortfall]
     deadlines: int | None
     deadline_misses: int | None
     deadline_misses_by: dict[str, int]
@@ -125,10 +82,14 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     """Return the summary of a flight; what the world did not report before it ended is computed from the record."""
     end = flight.end or {}
     info = flight.info
-    record_facts = _record_facts(flight, end.get("last_ns", flight.last_ns))
+    record_facts = facts_of_record(flight, end.get("last_ns", flight.last_ns))
     asked = flight.scenario.report.window_s if flight.scenario else None
     window_s, window_note = window(asked, flight.last_ns / 1e9)
-    clusters = {f.name: ClusterErrors(f.drones, f.errors(window_s)) for f in formations}
+    clusters = {
+        f.name: ClusterErrors(f.drones, f.errors(window_s), dict(paper_table(flight.scenario, f.name)))
+        for f in formations
+    }
+    short = shortfalls(flight, window_s)
     wall_s, span_s = end.get("wall_s", flight.wall_s), (flight.last_ns - flight.first_ns) / 1e9
     sim_s = end.get("sim_s", span_s if flight.replay_of else flight.last_ns / 1e9)
     lines, left_out = _lines(flight.events)
@@ -143,6 +104,8 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         wall_s=wall_s,
         sim_s=sim_s,
         ended=_ended(flight),
+        as_planned=not any(each.fails for each in short),
+        shortfalls=short,
         deadlines=end.get("deadlines"),
         deadline_misses=end.get("deadline_misses"),
         deadline_misses_by=end.get("deadline_misses_by", {}),
@@ -159,42 +122,6 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         record=record_facts,
         notes=_notes(flight, record_facts, formations, window_s, window_note),
     )
-
-
-def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
-    """Return what is on record of a flight whose last instant is at `last_ns` as far as it is known."""
-    tracks, state = [track for track in flight.tracks if not track.external], flight.completeness
-    t_ns = np.concatenate([track.t_ns for track in tracks] or [np.zeros(0, np.int64)])
-    states = np.concatenate([track.truth for track in tracks] or [np.zeros((0, TRUTH_WIDTH))])
-    drone = np.repeat(np.arange(len(tracks)), [len(track.t_ns) for track in tracks])
-    order, truth = np.lexsort((drone, t_ns)), TruthHash(len(t_ns))
-    truth.add(t_ns[order], states[order])
-    return RecordFacts(
-        messages=flight.messages,
-        complete=state.complete,
-        state=str(state),
-        gates=state.gates,
-        gates_missing=state.gates_missing,
-        gaps=[{"gates": g.gates, "from_s": g.from_ns / 1e9, "to_s": g.to_ns / 1e9} for g in state.gaps],
-        messages_missing=state.messages_missing,
-        undecoded=flight.undecoded,
-        truth_instants=len(t_ns),
-        truth_missing=_missing(flight, tracks, last_ns),
-        truth_sha256=truth.hexdigest(),
-    )
-
-
-def _missing(flight: RecordedFlight, tracks: list[Track], last_ns: int) -> int:
-    """Return how many truth messages of some drones there are not, every gate from the first one on to the last.
-
-    A flight has truth from 0 or the first gate on, a replay from where it was begun.
-    """
-    gate_ns = flight.info.gate_ns if flight.info else None
-    present = sum(len(track.t_ns) for track in tracks)
-    if not gate_ns or not present:
-        return 0
-    first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns)
-    return max(0, len(tracks) * ((last_ns - first_ns) // gate_ns + 1) - present)
 
 
 def _notes(
@@ -285,12 +212,8 @@ def _formation_notes(flight: RecordedFlight, formations: list[Formation], window
         if cluster.name not in judged:
             notes.append(f"Cluster {cluster.name} published no state that can be judged: no table of it.")
     for formation in formations:
-        rows = formation.within(window_s)
-        engaged = sum(phase == "engaged" for phase, row in zip(formation.phases, rows, strict=True) if row)
-        if not rows.any():
+        if not formation.within(window_s).any():
             notes.append(f"Cluster {formation.name} published no state inside the window.")
-        elif engaged < rows.sum():
-            notes.append(f"Cluster {formation.name} was engaged in {engaged} of {rows.sum()} instants of the window.")
     if not flight.clusters:
         notes.append("The scenario has no cluster: there is no table of errors.")
     return notes

@@ -1,56 +1,24 @@
 """What a sweep came to at each point of its grid: distributions, and confidence intervals of means and shares. Pure."""
 
-import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
-from scipy.special import betaincinv, stdtrit
 
+from zsim.errors import ScenarioError
+from zsim_analysis.report.paper import paper_table
 from zsim_analysis.sweep.axes import Draw, text_of
 from zsim_analysis.sweep.design import SweepDesign
+from zsim_analysis.sweep.intervals import LEVEL, ConfidenceInterval, mean_interval, share_interval
 from zsim_analysis.sweep.sweep_run import FIXED, Row, engaged_column
 
-LEVEL = 0.95  # of all intervals of a report
 STATISTICS = ("est_std", "true_std", "true_rms", "true_mean")
 _COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # start of a column: its cluster's name, and its own
-
-
-class ConfidenceInterval(Struct, frozen=True):
-    """A value with the ends of its confidence interval; NaN ends where one sample shows no spread."""
-
-    value: float
-    low: float
-    high: float
-
-
-def mean_interval(samples: NDArray[np.float64], level: float = LEVEL) -> ConfidenceInterval:
-    """Return the mean of samples (n,) with Student's interval: mean ± t(n − 1) s / √n.
-
-    It holds for normal samples, and for others by the central limit theorem as n grows.
-    """
-    n = len(samples)
-    middle = float(np.mean(samples)) if n else math.nan
-    if n < 2:
-        return ConfidenceInterval(middle, math.nan, math.nan)
-    half = float(stdtrit(n - 1, (1 + level) / 2) * np.std(samples, ddof=1) / math.sqrt(n))
-    return ConfidenceInterval(middle, middle - half, middle + half)
-
-
-def share_interval(count: int, of: int, level: float = LEVEL) -> ConfidenceInterval:
-    """Return count / of with the exact interval of Clopper and Pearson (Biometrika 26, 1934); of > 0.
-
-    It covers the true share at least as often as `level` says, whatever the share and the number of runs.
-    """
-    tail = (1 - level) / 2
-    low = float(betaincinv(count, of - count + 1, tail)) if count else 0.0
-    high = float(betaincinv(count + 1, of - count, 1 - tail)) if count < of else 1.0
-    return ConfidenceInterval(count / of, low, high)
 
 
 class FormationParameter(Struct, frozen=True):
@@ -91,6 +59,7 @@ class GridPoint(Struct, frozen=True):
         without_collision: share of those that ended well.
         engaged: runs that ended well and had every cluster engaged at some instant of the judged window; None where
             no run has a cluster.
+        as_planned: share of those that ended well that did what their plan says.
         spreads: by column of the table, of those that ended well.
     """
 
@@ -100,6 +69,7 @@ class GridPoint(Struct, frozen=True):
     ended_well: ConfidenceInterval | None
     without_collision: ConfidenceInterval | None
     engaged: int | None
+    as_planned: ConfidenceInterval | None
     spreads: dict[str, Distribution]
 
 
@@ -108,6 +78,10 @@ class SweepSummary(Struct, frozen=True):
 
     Attributes:
         not_engaged: runs that ended well, but a cluster was never engaged within the judged window.
+        not_as_planned: by what they did not do, how many runs ended well and did not do what their plan says.
+        judged_unengaged: runs that ended well whose window holds instants at which a cluster was not engaged.
+        windows_s: the judged windows, least start and greatest end of all runs; None where no run has one.
+        paper_std: Table I by parameter, empty for any flight but Test 1.
         parameters: of the formations, by the beginning of their columns.
     """
 
@@ -118,6 +92,10 @@ class SweepSummary(Struct, frozen=True):
     finished: int
     failed: dict[str, int]
     not_engaged: int
+    not_as_planned: dict[str, int]
+    judged_unengaged: int
+    windows_s: tuple[float, float] | None
+    paper_std: dict[str, float]
     level: float
     flown_wall_s: float
     hosts: dict[str, int]
@@ -157,6 +135,7 @@ class SweepResults:
         self.errors = _error_columns(rows)
         self.clusters = _clusters(rows)
         self.drawn = [axis.path for axis in design.axes if isinstance(axis, Draw)]
+        self.paper_std = _paper_std(design)
 
     def values(self, column: str, point: int | None = None) -> NDArray[np.float64]:
         """Return what a column holds for the runs that ended well, at one point or all; NaN where unknown."""
@@ -183,6 +162,20 @@ class SweepResults:
         engaged = self.values("engaged", point)
         return int((engaged == 1).sum()), int(np.isfinite(engaged).sum())
 
+    def as_planned(self, point: int) -> tuple[int, int]:
+        """Return how many of a point's runs that ended well did what their plan says, and how many are judged."""
+        planned = self.values("as_planned", point)
+        return int((planned == 1).sum()), int(np.isfinite(planned).sum())
+
+    def windows_s(self) -> tuple[float, float] | None:
+        """Return the least start and the greatest end [s] of the judged windows, None where no run has one."""
+        start, end = (self.values(f"window_{side}_s") for side in ("from", "to"))
+        known = np.isfinite(start) & np.isfinite(end)
+        return (float(start[known].min()), float(end[known].max())) if known.any() else None
+
+    def _well(self) -> list[Row]:
+        return [row for row, well in zip(self.rows, self.well, strict=True) if well]
+
     def label(self, point: int) -> str:
         """Return the values of a point in short; "all runs" where there is no grid."""
         values = self.design.at(point).values()
@@ -201,6 +194,12 @@ class SweepResults:
             finished=len(rows),
             failed=dict(Counter(row["failure"] for row in rows if row["failure"]).most_common()),
             not_engaged=of - engaged,
+            not_as_planned=dict(
+                Counter(row["shortfall"] for row in self._well() if row.get("shortfall")).most_common()
+            ),
+            judged_unengaged=sum(row.get("engaged_throughout") is False for row in self._well()),
+            windows_s=self.windows_s(),
+            paper_std=dict(self.paper_std),
             level=LEVEL,
             flown_wall_s=sum(row["wall_s"] or 0.0 for row in rows),
             hosts=dict(Counter(row["host"] for row in rows if row["host"])),
@@ -222,6 +221,7 @@ class SweepResults:
             ended_well=share_interval(well, runs) if runs else None,
             without_collision=share_interval(*self.without_collision(point)) if well else None,
             engaged=engaged if of else None,
+            as_planned=share_interval(*planned) if (planned := self.as_planned(point))[1] else None,
             spreads=spreads,
         )
 
@@ -260,6 +260,21 @@ def distribution(samples: NDArray[np.float64]) -> Distribution | None:
 def _error_columns(rows: Sequence[Row]) -> list[str]:
     names = dict.fromkeys(name for row in rows for name in row if name not in FIXED)
     return [name for name in names if name.startswith(("errors.", "clusters.")) and name.endswith(STATISTICS)]
+
+
+def _paper_std(design: SweepDesign) -> Mapping[str, float]:
+    """Return Table I where all runs fly Test 1; empty where another flight is swept, or its plan varies."""
+    if any("plan" in path for path in design.varied):
+        return {}
+    try:
+        scenario = design.scenario(0)
+    except ScenarioError:
+        return {}
+    return paper_table(scenario, scenario.clusters[0].name) if len(scenario.clusters) == 1 else {}
+
+
+def _shortfall(row: Row) -> str | None:
+    return row.get("shortfall")
 
 
 def _shown(value: Any) -> str:

@@ -1,6 +1,6 @@
 """The figures of a sweep: a distribution per point of the grid, with the mean's confidence interval upon it."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,8 +20,8 @@ from zsim_analysis.report.pages import (
     legend_above,
     new_figure,
 )
-from zsim_analysis.report.summary import PAPER_TABLE_1
-from zsim_analysis.sweep.points import LEVEL, FormationParameter, SweepResults, mean_interval, share_interval
+from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
+from zsim_analysis.sweep.points import FormationParameter, SweepResults
 
 Samples = NDArray[np.float64]
 
@@ -44,15 +44,15 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
         yield ReportFigure(
             "true_rms.png",
             "How well the formation was flown",
-            "RMS of truth − desired within the window, a sample per run." + _legend(results),
+            f"RMS of truth − desired within the window{_window(results)}, a sample per run." + _legend(results),
             _panels(results, {f"{prefix}.true_rms": each for prefix, each in parameters.items()}, {}),
         )
         yield ReportFigure(
             "est_std.png",
-            "Standard deviations as the controller sees them, beside the paper's Table I",
-            "Standard deviation of estimate − desired within the window, a sample per run; dashed: the paper's figure."
-            + _legend(results),
-            _panels(results, {f"{prefix}.est_std": each for prefix, each in parameters.items()}, PAPER_TABLE_1),
+            f"Standard deviations as the controller sees them{', beside the paper' * bool(results.paper_std)}",
+            f"Standard deviation of estimate − desired within the window{_window(results)}, a sample per run"
+            f"{'; dashed: Table I of the paper' * bool(results.paper_std)}." + _legend(results),
+            _panels(results, {f"{prefix}.est_std": each for prefix, each in parameters.items()}, results.paper_std),
         )
     yield ReportFigure(
         "safety.png",
@@ -72,6 +72,11 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
             )
 
 
+def _window(results: SweepResults) -> str:
+    windows_s = results.windows_s()
+    return " ({:g} to {:g} s)".format(*windows_s) if windows_s else ""
+
+
 def _legend(results: SweepResults) -> str:
     level = f"{100 * LEVEL:g} %"
     if results.design.points == 1:
@@ -81,7 +86,7 @@ def _legend(results: SweepResults) -> str:
     return f" Boxes: quartiles and median, whiskers to 1.5 of the box. Orange: mean with its {level} interval.{more}"
 
 
-def _panels(results: SweepResults, columns: dict[str, FormationParameter], printed: dict[str, float]) -> Figure:
+def _panels(results: SweepResults, columns: dict[str, FormationParameter], printed: Mapping[str, float]) -> Figure:
     """Return a panel for each column and its parameter."""
     across = COLUMNS if results.design.points <= NARROW_MAX else COLUMNS - 1
     rows = -(-len(columns) // across)
@@ -100,6 +105,10 @@ def _panels(results: SweepResults, columns: dict[str, FormationParameter], print
 
 def _mark(axes: Axes, value: float, upright: bool) -> None:
     draw = axes.axvline if upright else axes.axhline
+    low, high = axes.get_xlim() if upright else axes.get_ylim()
+    room = 0.05 * (high - low)
+    set_range = axes.set_xlim if upright else axes.set_ylim
+    set_range(min(low, value - room), max(high, value + room))
     draw(value, color=PAPER, ls="--", lw=1.2, zorder=4, label="the paper's Table I")
 
 
@@ -115,6 +124,14 @@ def _distribution(axes: Axes, results: SweepResults, column: str, text: str) -> 
     for place in shown:
         _box(axes, _known(results.values(column, place)), place)
     _name_points(axes, results)
+    scale_to_samples(axes, _known(results.values(column)))
+
+
+def scale_to_samples(axes: Axes, samples: Samples) -> None:
+    """Give a y axis the range of its samples: an interval of two runs may be a hundred times as wide."""
+    if len(samples) and samples.max() > samples.min():
+        room = 0.08 * (samples.max() - samples.min())
+        axes.set_ylim(samples.min() - room, samples.max() + room)
 
 
 def _known(samples: Samples) -> Samples:
@@ -133,6 +150,9 @@ def _histogram(axes: Axes, samples: Samples) -> None:
     if np.isfinite(mean.low):
         axes.axvspan(mean.low, mean.high, color=VERMILION, alpha=0.25, lw=0, zorder=3)
     axes.axvline(mean.value, lw=1.4, **MEAN)
+    if samples.max() > samples.min():
+        room = 0.08 * (samples.max() - samples.min())
+        axes.set_xlim(samples.min() - room, samples.max() + room)
 
 
 def _box(axes: Axes, samples: Samples, place: int) -> None:

@@ -56,6 +56,10 @@ class RunResult(Struct, frozen=True, kw_only=True):
         wall_s: wall time of the flight.
         collisions: contacts between drones.
         engaged: whether every cluster was engaged at some instant of the judged window, None without a cluster.
+        engaged_throughout: whether every cluster was engaged at every instant of it, None without a cluster.
+        as_planned: whether the flight did what its plan says.
+        shortfall: the first thing that it did not do.
+        window_from_s, window_to_s: the judged window.
         host: where it was flown.
         fingerprint: numeric; equal ones promise equal bits.
     """
@@ -72,6 +76,11 @@ class RunResult(Struct, frozen=True, kw_only=True):
     min_separation_m: float | None = None
     collisions: int | None = None
     engaged: bool | None = None
+    engaged_throughout: bool | None = None
+    as_planned: bool | None = None
+    shortfall: str | None = None
+    window_from_s: float | None = None
+    window_to_s: float | None = None
     host: str = ""
     fingerprint: str = ""
 
@@ -214,6 +223,11 @@ def _row(
         min_separation_m=summary.min_separation_m,
         collisions=sum(event.kind == "collision" for event in flight.events),
         engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
+        engaged_throughout=not _outside_plan(summary, ("window", "early", "engagement")) if clusters else None,
+        as_planned=summary.as_planned,
+        shortfall=next((each.text for each in summary.shortfalls if each.fails), None),
+        window_from_s=summary.window_s[0],
+        window_to_s=summary.window_s[1],
         **where,
     )
     engaged_columns = {engaged_column(name): engaged.get(name) for name in clusters}
@@ -222,15 +236,24 @@ def _row(
     )
 
 
+def _outside_plan(summary: RunSummary, kinds: tuple[str, ...]) -> set[str]:
+    """Return the clusters that have a shortfall of one of some kinds."""
+    return {each.subject for each in summary.shortfalls if each.kind in kinds}
+
+
 def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, float | None]:
     """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster.
 
-    Those of a cluster that was not engaged are None: drones on the ground hold no formation.
+    Those of a cluster that was not engaged are None, and those of one whose plan was refused: drones on the ground, and
+    drones that hover in place of a trajectory, hold no formation that was asked for.
     """
     columns: dict[str, float | None] = {}
+    refused = _outside_plan(summary, ("plan",))
     for i, (name, cluster) in enumerate(summary.clusters.items()):
         prefix = "errors" if i == 0 else f"clusters.{name}.errors"
         for parameter, errors in cluster.errors.items():
             for statistic, value in msgspec.structs.asdict(errors).items():
-                columns[f"{prefix}.{parameter}.{statistic}"] = None if engaged[name] is None else value
+                columns[f"{prefix}.{parameter}.{statistic}"] = (
+                    None if engaged[name] is None or name in refused else value
+                )
     return columns

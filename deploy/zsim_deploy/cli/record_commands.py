@@ -3,6 +3,7 @@
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -52,7 +53,7 @@ def _failed(cause: str) -> typer.Exit:
 
 
 def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
-    """Make the report of a run if that is wanted; return what its record lacks, empty if nothing."""
+    """Make the report of a run if that is wanted; return what the run did not do or lacks, empty if nothing."""
     from zsim.record.completeness import record_completeness
 
     try:
@@ -101,7 +102,7 @@ def report(
 
 
 def _report(folder: Path) -> str:
-    """Make the report of a run or of a sweep, and print its table; return what the run's record lacks."""
+    """Make the report of a run or of a sweep, and print its table; return what the run did not do, or lacks."""
     require("report", REPORT_NEEDS)
     from rich.console import Console
 
@@ -110,16 +111,22 @@ def _report(folder: Path) -> str:
 
     if is_sweep(folder):
         from zsim_analysis.sweep.make_sweep_report import make_sweep_report as make
-        from zsim_analysis.sweep.make_sweep_report import table
+        from zsim_analysis.sweep.make_sweep_report import terminal_text
     else:
         from zsim_analysis.report.make_report import make_report as make
-        from zsim_analysis.report.make_report import table
+        from zsim_analysis.report.make_report import terminal_text
     with Console(stderr=True).status("reading …") as status:
         summary: Any = make(folder, lambda text: status.update(cell(text)))
-    PipedConsole().print(table(summary))
-    fault = "" if is_sweep(folder) else _show_record(summary.record.complete, summary.record.state)
+    PipedConsole().print(terminal_text(summary))
+    fault = "" if is_sweep(folder) else _fault_of(summary)
     print(printable(f"report: {folder / 'report.html'}"))
     return fault
+
+
+def _fault_of(summary: Any) -> str:
+    """Print whether the record is complete; return what it lacks, or what the flight did not do, empty if nothing."""
+    fault = _show_record(summary.record.complete, summary.record.state)
+    return fault or next((each.text for each in summary.shortfalls if each.fails), "")
 
 
 def _compare(directories: list[Path], out: Path | None) -> None:
@@ -182,7 +189,9 @@ def sweep(
             file=sys.stderr,
         )
         sys.exit(INTERRUPTED)
-    _conclude(folder, [row["failure"] for row in rows if row["failure"]], len(rows), report)
+    failures = [row["failure"] for row in rows if row["failure"]]
+    short = [row["shortfall"] for row in rows if row.get("shortfall") and not row["failure"]]
+    _conclude(folder, failures, len(rows), report, short)
 
 
 def _plan(
@@ -211,8 +220,8 @@ def _plan(
         )
 
 
-def _conclude(folder: Path, failures: list[str], runs: int, report: bool) -> None:
-    """Print what did not end well, make the report, and fail if no run ended well."""
+def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
+    """Print what did not end well, make the report, and fail if no run ended well and flew its plan."""
     for failure in sorted(set(failures), key=failures.count, reverse=True)[:5]:
         print(printable(f"{failures.count(failure)} of {runs} runs failed: {failure}"), file=sys.stderr)
     if report:
@@ -220,6 +229,8 @@ def _conclude(folder: Path, failures: list[str], runs: int, report: bool) -> Non
     print(printable(f"table: {folder / 'sweep.parquet'}"))
     if len(failures) == runs:
         raise _failed(f"none of {runs} runs ended well: {failures[0]}")
+    if len(failures) + len(short) == runs:
+        raise _failed(f"none of {runs} runs was flown as planned: {short[0]}")
 
 
 @app.command(rich_help_panel=RUN)

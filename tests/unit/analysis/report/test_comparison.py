@@ -27,7 +27,7 @@ from zsim_analysis.report.comparison import (
     run_names,
     scenario_rows,
 )
-from zsim_analysis.report.comparison_figures import comparison_figures
+from zsim_analysis.report.figures.comparison_figures import comparison_figures
 from zsim_analysis.report.make_report import STATISTICS, compare, comparison_path, fact_rows, judge, statistics_rows
 from zsim_analysis.report.pages import STYLES, run_style
 from zsim_deploy.cli.cli import app
@@ -204,11 +204,13 @@ def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
     for name, figure in drawn.items():
         assert figure.get_size_inches()[0] * figure.dpi >= 1000
         assert any(axes.has_data() for axes in figure.axes), name
+    labels = [axes.get_xlabel() for axes in drawn["rms_main.png"].axes]
+    assert [text.rpartition("(")[2] for text in labels] == ["m)", "rad)"]
     x_true, x_measured = drawn["figure_6_position_main.png"].axes[:2]
     largest = [float(np.nanmax(np.abs(np.asarray(line.get_ydata()) - 5.0))) for line in x_true.lines[::2][:3]]
     assert [line.get_label() for line in x_true.lines[::2][:3]] == ["calm", "rough", "calm again"]
     assert largest == pytest.approx([ERRORS[0], 3 * ERRORS[0], ERRORS[0]], rel=1e-3)
-    assert len(x_measured.lines) == 6
+    assert len(x_measured.lines) == 9  # measured, desired, and the engagement of three runs
     assert [axes.get_title() for axes in drawn["plan_view.png"].axes] == [run.name for run in four]
 
 

@@ -18,6 +18,7 @@ import pytest
 import synthetic_record
 from refused import has_terms, refused
 from rich.console import Console
+from rich.table import Table
 from synthetic_record import GATE_NS, SCENARIOS, Flown
 
 from zsim.contract import keys, messages, run_messages
@@ -25,7 +26,7 @@ from zsim.errors import RecordError, ReportError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim_analysis.reading.formation import window
-from zsim_analysis.report.make_report import judge, make_report, page, table
+from zsim_analysis.report.make_report import PAPER_COLUMN, judge, make_report, page, table, terminal_text
 from zsim_analysis.report.pages import thinned
 
 NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
@@ -270,7 +271,8 @@ def test_a_run_without_a_cluster(tmp_path):
     assert summary.errors == {}
     assert any("no cluster" in note for note in summary.notes)
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"plan_view.png", "drones.png"}
-    assert "No cluster" in (tmp_path / "report.html").read_text()
+    assert '<table class="numbers">' not in (tmp_path / "report.html").read_text()
+    assert not any(isinstance(each, Table) for each in terminal_text(summary).renderables)
 
 
 def test_a_cluster_that_said_nothing(tmp_path):
@@ -350,6 +352,7 @@ def test_the_page_asks_nothing_of_the_network_and_runs_nothing(run):
     assert not re.search(r"https?:|@import|url\(", text)
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
     assert 'name="viewport"' in text
+    assert len(re.findall(r'<img src="[^"]+" alt="[^"]+" width="\d+" height="\d+">', text)) == len(FIGURES)
     assert "2 of 600 (estimator.drone1 2)" in text
 
 
@@ -367,13 +370,21 @@ def test_figures_show_something(run):
 
 def test_the_terminal_table_stands_beside_the_paper(run):
     _, summary = run
-    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    console.print(table(summary))
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(table(summary, "main"))
     console.file.close()
     text = console.export_text()
     row = next(line for line in text.splitlines() if line.strip("│ ").startswith("p (m)"))
     assert "0.032" in row
     assert f"{AMPLITUDE[9] / math.sqrt(2):.4f}" in row
+    assert any("beta (rad)" in line for line in text.splitlines())  # 80 columns do not break a name
+
+
+def test_the_paper_stands_beside_its_test_1_alone(tmp_path):
+    summary = report_of(tmp_path, flown(scenario="trajectory", overrides=("report.window_s=[2, 9.98]",)))
+    assert summary.clusters["main"].paper_std == {}
+    assert PAPER_COLUMN not in [column.header for column in table(summary, "main").columns]
+    assert PAPER_COLUMN not in page(summary, [])
 
 
 @pytest.mark.usefixtures("unrendered")

@@ -14,10 +14,10 @@ from sweep_rows import made, plan, well
 from zsim.errors import ReportError
 from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
-from zsim_analysis.sweep.make_sweep_report import make_sweep_report
+from zsim_analysis.sweep.make_sweep_report import make_sweep_report, terminal_text
 from zsim_analysis.sweep.make_sweep_report import table as shown_table
 from zsim_analysis.sweep.points import SweepResults
-from zsim_analysis.sweep.sweep_figures import slices
+from zsim_analysis.sweep.sweep_figures import figures, slices
 from zsim_analysis.sweep.sweep_folder import locked, read_table
 from zsim_analysis.sweep.sweep_run import Row
 
@@ -127,6 +127,49 @@ def test_the_report_says_which_cluster_and_how_many_were_engaged(tmp_path: Path)
         SweepResults(SweepDesign(of), read_table(tmp_path / "sweep.parquet")).summary().json()
         == (tmp_path / "summary.json").read_bytes()
     )
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_sweep_marks_runs_that_left_their_plan_and_shows_window_and_errors(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=8)
+    known = {"window_from_s": 5.0, "window_to_s": 9.0, "engaged": True}
+    rows = [
+        made(
+            of,
+            run,
+            collisions=0,
+            as_planned=run > 1,
+            shortfall=None if run > 1 else "main: target refused",
+            engaged_throughout=run != 2,
+            **known,
+        )
+        for run in range(8)
+    ]
+    page = report_of(tmp_path, of, rows)
+    summary = msgspec.json.decode((tmp_path / "summary.json").read_bytes())
+    assert summary["not_as_planned"] == {"main: target refused": 2}
+    assert summary["judged_unengaged"] == 1
+    assert summary["windows_s"] == [5.0, 9.0]
+    assert [point["as_planned"]["value"] for point in summary["points"]] == [0.75, 0.75]
+    assert "target refused" in page
+    assert "5 to 9 s" in page
+    console = Console(file=io.StringIO(), width=80)
+    console.print(terminal_text(SweepResults(SweepDesign(of), rows).summary()))
+    assert isinstance(console.file, io.StringIO)
+    text = console.file.getvalue()
+    assert "target refused" in text
+    assert "5 to 9 s" in text
+    assert next(line for line in text.splitlines() if "x_c" in line).split()[1:] == ["x_c", "y_c", "beta"]
+
+
+def test_an_axis_is_that_of_its_samples_not_of_an_interval_of_two_runs() -> None:
+    of = plan("seed", "duration_s=1,2", runs=4)
+    results = SweepResults(SweepDesign(of), [well(of, run) for run in range(4)])
+    figure = next(each.drawing for each in figures(results) if each.name == "true_rms.png")
+    samples = results.values("errors.x_c.true_rms")
+    low, high = figure.axes[0].get_ylim()
+    assert samples.min() - np.ptp(samples) < low < samples.min()
+    assert samples.max() < high < samples.max() + np.ptp(samples)
 
 
 def test_slices_of_a_drawn_value_hold_as_many_runs_each() -> None:

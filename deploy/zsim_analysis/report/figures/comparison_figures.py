@@ -7,8 +7,22 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.flight import Array
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.report.comparison import ComparedRun, clusters, parameters
+from zsim_analysis.report.figures.plan_view import NAMED_MAX, draw_obstacles, draw_path
+from zsim_analysis.report.figures.report_figures import (
+    ROWS_MAX,
+    curves,
+    draw_drone_panels,
+    draw_error,
+    drone_panel_heights,
+    name_states,
+    parameter_groups,
+    scale,
+)
+from zsim_analysis.report.figures.time_marks import draw_marks, time_marks
 from zsim_analysis.report.pages import (
     BLACK,
     ReportFigure,
@@ -20,17 +34,6 @@ from zsim_analysis.report.pages import (
     line,
     new_figure,
     run_style,
-)
-from zsim_analysis.report.report_figures import (
-    NAMED_MAX,
-    ROWS_MAX,
-    curves,
-    draw_drone_panels,
-    draw_error,
-    draw_path,
-    drone_panel_heights,
-    name_states,
-    parameter_groups,
 )
 
 COLUMNS = 3  # runs beside each other in a row of a figure, at most
@@ -93,7 +96,7 @@ def _of_parameters(
             yield ReportFigure(
                 f"{file}_{cluster}.png",
                 f"{what} (the paper's Figure {number}){suffix}",
-                f"True and measured (from the estimates) {', '.join(shown)} of the runs; dotted: desired.",
+                f"True and measured (from the estimates) {', '.join(shown)}; dotted: desired; upright: engagement.",
                 _draw_parameters(runs, cluster, shown),
             )
 
@@ -110,6 +113,7 @@ def draw_plans(runs: Sequence[ComparedRun]) -> Figure:
         dress(axes)
         axes.set_title(run.name, fontsize=10)
         axes.set_aspect("equal", adjustable="box")
+        draw_obstacles(axes, run.flight.scenario)
         for track in run.flight.tracks:
             draw_path(axes, track, drone_colour(order[track.name]), named=False)
     for axes in grid.flat[len(runs) - across : len(runs)]:
@@ -168,6 +172,7 @@ def _draw_run_drones(run: ComparedRun, panels: Any, order: dict[str, int], first
     panels[0].set_title(run.name, fontsize=10)
     draw_drone_panels(panels, run.flight.tracks, order, named=0)
     panels[-1].tick_params(labelbottom=True)
+    draw_marks(panels, time_marks(run.flight, run.formations[0] if run.formations else None))
 
 
 def _share_range(axes: Sequence[Axes]) -> None:
@@ -180,29 +185,39 @@ def _share_range(axes: Sequence[Axes]) -> None:
 
 
 def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
+    """Return the RMS errors, a panel for each unit: metres and radians have no axis in common."""
     shown = list(names)[:ROWS_MAX]
-    figure = new_figure(WIDTH_IN, 1.0 + 0.16 * (len(runs) + 1) * len(shown))
-    axes = figure.subplots()
+    groups = {each: [name for name in shown if unit(name) == each] for each in dict.fromkeys(map(unit, shown))}
+    figure = new_figure(WIDTH_IN, 1.0 + len(groups) * 0.4 + 0.16 * (len(runs) + 1) * len(shown))
+    heights = [len(group) for group in groups.values()]
+    panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, (measure, group) in zip(panels, groups.items(), strict=True):
+        _draw_rms_panel(axes, runs, cluster, group)
+        axes.set_xlabel(f"RMS error ({measure})", fontsize=10)
+    for i, run in enumerate(runs):
+        look = run_style(i)
+        panels[0].plot([], [], look.marker, color=look.color, ms=7, label=run.name)
+    legend_above(figure, panels[0])
+    return figure
+
+
+def _draw_rms_panel(axes: Axes, runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> None:
     dress(axes)
     lane = 1.0 / (len(runs) + 1)
     for i, run in enumerate(runs):
         judged, look = run.summary.clusters.get(cluster), run_style(i)
-        for row, name in enumerate(shown):
+        for row, name in enumerate(names):
             errors = judged.errors.get(name) if judged else None
             y = row + (i - (len(runs) - 1) / 2) * lane
             for value, face in ((errors and errors.true_rms, look.color), (errors and errors.est_rms, "white")):
                 if value is not None:
                     axes.plot(value, y, look.marker, color=look.color, mfc=face, ms=7, zorder=3)
-        axes.plot([], [], look.marker, color=look.color, ms=7, label=run.name)
-    axes.set_yticks(range(len(shown)), [label(name) for name in shown])
-    axes.set_ylim(len(shown) - 0.5, -0.5)
+    axes.set_yticks(range(len(names)), [label(name) for name in names])
+    axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlim(left=0)
-    for row in range(1, len(shown)):
+    for row in range(1, len(names)):
         axes.axhline(row - 0.5, color="#d8dee4", lw=0.6, zorder=1)
     axes.grid(False, axis="y")
-    axes.set_xlabel("RMS error (m, rad)", fontsize=10)
-    legend_above(figure, axes)
-    return figure
 
 
 def _draw_errors(
@@ -222,6 +237,7 @@ def _draw_errors(
                 continue
             draw_error(axes, formation, name, np.ones(len(formation.t_s), bool))
             axes.axvspan(*run.summary.window_s, color="#eef2f6", zorder=0)
+            draw_marks([axes], time_marks(run.flight, formation))
     for name, axes in zip(shown, grid[:, 0], strict=True):
         axes.set_ylabel(label(name), fontsize=10)
         if limit := _greatest(runs, cluster, name):
@@ -251,10 +267,14 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
     for name, (true_axes, measured_axes) in zip(names, grid, strict=True):
         dress(true_axes, label(name))
         dress(measured_axes)
+        drawn: list[Array] = []
         for i, run in enumerate(runs):
             formation = run.formation(cluster)
             if formation is not None and name in formation.names:
-                _draw_run(true_axes, measured_axes, formation, name, i, run.name)
+                drawn += _draw_run(true_axes, measured_axes, formation, name, i, run.name)
+        if drawn:
+            scale(true_axes, *drawn)
+        _mark_engagements((true_axes, measured_axes), [run.formation(cluster) for run in runs])
     grid[0, 0].plot([], [], label="desired, while engaged", **DESIRED)
     grid[0, 0].set_title("true", fontsize=10)
     grid[0, 1].set_title("measured (estimates)", fontsize=10)
@@ -264,7 +284,10 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
     return figure
 
 
-def _draw_run(true_axes: Axes, measured_axes: Axes, formation: Formation, name: str, index: int, run: str) -> None:
+def _draw_run(
+    true_axes: Axes, measured_axes: Axes, formation: Formation, name: str, index: int, run: str
+) -> list[Array]:
+    """Draw a run; return what its axes are to hold."""
     desired, measured, true = curves(formation, name)
     look = run_style(index)
     drawn: dict[str, Any] = {"color": look.color, "ls": look.dashes, "lw": 1.3, "zorder": 3}
@@ -273,6 +296,16 @@ def _draw_run(true_axes: Axes, measured_axes: Axes, formation: Formation, name: 
     engaged = np.array([phase == "engaged" for phase in formation.phases])
     for axes in (true_axes, measured_axes):
         line(axes, formation.t_s, np.where(engaged, desired, np.nan), **DESIRED)
+    since = formation.since_engaged
+    return [true, measured[since], desired[since]]
+
+
+def _mark_engagements(axes: Sequence[Axes], formations: Sequence[Formation | None]) -> None:
+    """Draw when each run's formation was engaged, in the run's colour."""
+    for index, formation in enumerate(formations):
+        if formation is not None and formation.engaged_s is not None:
+            for each in axes:
+                each.axvline(formation.engaged_s, color=run_style(index).color, lw=0.9, ls="-.", zorder=1.5)
 
 
 def _draw_absence(axes: Axes) -> None:

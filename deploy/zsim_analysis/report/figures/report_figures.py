@@ -4,6 +4,7 @@ The paper's are errors (5), position (6), orientation (7) and shape (8).
 """
 
 from collections.abc import Iterator, Sequence
+from textwrap import shorten
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,11 +14,11 @@ from matplotlib.patches import Patch
 
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.flight import Array, RecordedFlight, Track
-from zsim_analysis.reading.formation import Formation, common_instants
+from zsim_analysis.reading.formation import Formation
+from zsim_analysis.report.figures.plan_view import NAMED_MAX, draw_plan
+from zsim_analysis.report.figures.time_marks import TimeMarks, draw_marks, time_marks
 from zsim_analysis.report.pages import (
-    BLACK,
     BLUE,
-    DARK,
     DESIRED,
     GREEN,
     GREY,
@@ -34,15 +35,18 @@ from zsim_analysis.report.pages import (
     label_time,
     legend_above,
     line,
+    mark_figure,
     new_figure,
 )
+from zsim_analysis.report.summary import RunSummary
 
 POSITION = ("x_c", "y_c", "z_c")
 ORIENTATION = ("roll", "pitch", "yaw")
+MARK_MAX = 110  # characters in a line above a figure
 ROWS_MAX = 24  # parameters in one figure; 6 drones
 
 
-def draw_errors(formation: Formation, window_s: tuple[float, float]) -> Figure:
+def draw_errors(formation: Formation, window_s: tuple[float, float], marks: TimeMarks) -> Figure:
     """Return Figure 5: a row per parameter, the whole run on the left, the window on the right."""
     names = formation.names[:ROWS_MAX]
     figure = new_figure(12, 1.0 + 1.15 * len(names))
@@ -54,6 +58,8 @@ def draw_errors(formation: Formation, window_s: tuple[float, float]) -> Figure:
         whole.set_ylabel(label(name), fontsize=10)
         draw_error(zoom, formation, name, rows)
         _write_statistics(zoom, formation, name, rows)
+    for column in grid.T:
+        draw_marks(column, marks)
     grid[0, 0].set_title("whole run (shaded: window)", fontsize=10)
     grid[0, 1].set_title(f"window, {window_s[0]:g} to {window_s[1]:g} s", fontsize=10)
     label_time(grid[-1])
@@ -69,6 +75,8 @@ def draw_error(axes: Axes, formation: Formation, name: str, rows: np.ndarray) ->
     axes.axhline(0, color="#000000", lw=0.6, zorder=1)
     line(axes, formation.t_s[rows], formation.true_error[rows, i], label="truth − desired", **TRUE)
     line(axes, formation.t_s[rows], formation.est_error[rows, i], label="estimate − desired", **MEASURED)
+    judged = rows & formation.since_engaged
+    scale(axes, formation.true_error[judged, i], formation.est_error[judged, i])
 
 
 def _write_statistics(axes: Axes, formation: Formation, name: str, rows: np.ndarray) -> None:
@@ -85,7 +93,7 @@ def _darker(colour: str) -> str:
     return {"#e69f00": "#9a6a00"}.get(colour, colour)
 
 
-def draw_parameters(formation: Formation, names: Sequence[str], title: str) -> Figure:
+def draw_parameters(formation: Formation, names: Sequence[str], title: str, marks: TimeMarks) -> Figure:
     """Return Figure 6, 7 or 8: desired, measured and true values of some parameters over the run."""
     shown = list(names)[:ROWS_MAX]
     figure = new_figure(11, 1.2 + 2.1 * max(1, len(shown)))
@@ -96,6 +104,9 @@ def draw_parameters(formation: Formation, names: Sequence[str], title: str) -> F
         line(axes, formation.t_s, measured, label="measured (estimates)", **MEASURED)
         line(axes, formation.t_s, true, label="true", **TRUE)
         line(axes, formation.t_s, desired, label="desired", **DESIRED)
+        since = formation.since_engaged
+        scale(axes, true, measured[since], desired[since])
+    draw_marks(list(grid[: len(shown)]), marks)
     label_time(grid[-1:])
     grid[0].set_title(f"{title}, cluster {formation.name}", fontsize=11, loc="left")
     figure.align_ylabels(grid)
@@ -104,13 +115,36 @@ def draw_parameters(formation: Formation, names: Sequence[str], title: str) -> F
 
 
 def curves(formation: Formation, name: str) -> tuple[Array, Array, Array]:
-    """Return desired, measured and true values of a parameter; angles without jumps at ±π."""
+    """Return desired, measured and true values of a parameter; angles without jumps at ±π.
+
+    Angles are unwrapped from the engagement on: before it the desired value is the estimate's own, whose noise may turn
+    it by whole rounds.
+    """
     i = formation.column(name)
     desired = formation.desired[:, i].copy()
     known = np.isfinite(desired)
-    if unit(name) == "rad":
-        desired[known] = np.unwrap(desired[known])
-    return desired, desired + formation.est_error[:, i], desired + formation.true_error[:, i]
+    if unit(name) != "rad" or not known.any():
+        return desired, desired + formation.est_error[:, i], desired + formation.true_error[:, i]
+    since = known & formation.since_engaged
+    desired[since] = np.unwrap(desired[since])
+    lines = desired, desired + formation.est_error[:, i], desired + formation.true_error[:, i]
+    before = known & ~since
+    for each in lines:
+        each[before] = _nearest_round(each[before], desired[since][0] if since.any() else 0.0)
+    return lines
+
+
+def _nearest_round(angles: Array, to: float) -> Array:
+    """Return angles [rad] less the whole turns that bring each within half a turn of `to`."""
+    return angles - 2 * np.pi * np.round((angles - to) / (2 * np.pi))
+
+
+def scale(axes: Axes, *values: Array) -> None:
+    """Give an axis the range of values, not of all that is drawn: what is noise before the engagement leaves it."""
+    known = np.concatenate([each[np.isfinite(each)] for each in values])
+    if len(known) and known.max() > known.min():
+        room = 0.06 * (known.max() - known.min())
+        axes.set_ylim(known.min() - room, known.max() + room)
 
 
 def parameter_groups(names: Sequence[str]) -> list[tuple[str, int, str, list[str]]]:
@@ -123,10 +157,7 @@ def parameter_groups(names: Sequence[str]) -> list[tuple[str, int, str, list[str
     ]
 
 
-OUTLINES = 7  # formations drawn into the plan, few enough to be distinct
-APART = 0.6  # of the formation's own size: outlines nearer than this would cover each other
 DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
-NAMED_MAX = 12  # drones that a legend names
 STATES = {
     "landed": GREY,
     "taking_off": ORANGE,
@@ -137,77 +168,7 @@ STATES = {
 }
 
 
-def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure:
-    """Return the true paths from above with the outlines of the formations at some instants."""
-    figure = new_figure(9, 9)
-    axes = figure.subplots()
-    dress(axes, "north y (m)")
-    axes.set_xlabel("east x (m)", fontsize=10)
-    axes.set_aspect("equal", adjustable="datalim")
-    for i, track in enumerate(flight.tracks):
-        draw_path(axes, track, drone_colour(i), named=i < NAMED_MAX)
-    for formation in formations:
-        _draw_desired(axes, formation)
-        _draw_outlines(axes, formation, flight.tracks)
-    legend_above(figure, axes, columns=4)
-    return figure
-
-
-def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
-    """Draw a true path from above, with its start and its end."""
-    if not len(track.t_ns):
-        return
-    step = max(1, len(track.t_ns) // 4000)  # a path has no extremes to keep, only a shape
-    x, y = track.p_W[::step, 0], track.p_W[::step, 1]
-    axes.plot(x, y, color=colour, lw=0.8, alpha=0.6, zorder=2, label=track.name if named else None)
-    axes.plot(x[0], y[0], marker="s", color=colour, ms=7, mec="white", zorder=5)
-    axes.plot(*track.p_W[-1, :2], marker="o", color=colour, ms=7, mec="white", zorder=5)
-
-
-def _draw_desired(axes: Axes, formation: Formation) -> None:
-    if "x_c" in formation.names and len(formation.t_s):
-        engaged = np.array([phase == "engaged" for phase in formation.phases])
-        desired = np.where(engaged[:, None], formation.desired, np.nan)
-        x, y = (desired[:, formation.column(name)] for name in ("x_c", "y_c"))
-        step = max(1, len(x) // 4000)
-        axes.plot(x[::step], y[::step], color=BLACK, lw=1.3, zorder=3, label=f"desired centroid of {formation.name}")
-
-
-def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
-    members = [track for name in formation.drones for track in tracks if track.name == name]
-    for t_s, p_W in outlines(members):
-        ring = np.vstack([p_W, p_W[:1]])
-        axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=DARK, lw=1.2, zorder=4)
-        out = p_W[0] - p_W.mean(axis=0)
-        away = out / max(float(np.linalg.norm(out)), 1e-9)
-        axes.annotate(
-            f"{t_s:.0f} s",
-            p_W[0],
-            xytext=18 * away,
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=9,
-            zorder=6,
-            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
-        )
-
-
-def outlines(members: Sequence[Track]) -> Iterator[tuple[float, Array]]:
-    """Yield times [s] and positions (n, 2) [m] at which the outlines of a formation do not cover each other."""
-    t_ns, places = common_instants(list(members))
-    if not len(t_ns):
-        return
-    p_W = np.stack([track.p_W[place, :2] for track, place in zip(members, places, strict=True)], axis=1)
-    drawn: list[Array] = []
-    for k in np.linspace(len(t_ns) - 1, 0, OUTLINES).astype(int):
-        size = np.linalg.norm(p_W[k] - p_W[k].mean(axis=0), axis=1).max()
-        if all(np.linalg.norm(p_W[k] - other, axis=1).max() > APART * size for other in drawn):
-            drawn.append(p_W[k])
-            yield float(t_ns[k]) / 1e9, p_W[k]
-
-
-def draw_drones(flight: RecordedFlight) -> Figure:
+def draw_drones(flight: RecordedFlight, marks: TimeMarks) -> Figure:
     """Return altitude, state and battery of every drone over the run."""
     count = len(flight.tracks)
     figure = new_figure(11, 6.4 + 0.28 * count)
@@ -216,6 +177,7 @@ def draw_drones(flight: RecordedFlight) -> Figure:
         dress(axes, quantity)
     draw_drone_panels(panels, flight.tracks, {track.name: i for i, track in enumerate(flight.tracks)}, NAMED_MAX)
     name_states(panels[1], flight.tracks)
+    draw_marks(panels, marks)
     figure.align_ylabels()
     legend_above(figure, panels[0])
     return figure
@@ -268,12 +230,29 @@ def name_states(axes: Axes, tracks: Sequence[Track]) -> None:
         axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.005, 0.5), frameon=False, fontsize=9)
 
 
-def figures(
+def figures(flight: RecordedFlight, formations: Sequence[Formation], summary: RunSummary) -> Iterator[ReportFigure]:
+    """Yield the figures that the record has data for, the first cluster's under the plain names, marked if need be."""
+    mark = shortfall_mark(summary)
+    for figure in _plain(flight, formations, summary.window_s):
+        mark_figure(figure.drawing, mark)
+        yield figure
+
+
+def shortfall_mark(summary: RunSummary) -> str:
+    """Return what every figure of a flight that did not fly its plan says of it; empty for one that did."""
+    failed = [each.text for each in summary.shortfalls if each.fails]
+    if not failed:
+        return ""
+    more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
+    return f"Not as planned: {shorten(failed[0], MARK_MAX, placeholder=' …')}{more}"
+
+
+def _plain(
     flight: RecordedFlight, formations: Sequence[Formation], window_s: tuple[float, float]
 ) -> Iterator[ReportFigure]:
-    """Yield the figures that the record has data for, the first cluster's under the plain names."""
     for i, formation in enumerate(formations):
-        yield from _of_cluster(formation, window_s, f"_{formation.name}" if i else "")
+        marks = time_marks(flight, formation)
+        yield from _of_cluster(formation, window_s, marks, f"_{formation.name}" if i else "")
     if any(len(track.t_ns) for track in flight.tracks):
         yield ReportFigure(
             "plan_view.png",
@@ -285,23 +264,25 @@ def figures(
             "drones.png",
             "Drones",
             "True altitude, state of the firmware and battery of every drone.",
-            draw_drones(flight),
+            draw_drones(flight, time_marks(flight, formations[0] if formations else None)),
         )
 
 
-def _of_cluster(formation: Formation, window_s: tuple[float, float], suffix: str) -> Iterator[ReportFigure]:
+def _of_cluster(
+    formation: Formation, window_s: tuple[float, float], marks: TimeMarks, suffix: str
+) -> Iterator[ReportFigure]:
     yield ReportFigure(
         f"figure_5_errors{suffix}.png",
         "Formation parameters' errors (the paper's Figure 5)",
         "Left: the whole run. Right: the window of the statistics, on an axis of its own. "
         "Estimate − desired is what the controller sees; truth − desired is what the drones do. "
         "Until the formation is engaged, the controller takes its own estimate as the desired value.",
-        draw_errors(formation, window_s),
+        draw_errors(formation, window_s, marks),
     )
     for file, number, what, names in parameter_groups(formation.names):
         yield ReportFigure(
             f"{file}{suffix}.png",
             f"{what} (the paper's Figure {number})",
             f"Desired, measured (from the estimates) and true {', '.join(names)}.",
-            draw_parameters(formation, names, what),
+            draw_parameters(formation, names, what, marks),
         )
