@@ -6,7 +6,12 @@ I. Mas, S. Curi, R. Sanchez Pena, Open-source Multi-UAV Simulator for the ROS En
 import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from zsim.scenario.scenario import Cluster, Scenario
+from zsim_agents.formation.expression import ExpressionError
+from zsim_agents.formation.spaces.scenario_space import cluster_space
+from zsim_agents.formation.variable_values import TrajectoryError, named_values
 
 # Table I: standard deviation of the formation parameters for Test 1 after steady state; m and rad.
 PAPER_TABLE_1 = {
@@ -42,6 +47,7 @@ TEST_1_TARGET = {
     "q": 4.0,
     "beta": math.pi / 4,
 }
+ROBOTS = 3
 TOLERANCE = 1e-3  # of a target that is written with fewer digits
 
 
@@ -54,7 +60,13 @@ def paper_table(scenario: Scenario | None, cluster: str) -> Mapping[str, float]:
 
 def _is_test_1(cluster: Cluster) -> bool:
     """Return whether a cluster of three drones is led from the ground to equation (3), as in Test 1."""
-    target, plan = cluster.plan.target, cluster.plan
-    if len(cluster.drones) != 3 or plan.takeoff_s is None or plan.trajectory is not None:
+    plan = cluster.plan
+    if len(cluster.drones) != ROBOTS or plan.takeoff_s is None or plan.trajectory is not None:
         return False
-    return all(abs(target.get(name, math.inf) - value) <= TOLERANCE for name, value in TEST_1_TARGET.items())
+    space = cluster_space(ROBOTS)
+    try:
+        target = named_values(space, plan.target, "target", np.full(len(space.names), np.inf))
+    except (TrajectoryError, ExpressionError):
+        return False  # it was refused in flight
+    wanted = [TEST_1_TARGET.get(name, np.nan) for name in space.names]
+    return all(abs(target[k] - value) <= TOLERANCE for k, value in enumerate(wanted) if not np.isnan(value))

@@ -268,7 +268,7 @@ def test_every_variable_has_a_range_in_its_unit():
     assert found["z_c"].low > 0
     assert found["beta"].low > 0
     assert found["beta"].high < 180
-    goal = cluster.plan.target
+    goal = {name: float(value) for name, value in cluster.plan.target.items()}
     assert all(found[n].refusal(found[n].to_display(v)) is None for n, v in goal.items())
 
 
