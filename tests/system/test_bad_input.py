@@ -120,8 +120,14 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "expecting a ghost": (("run", "{one}", "--set", "processes.expect=[estimator.ghost]"), ("'ghost'",)),
     "unwritable out": (("run", "{one}", "--out", "/proc/zsim"), ("/proc/zsim: ",)),
     "out is a file": (("run", "{one}", "--out", "{one}"), ("one.yaml: ",)),
-    "a bad plan, looked at": (("validate", "{bad}"), ("x_c",)),
-    "a bad plan": (("run", "{bad}", "--in-process", "--out", "{folder}/e"), ("x_c",)),
+    "a bad plan, looked at": (
+        ("validate", "{bad}"),
+        ("bad.yaml: clusters[0].plan.trajectory.expressions.x_c", "'sin('"),
+    ),
+    "a bad plan": (
+        ("run", "{bad}", "--in-process", "--out", "{folder}/e"),
+        ("bad.yaml: clusters[0].plan.trajectory.expressions.x_c", "'sin('"),
+    ),
 }
 
 

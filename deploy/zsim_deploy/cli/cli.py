@@ -87,6 +87,7 @@ def run(
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
     from zsim.runtime.progress import Screen
+    from zsim_agents.hosting import check_plans
     from zsim_deploy.launch.run import (
         RunOptions,
         check_endpoint,
@@ -113,6 +114,8 @@ def run(
         first = [name for name in order.split(",") if name]
         pace = flight.mode_and_rate()
         scenario = with_cameras(flight.scenario()) if cameras else flight.scenario()
+        if in_process:
+            check_plans(scenario, flight.path.name)  # as processes, controllers refuse them
         options = RunOptions(scenario, Path(), *pace, listen, insecure, hosted, first, console, cameras, detect)
     if not in_process:
         if options.camera_children():
