@@ -161,7 +161,7 @@ def states(shown: dict[str, Any]) -> list[str]:
 def test_an_operator_sees_three_drones_and_flies_them(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:
-    federation.run(TRIAD, "--rate", "4")  # a browser without a graphics card draws all the while
+    run = federation.run(TRIAD, "--rate", "4")  # a browser without a graphics card draws all the while
     _, links = console(federation, "--token", STEER)
 
     # who may come in
@@ -185,6 +185,12 @@ def test_an_operator_sees_three_drones_and_flies_them(
     button.evaluate("button => button.click()")
     later = operator.until(f"s.t_s > {start['t_s'] + 2}")
     assert later["clusters"][0]["phase"] == "idle"
+
+    # its camera is its own
+    assert viewer.page.locator("#zsim-tools [aria-pressed=true]").text_content() == "Follow"
+    viewer.page.locator("#zsim-tools").get_by_text("Follow").evaluate("button => button.click()")
+    viewer.page.locator("#zsim-tools [aria-pressed=false]").wait_for(state="attached")
+    operator.page.locator("#zsim-tools").get_by_text("Top").evaluate("button => button.click()")
 
     # what is refused is told
     operator.press("Engage")
@@ -230,6 +236,13 @@ def test_an_operator_sees_three_drones_and_flies_them(
     operator.select_tab("Fly")
     operator.press("Land")
     operator.until("s.drones.every(d => d.state == 'landed')")
+
+    # what is over is shown as over
+    assert operator.page.locator("body.zsim-old").count() == 0
+    run.signal(signal.SIGINT)
+    operator.page.locator("body.zsim-old").wait_for(state="attached")
+    assert operator.page.locator("#zsim-age").is_visible()
+    run.ends(with_code=130)
     for page in (operator, viewer, refused):
         assert page.outside() == set()
         assert page.faults == []

@@ -26,19 +26,19 @@ from zsim.contract import flight_messages
 from zsim.contract.messages import Info
 from zsim.schema import message
 from zsim.transport.session import Session
+from zsim_bridges.console.action_socket import ActionSockets
 from zsim_bridges.console.camera_socket import CameraSockets
 from zsim_bridges.console.http_proxy import (
     BACKEND_HOST,
     MESSAGE_MAX,
-    OPERATOR,
     SECRET_HEADER,
-    VIEWER,
     HttpProxy,
     ListenAddress,
     ViserBackend,
 )
+from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
-from zsim_bridges.console.page.page_camera import CameraFollow
+from zsim_bridges.console.page_tokens import OPERATOR, VIEWER
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.observer_process import ObserverProcess
 
@@ -166,25 +166,17 @@ _DECODER = msgspec.msgpack.Decoder(ViewerCamera | ControlUpdate | SceneClick)
 
 
 class PageControls:
-    """The controls that viser knows, and the switches that each page has for itself.
+    """The controls that viser knows.
 
     Args:
         gui: of all pages.
-        switches: ids of those of single pages.
     """
 
-    def __init__(self, gui: viser.GuiApi, switches: set[str]) -> None:
+    def __init__(self, gui: viser.GuiApi) -> None:
         self._gui = gui
-        self._switches = switches
-
-    def is_local(self, uuid: str) -> bool:
-        """Return whether a control changes nothing but its own page."""
-        return uuid in self._switches
 
     def accepts(self, uuid: str, value: Value) -> bool:
         """Return whether a control takes such a value: viser converts it to its type, and fails where it cannot."""
-        if uuid in self._switches:
-            return isinstance(value, bool)
         handle: Any = self._gui._gui_input_handle_from_uuid.get(uuid)  # viser has no public way to a control by its id
         return handle is not None and _accepts(handle, value)
 
@@ -217,8 +209,7 @@ def is_permitted(data: bytes, role: str, controls: PageControls) -> bool:
         return False
     if not isinstance(message, ControlUpdate):
         return True
-    permitted = role == OPERATOR or controls.is_local(message.uuid)
-    return permitted and controls.accepts(message.uuid, message.updates.value)
+    return role == OPERATOR and controls.accepts(message.uuid, message.updates.value)
 
 
 class Console:
@@ -246,10 +237,12 @@ class Console:
         self._camera_follow = CameraFollow(self._viser.server)
         self._frustums = CameraFrustums(self._viser.server)
         _show_text(self._viser.server.gui, "waiting for a world")
-        controls = PageControls(self._viser.server.gui, self._camera_follow.switches)
+        controls = PageControls(self._viser.server.gui)
         permits = partial(is_permitted, controls=controls)
         sockets = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
-        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, permits, sockets.respond)
+        actions = ActionSockets(self._frustums.client_id, self._camera_follow)
+        secret, port = self._viser.secret, self._viser.port
+        backend = ViserBackend(port, secret, self._state, permits, sockets.respond, actions.respond)
         self._proxy = HttpProxy(address, token, backend)
 
     @contextmanager

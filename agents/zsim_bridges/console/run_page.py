@@ -26,9 +26,9 @@ from zsim_bridges.console import console_tables
 from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows
+from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.console_page import ConsolePage
-from zsim_bridges.console.page.page_camera import CameraFollow
 from zsim_bridges.console.page.picture import (
     CanvasTrails,
     DronePoses,
@@ -114,7 +114,6 @@ class RunPage:
         hats = self._scenario.environment.hats
         self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
         self._frustums = frustums
-        self._has_clicks = False
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
         self._trails = CanvasTrails(len(names))
@@ -126,6 +125,7 @@ class RunPage:
         robots = sum(space.n for space in self._spaces.values())
         arms_m = [drone.arm_m for drone in self._scenario.drones]
         self._scene = SceneNodes(server, info.drones, arms_m, robots, len(self._spaces))
+        self._scene.on_click(self._on_click)
         self._scene.obstacles(self._scenario.environment.obstacles)
         show = self._scene.show
         self._page = ConsolePage(
@@ -167,7 +167,7 @@ class RunPage:
     def _update(self, wall_s: float) -> None:
         self._observer.tick()
         new = self.views.update()
-        self._update_cameras()
+        self.cameras.update()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
@@ -181,18 +181,12 @@ class RunPage:
                 self._table_s = wall_s
                 self._update_tables(wall_s)
 
-    def _update_cameras(self) -> None:
-        """Keep up with the cameras; once there are any, a click on a drone shows what it sees."""
-        self.cameras.update()
-        if not self._has_clicks and self.cameras.cameras():
-            self._has_clicks = True
-            self._scene.on_click(self._on_click)
-
     def _on_click(self, event: viser.SceneClickEvent) -> None:
         if self._drones is None:
             return
         drone = drone_on_ray(self._drones, self._scene.radii_m, event.ray_origin, event.ray_direction)
         if drone is not None:
+            self._page.drone_form.choose(drone)
             self._frustums.click(event.client_id, drone)
 
     def _draw_end(self) -> None:
@@ -223,7 +217,7 @@ class RunPage:
         before_ns = self._drawn_ns
         drones = self._store_drones(self.views.drones)
         dt_s = min(self._period_s(), max(0.0, (drones.t_ns - before_ns) / 1e9))
-        self._scene.drones(drones, dt_s)
+        self._scene.drones(drones, dt_s, self._page.drone_form.chosen)
         estimates = self.views.estimates().values()
         self._scene.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
         if self._shapes:

@@ -6,6 +6,7 @@ Axes, units and quaternions as everywhere: W east, north, up; quaternions w firs
 import math
 from collections import deque
 from collections.abc import Sequence
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -106,6 +107,14 @@ def drone_on_ray(
     distances_m = np.linalg.norm(away - ahead_m[:, None] * (direction / length), axis=1)
     hit = (ahead_m > 0.0) & (distances_m <= np.maximum(radii_m, CLICK_RAD * ahead_m))
     return drones.names[int(np.argmin(np.where(hit, distances_m, math.inf)))] if hit.any() else None
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Return what tells names apart: without the letters with which all begin; in full where one would be empty."""
+    alike = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
+    stem = len(list(alike))
+    short = [name[stem:] for name in names]
+    return short if all(short) else list(names)
 
 
 def rotor_angles(angles: Array, speeds: Array, turns: Array, dt_s: float) -> Array:

@@ -187,3 +187,7 @@ class DroneForm:
     def chosen(self) -> str:
         """Name of the drone that is chosen."""
         return self._chosen.value
+
+    def choose(self, drone: str) -> None:
+        """Choose a drone, as a click on it in the scene does."""
+        self._chosen.value = drone

@@ -19,7 +19,7 @@ from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import PageControls, ViewerCamera, is_permitted
-from zsim_bridges.console.http_proxy import OPERATOR, VIEWER, ListenAddress, PageRequest, PageTokens
+from zsim_bridges.console.http_proxy import ListenAddress
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page import picture as pic
 from zsim_bridges.console.page.operator_input import primary_variables, slider_ranges
@@ -32,6 +32,7 @@ from zsim_bridges.console.page.picture import (
     CanvasTrails,
     VariableHistory,
 )
+from zsim_bridges.console.page_tokens import OPERATOR, VIEWER, PageRequest, PageTokens
 from zsim_bridges.console.sensor_rates import SensorRates
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
@@ -71,6 +72,13 @@ def test_a_view_of_some_drones_keeps_their_places():
     assert found.p_W[2].tolist() == [1, 2, 3]
     assert found.q_WB.shape == (3, 4)
     assert not pic.drone_poses(ViewDrones(7, 0, ()), ("d0",)).present.any()
+
+
+def test_many_names_are_shown_by_what_tells_them_apart():
+    assert pic.short_names(["drone1", "drone2", "drone30"]) == ["1", "2", "30"]
+    assert pic.short_names(["drone10", "drone11"]) == ["10", "11"]
+    assert pic.short_names(["north", "south"]) == ["north", "south"]
+    assert pic.short_names(["drone", "drone2"]) == ["drone", "drone2"]
 
 
 def test_rotors_stand_on_their_drone_and_turn_about_its_axis():
@@ -433,11 +441,10 @@ UPDATE = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": True}}
 
 def test_a_viewer_steers_nothing_but_its_own_page():
     packed = msgspec.msgpack.encode
-    others, own = controls(a=True), controls(switches={"a"})
-    assert is_permitted(packed(CAMERA), VIEWER, others)
-    assert not is_permitted(packed(UPDATE), VIEWER, others)
-    assert is_permitted(packed(UPDATE), VIEWER, own)
-    assert is_permitted(packed(UPDATE), OPERATOR, others)
+    there = controls(a=True)
+    assert is_permitted(packed(CAMERA), VIEWER, there)
+    assert not is_permitted(packed(UPDATE), VIEWER, there)
+    assert is_permitted(packed(UPDATE), OPERATOR, there)
 
 
 CLICK = {
@@ -465,14 +472,14 @@ def test_every_page_may_click_into_its_scene(role: str):
     assert not permitted(modifier="x" * 65)
 
 
-def controls(switches: set[str] | None = None, **values: Any) -> PageControls:
+def controls(**values: Any) -> PageControls:
     """Return what is known of controls that hold such values; a list is that of a dropdown."""
     handles = {
         uuid: SimpleNamespace(value=now[0], options=now) if isinstance(now, list) else SimpleNamespace(value=now)
         for uuid, now in values.items()
     }
     gui: Any = SimpleNamespace(_gui_input_handle_from_uuid=handles)
-    return PageControls(gui, switches or set())
+    return PageControls(gui)
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,8 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_server import PrivateViser
 from zsim_bridges.console.page import scene_nodes as stages
+from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
-from zsim_bridges.console.page.page_camera import CameraFollow
 from zsim_bridges.console.page.picture import drone_poses
 from zsim_bridges.console.run_page import RunPage, picture_rate_hz
 from zsim_bridges.console.view_buffer import TimeMonitor
@@ -277,67 +277,6 @@ def test_a_slider_that_was_moved_just_before_its_page_closed_is_sent_now_or_neve
     seen.draw(drones(*NAMES))
     assert len(sent) == 1
     seen.show.close()
-
-
-class Page:
-    """A page of viser's, with its camera and its switch."""
-
-    def __init__(self, number: int) -> None:
-        self.client_id = number
-        self.camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3))
-        self.switch = SimpleNamespace(value=False, _impl=SimpleNamespace(uuid=f"u{number}"))
-        self.gui = SimpleNamespace(add_checkbox=lambda *_, **__: self.switch)
-
-    def atomic(self) -> "Page":
-        return self
-
-    def __enter__(self) -> None:
-        return
-
-    def __exit__(self, *_: object) -> None:
-        return
-
-
-def cameras(calls: dict[str, Any], there: set[int]) -> Any:
-    """Return a server that has pages of some numbers."""
-    return SimpleNamespace(
-        on_client_connect=lambda call: calls.update(come=call),
-        on_client_disconnect=lambda call: calls.update(go=call),
-        get_clients=lambda: dict.fromkeys(there),
-    )
-
-
-def test_a_page_that_went_before_it_was_known_is_forgotten():
-    calls: dict[str, Any] = {}
-    followers = CameraFollow(cameras(calls, set()))
-    gone = Page(1)
-    calls["go"](gone)
-    calls["come"](gone)
-    assert followers.switches == set()
-    gone.switch.value = True
-    followers.follow(np.array([(10.0, 0.0, 2.0)]))
-    assert followers._targets == {}
-
-
-def test_cameras_follow_where_their_page_says_so():
-    calls: dict[str, Any] = {}
-    followers = CameraFollow(cameras(calls, {1, 2}))
-    one, other = Page(1), Page(2)
-    calls["come"](one)
-    calls["come"](other)
-    assert followers.switches == {"u1", "u2"}
-    one.switch.value = True
-    followers.follow(np.array([(0.0, 0.0, 2.0), (2.0, 0.0, 2.0)]))  # the first picture: everybody looks there
-    followers.follow(np.array([(10.0, 0.0, 2.0), (12.0, 0.0, 2.0)]))
-    followers.follow(np.zeros((0, 3)))
-    assert one.camera.look_at.tolist() == [11.0, 0.0, 2.0]
-    assert other.camera.look_at.tolist() == [1.0, 0.0, 2.0]
-    followers.restart()  # another run
-    followers.follow(np.array([(30.0, 0.0, 2.0)]))
-    assert other.camera.look_at.tolist() == [30.0, 0.0, 2.0]
-    calls["go"](one)
-    assert followers.switches == {"u2"}
-    assert followers._targets == {}
 
 
 def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
