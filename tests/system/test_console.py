@@ -220,6 +220,14 @@ def test_an_operator_sees_three_drones_and_flies_them(
     operator.until(f"Math.abs(s.clusters[0].desired.p - {wanted}) < 0.06")
     there = operator.until(f"Math.abs(s.clusters[0].true.p - {wanted}) < 0.3")
 
+    # plots are as wide later as they are now
+    operator.select_tab("Plots")
+    operator.page.locator(".uplot canvas").first.wait_for()
+    width = "document.querySelector('.uplot-container').offsetWidth"
+    width_px, now_s = operator.page.evaluate(width), operator.state()["t_s"]
+    operator.until(f"s.t_s > {now_s + 20}")
+    assert operator.page.evaluate(width) == width_px
+
     # GPS lost by a button
     before = there["drones"][0]["sigma_m"]
     operator.select_tab("Faults")

@@ -4,6 +4,8 @@ import gzip
 import importlib.resources
 
 PARTS = ("camera_windows.html", "scene_tools.html")  # of the page beside viser's
+STYLE = "<style>div:has(> .uplot) {contain: inline-size}</style>"
+"""A plot takes the width that its panel has: else the panel grows with its plots where no box around it may clip."""
 VIEW_STYLE = (
     "<style>body::before{content:'view only';position:fixed;top:8px;left:50%;transform:translateX(-50%);z-index:9999;"
     "background:#1971c2;color:#fff;font:600 13px sans-serif;padding:3px 14px;border-radius:10px}"
@@ -13,12 +15,12 @@ VIEW_STYLE = (
 
 def operator_page() -> bytes:
     """Return the page of operators, compressed."""
-    return _page("")
+    return _page(STYLE)
 
 
 def viewer_page() -> bytes:
     """Return the page of viewers, compressed."""
-    return _page(VIEW_STYLE)
+    return _page(STYLE + VIEW_STYLE)
 
 
 def _page(style: str) -> bytes:

@@ -249,6 +249,8 @@ class RunPage:
             if view is not None:
                 true_c = None if true_shape is None else true_shape.c
                 self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true_c)
+        estimates = self.views.estimates().items()
+        self._page.flights.add(drones, {name: each.estimate for name, each in estimates if each.fresh})
 
     def _camera_targets(self, drones: DronePoses) -> np.ndarray:
         """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""

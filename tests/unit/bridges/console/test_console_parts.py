@@ -229,6 +229,25 @@ def test_an_angle_that_goes_round_breaks_the_curve():
     assert desired[3] == pytest.approx(math.degrees(3.3) - 360)
 
 
+def test_errors_are_counted_from_what_is_desired():
+    history = VariableHistory(1)
+    for k, yaw in enumerate((3.0, 3.1, -3.1)):
+        history.add(float(k), (3.1,), (yaw,), np.array([yaw - 0.1]))
+    _, desired, estimated, true = history.curves(0, angular=True, less=0)
+    assert desired == pytest.approx([0.0, 0.0, 0.0])
+    assert np.radians(estimated) == pytest.approx([-0.1, 0.0, math.tau - 6.2])
+    assert np.radians(true) == pytest.approx([-0.2, -0.1, math.tau - 6.3])
+
+
+def test_a_window_shows_the_newest_of_the_curves():
+    history = VariableHistory(1)
+    for k in range(100):
+        history.add(float(k), (1.0,), (2.0,), None)
+    t, desired, *_ = history.curves(0, angular=False, span_s=20.0)
+    assert t.tolist() == list(range(79, 100))
+    assert len(desired) == 21
+
+
 def test_rates_follow_from_counts():
     rates = SensorRates()
     assert rates.update("d1", 0, {"gps": (10, 0)}) == {}
