@@ -157,6 +157,18 @@ class CommandClient:
         """Request an operation of the world."""
         self._ask(keys.CONTROL, op, args, f"{op} {_format_arguments(args)}".strip())
 
+    def seek(self, t_s: float, step: bool) -> None:
+        """Request a replay to go on from an instant, and to play the gate there if it stands still."""
+        self._submit(self._requests.submit, f"seek {t_s:g} s", self._seek, t_s, step)
+
+    def timeline(self) -> dict[str, Any]:
+        """Return the timeline of a replay, empty where nobody answers."""
+        with suppress(ZsimError):
+            answer = self._link.request(keys.CONTROL, "timeline", self._name, {}, ANSWER_TIMEOUT_S)
+            if answer.ok and isinstance(answer.result, dict) and "to_s" in answer.result:
+                return answer.result
+        return {}
+
     def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
         """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""
         self._ask(
@@ -197,6 +209,10 @@ class CommandClient:
     def _request(self, key: str, op: str, args: dict[str, Any]) -> str:
         answer = self._link.request(key, op, self._name, args, ANSWER_TIMEOUT_S)
         return "" if answer.ok else answer.error or "refused without a reason"
+
+    def _seek(self, t_s: float, step: bool) -> str:
+        refusal = self._request(keys.CONTROL, "seek", {"t_s": t_s})
+        return refusal or (self._request(keys.CONTROL, "step", {"gates": 1}) if step else "")
 
     def _acquire_and_send(self, drone: str, mode: str, stops: int) -> str:
         """Acquire a drone and send the mode, unless more emergencies were requested meanwhile."""

@@ -39,6 +39,7 @@ from zsim_bridges.console.http_proxy import (
 from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page_tokens import OPERATOR, VIEWER
+from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.observer_process import ObserverProcess
 
@@ -240,7 +241,7 @@ class Console:
         controls = PageControls(self._viser.server.gui)
         permits = partial(is_permitted, controls=controls)
         sockets = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
-        actions = ActionSockets(self._frustums.client_id, self._camera_follow)
+        actions = ActionSockets(self._frustums.client_id, self._camera_follow, self._record)
         secret, port = self._viser.secret, self._viser.port
         backend = ViserBackend(port, secret, self._state, permits, sockets.respond, actions.respond)
         self._proxy = HttpProxy(address, token, backend)
@@ -277,6 +278,9 @@ class Console:
             page.run(stopped)
         finally:
             page.close()
+
+    def _record(self) -> RecordPlayer | None:
+        return self._run_page.record if self._run_page else None
 
     def _state(self) -> dict[str, Any]:
         return self._run_page.state() if self._run_page else {"run_id": None}

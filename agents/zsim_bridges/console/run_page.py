@@ -40,6 +40,8 @@ from zsim_bridges.console.page.picture import (
     ghosts,
 )
 from zsim_bridges.console.page.scene_nodes import SceneNodes
+from zsim_bridges.console.picture_rate import picture_rate_hz
+from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.run_state import console_state
 from zsim_bridges.console.view_buffer import TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
@@ -48,14 +50,6 @@ TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
 STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
 EVENTS_SHOWN = 60
 NOTICE_S = 8.0  # wall; how long a refusal stays in the corner
-FEW_DRONES = 20  # drones from which on pictures come half as often
-RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST_RATE = 4.0  # x real time; from then on the rate is halved, too: the run needs the processors
-
-
-def picture_rate_hz(drones: int, rate: float) -> float:
-    """Return how many pictures a second suit so many drones, and a run that goes so many times as fast as real time."""
-    return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ
 
 
 def _spaces(scenario: Scenario) -> dict[str, ClusterSpace]:
@@ -85,6 +79,7 @@ class RunPage:
     Attributes:
         views: the newest of everything.
         cameras: of the drones.
+        record: what is played, of a replay.
     """
 
     def __init__(
@@ -111,6 +106,7 @@ class RunPage:
         self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
         self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command)
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
+        self.record = RecordPlayer(self._client, self._time_monitor, bool(info.replay_of))
         hats = self._scenario.environment.hats
         self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
         self._frustums = frustums
@@ -143,6 +139,7 @@ class RunPage:
         """Draw pictures until the run is over or `stopped` returns true."""
         self.views.open()
         self.cameras.open()
+        self.record.load()
         pause = threading.Event()
         next_s = time.monotonic()
         with self._time_monitor.polling():
@@ -155,7 +152,7 @@ class RunPage:
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
         state = console_state(self._info.run_id, self.views, self._time_monitor, dict(self._shapes))
-        return {**state, "cameras": self.cameras.state()}
+        return {**state, "cameras": self.cameras.state(), "timeline": self.record.timeline}
 
     # A picture
 

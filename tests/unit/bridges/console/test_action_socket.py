@@ -18,7 +18,9 @@ class Actions:
     def __init__(self) -> None:
         self.looked: list[tuple[Any, ...]] = []
         cameras: Any = SimpleNamespace(choose=lambda *args: self.looked.append(args))
-        self._sockets = ActionSockets({"key": 7}.get, cameras)
+        self.played: list[tuple[str, float]] = []
+        self.record: Any = SimpleNamespace(play=lambda *args: self.played.append(args))
+        self._sockets = ActionSockets({"key": 7}.get, cameras, lambda: self.record)
 
     def act(self, role: str, **action: Any) -> bool:
         return self._sockets.act(json.dumps(action), role)
@@ -39,3 +41,22 @@ def test_what_is_no_action_closes_the_socket(change: dict[str, Any]):
     actions = Actions()
     assert not actions.act(OPERATOR, **LOOK | change)
     assert actions.looked == []
+
+
+def test_an_operator_plays_a_record_and_a_viewer_does_not():
+    actions = Actions()
+    assert actions.act(OPERATOR, do="play", op="seek", value=5.0)
+    assert not actions.act(VIEWER, do="play", op="seek", value=5.0)
+    assert actions.played == [("seek", 5.0)]
+
+
+def test_without_a_run_nothing_is_played():
+    actions = Actions()
+    actions.record = None
+    assert actions.act(OPERATOR, do="play", op="pause")
+    assert actions.played == []
+
+
+@pytest.mark.parametrize("change", [{"op": "acquire"}, {"value": -1.0}, {"value": 1e10}, {"value": "1"}])
+def test_what_no_timeline_says_closes_the_socket(change: dict[str, Any]):
+    assert not Actions().act(OPERATOR, **{"do": "play", "op": "seek", "value": 1.0} | change)

@@ -22,7 +22,8 @@ from zsim_bridges.console.page import scene_nodes as stages
 from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.picture import drone_poses
-from zsim_bridges.console.run_page import RunPage, picture_rate_hz
+from zsim_bridges.console.picture_rate import picture_rate_hz
+from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.console.view_buffer import TimeMonitor
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
@@ -86,7 +87,9 @@ class Seen:
         )
         drones = DRONES
         scenario = STEP.read_text()
-        info: Any = SimpleNamespace(run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario)
+        info: Any = SimpleNamespace(
+            run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario, replay_of=""
+        )
         server.get_clients = lambda: {0: None} if watched else {}
         self.show = RunPage(
             server, self.link, info, self.observer, CameraFollow(server), CameraFrustums(server), 1000.0
