@@ -29,14 +29,14 @@ class PlottedVariable(NamedTuple):
 
     Attributes:
         history: where its points are.
-        index: in it.
+        column: in it.
         label: with its unit.
         angular: whether it is an angle.
         reference: the one of SERIES from which errors are counted.
     """
 
     history: VariableHistory
-    index: int
+    column: int
     label: str
     angular: bool
     reference: int
@@ -118,7 +118,7 @@ class VariablePlots:
             return
         for each, plot in zip(shown, self._plots, strict=False):
             less, span_s = each.reference if self._errors.value else None, self._windows[self._window.value]
-            curves = each.history.curves(each.index, each.angular, span_s, less)
+            curves = each.history.curves(each.column, each.angular, span_s, less)
             if len(curves[0]) > 1:
                 plot.data = curves
 

@@ -28,7 +28,7 @@ def poses(t_s: float) -> DronePoses:
 
 def filled(seconds: int) -> FlightHistory:
     flights = flight_history(CLUSTER.drones)
-    estimate = EstimateView("drone1", (1.5, 2.0, 3.0), (0.0,) * 6, math.radians(32.0), 0.1, {})
+    estimate = EstimateView("drone1", (1.5, 2.0, 3.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), math.radians(32.0), 0.1, {})
     for t in range(seconds):
         flights.add(poses(float(t)), {"drone1": estimate})
     return flights
@@ -59,13 +59,13 @@ class Gui:
 def test_every_drone_has_its_flight_true_and_estimated():
     flights = filled(3)
     shown = {each.label.partition(" ")[0]: each for each in flights.variables("drone1")}
-    last = {name: [c[-1] for c in each.history.curves(each.index, each.angular)[1:]] for name, each in shown.items()}
+    last = {name: [c[-1] for c in each.history.curves(each.column, each.angular)[1:]] for name, each in shown.items()}
     assert last["x"][1:] == pytest.approx([1.5, 1.0])
     assert last["yaw"][1:] == pytest.approx([32.0, 30.0])
     assert last["roll"][2] == pytest.approx(6.0)
     assert math.isnan(last["roll"][1])
     gone = flights.variables("drone2")[0]
-    assert np.isnan(gone.history.curves(gone.index, False)[3]).all()
+    assert np.isnan(gone.history.curves(gone.column, False)[3]).all()
 
 
 def test_any_variable_of_any_drone_can_be_chosen_with_its_error_and_its_window():
