@@ -1,10 +1,11 @@
-"""The page: viser's, with the cameras' windows below the scene; that of viewers shows its controls disabled."""
+"""The page: viser's, below a head of its own, with the cameras' windows; viewers see its controls disabled."""
 
 import gzip
 import importlib.resources
 
+OWN_PARTS = ("head_bar.html", "camera_windows.html")
 VIEW_STYLE = (
-    "<style>body::before{content:'view only';position:fixed;top:8px;left:50%;transform:translateX(-50%);z-index:9999;"
+    "<style>body::before{content:'view only';position:fixed;top:52px;left:50%;transform:translateX(-50%);z-index:9999;"
     "background:#1971c2;color:#fff;font:600 13px sans-serif;padding:3px 14px;border-radius:10px}"
     ".mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"
 )
@@ -22,7 +23,8 @@ def viewer_page() -> bytes:
 
 def _page(style: str) -> bytes:
     html = importlib.resources.files("viser").joinpath("client/build/index.html").read_text()
-    windows = importlib.resources.files("zsim_bridges.console.page").joinpath("camera_windows.html").read_text("utf-8")
-    head, end, tail = html.rpartition("</body>")
-    with_windows = f"{head}{windows}{end}{tail}" if end else f"{html}{windows}"
-    return gzip.compress(with_windows.replace("</head>", f"{style}</head>", 1).encode())
+    own = importlib.resources.files("zsim_bridges.console.page")
+    parts = "".join(own.joinpath(name).read_text("utf-8") for name in OWN_PARTS)
+    before, end, after = html.rpartition("</body>")
+    whole = f"{before}{parts}{end}{after}" if end else f"{html}{parts}"
+    return gzip.compress(whole.replace("</head>", f"{style}</head>", 1).encode())
