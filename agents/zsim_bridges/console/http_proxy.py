@@ -7,11 +7,12 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 from urllib.parse import quote
 
 import msgspec
 from aiohttp import ClientError, ClientSession, WSMsgType, web
+from msgspec import Struct
 
 from zsim.errors import RunError
 from zsim_bridges.console import page_html
@@ -57,6 +58,8 @@ class ViserBackend(NamedTuple):
         permits: returns whether a message of a page may reach viser, by the page's role.
         serve_cameras: answers a page's request for a socket of pictures, until it closes.
         serve_actions: answers one for a socket of what is done in the scene, by the page's role, until it closes.
+        head: returns what the head of the page shows, as plain data.
+        command: does what a button of the head asks for; returns why it is refused, empty where it is not.
     """
 
     port: int
@@ -65,6 +68,14 @@ class ViserBackend(NamedTuple):
     permits: Callable[[bytes, str], bool]
     serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]
     serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]
+    head: Callable[[], dict[str, Any]]
+    command: Callable[[str], str]
+
+
+class HeadCommand(Struct, frozen=True, forbid_unknown_fields=True):
+    """What a button of the page's head asks for."""
+
+    op: Literal["emergency", "land", "acknowledge"]
 
 
 class HttpProxy:
@@ -106,10 +117,12 @@ class HttpProxy:
             yield
 
     async def _open(self) -> ServedSite:
-        app = web.Application()
+        app = web.Application(client_max_size=MESSAGE_MAX)
         app.add_routes([web.get(path, self._page) for path in ("/", VIEW_PATH)])
-        for path, handler in (("/state", self._state), ("/cameras", self._cameras), ("/actions", self._actions)):
+        shared = {"/state": self._state, "/head": self._head, "/cameras": self._cameras, "/actions": self._actions}
+        for path, handler in shared.items():
             app.add_routes([web.get(path, handler), web.get(f"{VIEW_PATH}{path}", handler)])
+        app.add_routes([web.post("/command", self._command)])
         try:
             site = await start_site(app, *self._address, shutdown_s=CLOSE_S)
         except OSError as error:
@@ -148,10 +161,26 @@ class HttpProxy:
         return response
 
     async def _state(self, request: web.Request) -> web.Response:
+        return self._answer(request, self._backend.state)
+
+    async def _head(self, request: web.Request) -> web.Response:
+        return self._answer(request, self._backend.head)
+
+    def _answer(self, request: web.Request, shown: Callable[[], dict[str, Any]]) -> web.Response:
         if self._tokens.role_of(_page_request(request)) is None:
             return _missing_token()
-        body = msgspec.json.encode(self._backend.state())
-        return web.Response(body=body, content_type="application/json", headers=HEADERS)
+        return _json_response(shown())
+
+    async def _command(self, request: web.Request) -> web.Response:
+        """Do what an operator's button asks for; viewers have no such path."""
+        if self._tokens.role_of(_page_request(request)) != OPERATOR:
+            return _missing_token()
+        try:
+            command = _HEAD_COMMANDS.decode(await request.read())
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            return _json_response({"refusal": f"body: {error}"}, 400)
+        refusal = self._backend.command(command.op)
+        return _json_response({"refusal": refusal}, 409 if refusal else 200)
 
     async def _cameras(self, request: web.Request) -> web.StreamResponse:
         """Serve a page's socket for pictures of cameras: viewers see them, too."""
@@ -207,6 +236,14 @@ class HttpProxy:
         async for message in page:
             if message.type is WSMsgType.BINARY and self._backend.permits(message.data, role):
                 await viser.send_bytes(message.data)
+
+
+_HEAD_COMMANDS = msgspec.json.Decoder(HeadCommand)
+
+
+def _json_response(shown: dict[str, Any], status: int = 200) -> web.Response:
+    body = msgspec.json.encode(shown)
+    return web.Response(body=body, status=status, content_type="application/json", headers=HEADERS)
 
 
 async def _to_page(viser: Any, page: web.WebSocketResponse) -> None:

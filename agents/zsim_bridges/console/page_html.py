@@ -1,13 +1,16 @@
-"""The page: viser's, with tools over the scene and the cameras' windows below it; viewers see its controls disabled."""
+"""The page: viser's, below a head of its own, with tools over the scene and the cameras' windows.
+
+Viewers see its controls disabled.
+"""
 
 import gzip
 import importlib.resources
 
-PARTS = ("camera_windows.html", "scene_tools.html")  # of the page beside viser's
+PARTS = ("head_bar.html", "camera_windows.html", "scene_tools.html")  # of the page beside viser's
 STYLE = "<style>div:has(> .uplot) {contain: inline-size}</style>"
 """A plot takes the width that its panel has: else the panel grows with its plots where no box around it may clip."""
 VIEW_STYLE = (
-    "<style>body::before{content:'view only';position:fixed;top:8px;left:50%;transform:translateX(-50%);z-index:9999;"
+    "<style>body::before{content:'view only';position:fixed;top:52px;left:50%;transform:translateX(-50%);z-index:9999;"
     "background:#1971c2;color:#fff;font:600 13px sans-serif;padding:3px 14px;border-radius:10px}"
     ".mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"
 )

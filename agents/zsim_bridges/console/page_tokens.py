@@ -1,4 +1,4 @@
-"""Who may open which page of the console: by a token, or from this machine alone."""
+"""Who may open pages of the console, and in which role: by tokens; on this machine alone by a request's origin."""
 
 from typing import NamedTuple
 from urllib.parse import urlsplit

@@ -70,7 +70,8 @@ def console(
     own_name = process_name("console", name, reach.who, "*")
     say = JsonProgress().say if reach.launched else log_printer(None)
     require_files(SERVER_FILES, "a console and its pages")
-    shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)
+    world = f"federation {reach.federation!r} on {reach.endpoint}"
+    shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say, world)
     with shown.open():
         serve_runs(own_name, shown.serve, reach)
 

@@ -11,8 +11,10 @@ from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.page.formation_form import FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
-from zsim_bridges.console.page.run_forms import DroneForm, FaultForm, FleetForm, RunForm
+from zsim_bridges.console.page.page_forms import set_theme
+from zsim_bridges.console.page.run_forms import FaultForm, FleetForm, RunForm
 from zsim_bridges.console.page.variable_plots import VariablePlots, flight_history
+from zsim_bridges.console.run_condition import RunCondition
 
 PANEL_PX = 350
 SWITCHES = {
@@ -36,11 +38,12 @@ class ConsolePage:
         drones: of the run, with their rotors.
 
     Attributes:
-        clock, phases, drones, sensors, faults, events: the tables.
+        phases, drones, faults: the tables.
         forms, plots: of each formation.
         flights: what plots show of single drones.
         chosen: the formation that is shown; empty where there is none.
-        drone_form: has the chosen drone.
+        fleet: requests of all drones.
+        drone_folder, figure_folder, event_folder, theme_folder: of what each page has for itself.
     """
 
     def __init__(
@@ -72,15 +75,14 @@ class ConsolePage:
 
     def _set_theme(self, gui: viser.GuiApi) -> None:
         gui.reset()
-        gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
+        set_theme(gui)
         gui.set_panel_label(f"zsim {self._scenario.name}")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
 
     def _right_panel(self, gui: viser.GuiApi) -> None:
-        self.clock = gui.add_html("")
         self.phases = gui.add_html("")
-        FleetForm(gui, self._client, self._scenario)
+        self.fleet = FleetForm(gui, self._client, self._scenario)
         if len(self._spaces) > 1:
             choice = gui.add_dropdown("formation", list(self._spaces))
             choice.on_update(lambda _: self._show_formation(choice.value))
@@ -91,8 +93,9 @@ class ConsolePage:
             self.faults = gui.add_html("")
             FaultForm(gui, self._client, self._report, self._scenario, self._drones)
         with tabs.add_tab("Run"):
-            RunForm(gui, self._client, self._rate)
+            self.run_form = RunForm(gui, self._client, self._rate)
             self._switches(gui)
+            self.theme_folder = gui.add_folder(None)
 
     def _formation_tabs(self, gui: viser.GuiApi, tabs: Any) -> None:
         """Give every formation a folder in two tabs; only that of the chosen one is visible."""
@@ -112,6 +115,13 @@ class ConsolePage:
             for folder in folders:
                 folder.visible = name == chosen
 
+    def refresh(self, run: RunCondition) -> None:
+        """Grey out what would be refused."""
+        self.fleet.refresh(run)
+        self.run_form.refresh(run)
+        for form in self.forms.values():
+            form.offer(run)
+
     def _switches(self, gui: viser.GuiApi) -> None:
         for what, label in SWITCHES.items():
             switch = gui.add_checkbox(label, True)
@@ -120,10 +130,10 @@ class ConsolePage:
     def _left_panel(self, gui: viser.GuiApi) -> None:
         panel = gui.add_panel()
         with panel.add_tab("Drones", viser.Icon.DRONE):
+            self.drone_folder = gui.add_folder(None)
             self.drones = gui.add_html("")
-            self.drone_form = DroneForm(gui, self._client, self._scenario)
-            self.sensors = gui.add_html("")
+            self.figure_folder = gui.add_folder(None)
         with panel.add_tab("Events", viser.Icon.LIST):
-            self.events = gui.add_html("")
+            self.event_folder = gui.add_folder(None)
         panel.dock_left()
         panel.set_width(PANEL_PX)

@@ -30,7 +30,6 @@ TRAIL_COLOURS = np.array(
 )
 SOLID = (134, 142, 150)
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
-CHOSEN = (25, 113, 194)
 SIDE_PX = 2.0  # of a formation's sides: as wide from afar
 FIELD_M = 150.0  # half a side of the ground
 GREEN = (206, 219, 196)
@@ -82,7 +81,6 @@ class SceneNodes:
         self._ghosts = self._batch("/ghosts", ghost, robots, GHOST, opacity=0.5) if robots else None
         self._ellipsoids = self._batch("/estimates", airframe.ball(), len(names), ELLIPSOID, opacity=0.35)
         self._names = self._labels(names)
-        self._ring = self._batch("/chosen", airframe.ring(), 1, CHOSEN)
         self._wind = self._scene.add_arrows(
             "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
             head_length=0.22, visible=False,
@@ -106,17 +104,13 @@ class SceneNodes:
             else:
                 self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
 
-    def drones(self, drones: DronePoses, dt_s: float, chosen: str = "") -> None:
-        """Move the drones; their rotors have turned for dt_s, and the chosen one has a ring."""
+    def drones(self, drones: DronePoses, dt_s: float) -> None:
+        """Move the drones, whose rotors have turned for dt_s."""
         drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
         self._airframes.move(drones)
         self._rotors.move(drones, dt_s)
         for label, p_W in zip(self._names, drones.p_W, strict=False):
             label.position = p_W + LABEL_B
-        if chosen in drones.names:
-            index = drones.names.index(chosen)
-            self._ring.batched_positions = drones.p_W[[index]]
-            self._ring.batched_scales = np.full((1, 3), self.radii_m[index])
 
     def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
         """Call back with viser's event of each click into the scene.

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from refused import has_terms, refused, without_tags
 
-from zsim.contract.run_messages import Clock, Event, Waiting
+from zsim.contract.run_messages import Event
 from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.errors import RunError
 from zsim.math import frames
@@ -19,6 +19,7 @@ from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import PageControls, ViewerCamera, is_permitted
+from zsim_bridges.console.event_log import EventRow
 from zsim_bridges.console.http_proxy import ListenAddress
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page import picture as pic
@@ -554,10 +555,13 @@ def test_tables_show_text_of_others_as_text():
     assert "&lt;script&gt;" in html
     assert "gps_dropout" in html
     assert html.count(console_tables.AMBER) == 2  # late, and a fault
+    assert has_terms(without_tags(html), "flying", "12 %", "lag 400 ms")
     assert console_tables.RED in html  # the battery
-    events = console_tables.event_table([Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")])
+    event = Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")
+    events = console_tables.event_table([EventRow(event, 3, False)])
     assert "1.50" in events
     assert "&lt;b&gt;no" in events
+    assert has_terms(without_tags(events), "3 ×")
 
 
 def test_many_formations_leave_room_for_the_emergency_button():
@@ -565,25 +569,6 @@ def test_many_formations_leave_room_for_the_emergency_button():
     assert console_tables.FEW_LINES in html
     assert html.count("<br>") == 15
     assert has_terms(without_tags(html), "taking off", "&lt;waits&gt")
-
-
-def test_the_clock_says_whom_the_run_waits_for():
-    now = Clock(2_000_000_000, 0, "r", 100, "waiting", 0.0, (Waiting("estimator.d1", "lab", 3.0),))
-    assert has_terms(without_tags(console_tables.clock_line(now, now.t_ns)), "waiting", "estimator.d1", "lab", "3 s")
-    assert "no clock" in console_tables.clock_line(None, 0)
-
-
-def test_the_clock_names_the_cause_and_not_who_only_waits_for_it():
-    waiting = (Waiting("estimator.d1", "lab", 3.0), Waiting("controller.main", "hall", 3.0, ("estimator.d1",)))
-    text = without_tags(console_tables.clock_line(Clock(0, 0, "r", 0, "running", 0.0, waiting), 0))
-    assert has_terms(text, "waiting", "estimator.d1", "lab")
-    assert "controller" not in text
-
-
-def test_the_clock_tells_a_pace_only_while_the_run_goes_on():
-    running, paused = (Clock(2_020_000_000, 0, "r", 101, state, 3.0) for state in ("running", "paused"))  # type: ignore[arg-type]
-    assert has_terms(without_tags(console_tables.clock_line(running, 2_010_000_000)), "2.0 s", "3.0")
-    assert "2.02 s</b><" in console_tables.clock_line(paused, 0)  # nothing is drawn yet
 
 
 def test_acting_faults_are_listed():
