@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONNECT_VARIABLE = "ZSIM_CONNECT"  # of the environment: the endpoint where --connect is not given
 RUN_ID = "{run}"  # in the folder of a record: a recorder that is started again finds the one that it had begun
+CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}  # modules by extra
 CONSOLE_PORT = 8080  # of its page
 RUN, HOSTS = "Run", "On several machines"  # panels of the help
 REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens

@@ -19,7 +19,7 @@ import msgspec
 import pytest
 import zstandard
 from chromium import needs_browser
-from console_browser import PATIENCE_MS, POLL_MS, BrowserPage, console
+from console_browser import PATIENCE_MS, POLL_MS, VIEWPORT, BrowserPage, console
 from federation import Federation, Role, free_port
 from refused import has_terms
 from websockets.exceptions import ConnectionClosed
@@ -30,6 +30,15 @@ from zsim_bridges.console.console_server import ViewerCamera
 
 STRIP = {"width": 860, "height": 120}  # of a page whose picture nobody looks at
 STEER = "a-good-token"
+SCREENS = ({"width": 1600, "height": 1000}, {"width": 1280, "height": 720}, {"width": 390, "height": 844})
+IN_SIGHT = """() => ['land', 'emergency'].every(name => {
+  const button = document.querySelector('#zsim-head button.' + name), box = button.getBoundingClientRect();
+  const inside = box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight;
+  return inside && document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2) === button;
+})"""
+OVERFLOWING = """() => [...document.querySelectorAll('.mantine-ScrollArea-viewport, #zsim-head')]
+  .filter(panel => panel.scrollWidth > panel.clientWidth + 1)
+  .map(panel => `${panel.className} ${panel.scrollWidth} > ${panel.clientWidth}`)"""
 TRIAD = """
 name: triad
 seed: 3
@@ -52,6 +61,17 @@ def status(address: str, **headers: str) -> int:
     """Return what HTTP answers to a get."""
     try:
         with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=PATIENCE_S) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        error.close()
+        return error.code
+
+
+def command(address: str, op: str) -> int:
+    """Return what HTTP answers to a button of the page's head."""
+    request = urllib.request.Request(address, json.dumps({"op": op}).encode())
+    try:
+        with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
             return answer.status
     except urllib.error.HTTPError as error:
         error.close()
@@ -152,6 +172,16 @@ def shown(address: str, until: Callable[[dict[str, Any]], bool]) -> dict[str, An
         time.sleep(POLL_MS / 1000)
 
 
+def press_until(address: str, page: PageConnection, label: str, wanted: str) -> None:
+    """Press a button again and again, which is greyed out at first, until all three drones are in a state."""
+
+    def press(state: dict[str, Any]) -> bool:
+        page.put(label, True)
+        return states(state) == [wanted] * 3
+
+    shown(address, press)
+
+
 def states(shown: dict[str, Any]) -> list[str]:
     return [drone["state"] for drone in shown.get("drones", ())]
 
@@ -161,7 +191,7 @@ def states(shown: dict[str, Any]) -> list[str]:
 def test_an_operator_sees_three_drones_and_flies_them(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:
-    federation.run(TRIAD, "--rate", "4")  # a browser without a graphics card draws all the while
+    run = federation.run(TRIAD, "--rate", "4")  # a browser without a graphics card draws all the while
     _, links = console(federation, "--token", STEER)
 
     # who may come in
@@ -186,9 +216,15 @@ def test_an_operator_sees_three_drones_and_flies_them(
     later = operator.until(f"s.t_s > {start['t_s'] + 2}")
     assert later["clusters"][0]["phase"] == "idle"
 
-    # what is refused is told
-    operator.press("Engage")
-    operator.wait_for_text("Refused: main: engage")
+    # its camera is its own
+    assert viewer.page.locator("#zsim-tools [aria-pressed=true]").text_content() == "Follow"
+    viewer.page.locator("#zsim-tools").get_by_text("Follow").evaluate("button => button.click()")
+    viewer.page.locator("#zsim-tools [aria-pressed=false]").wait_for(state="attached")
+    operator.page.locator("#zsim-tools").get_by_text("Top").evaluate("button => button.click()")
+
+    # what would be refused is greyed out
+    engage = operator.page.get_by_role("button", name="Engage", exact=True)
+    engage.and_(operator.page.locator(":disabled")).wait_for()
 
     # they take off by the button, and move
     operator.press("Take off")
@@ -205,6 +241,7 @@ def test_an_operator_sees_three_drones_and_flies_them(
     # p by its slider, and the true p follows
     slider = operator.page.get_by_role("slider").nth(PLACE_OF_P)
     engaged_p = engaged["clusters"][0]["desired"]["p"]
+    operator.page.get_by_role("button", name="Hold", exact=True).and_(operator.page.locator(":enabled")).wait_for()
     slider.and_(operator.page.locator(f"[aria-valuenow='{engaged_p:.1f}']")).wait_for(timeout=PATIENCE_MS)
     slider.focus()
     for _ in range(12):
@@ -213,6 +250,14 @@ def test_an_operator_sees_three_drones_and_flies_them(
     assert wanted > engaged_p + 0.3  # a press between two updates of the page may be lost
     operator.until(f"Math.abs(s.clusters[0].desired.p - {wanted}) < 0.06")
     there = operator.until(f"Math.abs(s.clusters[0].true.p - {wanted}) < 0.3")
+
+    # plots are as wide later as they are now
+    operator.select_tab("Plots")
+    operator.page.locator(".uplot canvas").first.wait_for()
+    width = "document.querySelector('.uplot-container').offsetWidth"
+    width_px, now_s = operator.page.evaluate(width), operator.state()["t_s"]
+    operator.until(f"s.t_s > {now_s + 20}")
+    assert operator.page.evaluate(width) == width_px
 
     # GPS lost by a button
     before = there["drones"][0]["sigma_m"]
@@ -226,10 +271,24 @@ def test_an_operator_sees_three_drones_and_flies_them(
     operator.press("Clear all faults")
     operator.until("s.faults.length == 0")
 
+    # on every screen both buttons are in sight, and no panel is wider than it may be
+    for size in SCREENS:
+        operator.page.set_viewport_size(size)
+        operator.page.wait_for_function(IN_SIGHT)
+        assert operator.page.evaluate(OVERFLOWING) == []
+    operator.page.set_viewport_size(VIEWPORT)
+
     # and down again
     operator.select_tab("Fly")
     operator.press("Land")
     operator.until("s.drones.every(d => d.state == 'landed')")
+
+    # what is over is shown as over
+    assert operator.page.locator("body.zsim-old").count() == 0
+    run.signal(signal.SIGINT)
+    operator.page.locator("body.zsim-old").wait_for(state="attached")
+    assert operator.page.locator("#zsim-age").is_visible()
+    run.ends(with_code=130)
     for page in (operator, viewer, refused):
         assert page.outside() == set()
         assert page.faults == []
@@ -241,7 +300,7 @@ def test_what_one_operator_moves_the_other_sees_move(
     federation.world(TRIAD, "--rate", "1")
     role, links = console(federation)
     role.line("console.1: in run")
-    label = "p [m]"
+    label = "over [s]"
     one, other = connected(links["steer"]), connected(links["steer"])
     for page in (one, other):
         page.wait_for_control(label)
@@ -263,14 +322,16 @@ def test_an_emergency_stops_a_drone_that_another_operator_flies(
     role.line("console.1: in run")
     address = links["steer"]
     page = connected(address)
-    page.wait_for_control("EMERGENCY – all rotors stop")
     page.wait_for_control("Take off")
     shown(address, lambda state: states(state) == ["landed"] * 3)
-    page.put("Take off", True)
-    shown(address, lambda state: states(state) == ["flying"] * 3)
+    press_until(address, page, "Take off", "flying")
     assert federation.client().request("world/control", "acquire", drone="drone1", priority=10)["ok"]
-    page.put("EMERGENCY – all rotors stop", True)
+    assert command(f"{links['look']}/command", "emergency") in (404, 405)  # who may only look has no such path
+    assert command(f"{address}command", "dance") == 400
+    assert command(f"{address}command", "emergency") == 200
     shown(address, lambda state: states(state) == ["emergency"] * 3)
+    page.wait_for_control("Reset all")
+    press_until(address, page, "Reset all", "landed")
 
 
 def test_a_run_with_a_console_prints_its_link_and_ends_as_a_whole(federation: Federation) -> None:

@@ -2,6 +2,8 @@
 
 import re
 import shutil
+import signal
+import urllib.request
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ import pytest
 import zenoh
 from federation import PAIR, PAIR_ROLES, Federation, Role
 from refused import parts
-from wire import Client
+from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader
 
@@ -96,6 +98,26 @@ def test_the_same_payloads(federation: Federation, flown: Path) -> None:
         output = [payload for payload in ear.received[key] if msgpack.unpackb(payload)["t_ns"] > 0]
         assert output == rest, key
     assert {view.key for view in views.now()} >= {"view/drones", "view/cluster/main"}
+
+
+def test_a_console_beside_it_has_a_timeline(federation: Federation, flown: Path) -> None:
+    """Played to its end, where it stands: nothing is over before somebody ends it."""
+    pytest.importorskip("viser", reason="viser is not installed; pip install 'zsim[console]'")
+    role = replay(federation, flown, "--console", "--rate", "0")
+    client = federation.client()
+    clock = client.subscribe("clock")
+    address = role.line("steer at").text.rpartition(" ")[2]
+    client.request("world/control", "seek", t_s=0)
+    clock.until(lambda m: m["state"] == "paused")
+    timeline = client.request("world/control", "timeline")["result"]
+    assert timeline["to_s"] > timeline["from_s"]
+    assert {mark["kind"] for mark in timeline["marks"]} >= {"mode"}
+    assert client.request("world/control", "seek", t_s=timeline["to_s"] / 2)["ok"]
+    with urllib.request.urlopen(f"{address}state", timeout=PATIENCE_S) as answer:
+        assert answer.status == 200
+    role.signal(signal.SIGINT)
+    role.ends(with_code=0)
+    federation.nobody_left()
 
 
 def test_a_part_of_it(federation: Federation, flown: Path) -> None:

@@ -17,6 +17,9 @@ from zsim_agents.formation.flight_check import FlightCheck, place_fault
 from zsim_agents.formation.flight_data import (
     AIRBORNE,
     DOWN,
+    GUARD_PARTS,
+    HELD_ON_REQUEST,
+    READY_TO_ENGAGE,
     EngagementLimits,
     GateInput,
     GateOutput,
@@ -217,7 +220,7 @@ class Engagement:
         return self._climb(gate, waiting, self._modes.commands(gate, "takeoff", frozenset({"landed"})))
 
     def _assembling(self, gate: GateInput) -> GateOutput:
-        return self._climb(gate, self.check.engagement_fault(gate) or "ready to engage")
+        return self._climb(gate, self.check.engagement_fault(gate) or READY_TO_ENGAGE)
 
     def _climb(self, gate: GateInput, reason: str, modes: tuple[ModeCommand, ...] = ()) -> GateOutput:
         """Lead the drones that fly straight up to the assembly height, each by its own velocity loop."""
@@ -232,9 +235,9 @@ class Engagement:
     def _fly(self, gate: GateInput) -> GateOutput:
         c_des, c_dot_des = self.guidance.value(gate.t_s)
         command = self.law.command(self.check.value, gate.p_W, gate.v_W, c_des, c_dot_des, self._dt_s)
-        reason = "held on request" if self.guidance.paused else ""
+        reason = HELD_ON_REQUEST if self.guidance.paused else ""
         if command.guarded:
-            reason = f"the guard parts {self._pairs(command.guarded)}"
+            reason = f"{GUARD_PARTS} {self._pairs(command.guarded)}"
         if c_des is not self._wrapped[0]:
             self._wrapped = c_des, self.space.wrapped(c_des)
         return self._output(gate, reason, command=command, reference=(self._wrapped[1], c_dot_des))

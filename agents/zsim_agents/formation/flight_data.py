@@ -17,6 +17,9 @@ from zsim_agents.formation.spaces.cluster_space import Array
 
 AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
 DOWN = frozenset({"landed", "emergency"})  # states of a drone that is on the ground, or falls to it
+HELD_ON_REQUEST = "held on request"  # reasons of a formation; a display reads from them what may be asked for
+READY_TO_ENGAGE = "ready to engage"
+GUARD_PARTS = "the guard parts"
 
 
 @dataclass(frozen=True)

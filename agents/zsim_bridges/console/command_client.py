@@ -2,7 +2,7 @@
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -107,10 +107,18 @@ ACCEPTANCE_TIMEOUT_S = 1.0  # how long the world may take to accept a command, b
 
 
 class RequestOutcome(NamedTuple):
-    """A request in words, and why it was refused; empty where it was not."""
+    """A request in words, and why it was refused; empty where it was not.
+
+    Attributes:
+        subject: the formation or drone; empty for the run.
+        op, args: what was asked of it.
+    """
 
     request: str
     refusal: str
+    subject: str = ""
+    op: str = ""
+    args: Mapping[str, Any] = {}
 
 
 class CommandClient:
@@ -155,13 +163,26 @@ class CommandClient:
 
     def request_world(self, op: str, **args: Any) -> None:
         """Request an operation of the world."""
-        self._ask(keys.CONTROL, op, args, f"{op} {_format_arguments(args)}".strip())
+        what = RequestOutcome(f"{op} {_format_arguments(args)}".strip(), "")
+        self._submit(self._requests.submit, what, self._request, keys.CONTROL, op, args)
+
+    def seek(self, t_s: float, step: bool) -> None:
+        """Request a replay to go on from an instant, and to play the gate there if it stands still."""
+        self._submit(self._requests.submit, RequestOutcome(f"seek {t_s:g} s", ""), self._seek, t_s, step)
+
+    def timeline(self) -> dict[str, Any]:
+        """Return the timeline of a replay, empty where nobody answers."""
+        with suppress(ZsimError):
+            answer = self._link.request(keys.CONTROL, "timeline", self._name, {}, ANSWER_TIMEOUT_S)
+            if answer.ok and isinstance(answer.result, dict) and "to_s" in answer.result:
+                return answer.result
+        return {}
 
     def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
         """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""
-        self._ask(
-            keys.cluster_control(cluster), op, args, f"{cluster}: {op} {shown or _format_arguments(args)}".strip()
-        )
+        text = f"{cluster}: {op} {shown or _format_arguments(args)}".strip()
+        what = RequestOutcome(text, "", cluster, op, args)
+        self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
 
     def send_mode(self, drones: Sequence[str], mode: str) -> None:
         """Let drones take off, land, stop at once or leave the emergency, whoever commands them.
@@ -170,33 +191,33 @@ class CommandClient:
         was requested before it is sent after it.
         """
         for drone in drones:
+            what = RequestOutcome(f"{drone}: {mode}", "", drone, mode)
             if mode == "emergency":
                 with self._lock:
                     self._emergencies[drone] += 1
-                self._submit(
-                    partial(self._queue.submit_urgent, drone), f"{drone}: {mode}", self._send_emergency, drone, mode
-                )
+                self._submit(partial(self._queue.submit_urgent, drone), what, self._send_emergency, drone, mode)
             else:
                 turn, stops = partial(self._queue.submit, drone), self._emergencies[drone]
-                self._submit(turn, f"{drone}: {mode}", self._acquire_and_send, drone, mode, stops)
-
-    def _ask(self, key: str, op: str, args: dict[str, Any], what: str) -> None:
-        self._submit(self._requests.submit, what, self._request, key, op, args)
+                self._submit(turn, what, self._acquire_and_send, drone, mode, stops)
 
     def _submit(
-        self, begin: Callable[[Callable[[], None]], Any], what: str, act: Callable[..., str], *args: Any
+        self, begin: Callable[[Callable[[], None]], Any], what: RequestOutcome, act: Callable[..., str], *args: Any
     ) -> None:
         def done() -> None:
-            self._report(RequestOutcome(what, _refusal_of(act, *args)))
+            self._report(what._replace(refusal=_refusal_of(act, *args)))
 
         try:
             begin(done)
         except RuntimeError:  # closed; a page of the run may still be open
-            self._report(RequestOutcome(what, "the run has ended"))
+            self._report(what._replace(refusal="the run has ended"))
 
     def _request(self, key: str, op: str, args: dict[str, Any]) -> str:
         answer = self._link.request(key, op, self._name, args, ANSWER_TIMEOUT_S)
         return "" if answer.ok else answer.error or "refused without a reason"
+
+    def _seek(self, t_s: float, step: bool) -> str:
+        refusal = self._request(keys.CONTROL, "seek", {"t_s": t_s})
+        return refusal or (self._request(keys.CONTROL, "step", {"gates": 1}) if step else "")
 
     def _acquire_and_send(self, drone: str, mode: str, stops: int) -> str:
         """Acquire a drone and send the mode, unless more emergencies were requested meanwhile."""

@@ -8,7 +8,7 @@ import contextlib
 import http
 import io
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -26,19 +26,21 @@ from zsim.contract import flight_messages
 from zsim.contract.messages import Info
 from zsim.schema import message
 from zsim.transport.session import Session
+from zsim_bridges.console.action_socket import ActionSockets
 from zsim_bridges.console.camera_socket import CameraSockets
 from zsim_bridges.console.http_proxy import (
     BACKEND_HOST,
     MESSAGE_MAX,
-    OPERATOR,
     SECRET_HEADER,
-    VIEWER,
     HttpProxy,
     ListenAddress,
     ViserBackend,
 )
+from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
-from zsim_bridges.console.page.page_camera import CameraFollow
+from zsim_bridges.console.page_head import no_run_head
+from zsim_bridges.console.page_tokens import OPERATOR, VIEWER
+from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.observer_process import ObserverProcess
 
@@ -166,27 +168,31 @@ _DECODER = msgspec.msgpack.Decoder(ViewerCamera | ControlUpdate | SceneClick)
 
 
 class PageControls:
-    """The controls that viser knows, and the switches that each page has for itself.
+    """The controls that viser knows, and those that each page has for itself.
 
     Args:
         gui: of all pages.
-        switches: ids of those of single pages.
+        pages: returns the GUI of each open page.
     """
 
-    def __init__(self, gui: viser.GuiApi, switches: set[str]) -> None:
+    def __init__(self, gui: viser.GuiApi, pages: Callable[[], Sequence[viser.GuiApi]] = tuple) -> None:
         self._gui = gui
-        self._switches = switches
+        self._pages = pages
 
     def is_local(self, uuid: str) -> bool:
-        """Return whether a control changes nothing but its own page."""
-        return uuid in self._switches
+        """Return whether a control changes nothing but its own page: what a page has for itself, but for buttons."""
+        own = self._own(uuid)
+        return own is not None and not isinstance(own, viser.GuiButtonHandle)
+
+    def _own(self, uuid: str) -> Any:
+        handles = (page._gui_input_handle_from_uuid.get(uuid) for page in self._pages())
+        return next((handle for handle in handles if handle is not None), None)
 
     def accepts(self, uuid: str, value: Value) -> bool:
         """Return whether a control takes such a value: viser converts it to its type, and fails where it cannot."""
-        if uuid in self._switches:
-            return isinstance(value, bool)
         handle: Any = self._gui._gui_input_handle_from_uuid.get(uuid)  # viser has no public way to a control by its id
-        return handle is not None and _accepts(handle, value)
+        handle = handle or self._own(uuid)
+        return handle is not None and not getattr(handle, "disabled", False) and _accepts(handle, value)
 
 
 def _accepts(handle: Any, value: Value) -> bool:
@@ -217,8 +223,7 @@ def is_permitted(data: bytes, role: str, controls: PageControls) -> bool:
         return False
     if not isinstance(message, ControlUpdate):
         return True
-    permitted = role == OPERATOR or controls.is_local(message.uuid)
-    return permitted and controls.accepts(message.uuid, message.updates.value)
+    return role == OPERATOR and controls.accepts(message.uuid, message.updates.value)
 
 
 class Console:
@@ -230,26 +235,36 @@ class Console:
         token: of operators; None on this machine alone.
         rate_hz: pictures a second; None: as many as suit the number of drones.
         say: prints a line.
+        world: where a run is looked for, in words.
 
     Raises:
         RunError: others could reach it, and there is no token.
     """
 
     def __init__(
-        self, address: ListenAddress, name: str, token: str | None, rate_hz: float | None, say: Callable[[str], None]
+        self,
+        address: ListenAddress,
+        name: str,
+        token: str | None,
+        rate_hz: float | None,
+        say: Callable[[str], None],
+        world: str = "",
     ) -> None:
         self._name = name
+        self._world = world
         self._rate_hz = rate_hz
         self._say = say
         self._run_page: RunPage | None = None
         self._viser = PrivateViser()
         self._camera_follow = CameraFollow(self._viser.server)
         self._frustums = CameraFrustums(self._viser.server)
-        _show_text(self._viser.server.gui, "waiting for a world")
-        controls = PageControls(self._viser.server.gui, self._camera_follow.switches)
+        _show_text(self._viser.server.gui, f"Waiting for a world: {world}" if world else "Waiting for a world")
+        controls = PageControls(self._viser.server.gui, self._pages)
         permits = partial(is_permitted, controls=controls)
         sockets = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
-        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, permits, sockets.respond)
+        actions = ActionSockets(self._frustums.client_id, self._camera_follow, self._record)
+        answers = permits, sockets.respond, actions.respond, self._head, self._command
+        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, *answers)
         self._proxy = HttpProxy(address, token, backend)
 
     @contextmanager
@@ -285,8 +300,20 @@ class Console:
         finally:
             page.close()
 
+    def _record(self) -> RecordPlayer | None:
+        return self._run_page.record if self._run_page else None
+
+    def _pages(self) -> list[viser.GuiApi]:
+        return [page.gui for page in self._viser.server.get_clients().values()]
+
     def _state(self) -> dict[str, Any]:
         return self._run_page.state() if self._run_page else {"run_id": None}
+
+    def _head(self) -> dict[str, Any]:
+        return self._run_page.head() if self._run_page else no_run_head(self._world)
+
+    def _command(self, op: str) -> str:
+        return self._run_page.command(op) if self._run_page else "there is no run yet"
 
 
 def _show_text(gui: viser.GuiApi, text: str) -> None:

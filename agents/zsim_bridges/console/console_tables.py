@@ -4,17 +4,18 @@ Order of this file: HTML, which is pure and in which all texts of other processe
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
-from zsim.contract.run_messages import Clock, Event, Fault
+from zsim.contract.run_messages import Fault
 from zsim.contract.views import EstimateView
+from zsim_bridges.console.alarms import BATTERY_LOW_PERCENT, LATE_MS, Severity
+from zsim_bridges.console.event_log import EventRow
+from zsim_bridges.console.flight_figures import FlightFigures
 from zsim_bridges.console.sensor_rates import Counts, SensorRates
 from zsim_bridges.console.view_buffer import ReceivedEstimate, ReceivedLink, ViewBuffer
 
-LATE_MS = 200.0  # of an estimator: ten gates of 20 ms
-LOW_PERCENT = 20.0  # of a battery; the AR.Drone warns there
 GREY, RED, AMBER, GREEN, BLUE = "#868e96", "#e03131", "#e8890c", "#2f9e44", "#1971c2"
 STATE_COLOURS = {
     "landed": GREY,
@@ -26,6 +27,8 @@ STATE_COLOURS = {
 }
 EVENT_COLOURS = {
     "refused": RED,
+    "accepted": BLUE,
+    "done": GREEN,
     "death": RED,
     "overdue": RED,
     "silent": RED,
@@ -37,6 +40,8 @@ EVENT_COLOURS = {
 }
 LINK_COLOURS = {"waiting": AMBER, "connected": BLUE, "armed": GREEN, "lost": RED}
 LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
+SEVERITY_COLOURS = {"red": RED, "amber": AMBER}
+LEFT_MAX_S = 24 * 3600.0  # of a battery that lasts longer no time is told
 NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
@@ -53,33 +58,70 @@ class DroneRow(NamedTuple):
     gps: str
     faults: tuple[str, ...]
     link: tuple[str, str] = ("", "")  # of a driver, in words, and their colour
+    sigma_m: float | None = None
+    severity: Severity | None = None  # of its worst alarm
 
 
-def drone_table(rows: Sequence[DroneRow]) -> str:
-    """Return the table of all drones."""
+def drone_table(rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures] | None = None) -> str:
+    """Return the table of all drones, with the `figures` of their flight by name."""
     head = _head(
         ("drone", ""),
         ("state", "of its firmware"),
-        ("battery", ""),
-        ("lag", "how far its estimator is behind the run"),
-        ("GPS", "fixes that its estimator used / refused"),
-        ("flown by", "the process whose commands it obeys"),
+        ("z [m]", "height over the origin"),
+        ("v [m/s]", "speed over the ground and up"),
+        ("hdg", "heading [deg], from east to north"),
+        ("battery", "with the time left at the present drain"),
+        ("σ [m]", "of the estimated position"),
     )
-    return _table(head + "".join(map(_drone_cells, rows)))
+    return _table(head + "".join(_drone_cells(row, (figures or {}).get(row.name)) for row in rows))
 
 
-def _drone_cells(row: DroneRow) -> str:
+COLUMNS = 7  # of the table of drones
+
+
+def _drone_cells(row: DroneRow, figures: FlightFigures | None) -> str:
+    name = _coloured(row.name, SEVERITY_COLOURS[row.severity]) if row.severity else escape(row.name)
     state = _coloured(row.state.replace("_", " "), STATE_COLOURS.get(row.state, GREY))
-    battery = _coloured(f"{row.battery_percent:.0f} %", RED if row.battery_percent < LOW_PERCENT else "inherit")
-    lag = "–" if row.lag_ms is None else f"{row.lag_ms:.0f} ms"
+    flown = ["–"] * 3
+    if figures is not None:
+        flown = [f"{figures.position_m[2]:.1f}", f"{figures.speed_m_s:.1f}", f"{figures.heading_deg:.0f}°"]
+    left = battery_left_text(figures.battery_left_s if figures else None)
+    colour = RED if row.battery_percent < BATTERY_LOW_PERCENT else "inherit"
+    battery = _coloured(f"{row.battery_percent:.0f} %{left}", colour)
+    sigma = "–" if row.sigma_m is None else f"{row.sigma_m:.2f}"
+    return _cells((name, state, *flown, battery, sigma)) + _drone_notes(row)
+
+
+def _drone_notes(row: DroneRow) -> str:
+    """Return the rows below that of a drone: who flies it, and what is wrong."""
+    lag = "no estimate" if row.lag_ms is None else f"lag {row.lag_ms:.0f} ms"
     late = row.lag_ms is not None and row.lag_ms > LATE_MS
-    cells = (escape(row.name), state, battery, _coloured(lag, AMBER if late else "inherit"), escape(row.gps))
-    line = _cells((*cells, escape(row.commander or "nobody")))
+    about = (
+        f"{escape(row.commander or 'nobody')} · {_coloured(lag, AMBER if late else 'inherit')} · GPS {escape(row.gps)}"
+    )
     faults = f"⚠ {', '.join(row.faults)}" if row.faults else ""
-    for note, colour in ((faults, AMBER), row.link):
-        if note:
-            line += f"<tr><td colspan=6 style='color:{colour};padding:0 4px 2px 12px'>{escape(note)}</td></tr>"
-    return line
+    notes = [(escape(faults), AMBER), (escape(row.link[0]), row.link[1])]
+    return "".join(
+        f"<tr><td colspan={COLUMNS} style='color:{colour};padding:0 4px 2px 12px;white-space:normal'>{note}</td></tr>"
+        for note, colour in ((about, GREY), *notes)
+        if note
+    )
+
+
+def battery_left_text(left_s: float | None) -> str:
+    """Return the time that a battery lasts, to be written behind its charge; empty where it is not known."""
+    return "" if left_s is None or left_s > LEFT_MAX_S else f", {left_s / 60.0:.0f} min"
+
+
+def figure_lines(figures: FlightFigures | None) -> str:
+    """Return position, velocity and attitude of one drone."""
+    if figures is None:
+        return f"<div style='{STYLE};padding:2px 0'>not seen yet</div>"
+    x, y, z = figures.position_m
+    place = f"position {x:.2f}, {y:.2f}, {z:.2f} m"
+    speed = f"speed {figures.speed_m_s:.2f} m/s, climb {figures.climb_m_s:+.2f} m/s"
+    turn = f"roll {figures.roll_deg:+.1f}°, pitch {figures.pitch_deg:+.1f}°, heading {figures.heading_deg:.0f}°"
+    return f"<div style='{STYLE};padding:2px 0'>{place}<br>{speed}<br>{turn}</div>"
 
 
 def link_note(link: ReceivedLink | None) -> tuple[str, str]:
@@ -127,37 +169,28 @@ def formation_lines(states: Mapping[str, tuple[str, str]]) -> str:
     return f"<div style='{STYLE};{FEW_LINES};padding:2px 4px'>{'<br>'.join(lines) or 'no formation'}</div>"
 
 
-def clock_line(now: Clock | None, t_ns: int, silent_s: float = 0.0) -> str:
-    """Return the run's time, and which processes it waits for; or for how long the world has been `silent_s`.
-
-    `t_ns` is the time of the picture, 0 before the first.
-    """
-    if silent_s:
-        text = _coloured(f"no answer from the world for {silent_s:.0f} s", RED)
-        return f"<div style='{STYLE};padding:2px 4px;font-size:14px'>{text}, last at <b>{t_ns / 1e9:.1f} s</b></div>"
-    if now is None:
-        return f"<div style='{STYLE};padding:2px 4px'>no clock yet</div>"
-    waiting = [w for w in now.waiting_for if now.state == "waiting" or w.since_wall_s > 0.5]
-    waiting = [w for w in waiting if not w.held_by] or waiting  # causes alone
-    colour = {"running": GREEN, "paused": AMBER}.get(now.state, GREY)
-    t_s = (t_ns or now.t_ns) / 1e9
-    time, pace = (f"{t_s:.1f}", f" × {now.rate:.1f} real time") if now.state == "running" else (f"{t_s:.2f}", "")
-    text = f"{_coloured(now.state, colour)} <b>{time} s</b>{pace}"
-    if waiting:
-        names = ", ".join(f"{w.name} on {w.host} ({w.since_wall_s:.0f} s)" for w in waiting[:4])
-        text += f"<br>waiting for {escape(names)}"
-    return f"<div style='{STYLE};padding:2px 4px;font-size:14px'>{text}</div>"
+def event_table(newest_first: Iterable[EventRow]) -> str:
+    """Return the table of events, which are given newest first: a line each, whole in its tooltip."""
+    lines = map(_event_cells, newest_first)
+    widths = "<colgroup><col style='width:52px'><col style='width:66px'><col></colgroup>"
+    head = _head(("t [s]", "simulated time of the newest"), ("event", ""), ("newest first", ""))
+    return _table(widths + head + "".join(lines), "table-layout:fixed")
 
 
-def event_table(newest_first: Iterable[Event]) -> str:
-    """Return the table of events, which are given newest first."""
-    lines = [
-        f"<tr><td style='text-align:right;color:{GREY}'>{event.t_ns / 1e9:.2f}</td>"
-        f"<td>{_coloured(event.kind, EVENT_COLOURS.get(event.kind, GREY))}</td><td>{escape(event.text)}</td></tr>"
-        for event in newest_first
-    ]
-    head = _head(("t [s]", "simulated time"), ("event", ""), ("newest first", ""))
-    return _table(head + "".join(lines), "overflow-wrap:anywhere")
+def _event_cells(row: EventRow) -> str:
+    event = row.event
+    kind = _coloured(event.kind, EVENT_COLOURS.get(event.kind, GREY))
+    return (
+        f"<tr title='{escape(event.text)}'><td style='text-align:right;color:{GREY}'>{event.t_ns / 1e9:.2f}</td>"
+        f"<td style='{ONE_LINE}'>{kind}</td><td style='{ONE_LINE}'>{_times(row.times)}{escape(event.text)}</td></tr>"
+    )
+
+
+ONE_LINE = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
+
+
+def _times(times: int) -> str:
+    return f"<b>{times} ×</b> " if times > 1 else ""
 
 
 def fault_lines(faults: Sequence[str]) -> str:
@@ -195,9 +228,16 @@ class TableRows:
     Args:
         views: the newest ones.
         own_rates: of the user's sensors of each drone [Hz], by drone and sensor.
+        severity_of: returns how bad the worst alarm of a drone is.
     """
 
-    def __init__(self, views: ViewBuffer, own_rates: Mapping[str, Mapping[str, float]]) -> None:
+    def __init__(
+        self,
+        views: ViewBuffer,
+        own_rates: Mapping[str, Mapping[str, float]],
+        severity_of: Callable[[str], Severity | None] = lambda _: None,
+    ) -> None:
+        self._severity_of = severity_of
         self._views = views
         self._own_rates = own_rates
         self._rates = SensorRates()
@@ -207,25 +247,23 @@ class TableRows:
         view, estimates, rows = self._views.drones, self._views.estimates(), []
         if view is None:
             return []
-        faults = self._active()
+        faults = active_faults(self._views)
         for drone in view.drones:
             received = estimates.get(drone.name)
             gps = received.estimate.sensors.get("gps") if received else None
             own_faults = tuple(fault.kind for fault in faults if fault.target == drone.name)
             fixes = "–" if gps is None else f"{gps[0]} / {gps[1]}"
-            lag = self._lag_ms(received, view.t_ns) if received else None
+            lag = self._views.lag_ms(received) if received else None
             row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, fixes, own_faults)
             external = drone.name in self._views.external
-            rows.append(DroneRow(*row, link_note(self._views.link_of(drone.name)) if external else ("", "")))
+            link = link_note(self._views.link_of(drone.name)) if external else ("", "")
+            sigma = sigma_m(received.estimate) if received and received.fresh else None
+            rows.append(DroneRow(*row, link, sigma, self._severity_of(drone.name)))
         return rows
 
     def active_faults(self) -> list[str]:
         """Return kind and target of each active fault."""
-        return [f"{fault.kind} of {fault.target}{_end_text(fault)}" for fault in self._active()]
-
-    def _active(self) -> list[Fault]:
-        now_ns = self._views.drones.t_ns if self._views.drones else 0
-        return [fault for fault in self._views.faults if _is_active(fault, now_ns)]
+        return [f"{fault.kind} of {fault.target}{_end_text(fault)}" for fault in active_faults(self._views)]
 
     def sensor_table(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
@@ -236,12 +274,11 @@ class TableRows:
         rates = self._rates.update(drone, received.t_ns, estimate.sensors) if received.fresh else {}
         return sensor_table(drone, estimate.sensors, rates, _uncertainty(received), own_rates)
 
-    def _lag_ms(self, received: ReceivedEstimate, now_ns: int) -> float:
-        """Return how far an estimator is behind: by its health, or by its view where that is old."""
-        health = self._views.healths.get(received.process)
-        if health is not None and received.fresh:
-            return health.lag_ns / 1e6
-        return max(0, now_ns - received.t_ns) / 1e6
+
+def active_faults(views: ViewBuffer) -> list[Fault]:
+    """Return the injected faults that act at the time of the newest view."""
+    now_ns = views.drones.t_ns if views.drones else 0
+    return [fault for fault in views.faults if _is_active(fault, now_ns)]
 
 
 def _is_active(fault: Fault, now_ns: int) -> bool:

@@ -6,26 +6,19 @@ import socket
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
-from urllib.parse import quote, urlsplit
+from functools import partial
+from typing import Any, Literal, NamedTuple
+from urllib.parse import quote
 
 import msgspec
 from aiohttp import ClientError, ClientSession, WSMsgType, web
+from msgspec import Struct
 
 from zsim.errors import RunError
 from zsim_bridges.console import page_html
-from zsim_bridges.loopback import is_loopback_authority
-from zsim_bridges.web_server import (
-    ServedSite,
-    check_token,
-    open_on_thread,
-    start_site,
-    tokens_match,
-    url_host,
-)
+from zsim_bridges.console.page_tokens import OPERATOR, VIEW_PATH, VIEWER, PageRequest, PageTokens
+from zsim_bridges.web_server import ServedSite, open_on_thread, start_site, url_host
 
-OPERATOR, VIEWER = "operator", "viewer"
-VIEW_PATH = "/view"
 MESSAGE_MAX = 100_000  # bytes of one message of a page
 BACKEND_HOST = "127.0.0.1"  # where viser listens
 SECRET_HEADER = "X-Zsim-Console"  # which viser's server asks for
@@ -40,78 +33,6 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-
-
-class PageRequest(NamedTuple):
-    """The fields of an HTTP request that identify its sender."""
-
-    path: str
-    host: str  # of its Host header
-    origin: str | None
-    token: str  # in its address; empty for none
-    cookies: dict[str, str]
-
-
-class PageTokens:
-    """Decides by tokens who may open pages.
-
-    Args:
-        listen: the address on which pages are served.
-        port: and the port.
-        operator, viewer: tokens; the first is None where only this machine can connect.
-
-    Raises:
-        RunError: others could reach it, and there is no token.
-    """
-
-    def __init__(self, listen: str, port: int, operator: str | None, viewer: str) -> None:
-        check_token("console", listen, operator)
-        self._tokens = {OPERATOR: operator, VIEWER: viewer}
-        self._port = port
-
-    def cookie(self, role: str) -> str:
-        """Return the name of a role's cookie: a browser keeps those of all ports of a host together."""
-        return f"zsim_{role}_{self._port}"
-
-    def role_of(self, request: PageRequest) -> str | None:
-        """Return the role in which the page of this path may be opened, None if it may not."""
-        role = VIEWER if request.path.startswith(VIEW_PATH) else OPERATOR
-        if self._tokens[OPERATOR] is None:
-            return role if _is_from_own_page(request) else None
-        if request.origin is not None and _origin_address(request.origin) != request.host:
-            return None
-        sufficient = (OPERATOR,) if role == OPERATOR else (VIEWER, OPERATOR)
-        return role if any(self._has_token(request, each) for each in sufficient) else None
-
-    def role_of_address(self, request: PageRequest) -> str | None:
-        """Return the role whose token stands in the address, None if none does: it is to become a cookie."""
-        roles = (role for role in (OPERATOR, VIEWER) if self._is_token(request.token, role))
-        return next(roles, None) if request.token else None
-
-    def _has_token(self, request: PageRequest, role: str) -> bool:
-        cookie = request.cookies.get(self.cookie(role), "")
-        return self._is_token(request.token, role) or self._is_token(cookie, role)
-
-    def _is_token(self, received: str, role: str) -> bool:
-        token = self._tokens[role]
-        return token is not None and tokens_match(received, token)
-
-
-def _origin_address(origin: str) -> str | None:
-    """Return host and port of an Origin header, None where it cannot be parsed."""
-    try:
-        return urlsplit(origin).netloc
-    except ValueError:
-        return None
-
-
-def _is_from_own_page(request: PageRequest) -> bool:
-    """Return whether a request comes from the console's own page, by a name of this machine."""
-    own_page = request.origin is None or _origin_address(request.origin) == request.host
-    try:
-        return own_page and is_loopback_authority(request.host)
-    except ValueError:
-        return False
 
 
 class ListenAddress(NamedTuple):
@@ -136,6 +57,9 @@ class ViserBackend(NamedTuple):
         state: returns what the console shows, as plain data.
         permits: returns whether a message of a page may reach viser, by the page's role.
         serve_cameras: answers a page's request for a socket of pictures, until it closes.
+        serve_actions: answers one for a socket of what is done in the scene, by the page's role, until it closes.
+        head: returns what the head of the page shows, as plain data.
+        command: does what a button of the head asks for; returns why it is refused, empty where it is not.
     """
 
     port: int
@@ -143,6 +67,15 @@ class ViserBackend(NamedTuple):
     state: Callable[[], dict[str, Any]]
     permits: Callable[[bytes, str], bool]
     serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]
+    head: Callable[[], dict[str, Any]]
+    command: Callable[[str], str]
+
+
+class HeadCommand(Struct, frozen=True, forbid_unknown_fields=True):
+    """What a button of the page's head asks for."""
+
+    op: Literal["emergency", "land", "acknowledge"]
 
 
 class HttpProxy:
@@ -184,10 +117,12 @@ class HttpProxy:
             yield
 
     async def _open(self) -> ServedSite:
-        app = web.Application()
+        app = web.Application(client_max_size=MESSAGE_MAX)
         app.add_routes([web.get(path, self._page) for path in ("/", VIEW_PATH)])
-        app.add_routes([web.get(path, self._state) for path in ("/state", f"{VIEW_PATH}/state")])
-        app.add_routes([web.get(path, self._cameras) for path in ("/cameras", f"{VIEW_PATH}/cameras")])
+        shared = {"/state": self._state, "/head": self._head, "/cameras": self._cameras, "/actions": self._actions}
+        for path, handler in shared.items():
+            app.add_routes([web.get(path, handler), web.get(f"{VIEW_PATH}{path}", handler)])
+        app.add_routes([web.post("/command", self._command)])
         try:
             site = await start_site(app, *self._address, shutdown_s=CLOSE_S)
         except OSError as error:
@@ -226,17 +161,40 @@ class HttpProxy:
         return response
 
     async def _state(self, request: web.Request) -> web.Response:
+        return self._answer(request, self._backend.state)
+
+    async def _head(self, request: web.Request) -> web.Response:
+        return self._answer(request, self._backend.head)
+
+    def _answer(self, request: web.Request, shown: Callable[[], dict[str, Any]]) -> web.Response:
         if self._tokens.role_of(_page_request(request)) is None:
             return _missing_token()
-        body = msgspec.json.encode(self._backend.state())
-        return web.Response(body=body, content_type="application/json", headers=HEADERS)
+        return _json_response(shown())
+
+    async def _command(self, request: web.Request) -> web.Response:
+        """Do what an operator's button asks for; viewers have no such path."""
+        if self._tokens.role_of(_page_request(request)) != OPERATOR:
+            return _missing_token()
+        try:
+            command = _HEAD_COMMANDS.decode(await request.read())
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            return _json_response({"refusal": f"body: {error}"}, 400)
+        refusal = self._backend.command(command.op)
+        return _json_response({"refusal": refusal}, 409 if refusal else 200)
 
     async def _cameras(self, request: web.Request) -> web.StreamResponse:
         """Serve a page's socket for pictures of cameras: viewers see them, too."""
+        return await self._socket(request, "cameras", lambda _: self._backend.serve_cameras(request))
+
+    async def _actions(self, request: web.Request) -> web.StreamResponse:
+        """Serve a page's socket for what is done in the scene: viewers move their cameras."""
+        return await self._socket(request, "actions", partial(self._backend.serve_actions, request))
+
+    async def _socket(
+        self, request: web.Request, what: str, serve: Callable[[str], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
         role = self._tokens.role_of(_page_request(request))
-        if role is None:
-            return _missing_token()
-        return await self._stream(f"cameras of {role}", lambda: self._backend.serve_cameras(request))
+        return _missing_token() if role is None else await self._stream(f"{what} of {role}", lambda: serve(role))
 
     async def _stream(self, what: str, serve: Callable[[], Awaitable[web.StreamResponse]]) -> web.StreamResponse:
         """Serve a socket, unless too many of its kind are open."""
@@ -278,6 +236,14 @@ class HttpProxy:
         async for message in page:
             if message.type is WSMsgType.BINARY and self._backend.permits(message.data, role):
                 await viser.send_bytes(message.data)
+
+
+_HEAD_COMMANDS = msgspec.json.Decoder(HeadCommand)
+
+
+def _json_response(shown: dict[str, Any], status: int = 200) -> web.Response:
+    body = msgspec.json.encode(shown)
+    return web.Response(body=body, status=status, content_type="application/json", headers=HEADERS)
 
 
 async def _to_page(viser: Any, page: web.WebSocketResponse) -> None:

@@ -1,10 +1,16 @@
-"""The page: viser's, with the cameras' windows below the scene; that of viewers shows its controls disabled."""
+"""The page: viser's, below a head of its own, with tools over the scene and the cameras' windows.
+
+Viewers see its controls disabled.
+"""
 
 import gzip
 import importlib.resources
 
+PARTS = ("head_bar.html", "camera_windows.html", "scene_tools.html")  # of the page beside viser's
+STYLE = "<style>div:has(> .uplot) {contain: inline-size}</style>"
+"""A plot takes the width that its panel has: else the panel grows with its plots where no box around it may clip."""
 VIEW_STYLE = (
-    "<style>body::before{content:'view only';position:fixed;top:8px;left:50%;transform:translateX(-50%);z-index:9999;"
+    "<style>body::before{content:'view only';position:fixed;top:52px;left:50%;transform:translateX(-50%);z-index:9999;"
     "background:#1971c2;color:#fff;font:600 13px sans-serif;padding:3px 14px;border-radius:10px}"
     ".mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"
 )
@@ -12,17 +18,18 @@ VIEW_STYLE = (
 
 def operator_page() -> bytes:
     """Return the page of operators, compressed."""
-    return _page("")
+    return _page(STYLE)
 
 
 def viewer_page() -> bytes:
     """Return the page of viewers, compressed."""
-    return _page(VIEW_STYLE)
+    return _page(STYLE + VIEW_STYLE)
 
 
 def _page(style: str) -> bytes:
     html = importlib.resources.files("viser").joinpath("client/build/index.html").read_text()
-    windows = importlib.resources.files("zsim_bridges.console.page").joinpath("camera_windows.html").read_text("utf-8")
+    folder = importlib.resources.files("zsim_bridges.console.page")
+    parts = "".join(folder.joinpath(name).read_text("utf-8") for name in PARTS)
     head, end, tail = html.rpartition("</body>")
-    with_windows = f"{head}{windows}{end}{tail}" if end else f"{html}{windows}"
-    return gzip.compress(with_windows.replace("</head>", f"{style}</head>", 1).encode())
+    whole = f"{head}{parts}{end}{tail}" if end else f"{html}{parts}"
+    return gzip.compress(whole.replace("</head>", f"{style}</head>", 1).encode())

@@ -26,9 +26,10 @@ from zsim_bridges.console import console_tables
 from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows
+from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.console_page import ConsolePage
-from zsim_bridges.console.page.page_camera import CameraFollow
+from zsim_bridges.console.page.page_forms import PageForms
 from zsim_bridges.console.page.picture import (
     CanvasTrails,
     DronePoses,
@@ -40,22 +41,16 @@ from zsim_bridges.console.page.picture import (
     ghosts,
 )
 from zsim_bridges.console.page.scene_nodes import SceneNodes
+from zsim_bridges.console.picture_rate import picture_rate_hz
+from zsim_bridges.console.record_player import RecordPlayer
+from zsim_bridges.console.run_monitor import RunMonitor
 from zsim_bridges.console.run_state import console_state
 from zsim_bridges.console.view_buffer import TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
 STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
-EVENTS_SHOWN = 60
 NOTICE_S = 8.0  # wall; how long a refusal stays in the corner
-FEW_DRONES = 20  # drones from which on pictures come half as often
-RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST_RATE = 4.0  # x real time; from then on the rate is halved, too: the run needs the processors
-
-
-def picture_rate_hz(drones: int, rate: float) -> float:
-    """Return how many pictures a second suit so many drones, and a run that goes so many times as fast as real time."""
-    return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ
 
 
 def _spaces(scenario: Scenario) -> dict[str, ClusterSpace]:
@@ -85,6 +80,7 @@ class RunPage:
     Attributes:
         views: the newest of everything.
         cameras: of the drones.
+        record: what is played, of a replay.
     """
 
     def __init__(
@@ -110,15 +106,17 @@ class RunPage:
         age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
         self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
         self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command)
+        self._monitor = RunMonitor(self.views, self._time_monitor, self._scenario, bool(info.replay_of))
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
+        self.record = RecordPlayer(self._client, self._time_monitor, bool(info.replay_of))
         hats = self._scenario.environment.hats
         self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
         self._frustums = frustums
-        self._has_clicks = False
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
         self._trails = CanvasTrails(len(names))
-        self._table_rows = TableRows(self.views, {drone.name: own_rates(drone) for drone in self._scenario.drones})
+        rates = {drone.name: own_rates(drone) for drone in self._scenario.drones}
+        self._table_rows = TableRows(self.views, rates, self._monitor.board.severity_of)
         self._shapes: dict[str, FormationShape | None] = {}
         self._drones: DronePoses | None = None
         self._drawn_ghosts: dict[str, Any] = {}
@@ -126,15 +124,20 @@ class RunPage:
         robots = sum(space.n for space in self._spaces.values())
         arms_m = [drone.arm_m for drone in self._scenario.drones]
         self._scene = SceneNodes(server, info.drones, arms_m, robots, len(self._spaces))
+        self._scene.on_click(self._on_click)
         self._scene.obstacles(self._scenario.environment.obstacles)
         show = self._scene.show
         self._page = ConsolePage(
             server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones
         )
+        page = self._page
+        folders = page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
+        self._page_forms = PageForms(server, self._client, list(names), self._scene.radii_m, *folders)
 
     def close(self) -> None:
         """Send nothing any more."""
         self._client.close()
+        self._page_forms.close()
         self.cameras.close()
         self._frustums.clear()
         self._scene.close()
@@ -143,6 +146,7 @@ class RunPage:
         """Draw pictures until the run is over or `stopped` returns true."""
         self.views.open()
         self.cameras.open()
+        self.record.load()
         pause = threading.Event()
         next_s = time.monotonic()
         with self._time_monitor.polling():
@@ -155,7 +159,21 @@ class RunPage:
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
         state = console_state(self._info.run_id, self.views, self._time_monitor, dict(self._shapes))
-        return {**state, "cameras": self.cameras.state()}
+        return {**state, "cameras": self.cameras.state(), "timeline": self.record.timeline}
+
+    def head(self) -> dict[str, Any]:
+        """Return the head of the page, as plain data."""
+        return self._monitor.head(time.monotonic())
+
+    def command(self, op: str) -> str:
+        """Do what a button of the page's head asks for; return why it is refused, empty where it is not."""
+        if op == "acknowledge":
+            self._monitor.board.acknowledge()
+            return ""
+        refusal = self.head()["refusals"][op]
+        if not refusal:
+            self._page.fleet.request_all(op)
+        return refusal
 
     # A picture
 
@@ -167,7 +185,8 @@ class RunPage:
     def _update(self, wall_s: float) -> None:
         self._observer.tick()
         new = self.views.update()
-        self._update_cameras()
+        self._update_monitor(wall_s)
+        self.cameras.update()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
@@ -181,23 +200,27 @@ class RunPage:
                 self._table_s = wall_s
                 self._update_tables(wall_s)
 
-    def _update_cameras(self) -> None:
-        """Keep up with the cameras; once there are any, a click on a drone shows what it sees."""
-        self.cameras.update()
-        if not self._has_clicks and self.cameras.cameras():
-            self._has_clicks = True
-            self._scene.on_click(self._on_click)
+    def _update_monitor(self, wall_s: float) -> None:
+        """Keep up with the run's condition, and note among the events what is done that was accepted before."""
+        if self.views.drones is not None:
+            self._monitor.flight.update(self.views.drones)
+        for done in self._monitor.update(wall_s):
+            self._note("done", done.subject, f"{done.text}: done")
 
     def _on_click(self, event: viser.SceneClickEvent) -> None:
         if self._drones is None:
             return
         drone = drone_on_ray(self._drones, self._scene.radii_m, event.ray_origin, event.ray_direction)
         if drone is not None:
+            self._page_forms.choose(event.client_id, drone)
             self._frustums.click(event.client_id, drone)
 
     def _draw_end(self) -> None:
         """Draw the end of the run, for pages that are opened between two runs."""
         self.views.update()
+        if self._observer.end_reason or self.views.end:
+            self._monitor.end(self._observer.end_reason)
+        self._monitor.update(time.monotonic())
         with self._server.atomic():
             if self.views.drones is not None:
                 self._draw()
@@ -224,6 +247,7 @@ class RunPage:
         drones = self._store_drones(self.views.drones)
         dt_s = min(self._period_s(), max(0.0, (drones.t_ns - before_ns) / 1e9))
         self._scene.drones(drones, dt_s)
+        self._page_forms.move_rings(drones)
         estimates = self.views.estimates().values()
         self._scene.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
         if self._shapes:
@@ -255,6 +279,8 @@ class RunPage:
             if view is not None:
                 true_c = None if true_shape is None else true_shape.c
                 self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true_c)
+        estimates = self.views.estimates().items()
+        self._page.flights.add(drones, {name: each.estimate for name, each in estimates if each.fresh})
 
     def _camera_targets(self, drones: DronePoses) -> np.ndarray:
         """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""
@@ -265,16 +291,12 @@ class RunPage:
 
     def _update_tables(self, wall_s: float) -> None:
         page = self._page
-        page.clock.content = console_tables.clock_line(
-            self._time_monitor.clock, int(self._drawn_ns), self._time_monitor.silent_s
-        )
+        self._update_controls()
         page.phases.content = console_tables.formation_lines(
             {n: (v.phase, v.reason) for n, v in self.views.clusters.items()}
         )
-        page.drones.content = console_tables.drone_table(self._table_rows.drone_rows())
-        page.sensors.content = self._table_rows.sensor_table(page.drone_form.chosen)
+        page.drones.content = console_tables.drone_table(self._table_rows.drone_rows(), self._monitor.flight.figures)
         page.faults.content = console_tables.fault_lines(self._table_rows.active_faults())
-        page.events.content = console_tables.event_table(list(self.views.events)[:EVENTS_SHOWN])
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
             page.plots[page.chosen].draw()
@@ -282,17 +304,34 @@ class RunPage:
             self._scene.trails(*self._trails.segments(self._drones.p_W))
             self._scene.wind(self._drones)
 
+    def _update_controls(self) -> None:
+        """Grey out what would be refused, and show on each page the drone that it has chosen."""
+        self._page.refresh(self._monitor.condition)
+        self._page_forms.refresh(self._monitor.condition)
+        self._page_forms.show_figures(self._drone_figures)
+        self._page_forms.show_events(self.views.log.rows())
+
+    def _drone_figures(self, drone: str) -> str:
+        """Return figures and sensors of one drone, as HTML."""
+        figures = console_tables.figure_lines(self._monitor.flight.figures.get(drone))
+        return figures + self._table_rows.sensor_table(drone)
+
     def _on_outcome(self, outcome: RequestOutcome) -> None:
         """Show the outcome of a request: a refusal in the corner of every page, and among the events.
 
-        The world publishes an event of what it has done, but not of requests to formations.
+        The world publishes an event of what it has done, but not of requests to formations, which are only accepted.
         """
-        kind, result = ("refused", outcome.refusal) if outcome.refusal else ("control", "done")
-        if outcome.refusal or outcome.request.partition(":")[0] in self._spaces:
-            text = f"{outcome.request}: {result}"
-            self.views.events.appendleft(Event(self._observer.now_ns, 0, kind, self._observer.name, "", text))
         if outcome.refusal:
+            self._note("refused", outcome.subject, f"{outcome.request}: {outcome.refusal}")
             self._notify(outcome.request, outcome.refusal)
+            return
+        known = self._monitor.pending.accept(outcome.subject, outcome.op, outcome.request, outcome.args)
+        if known or outcome.subject in self._spaces:
+            self._note("accepted", outcome.subject, f"{outcome.request}: accepted")
+
+    def _note(self, kind: str, subject: str, text: str) -> None:
+        """Add an event of the console's own to those that are shown."""
+        self.views.log.add(Event(self._observer.now_ns, 0, kind, self._observer.name, subject, text))
 
     def _on_refused_command(self, event: Event) -> None:
         """Show that the world has refused a command of the console's."""

@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -17,9 +17,10 @@ from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError, ZsimError
 from zsim.transport.session import RawSample, Session
+from zsim_bridges.console.alarms import BACK, LOST
+from zsim_bridges.console.event_log import EventLog
 from zsim_bridges.observer_process import ObserverProcess
 
-EVENTS_KEPT = 200
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
 POLL_S = 0.25  # wall; rarely, since a message of each gate costs the world time
 ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
@@ -66,7 +67,9 @@ class ViewBuffer:
         healths: the newest of each process.
         external: names of the drones whose bodies are external.
         faults: injected ones, planned and active.
-        events: newest first.
+        log: events as they are shown; events: newest first.
+        losses: the newest event about each process or drone that is lost.
+        end: why the run ended, by its last event; empty while it goes on.
     """
 
     def __init__(
@@ -95,7 +98,10 @@ class ViewBuffer:
         self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         self._links: dict[str, LinkState] = {}
         self.faults: tuple[Fault, ...] = ()
-        self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self.log = EventLog(observer.name)
+        self.events = self.log.newest
+        self.losses: dict[str, Event] = {}
+        self.end = ""
 
     def open(self) -> None:
         """Subscribe, and read the last values of before."""
@@ -137,6 +143,13 @@ class ViewBuffer:
         """Return the newest state of the link to an external drone, None before the first."""
         key = keys.link(drone)
         return ReceivedLink(self._links[key], self._wall_s() - self._received_s[key]) if key in self._links else None
+
+    def lag_ms(self, received: ReceivedEstimate) -> float:
+        """Return how far an estimator is behind: by its health, or by its view where that is old."""
+        health = self.healths.get(received.process)
+        if health is not None and received.fresh:
+            return health.lag_ns / 1e6
+        return max(0, (self.drones.t_ns if self.drones else 0) - received.t_ns) / 1e6
 
     def _is_fresh(self, process: str, ahead_ns: int) -> bool:
         """Return whether an estimator's view is of the time of the drones' view; both skip gates."""
@@ -188,8 +201,14 @@ class ViewBuffer:
             with self._arrived:
                 self._answers[_drone(event)] += 1
                 self._arrived.notify_all()
+        if event.kind in LOST:
+            self.losses = {**self.losses, event.subject: event}
+        elif event.kind in BACK:
+            self.losses = {name: lost for name, lost in self.losses.items() if name != event.subject}
+        elif event.kind == "end":
+            self.end = event.text
         if event.kind != "command":  # an event of a mode or of a refusal follows, with more in it
-            self.events.appendleft(event)
+            self.log.add(event)
         if event.kind == "refused" and event.source == self._observer.name:
             self._refused(event)
 

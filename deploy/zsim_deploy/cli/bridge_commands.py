@@ -9,7 +9,15 @@ import typer
 
 from zsim.errors import RunError, SessionError, printable
 from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
-from zsim_deploy.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, participant_options, positive, require
+from zsim_deploy.arguments import (
+    CONSOLE_NEEDS,
+    CONSOLE_PORT,
+    LOOK_S,
+    WorldAccess,
+    participant_options,
+    positive,
+    require,
+)
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -22,8 +30,7 @@ OPERATE, TRANSLATE = "Watch and steer", "Others come in"  # panels of the help
 TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everybody on the machine
 DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID that ROS 2 takes
 
-CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}  # modules by extra
-GATEWAY_NEEDS = {"gateway": ("aiohttp",)}
+GATEWAY_NEEDS = {"gateway": ("aiohttp",)}  # modules by extra
 ROS1_NEEDS = {"ros1": ("rosbags",)}
 ROS2_NEEDS = {"ros2": ("rosbags", "xxhash")}
 
@@ -63,7 +70,8 @@ def console(
     own_name = process_name("console", name, reach.who, "*")
     say = JsonProgress().say if reach.launched else log_printer(None)
     require_files(SERVER_FILES, "a console and its pages")
-    shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)
+    world = f"federation {reach.federation!r} on {reach.endpoint}"
+    shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say, world)
     with shown.open():
         serve_runs(own_name, shown.serve, reach)
 

@@ -15,6 +15,7 @@ from zsim import __version__
 from zsim.errors import BehindError, SupersededError, ZsimError, printable
 from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import (
+    CONSOLE_NEEDS,
     HOSTS,
     RUN,
     FlightOptions,
@@ -103,7 +104,7 @@ def run(
     if in_process:
         _refuse_with_others(flight, listen, hosted, console, cameras, detect)
     if console:
-        require("console", bridge_commands.CONSOLE_NEEDS)
+        require("console", CONSOLE_NEEDS)
     if continue_:
         _refuse_to_change(flight, out, in_process, listen, insecure, hosted)
         options, in_process = options_of(flight.path)

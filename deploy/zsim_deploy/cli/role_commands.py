@@ -1,6 +1,7 @@
 """The commands that are one role of a federation each, and `zsim replay`, which stands in for the world."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 from zsim.contract.run_messages import RATE_MAX
 from zsim.scenario.role_table import AGENTS, Role
 from zsim_deploy.arguments import (
+    CONSOLE_NEEDS,
     DEFAULT_ENDPOINT,
     RUN,
     RUN_ID,
@@ -178,6 +180,9 @@ def replay(
         typer.Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
     ] = None,
     paused: Annotated[bool, typer.Option("--paused", help="Stand at the first gate until asked to resume.")] = False,
+    console: Annotated[
+        bool, typer.Option("--console", help="Show it in the browser, with a timeline; stand still at its end.")
+    ] = False,
     listen: Annotated[
         list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
     ] = None,
@@ -189,11 +194,17 @@ def replay(
 ) -> None:
     """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
     require("replay", REPLAY_NEEDS)
+    if console:
+        require("console", CONSOLE_NEEDS)
+    from zsim_deploy.launch.console_process import console_beside
     from zsim_deploy.roles.world_role import ReplayOptions, play
     from zsim_world.playback.playback import PlaybackRange
 
     check_range(from_, to)
     to_ns = None if to is None else round(to * 1e9)
-    choice = PlaybackRange(round((from_ or 0.0) * 1e9), to_ns, tuple(keys or ["**"]), paused)
-    options = ReplayOptions(choice, rate, tuple(expect or ()), tuple(listen or [DEFAULT_ENDPOINT]), federation)
-    play(directory, options, identity(host, tls, insecure, access))
+    choice = PlaybackRange(round((from_ or 0.0) * 1e9), to_ns, tuple(keys or ["**"]), paused, holds=console)
+    endpoints = tuple(listen or [DEFAULT_ENDPOINT])
+    options = ReplayOptions(choice, rate, tuple(expect or ()), endpoints, federation)
+    beside = console_beside(endpoints[0], directory, federation, tls) if console else nullcontext()
+    with beside:
+        play(directory, options, identity(host, tls, insecure, access))

@@ -92,7 +92,7 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
             ChildProcess(f"{role}.{thing}", [role, *reach, "--", thing], logs, launcher) for role, _, thing in split
         ]
     if options.console:
-        show = ["console", "--name", CONSOLE, "--port", str(_page_port()), *reach]
+        show = ["console", "--name", CONSOLE, "--port", str(page_port()), *reach]
         children.append(ChildProcess(CONSOLE, show, logs, launcher, supervisor.handle_line))
     for role, name, drones in options.camera_children():
         draw = [COMMANDS.get(role, role), "--name", name, *reach, "--", *drones]
@@ -148,7 +148,7 @@ def _is_free(port: int) -> bool:
     return True
 
 
-def _page_port() -> int:
+def page_port() -> int:
     """Return the console's port, or another free one where that is taken."""
     return CONSOLE_PORT if _is_free(CONSOLE_PORT) else _any_port()
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState, Status, Truth
 from zsim.contract.snapshot import State
+from zsim.contract.state_rules import state_refusal
 from zsim.scenario.external_bodies import POSE_AGE_MAX_NS, moved_on, truth_fault
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.fleet.state_rules import state_refusal
 from zsim_world.state.fleet_arrays import STATE, VEHICLE
 
 

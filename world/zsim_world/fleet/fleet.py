@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import RotorInfo
 from zsim.contract.snapshot import State
+from zsim.contract.state_rules import state_refusal
 from zsim.errors import RunError
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.gps import GpsConfig
@@ -26,7 +27,6 @@ from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.initial_state import arrays
-from zsim_world.fleet.state_rules import state_refusal
 from zsim_world.physics.air import WIND
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import WHOSE, Sampled, Sampler, SensorSample, with_more

@@ -87,6 +87,10 @@ class RunClock:
         if self.ended is None:
             self.ended = reason
 
+    def hold(self) -> None:
+        """Stand still until a request lets time go on."""
+        self.state, self.steps_allowed = "paused", 0
+
     # Requests
 
     def operations(self) -> dict[str, Operation]:
@@ -102,7 +106,7 @@ class RunClock:
     def _pause(self, _: ControlRequest) -> Refusal | None:
         if self.state != "running":
             return Refusal("the run", self.state, "pause needs a running one")
-        self.state, self.steps_allowed = "paused", 0
+        self.hold()
         return None
 
     def _resume(self, _: ControlRequest) -> Refusal | None:

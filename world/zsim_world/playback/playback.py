@@ -25,6 +25,7 @@ from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.run_clock import number, refused_argument
 from zsim_world.flight.run_outbox import Refusal
 from zsim_world.playback.live_processes import LiveProcesses
+from zsim_world.playback.record_timeline import timeline_marks
 from zsim_world.playback.recorded_gates import Gate, PlaybackViews, RecordedGates, is_played, without_kills
 
 RECORD_OVER = "the record is over"  # why a replay of the whole record ended
@@ -41,12 +42,14 @@ class PlaybackRange(NamedTuple):
         from_ns, to_ns: first and last gate [ns]; None for the end.
         keys: expressions; what matches none is not played.
         paused: whether it stands still after its first gate.
+        holds: whether it stands still after its last one, for who wants to go back, rather than end.
     """
 
     from_ns: int = 0
     to_ns: int | None = None
     keys: tuple[str, ...] = ("**",)
     paused: bool = False
+    holds: bool = False
 
 
 class Playback(Coordinator):
@@ -81,7 +84,7 @@ class Playback(Coordinator):
         super().__init__(scenario, "lockstep", rate, wall_ns, run_id, [])
         self._recorded = info
         self._played = played
-        self._operations["seek"] = self._seek
+        self._operations |= {"seek": self._seek, "timeline": self._timeline}
         self.refused_queries = tuple(keys.cluster_control(cluster.name) for cluster in scenario.clusters)
         self._table = run_key_table(info)
         self._kinds = len(self._table) // len(self.names)  # of messages about a drone
@@ -117,9 +120,9 @@ class Playback(Coordinator):
 
     def advance(self, wall_ns: int) -> None:
         """Play the next gate."""
-        gate = self._coming
-        if gate is None:
-            self.clock.stop(RECORD_OVER)
+        gate, over = self._coming, self._over()
+        if gate is None or over:
+            self._end(over)
             return
         if self.clock.state == "waiting":
             self.clock.start(gate.t_ns, self._played.paused)
@@ -127,11 +130,28 @@ class Playback(Coordinator):
             self.clock.advance(gate.t_ns)
         self._play(gate, wall_ns)
         self._read_next()
+        if over := self._over():
+            self._end(over)
+
+    def _over(self) -> str:
+        """Return why nothing more is to be played; empty while there is something."""
         to_ns = self._played.to_ns
         if self._coming is None:
-            self.clock.stop(RECORD_OVER)
-        elif to_ns is not None and self._coming.t_ns > to_ns:
-            self.clock.stop(f"played to {to_ns / 1e9:g} s")
+            return RECORD_OVER
+        return f"played to {to_ns / 1e9:g} s" if to_ns is not None and self._coming.t_ns > to_ns else ""
+
+    def _end(self, reason: str) -> None:
+        if self._played.holds:
+            self.clock.hold()
+        else:
+            self.clock.stop(reason)
+
+    def _timeline(self, _: ControlRequest) -> ControlAnswer:
+        """Answer how far the record goes and what happened when [s]: of many events those of each kind thinned out."""
+        last = self._reader.last(keys.CLOCK)
+        first = next(self._reader.messages([keys.CLOCK]), last)
+        span = {"from_s": first.t_ns / 1e9, "to_s": last.t_ns / 1e9} if first and last else {}
+        return ControlAnswer(True, result={**span, "marks": timeline_marks(self._reader)})
 
     def _seek(self, request: ControlRequest) -> Refusal | None:
         """Go on from another gate. Whoever is waited for would miss what lies between."""

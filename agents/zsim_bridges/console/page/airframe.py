@@ -107,6 +107,12 @@ def rotor() -> Mesh:
 
 
 @cache
+def ring() -> Mesh:
+    """Return a flat ring of 1 m radius, about the z axis."""
+    return _mesh([annulus(0.93, 1.0, 0.03, sections=40)])
+
+
+@cache
 def ball() -> Mesh:
     """Return a sphere of 1 m radius."""
     return _mesh([icosphere(subdivisions=2)])

@@ -62,6 +62,11 @@ class CameraFrustums:
         server.on_client_connect(self._on_connect)
         server.on_client_disconnect(self._on_disconnect)
 
+    def client_id(self, page: str) -> int | None:
+        """Return viser's number of a page, None of one that is not open."""
+        with self._lock:
+            return self._pages[page].client_id if page in self._pages else None
+
     def choose(self, page: str, camera: str) -> None:
         """Show a camera's frustum on a page, empty for none."""
         with self._lock:

@@ -14,6 +14,8 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
 from zsim_bridges.console.page.picture import SHAPED_PHASES
+from zsim_bridges.console.page.run_forms import refusal_lines, set_refusals
+from zsim_bridges.console.run_condition import RunCondition, formation_refusals
 
 STILL_S = 2.0  # wall; a formation whose goal has not changed for so long is not on its way: the slider shows its goal
 
@@ -43,6 +45,11 @@ class VariableSlider:
         self._slider: Any = gui.add_slider(range_.label, range_.low, range_.high, range_.step, range_.to_display(0.0))
         self._slider.on_update(self._on_update)
 
+    def lock(self, locked: bool) -> None:
+        """Let nobody move it, or let them."""
+        if self._slider.disabled != locked:
+            self._slider.disabled = locked
+
     @property
     def moved_s(self) -> float | None:
         """When an operator moved it last [s, wall], None once the value has been popped."""
@@ -64,6 +71,13 @@ class VariableSlider:
         shown = self.range.to_display(goal)
         if self._moved is None and not self._is_held(shown, wall_s):
             self._slider.value = shown
+            self._mark(goal)
+
+    def _mark(self, goal: float) -> None:
+        """Let the label have the true value where the slider cannot show it."""
+        label = self.range.label_of(goal)
+        if self._slider.label != label:
+            self._slider.label = label
 
     def _is_held(self, goal: float, wall_s: float) -> bool:
         kept = self._held
@@ -91,6 +105,7 @@ class VariableSlider:
 REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Land": "land"}
+LABELS = {**{op: label for label, op in OPERATIONS.items()}, "target": "sliders", "trajectory": "Trajectory"}
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
     "engage": viser.Icon.TRIANGLE,
@@ -127,8 +142,9 @@ class FormationForm:
         self._cluster = cluster
         self._space = space
         self._ranges = {each.name: each for each in ranges}
-        for label, op in OPERATIONS.items():
-            self._button(gui, label, op)
+        self._shown: tuple[float, ...] | None = None
+        self._controls = {op: self._button(gui, label, op) for label, op in OPERATIONS.items()}
+        self._reasons = gui.add_html("")
         hint = "Duration of a move; 0: as fast as the robots' limits let it"
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
         shown = primary_variables(space.names)
@@ -137,11 +153,23 @@ class FormationForm:
             self._single_variable(gui, [name for name in space.names if name not in shown])
         self._trajectories(gui, cluster.plan.trajectory)
 
+    def offer(self, run: RunCondition) -> None:
+        """Grey out what the controller would refuse, with its reason; a slider shows all the same where it stands."""
+        refusals = formation_refusals(run, self._cluster.name)
+        set_refusals(self._controls, refusals)
+        for slider in self._sliders.values():
+            slider.lock(bool(refusals["target"]))
+        self._reasons.content = refusal_lines(LABELS, refusals)
+
     def refresh(self, view: ViewCluster | None, wall_s: float) -> None:
         """Let the sliders that were not moved follow the formation."""
         if view is None:
             return
         shown = view.desired if view.phase in SHAPED_PHASES else view.value
+        first = self._shown is None
+        self._shown = tuple(shown)
+        if first:
+            self._prefill()
         for name, slider in self._sliders.items():
             slider.follow(shown[self._space.index(name)], wall_s)
 
@@ -167,9 +195,10 @@ class FormationForm:
         self._client.request_cluster(self._cluster.name, "target", shown=text, values=values, **lasting)
         return True
 
-    def _button(self, gui: viser.GuiApi, label: str, op: str) -> None:
+    def _button(self, gui: viser.GuiApi, label: str, op: str) -> Any:
         button = gui.add_button(label, icon=ICONS[op], color="blue" if op in ("takeoff", "engage") else "gray")
         button.on_click(lambda _: self._client.request_cluster(self._cluster.name, op))
+        return button
 
     def _single_variable(self, gui: viser.GuiApi, names: list[str]) -> None:
         with gui.add_folder("Other variables", expand_by_default=False):
@@ -183,15 +212,25 @@ class FormationForm:
     def _trajectories(self, gui: viser.GuiApi, planned: Trajectory | None) -> None:
         with gui.add_folder("Trajectory", expand_by_default=False):
             if planned is not None:
-                gui.add_button("Fly the scenario's").on_click(lambda _: self._fly(lambda: _planned_trajectory(planned)))
-            gui.add_markdown("<sub>t in seconds, lengths in metres, angles in radians</sub>")
+                planned_button = gui.add_button("Fly the scenario's")
+                planned_button.on_click(lambda _: self._fly(lambda: _planned_trajectory(planned)))
+            gui.add_markdown("<sub>expressions: t in seconds, lengths in metres, angles in radians</sub>")
             text = gui.add_text("expressions", EXAMPLES["expressions"], multiline=True)
             fly = gui.add_button("Fly the expressions")
             fly.on_click(lambda _: self._fly(lambda: operator_input.parse_expressions(text.value, self._space.names)))
-            points = gui.add_text("waypoints", EXAMPLES["waypoints"], multiline=True)
-            gui.add_button("Fly the waypoints").on_click(
-                lambda _: self._fly(lambda: operator_input.parse_waypoints(points.value))
-            )
+            gui.add_markdown("<sub>waypoints: seconds, metres, degrees, as the sliders</sub>")
+            self._points = gui.add_text("waypoints", EXAMPLES["waypoints"], multiline=True)
+            here = gui.add_button("Waypoints from here")
+            here.on_click(lambda _: self._prefill())
+            gui.add_button("Fly the waypoints").on_click(lambda _: self._fly(self._read_waypoints))
+
+    def _prefill(self) -> None:
+        """Write where the formation is as the first waypoint, and the same place as the next, to be changed."""
+        if self._shown is not None:
+            self._points.value = operator_input.waypoints_from(self._shown, list(self._ranges.values()))
+
+    def _read_waypoints(self) -> dict[str, Any]:
+        return operator_input.waypoints_in_si(operator_input.parse_waypoints(self._points.value), self._ranges)
 
     def _fly(self, read: Callable[[], dict[str, Any]]) -> None:
         try:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from zsim.scenario.scenario import Cluster, Scenario
@@ -43,6 +43,14 @@ class SliderRange(NamedTuple):
         """Return a value [m, rad] in the unit of the range, to its step, within it."""
         shown = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
         return min(max(round(round(shown / self.step) * self.step, DIGITS), self.low), self.high)
+
+    def label_of(self, value: float) -> str:
+        """Return the label beside a value [m, rad]: with the value itself where the range does not hold it."""
+        shown = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
+        slack = self.step / 2.0
+        if self.low - slack <= shown <= self.high + slack:
+            return self.label
+        return f"{self.name} = {shown:.1f} {self.unit}: out of range"
 
     def to_si(self, shown: float) -> float:
         """Return a value in the unit of the range as [m, rad]."""
@@ -132,6 +140,33 @@ def parse_waypoints(text: str) -> dict[str, Any]:
         points.append({"at_s": _number(at, f"line {number}: the time"), "values": values})
     if not points:
         raise InputError("waypoints are empty; must have a line SECONDS: VARIABLE = VALUE at least")
+    return {"waypoints": points}
+
+
+WAYPOINT_STEP_S = 20.0  # from the first to the second waypoint of those that are prefilled
+PREFILLED = ("x_c", "y_c", "z_c", "yaw")  # variables that are, where a formation has them
+
+
+def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str:
+    """Return waypoints that begin where a formation is (its variables [m, rad]), in the units of the page."""
+    pairs = [
+        f"{each.name} = {_in_unit(each, here):g}"
+        for each, here in zip(ranges, value, strict=True)
+        if each.name in PREFILLED
+    ]
+    return "\n".join(f"{at_s:g}: {', '.join(pairs)}" for at_s in (0.0, WAYPOINT_STEP_S))
+
+
+def _in_unit(range_: SliderRange, value: float) -> float:
+    return round(math.degrees(math.remainder(value, math.tau)) if range_.unit == "deg" else value, 2)
+
+
+def waypoints_in_si(args: dict[str, Any], ranges: Mapping[str, SliderRange]) -> dict[str, Any]:
+    """Return the arguments of a trajectory of waypoints in the units of the page, in metres and radians."""
+    points = [
+        {**point, "values": {n: ranges[n].to_si(v) if n in ranges else v for n, v in point["values"].items()}}
+        for point in args["waypoints"]
+    ]
     return {"waypoints": points}
 
 

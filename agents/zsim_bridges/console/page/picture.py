@@ -6,6 +6,7 @@ Axes, units and quaternions as everywhere: W east, north, up; quaternions w firs
 import math
 from collections import deque
 from collections.abc import Sequence
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -106,6 +107,14 @@ def drone_on_ray(
     distances_m = np.linalg.norm(away - ahead_m[:, None] * (direction / length), axis=1)
     hit = (ahead_m > 0.0) & (distances_m <= np.maximum(radii_m, CLICK_RAD * ahead_m))
     return drones.names[int(np.argmin(np.where(hit, distances_m, math.inf)))] if hit.any() else None
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Return what tells names apart: without the letters with which all begin; in full where one would be empty."""
+    alike = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
+    stem = len(list(alike))
+    short = [name[stem:] for name in names]
+    return short if all(short) else list(names)
 
 
 def rotor_angles(angles: Array, speeds: Array, turns: Array, dt_s: float) -> Array:
@@ -235,7 +244,13 @@ class VariableHistory:
         self._times: deque[float] = deque(maxlen=HISTORY_POINTS_MAX)
         self._rows: deque[Array] = deque(maxlen=HISTORY_POINTS_MAX)
 
-    def add(self, t_s: float, desired: Sequence[float] | None, value: Sequence[float], true: Array | None) -> bool:
+    def is_due(self, t_s: float) -> bool:
+        """Return whether a point of that time [s] would be added."""
+        return not self._times or not 0.0 <= t_s - self._times[-1] < INTERVAL_S
+
+    def add(
+        self, t_s: float, desired: Sequence[float] | None, value: Sequence[float] | Array, true: Array | None
+    ) -> bool:
         """Add a point, unless the last one is hardly older; return whether it was added.
 
         Args:
@@ -245,7 +260,7 @@ class VariableHistory:
         if self._times and t_s < self._times[-1]:
             self._times.clear()
             self._rows.clear()
-        if self._times and t_s - self._times[-1] < INTERVAL_S:
+        if not self.is_due(t_s):
             return False
         unknown = np.full(self._size, np.nan)
         columns = (unknown if each is None else np.asarray(each, dtype=float) for each in (desired, value, true))
@@ -256,13 +271,23 @@ class VariableHistory:
             self._rows.popleft()
         return True
 
-    def curves(self, index: int, angular: bool) -> tuple[Array, ...]:
+    def curves(self, index: int, angular: bool, span_s: float = SPAN_S, less: int | None = None) -> tuple[Array, ...]:
         """Return the times (M,) and the three curves (M,) of a variable, as `SERIES`; angles in degrees, wrapped.
 
         A curve is broken (NaN) where an angle goes round.
+
+        Args:
+            index: of the variable.
+            angular: whether it is an angle.
+            span_s: how far the curves go back.
+            less: the one of `SERIES` whose values are taken off the others, which then are errors; None for values.
         """
         t = np.array(self._times)
         table = np.array(self._rows)[:, :, index] if self._rows else np.zeros((0, 3))
+        recent = t >= (t[-1] if len(t) else 0.0) - span_s
+        t, table = t[recent], table[recent]
+        if less is not None:
+            table = table - table[:, [less]]
         if angular:
             table = np.degrees(np.arctan2(np.sin(table), np.cos(table)))
             around = np.abs(np.diff(table, axis=0, prepend=table[:1])) > 180.0

@@ -1,6 +1,7 @@
 """Controls of the run's time, of drones one by one or all together, and of injected faults."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
 from typing import Any
 
 import viser
@@ -12,6 +13,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.page import operator_input
+from zsim_bridges.console.run_condition import RunCondition, drone_refusals, fleet_refusals, run_refusals
 
 DURATION_S = 30.0  # of a fault, unless another time is typed
 WEAK_THRUST_SHARE = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
@@ -103,15 +105,35 @@ def _help(fault: FaultKind) -> str:
     return f"<sub>{fault.description}; strikes a {fault.strikes}. {'; '.join(lines)}</sub>"
 
 
-PINNED = """<style>
-.mantine-ScrollArea-content div:has(.icon-tabler-alert-octagon) {overflow: visible !important}
-div:has(> button .icon-tabler-alert-octagon) {position: sticky; top: 0; z-index: 10}
-</style>"""  # the button of that icon is seen however far a page is scrolled: no box around it may clip
-FLEET = {"Take off all": "takeoff", "Land all": "land"}  # an operation of a formation, and a mode of a drone
+def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> None:
+    """Grey out the controls of those operations that would be refused; the reason is their tooltip.
+
+    Viser sends an assigned property always: what has not changed is left alone.
+    """
+    for op, control in controls.items():
+        reason = refusals.get(op, "")
+        if control.disabled != bool(reason):
+            control.disabled = bool(reason)
+        if control.hint != (reason or None):
+            control.hint = reason or None
+
+
+def refusal_lines(labels: Mapping[str, str], refusals: Mapping[str, str]) -> str:
+    """Return, a line for each reason, which controls are greyed out, as HTML; `labels` names them by operation."""
+    by_reason: dict[str, list[str]] = {}
+    for op, label in labels.items():
+        if refusals.get(op):
+            by_reason.setdefault(refusals[op], []).append(label)
+    lines = [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()]
+    return f"<div style='{REASON_STYLE}'>{'<br>'.join(map(escape, lines))}</div>" if lines else ""
+
+
+REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 8px;overflow-wrap:anywhere"
+FLEET = {"Take off all": "takeoff", "Reset all": "reset"}  # an operation of formations, and a mode of drones
 
 
 class RunForm:
-    """Pause, resume, single steps, rate.
+    """Pause or resume, single steps, rate.
 
     Args:
         gui: viser's, in the folder where they are to be.
@@ -120,19 +142,33 @@ class RunForm:
     """
 
     def __init__(self, gui: viser.GuiApi, client: CommandClient, rate: float) -> None:
-        gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE).on_click(lambda _: client.request_world("pause"))
-        gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY).on_click(lambda _: client.request_world("resume"))
+        pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+        pause.on_click(lambda _: client.request_world("pause"))
+        resume = gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY, visible=False)
+        resume.on_click(lambda _: client.request_world("resume"))
         gates = gui.add_number("gates", 1, min=1, max=GATES_MAX, step=1)
         step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
         step.on_click(lambda _: client.request_world("step", gates=int(gates.value)))
         wanted = gui.add_number(
             "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
         )
-        gui.add_button("Set rate").on_click(lambda _: client.request_world("rate", value=float(wanted.value)))
+        set_rate = gui.add_button("Set rate")
+        set_rate.on_click(lambda _: client.request_world("rate", value=float(wanted.value)))
+        self._controls = {"pause": pause, "resume": resume, "step": step, "rate": set_rate}
+        self._reasons = gui.add_html("")
+
+    def refresh(self, run: RunCondition) -> None:
+        """Offer what the run would not refuse: Resume stands in the place of Pause while it is paused."""
+        refusals = run_refusals(run)
+        set_refusals(self._controls, refusals)
+        paused = run.clock == "paused"
+        if self._controls["resume"].visible != paused:
+            self._controls["pause"].visible, self._controls["resume"].visible = not paused, paused
+        self._reasons.content = refusal_lines({"step": "Step", "rate": "Set rate"}, refusals)
 
 
 class FleetForm:
-    """Emergency, take-off and landing of all drones.
+    """Take-off and reset of all drones; their landing and emergency, too, for the head of the page.
 
     Formations take off and land by their controllers, drones of none each by itself.
 
@@ -146,44 +182,89 @@ class FleetForm:
         self._client = client
         self._formations = [cluster.name for cluster in scenario.clusters]
         in_formation = {name for cluster in scenario.clusters for name in cluster.drones}
-        drones = [drone.name for drone in scenario.drones]
-        self._single = [name for name in drones if name not in in_formation]
-        stop = gui.add_button("EMERGENCY – all rotors stop", color="red", icon=viser.Icon.ALERT_OCTAGON)
-        stop.on_click(lambda _: client.send_mode(drones, "emergency"))
-        gui.add_html(PINNED)
-        both = gui.add_button_group("all drones", list(FLEET))
-        both.on_click(lambda _: self._request_all(FLEET[both.value]))
+        self._drones = [drone.name for drone in scenario.drones]
+        self._single = [name for name in self._drones if name not in in_formation]
+        self._run = RunCondition()
+        self._controls: dict[str, Any] = {}
+        for label, op in FLEET.items():
+            icon = viser.Icon.PLANE_DEPARTURE if op == "takeoff" else viser.Icon.REFRESH
+            self._controls[op] = gui.add_button(label, icon=icon, color="gray")
+            self._controls[op].on_click(lambda _, op=op: self.request_all(op))
+        self._reasons = gui.add_html("")
 
-    def _request_all(self, operation: str) -> None:
-        for name in self._formations:
-            self._client.request_cluster(name, operation)
-        if self._single:
-            self._client.send_mode(self._single, operation)
+    def refresh(self, run: RunCondition) -> None:
+        """Offer what would not be refused; Reset all is there only while a drone is in an emergency."""
+        self._run = run
+        refusals = fleet_refusals(run, self._single)
+        set_refusals(self._controls, refusals)
+        in_emergency = not refusals["reset"]
+        if self._controls["reset"].visible != in_emergency:
+            self._controls["reset"].visible = in_emergency
+        self._reasons.content = refusal_lines({"takeoff": "Take off all"}, refusals)
+
+    def request_all(self, operation: str) -> None:
+        """Request takeoff or land of all formations and single drones, emergency of all, reset of those in one."""
+        if operation == "emergency":
+            self._client.send_mode(self._drones, operation)
+        elif operation == "reset":
+            self._client.send_mode([d for d in self._drones if self._run.drones.get(d) == "emergency"], operation)
+        else:
+            for name in self._formations:
+                self._client.request_cluster(name, operation)
+            if self._single:
+                self._client.send_mode(self._single, operation)
+
+
+DRONE_MODES = {"takeoff": "Take off", "land": "Land", "emergency": "Emergency", "reset": "Reset"}
+DRONE_ICONS = {
+    "takeoff": viser.Icon.PLANE_DEPARTURE,
+    "land": viser.Icon.PLANE_ARRIVAL,
+    "emergency": viser.Icon.ALERT_TRIANGLE,
+    "reset": viser.Icon.REFRESH,
+}
 
 
 class DroneForm:
-    """Take-off, landing and emergency of one drone.
+    """Take-off, landing and emergency of one drone, on one page: what another page chooses changes nothing here.
 
     Args:
-        gui: viser's, in the folder where they are to be.
+        gui: viser's of that page, in the folder where they are to be.
         client: sends requests.
-        scenario: names the drones.
+        names: of the drones.
+
+    Attributes:
+        choice: the control that chooses it.
     """
 
-    def __init__(self, gui: viser.GuiApi, client: CommandClient, scenario: Scenario) -> None:
-        names = [drone.name for drone in scenario.drones]
-        self._chosen = gui.add_dropdown("drone", names)
-        for label, mode, icon in (
-            ("Take off drone", "takeoff", viser.Icon.PLANE_DEPARTURE),
-            ("Land drone", "land", viser.Icon.PLANE_ARRIVAL),
-            ("Emergency drone", "emergency", viser.Icon.ALERT_TRIANGLE),
-            ("Reset drone", "reset", viser.Icon.REFRESH),
-        ):
+    def __init__(self, gui: viser.GuiApi, client: CommandClient, names: Sequence[str]) -> None:
+        self.choice = gui.add_dropdown("drone", list(names))
+        self._buttons: dict[str, Any] = {}
+        for mode, label in DRONE_MODES.items():
             colour = "red" if mode == "emergency" else "gray"
-            button = gui.add_button(label, icon=icon, color=colour)
-            button.on_click(lambda _, mode=mode: client.send_mode([self._chosen.value], mode))
+            button = gui.add_button(f"{label} {self.chosen}", icon=DRONE_ICONS[mode], color=colour)
+            button.on_click(lambda _, mode=mode: client.send_mode([self.chosen], mode))
+            self._buttons[mode] = button
+        self._reasons = gui.add_html("")
+        self._run = RunCondition()
+        self.choice.on_update(lambda _: self._rename())
 
     @property
     def chosen(self) -> str:
         """Name of the drone that is chosen."""
-        return self._chosen.value
+        return self.choice.value
+
+    def choose(self, drone: str) -> None:
+        """Choose a drone, as a click on it in the scene does."""
+        self.choice.value = drone
+
+    def refresh(self, run: RunCondition) -> None:
+        """Offer what would not be refused."""
+        self._run = run
+        refusals = drone_refusals(run, self.chosen)
+        set_refusals(self._buttons, refusals)
+        self._reasons.content = refusal_lines(DRONE_MODES, refusals)
+
+    def _rename(self) -> None:
+        for mode, button in self._buttons.items():
+            button.label = f"{DRONE_MODES[mode]} {self.chosen}"
+        self.refresh(self._run)

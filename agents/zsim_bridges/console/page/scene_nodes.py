@@ -12,14 +12,25 @@ from zsim.contract.messages import DroneInfo
 from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console.page import airframe
-from zsim_bridges.console.page.picture import Array, DronePoses, Ellipsoids, FormationShape, rotor_angles, rotor_poses
+from zsim_bridges.console.page.picture import (
+    Array,
+    DronePoses,
+    Ellipsoids,
+    FormationShape,
+    rotor_angles,
+    rotor_poses,
+    short_names,
+)
 
-NAMED_MAX = 12  # drones with their names beside them; more would hide each other
+NAMED_MAX = 60  # drones with their names beside them; more would hide each other
+LARGE_MAX = 12  # names in full, at full size; of more drones what tells them apart, smaller
+SMALL = 0.8  # of the size of a name
 TRAIL_COLOURS = np.array(
     [(25, 113, 194), (232, 137, 12), (47, 158, 68), (156, 54, 181), (224, 49, 49), (12, 133, 153)], np.uint8
 )
 SOLID = (134, 142, 150)
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
+SIDE_PX = 2.0  # of a formation's sides: as wide from afar
 FIELD_M = 150.0  # half a side of the ground
 GREEN = (206, 219, 196)
 WIND_M_PER_M_S = 0.5  # length of the arrow
@@ -74,7 +85,7 @@ class SceneNodes:
             "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
             head_length=0.22, visible=False,
         )  # fmt: skip
-        self._wind_label = self._scene.add_label("/wind_speed", "", visible=False, anchor="bottom-center")
+        self._wind_label = self._scene.add_label("/wind_speed", "", visible=False, anchor="bottom-left")
         self._shapes = _FormationNodes(self._scene, clusters) if clusters else None
 
     def obstacles(self, obstacles: Sequence[Obstacle]) -> None:
@@ -94,7 +105,7 @@ class SceneNodes:
                 self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
 
     def drones(self, drones: DronePoses, dt_s: float) -> None:
-        """Move the drones; their rotors have turned for dt_s."""
+        """Move the drones, whose rotors have turned for dt_s."""
         drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
         self._airframes.move(drones)
         self._rotors.move(drones, dt_s)
@@ -186,7 +197,10 @@ class SceneNodes:
     def _labels(self, names: tuple[str, ...]) -> list[Any]:
         if len(names) > NAMED_MAX:
             return []
-        return [self._scene.add_label(f"/names/{name}", name, anchor="bottom-center") for name in names]
+        many = len(names) > LARGE_MAX
+        look: Any = {"anchor": "bottom-center", "font_screen_scale": SMALL if many else 1.0}
+        shown = short_names(names) if many else names
+        return [self._scene.add_label(f"/names/{name}", text, **look) for name, text in zip(names, shown, strict=True)]
 
 
 class _AirframeNodes:
@@ -250,7 +264,9 @@ class _FormationNodes:
         if self._lines is not None:
             self._lines.points = points
         elif len(points):
-            self._lines = self._scene.add_line_segments("/formations/sides", points, SIDE, thickness=0.015)
+            self._lines = self._scene.add_line_segments(
+                "/formations/sides", points, SIDE, thickness=SIDE_PX, thickness_units="screen"
+            )
 
     def _write(self, shape: FormationShape | None) -> None:
         texts = [] if shape is None else [(s.name, s.ends_W.mean(axis=0)) for s in shape.sides if s.name]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from refused import has_terms, refused, without_tags
 
-from zsim.contract.run_messages import Clock, Event, Waiting
+from zsim.contract.run_messages import Event
 from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.errors import RunError
 from zsim.math import frames
@@ -19,7 +19,8 @@ from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import PageControls, ViewerCamera, is_permitted
-from zsim_bridges.console.http_proxy import OPERATOR, VIEWER, ListenAddress, PageRequest, PageTokens
+from zsim_bridges.console.event_log import EventRow
+from zsim_bridges.console.http_proxy import ListenAddress
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page import picture as pic
 from zsim_bridges.console.page.operator_input import primary_variables, slider_ranges
@@ -32,6 +33,7 @@ from zsim_bridges.console.page.picture import (
     CanvasTrails,
     VariableHistory,
 )
+from zsim_bridges.console.page_tokens import OPERATOR, VIEWER, PageRequest, PageTokens
 from zsim_bridges.console.sensor_rates import SensorRates
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
@@ -71,6 +73,13 @@ def test_a_view_of_some_drones_keeps_their_places():
     assert found.p_W[2].tolist() == [1, 2, 3]
     assert found.q_WB.shape == (3, 4)
     assert not pic.drone_poses(ViewDrones(7, 0, ()), ("d0",)).present.any()
+
+
+def test_many_names_are_shown_by_what_tells_them_apart():
+    assert pic.short_names(["drone1", "drone2", "drone30"]) == ["1", "2", "30"]
+    assert pic.short_names(["drone10", "drone11"]) == ["10", "11"]
+    assert pic.short_names(["north", "south"]) == ["north", "south"]
+    assert pic.short_names(["drone", "drone2"]) == ["drone", "drone2"]
 
 
 def test_rotors_stand_on_their_drone_and_turn_about_its_axis():
@@ -219,6 +228,25 @@ def test_an_angle_that_goes_round_breaks_the_curve():
     _, desired, _, _ = history.curves(0, angular=True)
     assert np.isnan(desired[2])
     assert desired[3] == pytest.approx(math.degrees(3.3) - 360)
+
+
+def test_errors_are_counted_from_what_is_desired():
+    history = VariableHistory(1)
+    for k, yaw in enumerate((3.0, 3.1, -3.1)):
+        history.add(float(k), (3.1,), (yaw,), np.array([yaw - 0.1]))
+    _, desired, estimated, true = history.curves(0, angular=True, less=0)
+    assert desired == pytest.approx([0.0, 0.0, 0.0])
+    assert np.radians(estimated) == pytest.approx([-0.1, 0.0, math.tau - 6.2])
+    assert np.radians(true) == pytest.approx([-0.2, -0.1, math.tau - 6.3])
+
+
+def test_a_window_shows_the_newest_of_the_curves():
+    history = VariableHistory(1)
+    for k in range(100):
+        history.add(float(k), (1.0,), (2.0,), None)
+    t, desired, *_ = history.curves(0, angular=False, span_s=20.0)
+    assert t.tolist() == list(range(79, 100))
+    assert len(desired) == 21
 
 
 def test_rates_follow_from_counts():
@@ -433,11 +461,10 @@ UPDATE = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": True}}
 
 def test_a_viewer_steers_nothing_but_its_own_page():
     packed = msgspec.msgpack.encode
-    others, own = controls(a=True), controls(switches={"a"})
-    assert is_permitted(packed(CAMERA), VIEWER, others)
-    assert not is_permitted(packed(UPDATE), VIEWER, others)
-    assert is_permitted(packed(UPDATE), VIEWER, own)
-    assert is_permitted(packed(UPDATE), OPERATOR, others)
+    there = controls(a=True)
+    assert is_permitted(packed(CAMERA), VIEWER, there)
+    assert not is_permitted(packed(UPDATE), VIEWER, there)
+    assert is_permitted(packed(UPDATE), OPERATOR, there)
 
 
 CLICK = {
@@ -465,14 +492,14 @@ def test_every_page_may_click_into_its_scene(role: str):
     assert not permitted(modifier="x" * 65)
 
 
-def controls(switches: set[str] | None = None, **values: Any) -> PageControls:
+def controls(**values: Any) -> PageControls:
     """Return what is known of controls that hold such values; a list is that of a dropdown."""
     handles = {
         uuid: SimpleNamespace(value=now[0], options=now) if isinstance(now, list) else SimpleNamespace(value=now)
         for uuid, now in values.items()
     }
     gui: Any = SimpleNamespace(_gui_input_handle_from_uuid=handles)
-    return PageControls(gui, switches or set())
+    return PageControls(gui)
 
 
 @pytest.mark.parametrize(
@@ -528,10 +555,13 @@ def test_tables_show_text_of_others_as_text():
     assert "&lt;script&gt;" in html
     assert "gps_dropout" in html
     assert html.count(console_tables.AMBER) == 2  # late, and a fault
+    assert has_terms(without_tags(html), "flying", "12 %", "lag 400 ms")
     assert console_tables.RED in html  # the battery
-    events = console_tables.event_table([Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")])
+    event = Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")
+    events = console_tables.event_table([EventRow(event, 3, False)])
     assert "1.50" in events
     assert "&lt;b&gt;no" in events
+    assert has_terms(without_tags(events), "3 ×")
 
 
 def test_many_formations_leave_room_for_the_emergency_button():
@@ -539,25 +569,6 @@ def test_many_formations_leave_room_for_the_emergency_button():
     assert console_tables.FEW_LINES in html
     assert html.count("<br>") == 15
     assert has_terms(without_tags(html), "taking off", "&lt;waits&gt")
-
-
-def test_the_clock_says_whom_the_run_waits_for():
-    now = Clock(2_000_000_000, 0, "r", 100, "waiting", 0.0, (Waiting("estimator.d1", "lab", 3.0),))
-    assert has_terms(without_tags(console_tables.clock_line(now, now.t_ns)), "waiting", "estimator.d1", "lab", "3 s")
-    assert "no clock" in console_tables.clock_line(None, 0)
-
-
-def test_the_clock_names_the_cause_and_not_who_only_waits_for_it():
-    waiting = (Waiting("estimator.d1", "lab", 3.0), Waiting("controller.main", "hall", 3.0, ("estimator.d1",)))
-    text = without_tags(console_tables.clock_line(Clock(0, 0, "r", 0, "running", 0.0, waiting), 0))
-    assert has_terms(text, "waiting", "estimator.d1", "lab")
-    assert "controller" not in text
-
-
-def test_the_clock_tells_a_pace_only_while_the_run_goes_on():
-    running, paused = (Clock(2_020_000_000, 0, "r", 101, state, 3.0) for state in ("running", "paused"))  # type: ignore[arg-type]
-    assert has_terms(without_tags(console_tables.clock_line(running, 2_010_000_000)), "2.0 s", "3.0")
-    assert "2.02 s</b><" in console_tables.clock_line(paused, 0)  # nothing is drawn yet
 
 
 def test_acting_faults_are_listed():

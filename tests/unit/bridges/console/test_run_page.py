@@ -6,9 +6,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
-from refused import has_terms, without_tags
+from refused import has_terms
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import DroneInfo, RotorInfo
@@ -19,10 +20,11 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_server import PrivateViser
 from zsim_bridges.console.page import scene_nodes as stages
+from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
-from zsim_bridges.console.page.page_camera import CameraFollow
 from zsim_bridges.console.page.picture import drone_poses
-from zsim_bridges.console.run_page import RunPage, picture_rate_hz
+from zsim_bridges.console.picture_rate import picture_rate_hz
+from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.console.view_buffer import TimeMonitor
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
@@ -86,7 +88,9 @@ class Seen:
         )
         drones = DRONES
         scenario = STEP.read_text()
-        info: Any = SimpleNamespace(run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario)
+        info: Any = SimpleNamespace(
+            run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario, replay_of=""
+        )
         server.get_clients = lambda: {0: None} if watched else {}
         self.show = RunPage(
             server, self.link, info, self.observer, CameraFollow(server), CameraFrustums(server), 1000.0
@@ -247,7 +251,62 @@ def test_a_world_that_is_gone_is_told_on_the_page(seen: Seen, monkeypatch: pytes
     monkeypatch.setattr(TimeMonitor, "silent_s", 12.0)
     state = seen.draw(drones(*NAMES))
     assert (state["clock"], state["silent_s"]) == ("silent", 12.0)
-    assert has_terms(without_tags(seen.show._page.clock.content), "no answer", "12 s")
+    head = seen.show.head()
+    assert (head["level"], head["age_s"]) == ("silent", 12.0)
+    assert has_terms(head["title"], "12 s")
+    page = seen.show._page
+    locked = [
+        *page.forms[CLUSTER]._controls.values(),
+        *page.fleet._controls.values(),
+        *page.run_form._controls.values(),
+    ]
+    assert all(control.disabled for control in locked)
+    seen.link.asked.clear()
+    assert all(seen.show.command(op) for op in ("land", "emergency"))
+    assert seen.link.asked == []
+
+
+def test_a_run_that_is_over_is_told_with_its_reason(seen: Seen):
+    seen.draw(drones(*NAMES), cluster())
+    event = Event(30_000_000, 0, "end", "world", "world", "330 s were flown")
+    seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
+    seen.draw(drones(*NAMES), cluster())
+    head = seen.show.head()
+    assert head["level"] == "ended"
+    assert has_terms(head["detail"], "330 s")
+    assert head["refusals"]["emergency"]
+
+
+def test_an_emergency_is_in_the_head_of_the_page(seen: Seen):
+    key, view = drones(*NAMES)
+    stopped = msgspec.structs.replace(view.drones[1], state="emergency", battery_percent=8.0)
+    seen.draw((key, msgspec.structs.replace(view, drones=(view.drones[0], stopped, view.drones[2]))), cluster())
+    head = seen.show.head()
+    assert (head["level"], head["refusals"]["emergency"]) == ("emergency", "")
+    alarms = {(alarm["subject"], alarm["name"], alarm["severity"]) for alarm in head["alarms"]}
+    assert alarms == {(NAMES[1], "emergency", "red"), (NAMES[1], "battery", "red")}
+    assert seen.show._monitor.board.severity_of(NAMES[1]) == "red"
+    assert seen.show._monitor.board.severity_of(NAMES[0]) is None
+    assert seen.show.command("acknowledge") == ""
+    assert all(alarm["acknowledged"] for alarm in seen.show.head()["alarms"])
+
+
+def test_the_death_of_a_process_is_an_alarm_until_it_is_back(seen: Seen):
+    seen.draw(drones(*NAMES))
+    for kind, alarmed in (("death", ["recorder"]), ("restart", [])):
+        event = Event(0, 0, kind, "world", "recorder", f"recorder: {kind}")
+        seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
+        seen.draw(drones(*NAMES))
+        assert [alarm["subject"] for alarm in seen.show.head()["alarms"]] == alarmed
+
+
+def test_accepted_and_done_are_told_apart(seen: Seen):
+    seen.show._on_outcome(RequestOutcome("main: engage", "", CLUSTER, "engage"))
+    kinds = [event.kind for event in seen.show.views.events]
+    assert kinds == ["accepted"]
+    seen.draw(drones(*NAMES), cluster())
+    kinds = [event.kind for event in seen.show.views.events]
+    assert kinds == ["done", "accepted"]
 
 
 def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
@@ -279,76 +338,15 @@ def test_a_slider_that_was_moved_just_before_its_page_closed_is_sent_now_or_neve
     seen.show.close()
 
 
-class Page:
-    """A page of viser's, with its camera and its switch."""
-
-    def __init__(self, number: int) -> None:
-        self.client_id = number
-        self.camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3))
-        self.switch = SimpleNamespace(value=False, _impl=SimpleNamespace(uuid=f"u{number}"))
-        self.gui = SimpleNamespace(add_checkbox=lambda *_, **__: self.switch)
-
-    def atomic(self) -> "Page":
-        return self
-
-    def __enter__(self) -> None:
-        return
-
-    def __exit__(self, *_: object) -> None:
-        return
-
-
-def cameras(calls: dict[str, Any], there: set[int]) -> Any:
-    """Return a server that has pages of some numbers."""
-    return SimpleNamespace(
-        on_client_connect=lambda call: calls.update(come=call),
-        on_client_disconnect=lambda call: calls.update(go=call),
-        get_clients=lambda: dict.fromkeys(there),
-    )
-
-
-def test_a_page_that_went_before_it_was_known_is_forgotten():
-    calls: dict[str, Any] = {}
-    followers = CameraFollow(cameras(calls, set()))
-    gone = Page(1)
-    calls["go"](gone)
-    calls["come"](gone)
-    assert followers.switches == set()
-    gone.switch.value = True
-    followers.follow(np.array([(10.0, 0.0, 2.0)]))
-    assert followers._targets == {}
-
-
-def test_cameras_follow_where_their_page_says_so():
-    calls: dict[str, Any] = {}
-    followers = CameraFollow(cameras(calls, {1, 2}))
-    one, other = Page(1), Page(2)
-    calls["come"](one)
-    calls["come"](other)
-    assert followers.switches == {"u1", "u2"}
-    one.switch.value = True
-    followers.follow(np.array([(0.0, 0.0, 2.0), (2.0, 0.0, 2.0)]))  # the first picture: everybody looks there
-    followers.follow(np.array([(10.0, 0.0, 2.0), (12.0, 0.0, 2.0)]))
-    followers.follow(np.zeros((0, 3)))
-    assert one.camera.look_at.tolist() == [11.0, 0.0, 2.0]
-    assert other.camera.look_at.tolist() == [1.0, 0.0, 2.0]
-    followers.restart()  # another run
-    followers.follow(np.array([(30.0, 0.0, 2.0)]))
-    assert other.camera.look_at.tolist() == [30.0, 0.0, 2.0]
-    calls["go"](one)
-    assert followers.switches == {"u2"}
-    assert followers._targets == {}
-
-
 def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
     seen.show._server.get_clients = dict  # type: ignore[assignment]  # nobody looks
     for outcome in (
-        RequestOutcome("main: takeoff", ""),
+        RequestOutcome("main: takeoff", "", "main", "takeoff"),
         RequestOutcome("rate value 2", ""),
         RequestOutcome("main", "not yet"),
     ):
         seen.show._on_outcome(outcome)
     found = [(event.kind, event.text) for event in seen.show.views.events]
-    assert [kind for kind, _ in found] == ["refused", "control"]
+    assert [kind for kind, _ in found] == ["refused", "accepted"]
     assert found[0][1] == "main: not yet"
     assert has_terms(found[1][1], "main", "takeoff")

@@ -14,6 +14,8 @@ from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health
 from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_tables import TableRows, sigma_m
+from zsim_bridges.console.page_head import page_head
+from zsim_bridges.console.run_condition import RunCondition
 from zsim_bridges.console.run_state import console_state
 from zsim_bridges.console.view_buffer import SILENT_S, TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
@@ -172,10 +174,10 @@ def test_silence_of_the_world_is_told_and_for_how_long():
 
 
 def test_a_silent_world_is_not_called_running():
-    shown = console_tables.clock_line(clock(7 * S), 7 * S, 12.3)
-    assert has_terms(without_tags(shown), "no answer", "12 s")
-    assert console_tables.RED in shown
-    assert "running" not in shown
+    head = page_head("step", RunCondition("running", silent_s=12.3), clock(7 * S), 7 * S)
+    assert head["level"] == "silent"
+    assert has_terms(head["title"], "12 s")
+    assert "running" not in head["title"]
 
 
 # Estimators

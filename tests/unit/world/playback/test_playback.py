@@ -21,6 +21,7 @@ from zsim.schema.message import Message
 from zsim.sensors.camera import FrontCamera
 from zsim_world.flight.world import World
 from zsim_world.playback.playback import NOT_FLYABLE, RECORD_OVER, Playback, PlaybackRange
+from zsim_world.playback.record_timeline import MARKS_MAX, timeline_marks
 from zsim_world.playback.recorded_gates import RecordedGates
 
 GATE_NS = 20_000_000
@@ -344,6 +345,40 @@ def faulty(tmp_path: Path) -> Iterator[RecordReader]:
     recorded += [message for number in range(3, 6) for message in gate(number)]
     with write(tmp_path, recorded) as reader:
         yield reader
+
+
+def test_a_replay_that_holds_stands_at_its_end_and_goes_back(flight: RecordReader):
+    held = Playback(flight, SCENARIO, INFO, PlaybackRange(holds=True))
+    for _ in range(1000):
+        if held.clock.is_halted:
+            break
+        held.advance(0)
+    assert held.clock.state == "paused"
+    assert held.ended is None
+    end_ns = held.now_ns
+    held.clock.state = "running"
+    held.advance(0)
+    assert (held.now_ns, held.clock.state) == (end_ns, "paused")
+    assert held._seek(ControlRequest("seek", {"t_s": 0.0})) is None
+    held.advance(0)
+    assert held.now_ns < end_ns
+
+
+def test_a_timeline_has_the_ends_of_the_record_and_its_events(tmp_path: Path):
+    reader = write(tmp_path, [*gate(0), *gate(1), event(1, "death"), event(1, "command", 1), *gate(2)])
+    with reader:
+        answer = Playback(reader, SCENARIO, INFO)._timeline(ControlRequest("timeline"))
+    assert answer.ok
+    assert (answer.result["from_s"], answer.result["to_s"]) == (0.0, 2 * GATE_NS / 1e9)
+    assert [(mark["t_s"], mark["kind"]) for mark in answer.result["marks"]] == [(GATE_NS / 1e9, "death")]
+
+
+def test_of_many_events_a_timeline_has_some(tmp_path: Path):
+    many = [event(k // 10, "control", k) for k in range(1000)]
+    with write(tmp_path, [*gate(0), *many]) as reader:
+        marks = timeline_marks(reader)
+    assert len(marks) <= MARKS_MAX
+    assert marks[-1]["t_s"] > 0.9 * 99 * GATE_NS / 1e9
 
 
 def test_a_seek_that_is_refused_changes_nothing(faulty: RecordReader):

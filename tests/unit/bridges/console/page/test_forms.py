@@ -1,5 +1,6 @@
 """The console's forms: what each control of the page asks for. The page is one that notes its controls."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,10 +14,11 @@ from zsim.contract.views import ViewCluster
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import KINDS
 from zsim.scenario.scenario import Scenario
+from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.page.console_page import SWITCHES, ConsolePage
-from zsim_bridges.console.page.formation_form import REST_S, STILL_S, FormationForm
+from zsim_bridges.console.page.formation_form import OPERATIONS, REST_S, STILL_S, FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.run_forms import (
     DURATION_S,
@@ -28,6 +30,7 @@ from zsim_bridges.console.page.run_forms import (
     FleetForm,
     RunForm,
 )
+from zsim_bridges.console.run_condition import RunCondition
 
 SCENARIOS = Path(__file__).parents[5] / "scenarios"
 PERSON, NOBODY = 1, None  # who moved a slider
@@ -41,6 +44,9 @@ class Control:
         self.value = value
         self.content = ""
         self.visible = True
+        self.disabled = False
+        self.hint: str | None = None
+        self.label = ""
         self.acts: list[Callable[[Any], None]] = []
 
     def __enter__(self) -> "Control":
@@ -206,24 +212,29 @@ def test_the_run_is_asked_for_what_the_button_says(bench: Bench, label: str, ask
 @pytest.mark.parametrize(
     ("label", "mode"),
     [
-        ("Take off drone", "takeoff"),
-        ("Land drone", "land"),
-        ("Emergency drone", "emergency"),
-        ("Reset drone", "reset"),
+        ("Take off", "takeoff"),
+        ("Land", "land"),
+        ("Emergency", "emergency"),
+        ("Reset", "reset"),
     ],
 )
 def test_the_chosen_drone_alone_gets_its_mode(bench: Bench, label: str, mode: str):
-    form = DroneForm(bench.gui, bench.client, bench.scenario)
-    bench.gui.at["drone"].value = bench.names[1]
-    bench.gui.press(label)
+    form = DroneForm(bench.gui, bench.client, bench.names)
+    bench.gui.at["drone"].put(bench.names[1])
+    button = bench.gui.at[f"{label} {bench.names[0]}"]
+    assert button.label == f"{label} {bench.names[1]}"
+    button.put(None)
     assert form.chosen == bench.names[1]
     assert bench.client.asked == [((bench.names[1],), mode)]
 
 
 @pytest.mark.parametrize(("label", "what"), [("Take off all", "takeoff"), ("Land all", "land")])
 def test_all_formations_and_all_drones_of_none_take_off_and_land(bench: Bench, label: str, what: str):
-    FleetForm(bench.gui, bench.client, mixed())
-    bench.gui.at["all drones"].put(label)
+    form = FleetForm(bench.gui, bench.client, mixed())
+    if what == "takeoff":
+        bench.gui.press(label)
+    else:
+        form.request_all(what)
     assert bench.client.asked == [("main", what, {}), ("other", what, {}), (("d5", "d6"), what)]
 
 
@@ -231,8 +242,9 @@ def test_all_formations_and_all_drones_of_none_take_off_and_land(bench: Bench, l
 def test_all_drones_are_in_formations_or_none_is(bench: Bench, alone: bool):
     scenario = mixed()
     clusters, drones = ([], scenario.drones[4:]) if alone else (scenario.clusters, scenario.drones[:4])
-    FleetForm(bench.gui, bench.client, msgspec.structs.replace(scenario, clusters=clusters, drones=drones))
-    bench.gui.at["all drones"].put("Land all")
+    FleetForm(bench.gui, bench.client, msgspec.structs.replace(scenario, clusters=clusters, drones=drones)).request_all(
+        "land"
+    )
     formations = [("main", "land", {}), ("other", "land", {})]
     assert bench.client.asked == ([(("d5", "d6"), "land")] if alone else formations)
 
@@ -242,6 +254,94 @@ def mixed() -> Scenario:
     drones = [{"name": f"d{k}", "position_m": [3 * k, 0, 0]} for k in range(1, 7)]
     clusters = [{"name": "main", "drones": ["d1", "d2"]}, {"name": "other", "drones": ["d3", "d4"]}]
     return scenario_file.resolve({"name": "t", "duration_s": 1, "drones": drones, "clusters": clusters}, "mixed.yaml")
+
+
+def flown(phase: str = "engaged", reason: str = "", **more: Any) -> RunCondition:
+    """Return the condition of a run in which a formation is in a phase."""
+    state = "landed" if phase == "idle" else "flying"
+    drones = dict.fromkeys(("drone1", "drone2", "drone3"), state)
+    return RunCondition(**{"clock": "running", "drones": drones, "phases": {"main": (phase, reason)}, **more})
+
+
+@pytest.mark.parametrize(
+    ("run", "off"),
+    [
+        (flown("idle"), {"Engage", "Hold", "Land"}),
+        (flown("engaged"), {"Take off", "Engage"}),
+        (flown("assembling", "drone2 is at z = 0.20 m"), {"Take off", "Engage", "Hold"}),
+        (flown("assembling", READY_TO_ENGAGE), {"Take off", "Hold"}),
+        (flown("held", HELD_ON_REQUEST), {"Take off", "Hold"}),
+        (flown("held", "drone2 is in state landed"), {"Take off", "Engage", "Hold"}),
+        (flown(silent_s=79.0), {"Take off", "Engage", "Hold", "Land"}),
+        (flown(ended="the run ended"), {"Take off", "Engage", "Hold", "Land"}),
+        (flown(replayed=True), {"Take off", "Engage", "Hold", "Land"}),
+    ],
+)
+def test_a_formation_is_offered_what_its_controller_would_grant(bench: Bench, run: RunCondition, off: set[str]):
+    bench.formation().offer(run)
+    locked = {label for label in OPERATIONS if bench.gui.at[label].disabled}
+    assert locked == off
+    assert all(bench.gui.at[label].hint for label in locked)
+    steered = run.off() == "" and not run.replayed and run.phases["main"] in STEERED
+    assert bench.gui.at["p [m]"].disabled is not steered
+
+
+STEERED = {("engaged", ""), ("held", HELD_ON_REQUEST)}
+
+
+def test_pause_becomes_resume(bench: Bench):
+    form = RunForm(bench.gui, bench.client, 1.0)
+    for clock, paused in (("running", False), ("paused", True), ("running", False)):
+        form.refresh(RunCondition(clock=clock))
+        assert (bench.gui.at["Resume"].visible, bench.gui.at["Pause"].visible) == (paused, not paused)
+        assert bench.gui.at["Step"].disabled is not paused
+
+
+def test_all_drones_that_stopped_are_reset_at_once(bench: Bench):
+    form = FleetForm(bench.gui, bench.client, bench.scenario)
+    form.refresh(flown())
+    assert not bench.gui.at["Reset all"].visible
+    form.refresh(flown(drones={"drone1": "emergency", "drone2": "landed", "drone3": "emergency"}))
+    assert bench.gui.at["Reset all"].visible
+    bench.gui.press("Reset all")
+    assert bench.client.asked == [(("drone1", "drone3"), "reset")]
+
+
+def test_the_choice_of_one_page_is_not_that_of_another(bench: Bench):
+    other = Gui()
+    mine = DroneForm(bench.gui, bench.client, bench.names)
+    DroneForm(other, bench.client, bench.names)  # type: ignore[arg-type]
+    other.at["drone"].put(bench.names[2])
+    bench.gui.press(f"Emergency {bench.names[0]}")
+    assert mine.chosen == bench.names[0]
+    assert bench.client.asked == [((bench.names[0],), "emergency")]
+
+
+def test_a_drone_is_offered_what_its_state_takes_and_always_its_emergency(bench: Bench):
+    form = DroneForm(bench.gui, bench.client, bench.names)
+    form.refresh(flown())
+    name = bench.names[0]
+    locked = {label: bench.gui.at[f"{label} {name}"].disabled for label in ("Take off", "Land", "Emergency", "Reset")}
+    assert locked == {"Take off": True, "Land": False, "Emergency": False, "Reset": True}
+
+
+def test_a_value_out_of_range_stands_beside_its_slider(bench: Bench):
+    form = bench.formation()
+    slider = bench.gui.at["p [m]"]
+    form.refresh(bench.view(p=25.37), LATER_S)
+    assert has_terms(slider.label, "p", "25.4 m")
+    form.refresh(bench.view(p=4.0), LATER_S)
+    assert slider.label == "p [m]"
+
+
+def test_waypoints_begin_where_the_formation_is_in_the_units_of_the_page(bench: Bench):
+    form = bench.formation()
+    form.refresh(bench.view(x_c=3.0, z_c=2.5, yaw=math.pi / 2), LATER_S)
+    assert has_terms(bench.gui.at["waypoints"].value, "0:", "x_c = 3", "z_c = 2.5", "yaw = 90")
+    bench.gui.press("Fly the waypoints")
+    ((_, op, args),) = bench.client.asked
+    assert op == "trajectory"
+    assert args["waypoints"][1]["values"]["yaw"] == pytest.approx(math.pi / 2)
 
 
 # Faults
@@ -467,7 +567,7 @@ def test_emergency_stops_everybody_and_switches_change_the_scene(bench: Bench):
     show = lambda *switched: shown.append(switched)  # noqa: E731
     page = ConsolePage(bench.gui, bench.scenario, spaces, bench.client, bench.outcomes.append, show, 2.0)
     assert bench.gui.at["rate"].value == 2.0
-    bench.gui.press("EMERGENCY – all rotors stop")
+    page.fleet.request_all("emergency")
     assert bench.client.asked == [(bench.names, "emergency")]
     assert page.chosen == bench.cluster.name
     for what, label in SWITCHES.items():

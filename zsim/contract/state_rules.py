@@ -1,9 +1,10 @@
 """In which states a drone takes which commands: the same for simulated and external ones. Pure."""
 
-from zsim.contract.flight_messages import DroneState
-from zsim_world.vehicles import firmware
+from typing import get_args
 
-_ALL = frozenset(firmware.MODES)
+from zsim.contract.flight_messages import DroneState
+
+_ALL: frozenset[DroneState] = frozenset(get_args(DroneState))
 _RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
     "takeoff": ("a take-off needs it landed", frozenset({"landed"})),
     "land": ("a landing needs it in the air", _ALL - {"landed", "emergency"}),
@@ -13,7 +14,7 @@ _RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
 _SETPOINT = ("a setpoint needs it hovering or flying", frozenset[DroneState]({"hovering", "flying"}))
 
 
-def state_refusal(name: str, state: DroneState, asked: str) -> str | None:
+def state_refusal(name: str, state: str, asked: str) -> str | None:
     """Return why a drone does not take a command in its state, None if it does.
 
     Args:

@@ -1,0 +1,154 @@
+"""Plots of a formation's variables and of its drones' flight, three at a time."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import viser
+from viser import uplot
+
+from zsim.contract.views import EstimateView
+from zsim.math import frames
+from zsim.scenario.scenario import Cluster
+from zsim_bridges.console.page.operator_input import SliderRange
+from zsim_bridges.console.page.picture import SERIES, SPAN_S, DronePoses, VariableHistory
+
+PLOTS_SHOWN = 3  # plots
+COLOURS = ("#868e96", "#1971c2", "#e8590c")  # of SERIES
+HEIGHT_PX = 150
+AXIS_PX = 56  # of figures such as -12.5, which would be clipped
+NONE = "none"
+WINDOWS_S = (SPAN_S, 60.0, 20.0)  # simulated
+FLIGHT = {"x": "m", "y": "m", "z": "m", "yaw": "deg", "roll": "deg", "pitch": "deg"}  # of each drone, with units
+ESTIMATED = 4  # of them, the first ones: views of estimates have no roll and pitch
+DESIRED, TRUE = SERIES.index("desired"), SERIES.index("true")
+
+
+class PlottedVariable(NamedTuple):
+    """A variable that can be plotted.
+
+    Attributes:
+        history: where its points are.
+        column: in it.
+        label: with its unit.
+        angular: whether it is an angle.
+        reference: the one of SERIES from which errors are counted.
+    """
+
+    history: VariableHistory
+    column: int
+    label: str
+    angular: bool
+    reference: int
+
+
+class FlightHistory(NamedTuple):
+    """Points of all drones of a run, each with the variables of FLIGHT."""
+
+    names: tuple[str, ...]
+    history: VariableHistory
+
+    def add(self, drones: DronePoses, estimates: Mapping[str, EstimateView]) -> None:
+        """Add where the drones truly are, and where they are estimated to be, if the last point is old enough."""
+        if not self.history.is_due(drones.t_ns / 1e9):
+            return
+        believed = np.full((len(self.names), len(FLIGHT)), np.nan)
+        for i, name in enumerate(self.names):
+            if name in estimates:
+                believed[i, :ESTIMATED] = *estimates[name].position_m, estimates[name].yaw_rad
+        rpy = frames.rpy_from_quaternion(drones.q_WB)
+        true = np.column_stack((drones.p_W, rpy[:, [2, 0, 1]]))
+        true[~drones.present] = np.nan
+        self.history.add(drones.t_ns / 1e9, None, believed.ravel(), true.ravel())
+
+    def variables(self, name: str) -> list[PlottedVariable]:
+        """Return what can be plotted of a drone."""
+        first = self.names.index(name) * len(FLIGHT)
+        return [
+            PlottedVariable(self.history, first + k, f"{variable} of {name} [{unit}]", unit == "deg", TRUE)
+            for k, (variable, unit) in enumerate(FLIGHT.items())
+        ]
+
+
+def flight_history(names: Sequence[str]) -> FlightHistory:
+    """Return an empty history of drones."""
+    return FlightHistory(tuple(names), VariableHistory(len(names) * len(FLIGHT)))
+
+
+class VariablePlots:
+    """Plots of one formation and of its drones, three variables at a time.
+
+    Args:
+        gui: viser's, in the folder where they are to be.
+        cluster: the formation.
+        ranges: of its variables.
+        flights: of the drones of the run.
+
+    Attributes:
+        history: of the formation's variables.
+    """
+
+    def __init__(self, gui: viser.GuiApi, cluster: Cluster, ranges: list[SliderRange], flights: FlightHistory) -> None:
+        self.history = VariableHistory(len(ranges))
+        of_all = [
+            PlottedVariable(self.history, k, each.label, each.unit == "deg", DESIRED) for k, each in enumerate(ranges)
+        ]
+        self._choices = _triples("", of_all)
+        for name in cluster.drones:
+            self._choices |= _triples(f"{name}: ", flights.variables(name))
+        self._choice = gui.add_dropdown("variables", [NONE, *self._choices], initial_value=next(iter(self._choices)))
+        windows = {f"the last {span_s:g} s": span_s for span_s in WINDOWS_S}
+        self._window = gui.add_dropdown("window", list(windows))
+        self._windows = windows
+        self._errors = gui.add_checkbox("Errors", False, hint="Against what is desired; of a drone, against truth")
+        self._still = gui.add_checkbox(
+            "Stand still", False, hint="Drag over a plot to zoom, double click for all of it"
+        )
+        gui.add_markdown(f"<sub>{_legend()} over time [s]; below a plot, the values at the cursor</sub>")
+        self._plots = [_plot(gui, each) for each in of_all[:PLOTS_SHOWN]]
+        self._shown: tuple[PlottedVariable, ...] = tuple(of_all[:PLOTS_SHOWN])
+
+    def draw(self) -> None:
+        """Send the curves that are chosen."""
+        shown = self._choices.get(self._choice.value, ())
+        if shown != self._shown:
+            self._shown = shown
+            self._retitle()
+        elif self._still.value:
+            return
+        for each, plot in zip(shown, self._plots, strict=False):
+            less, span_s = each.reference if self._errors.value else None, self._windows[self._window.value]
+            curves = each.history.curves(each.column, each.angular, span_s, less)
+            if len(curves[0]) > 1:
+                plot.data = curves
+
+    def _retitle(self) -> None:
+        for index, plot in enumerate(self._plots):
+            plot.visible = index < len(self._shown)
+            if plot.visible:
+                plot.title = self._shown[index].label
+                plot.data = tuple(np.zeros(2) for _ in range(1 + len(SERIES)))
+
+
+def _triples(of: str, variables: list[PlottedVariable]) -> dict[str, tuple[PlottedVariable, ...]]:
+    """Return variables as many at a time as are plotted, by what one chooses them by."""
+    triples = [variables[k : k + PLOTS_SHOWN] for k in range(0, len(variables), PLOTS_SHOWN)]
+    return {of + ", ".join(each.label.partition(" ")[0] for each in triple): tuple(triple) for triple in triples}
+
+
+def _legend() -> str:
+    return ", ".join(f"<span style='color:{c}'>{name}</span>" for name, c in zip(SERIES, COLOURS, strict=True))
+
+
+def _plot(gui: viser.GuiApi, variable: PlottedVariable) -> Any:
+    curves = [uplot.Series(label=n, stroke=c, width=1.5) for n, c in zip(SERIES, COLOURS, strict=True)]
+    empty = tuple(np.array([0.0, 1.0]) for _ in range(1 + len(SERIES)))
+    return gui.add_uplot(
+        empty,
+        (uplot.Series(label="t [s]"), *curves),
+        title=variable.label,
+        height=HEIGHT_PX,
+        axes=(uplot.Axis(), uplot.Axis(size=AXIS_PX)),
+        scales={"x": uplot.Scale(time=False, auto=True)},
+        legend=uplot.Legend(show=True, live=True),
+    )

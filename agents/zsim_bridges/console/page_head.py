@@ -1,0 +1,75 @@
+"""The head of the page as plain data: the run's condition in words, alarms, what its buttons are refused. Pure."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from zsim.contract.run_messages import Clock
+from zsim_bridges.console.run_condition import RunCondition, fleet_refusals
+
+WAITING_SHOWN = 4  # processes that are named
+SOON_S = 0.5  # wall; a running world waits for so long now and then
+
+
+def page_head(
+    name: str,
+    run: RunCondition,
+    clock: Clock | None,
+    t_ns: int,
+    alarms: Sequence[dict[str, object]] = (),
+    single: Sequence[str] = (),
+    kept: str = "",
+) -> dict[str, Any]:
+    """Return the head of the page of a run.
+
+    Args:
+        name: of the scenario.
+        run: its condition.
+        clock: the newest.
+        t_ns: simulated time of what is shown.
+        alarms: as `AlarmBoard.rows`.
+        single: drones of no formation.
+        kept: where the run's record and report are; empty where that is not known.
+    """
+    title, detail = _words(run, clock, t_ns)
+    lines = [each for each in (name, detail, *_phases(run), kept and f"record and report in {kept}") if each]
+    refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.grounded()}
+    head = {"level": run.level, "title": title, "detail": " · ".join(lines), "t_s": t_ns / 1e9}
+    return {**head, "age_s": run.silent_s, "refusals": refusals, "alarms": list(alarms)}
+
+
+def no_run_head(world: str) -> dict[str, Any]:
+    """Return the head of a page without a run; `world` says where one is looked for."""
+    reason = "there is no run yet"
+    refusals = {"land": reason, "emergency": reason}
+    head = {"level": "waiting", "title": "waiting for a world", "detail": world, "t_s": 0.0}
+    return {**head, "age_s": 0.0, "refusals": refusals, "alarms": []}
+
+
+def _words(run: RunCondition, clock: Clock | None, t_ns: int) -> tuple[str, str]:
+    """Return the title and the detail."""
+    t_s = (t_ns or (clock.t_ns if clock else 0)) / 1e9
+    if run.level == "ended":
+        return f"run over at {t_s:.1f} s", run.ended
+    if run.level == "silent":
+        return f"no answer from the world for {run.silent_s:.0f} s", f"what is shown is of {t_s:.1f} s, and may be over"
+    state = run.clock or "no clock yet"
+    pace = f" × {clock.rate:.1f}" if clock is not None and state == "running" else ""
+    title = f"{state} {t_s:.1f} s{pace}"
+    return f"EMERGENCY · {title}" if run.level == "emergency" else title, _waiting(clock)
+
+
+def _waiting(clock: Clock | None) -> str:
+    """Return which processes the world waits for, causes alone."""
+    if clock is None:
+        return "waiting for the world's clock"
+    late = [each for each in clock.waiting_for if clock.state == "waiting" or each.since_wall_s > SOON_S]
+    late = [each for each in late if not each.held_by] or late
+    names = [f"{each.name} on {each.host} ({each.since_wall_s:.0f} s)" for each in late]
+    rest = [f"{len(names) - WAITING_SHOWN} more"] if len(names) > WAITING_SHOWN else []
+    return f"waiting for {', '.join([*names[:WAITING_SHOWN], *rest])}" if names else ""
+
+
+def _phases(run: RunCondition) -> list[str]:
+    if len(run.phases) > 1 or run.ended or run.silent_s:
+        return []
+    return [f"{n}: {p.replace('_', ' ')}" + (f" – {reason}" if reason else "") for n, (p, reason) in run.phases.items()]

@@ -1,0 +1,121 @@
+"""The condition of the run that a page shows, and which of an operator's requests it would refuse, and why. Pure."""
+
+from collections.abc import Collection, Mapping
+from typing import Literal, NamedTuple
+
+from zsim.contract.state_rules import state_refusal
+from zsim_agents.formation.flight_data import DOWN, GUARD_PARTS, HELD_ON_REQUEST, READY_TO_ENGAGE
+
+Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
+
+
+class RunCondition(NamedTuple):
+    """What the controls of a page depend on.
+
+    Attributes:
+        clock: state of the run's clock; None before the first answer.
+        silent_s: for how long the world has not answered; 0 while it does [s, wall].
+        ended: why the run is over; empty while it goes on.
+        replayed: whether a record is played back: nobody can be flown.
+        drones: state of each drone by name, of those that were seen.
+        phases: phase and reason of each formation by name.
+    """
+
+    clock: str | None = None
+    silent_s: float = 0.0
+    ended: str = ""
+    replayed: bool = False
+    drones: Mapping[str, str] = {}
+    phases: Mapping[str, tuple[str, str]] = {}
+
+    @property
+    def level(self) -> Level:
+        """What matters most about the run."""
+        if self.ended:
+            return "ended"
+        if self.silent_s:
+            return "silent"
+        if "emergency" in self.drones.values():
+            return "emergency"
+        return "paused" if self.clock == "paused" else "running" if self.clock == "running" else "waiting"
+
+    def off(self) -> str:
+        """Return why no request can be answered; empty where one can."""
+        if self.ended:
+            return f"the run is over: {self.ended}"
+        return f"the world has not answered for {self.silent_s:.0f} s" if self.silent_s else ""
+
+    def grounded(self) -> str:
+        """Return why nothing can be flown; empty where something can."""
+        return self.off() or ("a record is played back" if self.replayed else "")
+
+
+def run_refusals(run: RunCondition) -> dict[str, str]:
+    """Return why each operation of the run's time would be refused; empty where it would not."""
+    off, state = run.off(), run.clock or "unknown"
+    running = "" if state == "running" else f"the run is {state}"
+    paused = "" if state == "paused" else f"the run is {state}, not paused"
+    return {"pause": off or running, "resume": off or paused, "step": off or paused, "rate": off}
+
+
+def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
+    """Return why each mode of one drone would be refused; empty where it would not."""
+    state = run.drones.get(drone)
+    modes = ("takeoff", "land", "emergency", "reset")
+    unseen = run.grounded() or ("" if state else f"{drone} was not seen yet")
+    refused = {mode: unseen or state_refusal(drone, state or "", mode) or "" for mode in modes}
+    return {**refused, "emergency": run.grounded()}  # never kept back: what is shown may be older than what is
+
+
+def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
+    """Return why each operation of a formation would be refused, as far as its phase says; empty where it would not."""
+    phase, reason = run.phases.get(cluster, ("", ""))
+    off = run.grounded() or ("" if phase else f"{cluster} has no controller yet")
+    flown = "" if phase == "engaged" else f"{cluster} is {_words(phase)}, not engaged"
+    on_request = phase == "held" and any(note in reason for note in (HELD_ON_REQUEST, GUARD_PARTS))
+    held = f"{cluster} is held: {reason}" if phase == "held" and not on_request else ""
+    steered = off or held or ("" if phase == "held" else flown)
+    return {
+        "takeoff": off or ("" if phase == "idle" else f"{cluster} is {_words(phase)}, not idle"),
+        "engage": off or _engage_refusal(cluster, phase, reason, on_request),
+        "hold": off or held or flown,
+        "land": off or ("all drones are on the ground" if phase == "idle" and _all_down(run) else ""),
+        "target": steered,
+        "trajectory": steered,
+    }
+
+
+def _engage_refusal(cluster: str, phase: str, reason: str, on_request: bool) -> str:
+    if on_request:
+        return ""
+    if phase == "assembling":
+        return "" if READY_TO_ENGAGE in reason else reason
+    return f"{cluster} is {_words(phase)}; it engages when assembled, or when held on request"
+
+
+def fleet_refusals(run: RunCondition, single: Collection[str] = ()) -> dict[str, str]:
+    """Return why each operation on all drones would do nothing; empty where it would.
+
+    Args:
+        run: its condition.
+        single: drones of no formation.
+    """
+    off = run.grounded()
+    phases = [phase for phase, _ in run.phases.values()]
+    singles = [run.drones.get(name) for name in single]
+    can_rise = "idle" in phases or "landed" in singles
+    in_air = not _all_down(run) or any(phase not in ("idle", "landing") for phase in phases)
+    in_emergency = "emergency" in run.drones.values()
+    return {
+        "takeoff": off or ("" if can_rise else "nobody is on the ground and idle"),
+        "land": off or ("" if in_air else "all drones are on the ground"),
+        "reset": off or ("" if in_emergency else "no drone is in an emergency"),
+    }
+
+
+def _all_down(run: RunCondition) -> bool:
+    return DOWN.issuperset(run.drones.values())
+
+
+def _words(phase: str) -> str:
+    return phase.replace("_", " ")

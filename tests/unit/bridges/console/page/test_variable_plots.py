@@ -1,0 +1,99 @@
+"""What can be plotted, and what a plot shows."""
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.contract.views import EstimateView
+from zsim.math import frames
+from zsim.scenario import scenario_file
+from zsim_bridges.console.page.operator_input import SliderRange
+from zsim_bridges.console.page.picture import SPAN_S, DronePoses
+from zsim_bridges.console.page.variable_plots import FlightHistory, VariablePlots, flight_history
+
+CLUSTER = scenario_file.load(Path(__file__).parents[5] / "scenarios" / "step.yaml").clusters[0]
+RANGES = [SliderRange(name, "m", 0.0, 9.0, 0.1) for name in ("x_c", "y_c", "z_c", "p")]
+
+
+def poses(t_s: float) -> DronePoses:
+    """drone1 at (1, 2, 3), turned by 30 degrees and rolled by 6; drone2 is not in the view."""
+    p_W = np.array([(1.0, 2.0, 3.0), (math.nan,) * 3, (7.0, 8.0, 9.0)])
+    q_WB = frames.quaternion_from_rpy(np.radians([(6.0, 0.0, 30.0)] * 3))
+    return DronePoses(round(t_s * 1e9), tuple(CLUSTER.drones), p_W, q_WB, np.zeros((3, 8)), np.zeros(3))
+
+
+def filled(seconds: int) -> FlightHistory:
+    flights = flight_history(CLUSTER.drones)
+    estimate = EstimateView("drone1", (1.5, 2.0, 3.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), math.radians(32.0), 0.1, {})
+    for t in range(seconds):
+        flights.add(poses(float(t)), {"drone1": estimate})
+    return flights
+
+
+class Gui:
+    """Controls that keep what they are given."""
+
+    def __init__(self) -> None:
+        self.plots: list[Any] = []
+        self.by_label: dict[str, Any] = {}
+
+    def add_dropdown(self, label: str, options: list[str], initial_value: str | None = None) -> Any:
+        made = SimpleNamespace(value=initial_value or options[0], options=options)
+        return self.by_label.setdefault(label, made)
+
+    def add_checkbox(self, label: str, value: bool, **_: Any) -> Any:
+        return self.by_label.setdefault(label, SimpleNamespace(value=value))
+
+    def add_markdown(self, _: str) -> None:
+        return
+
+    def add_uplot(self, data: Any, series: Any, title: str, **_: Any) -> Any:
+        self.plots.append(SimpleNamespace(data=data, title=title, visible=True))
+        return self.plots[-1]
+
+
+def test_every_drone_has_its_flight_true_and_estimated():
+    flights = filled(3)
+    shown = {each.label.partition(" ")[0]: each for each in flights.variables("drone1")}
+    last = {name: [c[-1] for c in each.history.curves(each.column, each.angular)[1:]] for name, each in shown.items()}
+    assert last["x"][1:] == pytest.approx([1.5, 1.0])
+    assert last["yaw"][1:] == pytest.approx([32.0, 30.0])
+    assert last["roll"][2] == pytest.approx(6.0)
+    assert math.isnan(last["roll"][1])
+    gone = flights.variables("drone2")[0]
+    assert np.isnan(gone.history.curves(gone.column, False)[3]).all()
+
+
+def test_any_variable_of_any_drone_can_be_chosen_with_its_error_and_its_window():
+    gui: Any = Gui()
+    plots = VariablePlots(gui, CLUSTER, RANGES, filled(100))
+    choice = gui.by_label["variables"]
+    assert len(choice.options) == 1 + 2 + 2 * len(CLUSTER.drones)
+    choice.value = next(each for each in choice.options if each.startswith("drone1"))
+    plots.draw()
+    assert [plot.visible for plot in gui.plots] == [True] * 3
+    assert gui.plots[0].data[2][-1] == pytest.approx(1.5)
+    gui.by_label["Errors"].value = True
+    window = gui.by_label["window"]
+    window.value = window.options[-1]
+    plots.draw()
+    assert gui.plots[0].data[2][-1] == pytest.approx(0.5)
+    assert np.ptp(gui.plots[0].data[0]) < SPAN_S / 2
+
+
+def test_plots_that_stand_still_keep_what_they_show():
+    gui: Any = Gui()
+    flights = filled(100)
+    plots = VariablePlots(gui, CLUSTER, RANGES, flights)
+    gui.by_label["variables"].value = gui.by_label["variables"].options[-1]
+    plots.draw()
+    plots.draw()
+    gui.by_label["Stand still"].value = True
+    before = gui.plots[0].data
+    flights.add(poses(100.0), {})
+    plots.draw()
+    assert gui.plots[0].data is before

@@ -1,0 +1,53 @@
+"""What a page does with the time of a replay."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from zsim_bridges.console.record_player import RecordPlayer
+
+TIMELINE = {"from_s": 0.0, "to_s": 9.0, "marks": []}
+
+
+def player(state: str, is_replay: bool = True) -> tuple[RecordPlayer, list[Any]]:
+    """Return a player that has loaded its timeline, and what it requests."""
+    asked: list[Any] = []
+    client: Any = SimpleNamespace(
+        timeline=lambda: TIMELINE,
+        seek=lambda t_s, step: asked.append(("seek", t_s, step)),
+        request_world=lambda op, **args: asked.append((op, args)),
+    )
+    monitor: Any = SimpleNamespace(clock=SimpleNamespace(state=state))
+    made = RecordPlayer(client, monitor, is_replay)
+    made.load()
+    return made, asked
+
+
+@pytest.mark.parametrize(
+    ("op", "value", "request_"),
+    [
+        ("pause", 1.0, ("pause", {})),
+        ("resume", 1.0, ("resume", {})),
+        ("step", 1.0, ("step", {"gates": 1})),
+        ("rate", 0.5, ("rate", {"value": 0.5})),
+        ("seek", 4.0, ("seek", 4.0, False)),
+    ],
+)
+def test_a_replay_is_asked_for_it(op: str, value: float, request_: Any):
+    made, asked = player("running")
+    made.play(op, value)
+    assert asked == [request_]
+
+
+def test_a_replay_that_stands_shows_where_it_was_put():
+    made, asked = player("paused")
+    made.play("seek", 4.0)
+    assert asked == [("seek", 4.0, True)]
+
+
+def test_a_flight_has_no_timeline():
+    made, asked = player("running", is_replay=False)
+    made.play("pause", 1.0)
+    assert made.timeline == {}
+    assert asked == []
