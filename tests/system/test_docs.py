@@ -78,7 +78,7 @@ KINDS = (
 )
 ELSEWHERE = ("apt-get install ", "git clone ", "cd ", "python3 -m venv ", ".venv/bin/pip install ", "ssh ", "scp ",
              "rsync ", "sudo ", "zenohd ", "ufw ", "chrt ", "kill ", "docker ", "kubectl ", "sh ",
-             ".venv/bin/pip wheel ", "make bench", ".venv/bin/python -m benchmarks")  # fmt: skip
+             ".venv/bin/pip wheel ", "export ", "make bench", ".venv/bin/python -m benchmarks")  # fmt: skip
 
 
 class Block(NamedTuple):
