@@ -138,7 +138,7 @@ def _misses(summary: RunSummary) -> str:
 
 def terminal_text(summary: RunSummary) -> Group:
     """Return what the flight did not do of its plan, and a table of errors for each cluster, for the terminal."""
-    marks = [Text(mark, style="bold red" if fails else "yellow") for mark, fails in marks_of(summary)]
+    marks = [Text(printable(mark), style="bold red" if fails else "yellow") for mark, fails in marks_of(summary)]
     return Group(*marks, *(table(summary, name) for name in summary.clusters))
 
 
