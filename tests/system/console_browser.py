@@ -26,8 +26,6 @@ class BrowserPage:
         page.on("request", lambda request: self.requested.append(request.url))
         page.on("websocket", lambda socket: self.requested.append(socket.url))
         page.on("pageerror", lambda error: self.faults.append(str(error)))
-        notice = page.locator(".mantine-Notification-root", has_text="WebGL is running in software mode")
-        page.add_locator_handler(notice, lambda notice: notice.get_by_role("button").click())  # it lies over the tabs
         page.goto(address)
 
     def press(self, name: str) -> None:

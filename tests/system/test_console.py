@@ -206,6 +206,7 @@ def test_an_operator_sees_three_drones_and_flies_them(
     assert "token" not in operator.page.url
     viewer = opened(links["look"], STRIP)
     operator.wait_for_text("running")
+    operator.page.locator(".mantine-Notification-closeButton").click()  # "software WebGL", of this browser alone
     start = operator.until("s.drones.length == 3 && s.clusters.length == 1 && s.clock == 'running'")
     assert [drone["state"] for drone in start["drones"]] == ["landed"] * 3
 
