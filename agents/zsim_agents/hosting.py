@@ -69,7 +69,7 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
 def check_plans(scenario: Scenario, source: str) -> None:
     """Refuse a scenario with a plan that its controller would refuse: an expression, a name, a template.
 
-    A run leaves this to its controllers, which load the mathematics of formations anyway.
+    A run as processes leaves this to its controllers, which load the mathematics of formations anyway.
 
     Raises:
         ScenarioError: the reasons, a line for each cluster.

@@ -99,9 +99,8 @@ class RepeatedEvents:
     """Events that come again and again: the first is a line at once, equal ones are one line with their count."""
 
     def __init__(self) -> None:
-        self._counted: dict[
-            tuple[str, str], tuple[float, float, int]
-        ] = {}  # simulated s of first and last, and how many
+        # by kind and text: simulated times [s] of the first and the last, and how many
+        self._counted: dict[tuple[str, str], tuple[float, float, int]] = {}
 
     def lines(self, t_s: float, kind: str, text: str) -> list[str]:
         """Return the lines to show now that an event has come."""

@@ -20,6 +20,7 @@ from zsim_agents.formation.flight_data import (
     GUARD_PARTS,
     HELD_ON_REQUEST,
     READY_TO_ENGAGE,
+    TOO_NEAR,
     EngagementLimits,
     GateInput,
     GateOutput,
@@ -302,7 +303,7 @@ class Engagement:
         """Return the output of a gate; without a reference its own value is the desired one."""
         alarmed = command.alarmed if command else ()
         if alarmed:
-            reason = f"ALARM, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
+            reason = f"{TOO_NEAR}, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
         if self.plan.note:
             reason = f"{reason}; {self.plan.note}" if reason else self.plan.note
         desired, desired_rate = reference or (self.check.value, np.zeros(self.space.size))

@@ -20,6 +20,7 @@ DOWN = frozenset({"landed", "emergency"})  # states of a drone that is on the gr
 HELD_ON_REQUEST = "held on request"  # reasons of a formation; a display reads from them what may be asked for
 READY_TO_ENGAGE = "ready to engage"
 GUARD_PARTS = "the guard parts"
+TOO_NEAR = "ALARM"
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from zsim.contract.run_messages import Event, Fault
+from zsim_agents.formation.flight_data import HELD_ON_REQUEST, TOO_NEAR
 
 Severity = Literal["amber", "red"]
 BATTERY_LOW_PERCENT, BATTERY_EMPTY_PERCENT = 20.0, 10.0  # the AR.Drone warns at the first
@@ -85,13 +86,13 @@ def _link_alarms(drone: DroneCondition) -> list[Alarm]:
     ]
 
 
-def formation_alarms(phases: Mapping[str, tuple[str, str]], flyable: bool = True) -> list[Alarm]:
+def formation_alarms(phases: Mapping[str, tuple[str, str]]) -> list[Alarm]:
     """Return the alarms of formations, by their phase and reason."""
     found = []
     for name, (phase, reason) in phases.items():
-        if "ALARM" in reason:
+        if TOO_NEAR in reason:
             found.append(Alarm("red", name, "too near", reason))
-        elif phase == "held" and "on request" not in reason and flyable:
+        elif phase == "held" and HELD_ON_REQUEST not in reason:
             found.append(Alarm("amber", name, "held", reason))
     return found
 

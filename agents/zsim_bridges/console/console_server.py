@@ -179,11 +179,6 @@ class PageControls:
         self._gui = gui
         self._pages = pages
 
-    def is_local(self, uuid: str) -> bool:
-        """Return whether a control changes nothing but its own page: what a page has for itself, but for buttons."""
-        own = self._own(uuid)
-        return own is not None and not isinstance(own, viser.GuiButtonHandle)
-
     def _own(self, uuid: str) -> Any:
         handles = (page._gui_input_handle_from_uuid.get(uuid) for page in self._pages())
         return next((handle for handle in handles if handle is not None), None)

@@ -41,7 +41,9 @@ EVENT_COLOURS = {
 LINK_COLOURS = {"waiting": AMBER, "connected": BLUE, "armed": GREEN, "lost": RED}
 LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 SEVERITY_COLOURS = {"red": RED, "amber": AMBER}
-LEFT_MAX_S = 24 * 3600.0  # of a battery that lasts longer no time is told
+LEFT_MAX_S = 24 * 3600.0  # of a battery that lasts longer no time is shown
+COLUMNS = 7  # of the table of drones
+ONE_LINE = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
 NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
@@ -74,9 +76,6 @@ def drone_table(rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures] |
         ("σ [m]", "of the estimated position"),
     )
     return _table(head + "".join(_drone_cells(row, (figures or {}).get(row.name)) for row in rows))
-
-
-COLUMNS = 7  # of the table of drones
 
 
 def _drone_cells(row: DroneRow, figures: FlightFigures | None) -> str:
@@ -184,9 +183,6 @@ def _event_cells(row: EventRow) -> str:
         f"<tr title='{escape(event.text)}'><td style='text-align:right;color:{GREY}'>{event.t_ns / 1e9:.2f}</td>"
         f"<td style='{ONE_LINE}'>{kind}</td><td style='{ONE_LINE}'>{_times(row.times)}{escape(event.text)}</td></tr>"
     )
-
-
-ONE_LINE = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
 
 
 def _times(times: int) -> str:

@@ -17,7 +17,6 @@ def page_head(
     t_ns: int,
     alarms: Sequence[dict[str, object]] = (),
     single: Sequence[str] = (),
-    kept: str = "",
 ) -> dict[str, Any]:
     """Return the head of the page of a run.
 
@@ -28,10 +27,9 @@ def page_head(
         t_ns: simulated time of what is shown.
         alarms: as `AlarmBoard.rows`.
         single: drones of no formation.
-        kept: where the run's record and report are; empty where that is not known.
     """
     title, detail = _words(run, clock, t_ns)
-    lines = [each for each in (name, detail, *_phases(run), kept and f"record and report in {kept}") if each]
+    lines = [each for each in (name, detail, *_phases(run)) if each]
     refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.grounded()}
     head = {"level": run.level, "title": title, "detail": " · ".join(lines), "t_s": t_ns / 1e9}
     return {**head, "age_s": run.silent_s, "refusals": refusals, "alarms": list(alarms)}

@@ -3,7 +3,8 @@
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from zsim_bridges.console import console_tables
 from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows
+from zsim_bridges.console.flight_figures import FlightFigures
 from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.console_page import ConsolePage
@@ -120,7 +122,7 @@ class RunPage:
         self._shapes: dict[str, FormationShape | None] = {}
         self._drones: DronePoses | None = None
         self._drawn_ghosts: dict[str, Any] = {}
-        self._drawn_ns = self._table_s = 0.0
+        self._drawn_ns = self._table_s = self._monitor_s = 0.0
         robots = sum(space.n for space in self._spaces.values())
         arms_m = [drone.arm_m for drone in self._scenario.drones]
         self._scene = SceneNodes(server, info.drones, arms_m, robots, len(self._spaces))
@@ -185,7 +187,11 @@ class RunPage:
     def _update(self, wall_s: float) -> None:
         self._observer.tick()
         new = self.views.update()
-        self._update_monitor(wall_s)
+        if new and self.views.drones is not None:
+            self._monitor.flight.update(self.views.drones)
+        if wall_s - self._monitor_s >= TABLE_S:
+            self._monitor_s = wall_s
+            self._update_monitor(wall_s)
         self.cameras.update()
         for form in self._page.forms.values():
             form.send(wall_s)
@@ -202,8 +208,6 @@ class RunPage:
 
     def _update_monitor(self, wall_s: float) -> None:
         """Keep up with the run's condition, and note among the events what is done that was accepted before."""
-        if self.views.drones is not None:
-            self._monitor.flight.update(self.views.drones)
         for done in self._monitor.update(wall_s):
             self._note("done", done.subject, f"{done.text}: done")
 
@@ -291,11 +295,12 @@ class RunPage:
 
     def _update_tables(self, wall_s: float) -> None:
         page = self._page
-        self._update_controls()
+        flown = self._monitor.flight.figures
+        self._update_controls(flown)
         page.phases.content = console_tables.formation_lines(
             {n: (v.phase, v.reason) for n, v in self.views.clusters.items()}
         )
-        page.drones.content = console_tables.drone_table(self._table_rows.drone_rows(), self._monitor.flight.figures)
+        page.drones.content = console_tables.drone_table(self._table_rows.drone_rows(), flown)
         page.faults.content = console_tables.fault_lines(self._table_rows.active_faults())
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
@@ -304,17 +309,16 @@ class RunPage:
             self._scene.trails(*self._trails.segments(self._drones.p_W))
             self._scene.wind(self._drones)
 
-    def _update_controls(self) -> None:
+    def _update_controls(self, flown: Mapping[str, FlightFigures]) -> None:
         """Grey out what would be refused, and show on each page the drone that it has chosen."""
         self._page.refresh(self._monitor.condition)
         self._page_forms.refresh(self._monitor.condition)
-        self._page_forms.show_figures(self._drone_figures)
+        self._page_forms.show_figures(partial(self._drone_figures, flown))
         self._page_forms.show_events(self.views.log.rows())
 
-    def _drone_figures(self, drone: str) -> str:
+    def _drone_figures(self, flown: Mapping[str, FlightFigures], drone: str) -> str:
         """Return figures and sensors of one drone, as HTML."""
-        figures = console_tables.figure_lines(self._monitor.flight.figures.get(drone))
-        return figures + self._table_rows.sensor_table(drone)
+        return console_tables.figure_lines(flown.get(drone)) + self._table_rows.sensor_table(drone)
 
     def _on_outcome(self, outcome: RequestOutcome) -> None:
         """Show the outcome of a request: a refusal in the corner of every page, and among the events.

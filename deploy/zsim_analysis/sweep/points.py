@@ -273,10 +273,6 @@ def _paper_std(design: SweepDesign) -> Mapping[str, float]:
     return paper_table(scenario, scenario.clusters[0].name) if len(scenario.clusters) == 1 else {}
 
 
-def _shortfall(row: Row) -> str | None:
-    return row.get("shortfall")
-
-
 def _shown(value: Any) -> str:
     text = f"{value:g}" if isinstance(value, float) else text_of(value)
     return text if len(text) <= 24 else f"{text[:23]}…"

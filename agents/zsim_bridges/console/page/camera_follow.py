@@ -65,11 +65,9 @@ class CameraFollow:
             page = self._pages.get(client_id)
             if page is None:
                 return
+            page.moved = page.moved or direction in DIRECTIONS or (fits and not page.fits)
+            page.direction = DIRECTIONS.get(direction, page.direction)
             page.follows, page.fits = follows, fits
-            if direction in DIRECTIONS:
-                page.direction, page.moved = DIRECTIONS[direction], True
-            elif fits and not page.fits:
-                page.moved = True
 
     def set_target(self, p_W: Array) -> None:
         """Aim the cameras of later pages at positions (n, 3) [m], unless there are none."""

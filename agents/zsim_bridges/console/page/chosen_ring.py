@@ -22,6 +22,7 @@ class ChosenRing:
 
     def __init__(self, scene: viser.SceneApi, radii_m: Array) -> None:
         self._radii_m = radii_m
+        self._chosen = -1
         mesh = airframe.ring()
         level, nowhere = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array(HIDDEN).reshape(1, 3)
         self._node: Any = scene.add_batched_meshes_simple(
@@ -33,4 +34,6 @@ class ChosenRing:
         """Put the ring about the chosen drone; out of sight while that one is not there."""
         index = drones.names.index(chosen)
         self._node.batched_positions = drones.p_W[[index]] if drones.present[index] else np.reshape(HIDDEN, (1, 3))
-        self._node.batched_scales = np.full((1, 3), self._radii_m[index])
+        if index != self._chosen:
+            self._chosen = index
+            self._node.batched_scales = np.full((1, 3), self._radii_m[index])

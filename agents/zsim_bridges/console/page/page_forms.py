@@ -14,6 +14,8 @@ from zsim_bridges.console.page.picture import Array, DronePoses
 from zsim_bridges.console.page.run_forms import DroneForm
 from zsim_bridges.console.run_condition import RunCondition
 
+ROWS_SHOWN = 60  # events
+
 
 class _PageForm(NamedTuple):
     """Controls of one page."""
@@ -125,9 +127,6 @@ class EventForm:
         """Show those of the rows, newest first, that are chosen."""
         chosen = event_log.chosen_rows(rows, self._drone.value, self._kind.value)
         self.table.content = event_table(chosen[:ROWS_SHOWN])
-
-
-ROWS_SHOWN = 60
 
 
 def set_theme(gui: viser.GuiApi, *, dark: bool = False) -> None:

@@ -15,6 +15,7 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.run_condition import RunCondition, drone_refusals, fleet_refusals, run_refusals
 
+REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 8px;overflow-wrap:anywhere"
 DURATION_S = 30.0  # of a fault, unless another time is typed
 WEAK_THRUST_SHARE = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
 GUST_M_S = (4.0, 0.0, 0.0)  # about what the drones of the formation can still hold against
@@ -128,7 +129,6 @@ def refusal_lines(labels: Mapping[str, str], refusals: Mapping[str, str]) -> str
     return f"<div style='{REASON_STYLE}'>{'<br>'.join(map(escape, lines))}</div>" if lines else ""
 
 
-REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 8px;overflow-wrap:anywhere"
 FLEET = {"Take off all": "takeoff", "Reset all": "reset"}  # an operation of formations, and a mode of drones
 
 
