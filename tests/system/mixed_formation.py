@@ -28,6 +28,15 @@ clusters:
 """
 """Three drones that take off when the estimators know where they are."""
 EXTERNAL, SIMULATED = FORMATION.replace("BODY", ", body: external"), FORMATION.replace("BODY", "")
+UNFLOWN = """
+name: unflown
+duration_s: 36000
+drones:
+  - {name: drone1, position_m: [0, 0, 0]}
+  - {name: drone2, position_m: [4, 0, 0], body: external}
+processes: {expect: []}
+"""
+"""A simulated drone and one of hardware, which nobody commands."""
 PACE = ("--realtime", "--rate", "2")
 SECOND_NS = 1_000_000_000
 DRONES = 3

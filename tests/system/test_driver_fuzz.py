@@ -12,6 +12,7 @@ from fake_aircraft import LANDED, FakeAircraft
 from fake_autopilot import ON_GROUND, FakeAutopilot
 from federation import Federation
 from mavlink_programs import free_udp_ports
+from mixed_formation import UNFLOWN
 from wire import PATIENCE_S
 
 from zsim_bridges.ardrone.wire import at_commands, navdata
@@ -20,14 +21,6 @@ from zsim_bridges.mavlink.wire.frame import Link
 
 pytestmark = pytest.mark.soak
 
-EXTERNAL = """
-name: external
-duration_s: 36000
-drones:
-  - {name: drone1, position_m: [0, 0, 0]}
-  - {name: drone2, position_m: [4, 0, 0], body: external}
-processes: {expect: []}
-"""
 COUNT = 1_000_000
 CHUNK = 100  # datagrams that a socket's buffer surely holds
 LEAST_COUNTED = 0.95  # of them: what is cut inside a frame is one fault with the next
@@ -151,7 +144,7 @@ def mutated(chance: random.Random, good: bytes) -> bytes:
 def test_a_million_malformed_datagrams_fly_nothing(federation: Federation, kind: type) -> None:
     aircraft, chance = kind(), random.Random(17)
     wire = Wire(aircraft)
-    federation.world(EXTERNAL, "--realtime", "--rate", "1")
+    federation.world(UNFLOWN, "--realtime", "--rate", "1")
     driver = federation.start(*aircraft.command, "--connect", federation.endpoint, "--armed")
     links = federation.client().subscribe("drone/drone2/link")
     try:

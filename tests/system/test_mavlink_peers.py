@@ -9,6 +9,7 @@ import pytest
 from federation import ONE, Federation
 from lab import Lab
 from mavlink_programs import free_udp_ports
+from mixed_formation import UNFLOWN
 from wire import PATIENCE_S
 
 from zsim_bridges.mavlink.wire import dialect
@@ -21,14 +22,6 @@ ARM, TAKE_OFF = 400, 22
 ACCEPTED = 0
 PACE = ("--rate", "1", "--duration", "600")
 KEYS = {"theirs": bytes(range(32)), "another": bytes(32)}
-EXTERNAL = """
-name: external
-duration_s: 600
-drones:
-  - {name: drone1, position_m: [0, 0, 0]}
-  - {name: drone2, position_m: [4, 0, 0], body: external}
-processes: {expect: []}
-"""
 
 
 def commands() -> Iterator[bytes]:
@@ -82,7 +75,7 @@ def test_a_driver_obeys_and_flies_a_vehicle_of_its_own_key_alone(
         ports += ("--api-local", str(local), "--gcs-local", str(local + 2), "--signing-key", str(tmp_path / "theirs"))
         served = hardware.start("mavlink", "serve", "--connect", hardware.endpoint, *ports)
         served.line("programs: UDP")
-        federation.world(EXTERNAL, "--realtime", "--rate", "1")
+        federation.world(UNFLOWN, "--realtime", "--rate", "1")
         links = federation.client().subscribe("drone/drone2/link")
         signed = ("--signing-key", str(tmp_path / key), "--armed")
         where = ("--connect", federation.endpoint, *signed)

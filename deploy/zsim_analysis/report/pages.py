@@ -73,6 +73,15 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
+def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
+    """Return the range of the finite samples, wider at each end by a share of it; None where it has no width."""
+    known = samples[np.isfinite(samples)]
+    if not len(known) or known.max() <= known.min():
+        return None
+    room = share * (known.max() - known.min())
+    return float(known.min() - room), float(known.max() + room)
+
+
 def mark_figure(figure: Figure, text: str) -> None:
     """Write above a figure that its flight is not what it may be taken for; nothing without a text."""
     if text:

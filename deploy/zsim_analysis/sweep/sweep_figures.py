@@ -19,11 +19,13 @@ from zsim_analysis.report.pages import (
     label,
     legend_above,
     new_figure,
+    padded_range,
 )
 from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
 from zsim_analysis.sweep.points import FormationParameter, SweepResults
 
 Samples = NDArray[np.float64]
+ROOM = 0.08  # of the range of samples, at each end of an axis
 
 POINTS_MAX = 24  # beside each other in one panel; the tables have all
 PANELS_MAX = 24  # parameters in one figure; 6 drones
@@ -129,9 +131,8 @@ def _distribution(axes: Axes, results: SweepResults, column: str, text: str) -> 
 
 def scale_to_samples(axes: Axes, samples: Samples) -> None:
     """Give a y axis the range of its samples: an interval of two runs may be a hundred times as wide."""
-    if len(samples) and samples.max() > samples.min():
-        room = 0.08 * (samples.max() - samples.min())
-        axes.set_ylim(samples.min() - room, samples.max() + room)
+    if limits := padded_range(samples, ROOM):
+        axes.set_ylim(limits)
 
 
 def _known(samples: Samples) -> Samples:
@@ -150,9 +151,8 @@ def _histogram(axes: Axes, samples: Samples) -> None:
     if np.isfinite(mean.low):
         axes.axvspan(mean.low, mean.high, color=VERMILION, alpha=0.25, lw=0, zorder=3)
     axes.axvline(mean.value, lw=1.4, **MEAN)
-    if samples.max() > samples.min():
-        room = 0.08 * (samples.max() - samples.min())
-        axes.set_xlim(samples.min() - room, samples.max() + room)
+    if limits := padded_range(samples, ROOM):
+        axes.set_xlim(limits)
 
 
 def _box(axes: Axes, samples: Samples, place: int) -> None:

@@ -37,6 +37,7 @@ from zsim_analysis.report.pages import (
     line,
     mark_figure,
     new_figure,
+    padded_range,
 )
 from zsim_analysis.report.summary import RunSummary
 
@@ -141,10 +142,8 @@ def _nearest_round(angles: Array, to: float) -> Array:
 
 def scale(axes: Axes, *values: Array) -> None:
     """Give an axis the range of values, not of all that is drawn: what is noise before the engagement leaves it."""
-    known = np.concatenate([each[np.isfinite(each)] for each in values])
-    if len(known) and known.max() > known.min():
-        room = 0.06 * (known.max() - known.min())
-        axes.set_ylim(known.min() - room, known.max() + room)
+    if limits := padded_range(np.concatenate(values), 0.06):
+        axes.set_ylim(limits)
 
 
 def parameter_groups(names: Sequence[str]) -> list[tuple[str, int, str, list[str]]]:
