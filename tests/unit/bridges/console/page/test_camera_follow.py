@@ -127,6 +127,20 @@ def test_who_zooms_keeps_the_distance_and_who_does_not_follow_the_place():
     assert still.camera.look_at[0] == pytest.approx(80.0)
 
 
+def test_who_follows_again_after_a_zoom_has_all_in_view_from_the_fitting_distance():
+    pages = Pages()
+    page = pages.come(Page(1))
+    pages.follow.follow(TRIANGLE)
+    fitting_m = page.distance_m
+    page.camera.position = page.camera.look_at + 1.3 * (page.camera.position - page.camera.look_at)
+    pages.follow.choose(1, follows=True, fits=False)
+    pages.follow.follow(TRIANGLE)
+    assert page.distance_m == pytest.approx(1.3 * fitting_m)
+    pages.follow.choose(1, follows=True, fits=True)
+    pages.follow.follow(TRIANGLE)
+    assert page.distance_m == pytest.approx(fitting_m)
+
+
 def test_a_page_that_went_before_it_was_known_is_forgotten():
     pages = Pages()
     gone = Page(1)
