@@ -19,7 +19,8 @@ from synthetic_camera import NUMBER_BITS, SETTINGS
 from wire import PATIENCE_S, Client
 
 from zsim.contract import keys, messages
-from zsim_bridges.console.page.page_camera import OFFSET_M
+from zsim_bridges.console.page.camera_follow import DIRECTIONS, SPARE
+from zsim_bridges.console.page.page_camera import fit_distance_m
 
 LOW = {"width": 1000, "height": 480}
 LAPTOP, DESK = {"width": 1280, "height": 720}, {"width": 1600, "height": 1000}
@@ -53,7 +54,8 @@ TWELVE = "\n".join(
 EMERGENCY = "EMERGENCY – all rotors stop"
 SKY = np.array(synthetic_camera.SKY[::-1])  # red, green, blue; nothing else in the scene has it
 SKY_PIXELS = 60  # of a frustum's picture, at least
-HAT_PIXELS = 20  # of a drone's hat, at least
+HAT_PIXELS = 10  # of a drone's hat, at least
+STANDS = np.array([(0.0, 1.5, 0.0), (-1.5, -1.5, 0.0), (1.5, -1.5, 0.0)])  # m; of TRIAD's drones, W
 FIELD_DEG = 75.0  # of viser's camera, from top to bottom
 NEAR = 12  # levels of 255: JPEG, and the scene's light
 
@@ -165,13 +167,17 @@ def wait_for_pictures_and_drones(page: BrowserPage, cameras: list[str]) -> None:
 
 
 def place_of(page: BrowserPage, p_W: tuple[float, float, float]) -> tuple[float, float]:
-    """Return where a point of the scene is on the page, as long as nobody has moved the page's camera."""
-    centre = np.array([0.0, -0.5, 0.0])  # of TRIAD's drones
-    ahead = -OFFSET_M / np.linalg.norm(OFFSET_M)
-    right = np.cross(ahead, (0.0, 0.0, 1.0)) / np.linalg.norm(np.cross(ahead, (0.0, 0.0, 1.0)))
-    x, y, z = np.array([right, np.cross(ahead, right), ahead]) @ (np.array(p_W) - centre - OFFSET_M)
+    """Return where a point of the scene of TRIAD is on the page, whose camera is reset for it."""
+    page.page.locator("#zsim-tools").get_by_text("Reset").click()
+    page.until(f"s.t_s > {page.state()['t_s'] + 1}")  # the next picture moves the camera
     box: Any = page.page.locator("canvas[data-engine]").bounding_box()
-    focal_px = box["height"] / 2 / math.tan(math.radians(FIELD_DEG) / 2)
+    fov, aspect, up = math.radians(FIELD_DEG), box["width"] / box["height"], np.array([0.0, 0.0, 1.0])
+    centre = (STANDS.min(axis=0) + STANDS.max(axis=0)) / 2
+    back = DIRECTIONS["reset"] / np.linalg.norm(DIRECTIONS["reset"])
+    eye = centre + SPARE * fit_distance_m(STANDS, centre, back, up, fov, aspect) * back
+    right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
+    x, y, z = np.array([right, -np.cross(back, right), -back]) @ (np.array(p_W) - eye)
+    focal_px = box["height"] / 2 / math.tan(fov / 2)
     return (
         box["x"] + box["width"] / 2 + focal_px * float(x / z),
         box["y"] + box["height"] / 2 + focal_px * float(y / z),
