@@ -223,6 +223,9 @@ def test_an_operator_sees_three_drones_and_flies_them(
     viewer.page.locator("#zsim-tools [aria-pressed=false]").wait_for(state="attached")
     operator.page.locator("#zsim-tools").get_by_text("Top").evaluate("button => button.click()")
 
+    # a flight has no timeline
+    assert not operator.page.locator("#zsim-record").is_visible()
+
     # what would be refused is greyed out
     engage = operator.page.get_by_role("button", name="Engage", exact=True)
     engage.and_(operator.page.locator(":disabled")).wait_for()
