@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from zsim.contract import flight_messages, keys
 from zsim.errors import ZsimError
 from zsim.transport.session import Session
-from zsim_bridges.console.view_buffer import ViewBuffer
+from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
 
 Task = Callable[[], None]
 

@@ -36,9 +36,9 @@ from zsim_bridges.console.http_proxy import (
     ListenAddress,
     ViserBackend,
 )
+from zsim_bridges.console.monitoring.page_head import no_run_head
 from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
-from zsim_bridges.console.page_head import no_run_head
 from zsim_bridges.console.page_tokens import OPERATOR, VIEWER
 from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.run_page import RunPage

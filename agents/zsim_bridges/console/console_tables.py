@@ -9,12 +9,11 @@ from html import escape
 from typing import NamedTuple
 
 from zsim.contract.run_messages import Fault
-from zsim.contract.views import EstimateView
-from zsim_bridges.console.alarms import BATTERY_LOW_PERCENT, LATE_MS, Severity
-from zsim_bridges.console.event_log import EventRow
-from zsim_bridges.console.flight_figures import FlightFigures
-from zsim_bridges.console.sensor_rates import Counts, SensorRates
-from zsim_bridges.console.view_buffer import ReceivedEstimate, ReceivedLink, ViewBuffer
+from zsim_bridges.console.monitoring.alarms import BATTERY_LOW_PERCENT, LATE_MS, Severity
+from zsim_bridges.console.monitoring.event_log import EventRow
+from zsim_bridges.console.monitoring.flight_figures import FlightFigures
+from zsim_bridges.console.monitoring.sensor_rates import Counts, SensorRates
+from zsim_bridges.console.monitoring.view_buffer import ReceivedEstimate, ReceivedLink, ViewBuffer
 
 GREY, RED, AMBER, GREEN, BLUE = "#868e96", "#e03131", "#e8890c", "#2f9e44", "#1971c2"
 STATE_COLOURS = {
@@ -243,7 +242,7 @@ class TableRows:
         view, estimates, rows = self._views.drones, self._views.estimates(), []
         if view is None:
             return []
-        faults = active_faults(self._views)
+        faults = self._views.active_faults()
         for drone in view.drones:
             received = estimates.get(drone.name)
             gps = received.estimate.sensors.get("gps") if received else None
@@ -253,13 +252,13 @@ class TableRows:
             row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, fixes, own_faults)
             external = drone.name in self._views.external
             link = link_note(self._views.link_of(drone.name)) if external else ("", "")
-            sigma = sigma_m(received.estimate) if received and received.fresh else None
+            sigma = received.sigma_m if received and received.fresh else None
             rows.append(DroneRow(*row, link, sigma, self._severity_of(drone.name)))
         return rows
 
     def active_faults(self) -> list[str]:
         """Return kind and target of each active fault."""
-        return [f"{fault.kind} of {fault.target}{_end_text(fault)}" for fault in active_faults(self._views)]
+        return [f"{fault.kind} of {fault.target}{_end_text(fault)}" for fault in self._views.active_faults()]
 
     def sensor_table(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
@@ -271,16 +270,6 @@ class TableRows:
         return sensor_table(drone, estimate.sensors, rates, _uncertainty(received), own_rates)
 
 
-def active_faults(views: ViewBuffer) -> list[Fault]:
-    """Return the injected faults that act at the time of the newest view."""
-    now_ns = views.drones.t_ns if views.drones else 0
-    return [fault for fault in views.faults if _is_active(fault, now_ns)]
-
-
-def _is_active(fault: Fault, now_ns: int) -> bool:
-    return fault.from_ns <= now_ns and (fault.until_ns is None or fault.until_ns > now_ns)
-
-
 def _end_text(fault: Fault) -> str:
     return "" if fault.until_ns is None else f" until {fault.until_ns / 1e9:.1f} s"
 
@@ -290,10 +279,4 @@ def _uncertainty(received: ReceivedEstimate) -> str:
     if not received.fresh:
         return f"no estimate since {received.t_ns / 1e9:.1f} s"
     heading_deg = math.degrees(received.estimate.yaw_sigma_rad)
-    return f"σ of position {sigma_m(received.estimate):.2f} m, of heading {heading_deg:.1f}°"
-
-
-def sigma_m(estimate: EstimateView) -> float:
-    """Return the root of the mean variance of the position over its axes; 0 where that is negative, so none."""
-    xx, _, _, yy, _, zz = estimate.covariance_m2
-    return math.sqrt(max(0.0, xx + yy + zz) / 3)
+    return f"σ of position {received.sigma_m:.2f} m, of heading {heading_deg:.1f}°"

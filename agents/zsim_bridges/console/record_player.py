@@ -3,7 +3,7 @@
 from typing import Any
 
 from zsim_bridges.console.command_client import CommandClient
-from zsim_bridges.console.view_buffer import TimeMonitor
+from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 
 
 class RecordPlayer:

@@ -27,7 +27,10 @@ from zsim_bridges.console import console_tables
 from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows
-from zsim_bridges.console.flight_figures import FlightFigures
+from zsim_bridges.console.monitoring.flight_figures import FlightFigures
+from zsim_bridges.console.monitoring.run_monitor import RunMonitor
+from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
+from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
 from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.console_page import ConsolePage
@@ -45,9 +48,7 @@ from zsim_bridges.console.page.picture import (
 from zsim_bridges.console.page.scene_nodes import SceneNodes
 from zsim_bridges.console.picture_rate import picture_rate_hz
 from zsim_bridges.console.record_player import RecordPlayer
-from zsim_bridges.console.run_monitor import RunMonitor
 from zsim_bridges.console.run_state import console_state
-from zsim_bridges.console.view_buffer import TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster

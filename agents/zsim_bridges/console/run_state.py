@@ -5,9 +5,9 @@ from typing import Any
 
 from zsim.contract.run_messages import Fault
 from zsim.contract.views import ViewCluster, ViewDrones
-from zsim_bridges.console.console_tables import sigma_m
+from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
+from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
 from zsim_bridges.console.page.picture import FormationShape
-from zsim_bridges.console.view_buffer import TimeMonitor, ViewBuffer
 
 EVENTS_MAX = 20
 SILENT = "silent"  # in place of the clock's state, where the world answers nothing
@@ -39,7 +39,7 @@ def console_state(
 
 
 def _drones(view: ViewDrones, views: ViewBuffer) -> list[dict[str, Any]]:
-    sigmas = {name: sigma_m(received.estimate) for name, received in views.estimates().items() if received.fresh}
+    sigmas = {name: received.sigma_m for name, received in views.estimates().items() if received.fresh}
     return [
         {"name": d.name, "position_m": list(d.position_m), "state": d.state, "sigma_m": sigmas.get(d.name)}
         for d in view.drones

@@ -5,14 +5,14 @@ from typing import Any, NamedTuple
 
 import viser
 
-from zsim_bridges.console import event_log
 from zsim_bridges.console.command_client import CommandClient
 from zsim_bridges.console.console_tables import event_table
-from zsim_bridges.console.event_log import EventRow
+from zsim_bridges.console.monitoring import event_log
+from zsim_bridges.console.monitoring.event_log import EventRow
+from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.page.chosen_ring import ChosenRing
 from zsim_bridges.console.page.picture import Array, DronePoses
 from zsim_bridges.console.page.run_forms import DroneForm
-from zsim_bridges.console.run_condition import RunCondition
 
 ROWS_SHOWN = 60  # events
 

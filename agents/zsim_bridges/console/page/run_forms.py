@@ -12,8 +12,8 @@ from zsim.scenario.fault_kinds import PROCESS_KILL, ROTORS, FaultKind, kinds_of
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.monitoring.run_condition import RunCondition, drone_refusals, fleet_refusals, run_refusals
 from zsim_bridges.console.page import operator_input
-from zsim_bridges.console.run_condition import RunCondition, drone_refusals, fleet_refusals, run_refusals
 
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 8px;overflow-wrap:anywhere"
 DURATION_S = 30.0  # of a fault, unless another time is typed

@@ -19,8 +19,9 @@ from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import PageControls, ViewerCamera, is_permitted
-from zsim_bridges.console.event_log import EventRow
 from zsim_bridges.console.http_proxy import ListenAddress
+from zsim_bridges.console.monitoring.event_log import EventRow
+from zsim_bridges.console.monitoring.sensor_rates import SensorRates
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page import picture as pic
 from zsim_bridges.console.page.operator_input import primary_variables, slider_ranges
@@ -34,7 +35,6 @@ from zsim_bridges.console.page.picture import (
     VariableHistory,
 )
 from zsim_bridges.console.page_tokens import OPERATOR, VIEWER, PageRequest, PageTokens
-from zsim_bridges.console.sensor_rates import SensorRates
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 LEVEL = (1.0, 0.0, 0.0, 0.0)

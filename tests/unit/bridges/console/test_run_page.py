@@ -19,13 +19,13 @@ from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_server import PrivateViser
+from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.page import scene_nodes as stages
 from zsim_bridges.console.page.camera_follow import CameraFollow
 from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.picture import drone_poses
 from zsim_bridges.console.picture_rate import picture_rate_hz
 from zsim_bridges.console.run_page import RunPage
-from zsim_bridges.console.view_buffer import TimeMonitor
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
 SCENARIO = scenario_file.load(STEP)

@@ -13,11 +13,12 @@ from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health
 from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
 from zsim_bridges.console import console_tables
-from zsim_bridges.console.console_tables import TableRows, sigma_m
-from zsim_bridges.console.page_head import page_head
-from zsim_bridges.console.run_condition import RunCondition
+from zsim_bridges.console.console_tables import TableRows
+from zsim_bridges.console.monitoring.page_head import page_head
+from zsim_bridges.console.monitoring.run_condition import RunCondition
+from zsim_bridges.console.monitoring.time_monitor import SILENT_S, TimeMonitor
+from zsim_bridges.console.monitoring.view_buffer import ReceivedEstimate, ViewBuffer
 from zsim_bridges.console.run_state import console_state
-from zsim_bridges.console.view_buffer import SILENT_S, TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
 S = 1_000_000_000  # ns
@@ -240,7 +241,8 @@ def test_of_two_estimators_of_one_drone_the_later_is_shown(order: tuple[int, int
 
 
 def test_a_covariance_that_is_none_has_no_sigma():
-    assert sigma_m(EstimateView("drone1", ORIGIN, (-9.0, 0.0, 0.0, 1.0, 0.0, 1.0), 0.0, 0.1, {})) == 0.0
+    estimate = EstimateView("drone1", ORIGIN, (-9.0, 0.0, 0.0, 1.0, 0.0, 1.0), 0.0, 0.1, {})
+    assert ReceivedEstimate("estimator.drone1", 0, estimate, True).sigma_m == 0.0
 
 
 # Faults and refusals

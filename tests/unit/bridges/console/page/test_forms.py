@@ -17,6 +17,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
+from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.page.console_page import SWITCHES, ConsolePage
 from zsim_bridges.console.page.formation_form import OPERATIONS, REST_S, STILL_S, FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
@@ -30,7 +31,6 @@ from zsim_bridges.console.page.run_forms import (
     FleetForm,
     RunForm,
 )
-from zsim_bridges.console.run_condition import RunCondition
 
 SCENARIOS = Path(__file__).parents[5] / "scenarios"
 PERSON, NOBODY = 1, None  # who moved a slider

@@ -3,14 +3,14 @@
 from typing import Any
 
 from zsim.scenario.scenario import Scenario
-from zsim_bridges.console import alarms
-from zsim_bridges.console.alarms import Alarm, AlarmBoard, DroneCondition
-from zsim_bridges.console.console_tables import active_faults, sigma_m
-from zsim_bridges.console.flight_figures import FlightMeter
-from zsim_bridges.console.page_head import page_head
-from zsim_bridges.console.pending_requests import PendingRequest, PendingRequests
-from zsim_bridges.console.run_condition import RunCondition
-from zsim_bridges.console.view_buffer import ReceivedEstimate, TimeMonitor, ViewBuffer
+from zsim_bridges.console.monitoring import alarms
+from zsim_bridges.console.monitoring.alarms import Alarm, AlarmBoard, DroneCondition
+from zsim_bridges.console.monitoring.flight_figures import FlightMeter
+from zsim_bridges.console.monitoring.page_head import page_head
+from zsim_bridges.console.monitoring.pending_requests import PendingRequest, PendingRequests
+from zsim_bridges.console.monitoring.run_condition import RunCondition
+from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
+from zsim_bridges.console.monitoring.view_buffer import ReceivedEstimate, ViewBuffer
 
 
 class RunMonitor:
@@ -76,14 +76,14 @@ class RunMonitor:
         ]
         found += alarms.formation_alarms(self.condition.phases)
         found += alarms.process_alarms(views.losses)
-        return found + alarms.fault_alarms(active_faults(views))
+        return found + alarms.fault_alarms(views.active_faults())
 
     def _drone(self, name: str, state: str, battery: float, received: ReceivedEstimate | None) -> DroneCondition:
         found = DroneCondition(name, state, battery)
         if received is not None:
             fresh = received.fresh
             lag_ms = self._views.lag_ms(received)
-            sigma = sigma_m(received.estimate) if fresh else None
+            sigma = received.sigma_m if fresh else None
             found = found._replace(lag_ms=lag_ms, sigma_m=sigma, estimate_lost=not fresh)
         link = self._views.link_of(name)
         if link is None:

@@ -1,11 +1,10 @@
-"""The newest views of a run, kept until the next picture is drawn, and the run's clock, polled now and then."""
+"""The newest views of a run, kept until the next picture is drawn."""
 
 import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from msgspec import UNSET
@@ -15,16 +14,13 @@ from zsim.contract.flight_messages import LinkState
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
-from zsim.errors import DecodeError, ZsimError
+from zsim.errors import DecodeError
 from zsim.transport.session import RawSample, Session
-from zsim_bridges.console.alarms import BACK, LOST
-from zsim_bridges.console.event_log import EventLog
+from zsim_bridges.console.monitoring.alarms import BACK, LOST
+from zsim_bridges.console.monitoring.event_log import EventLog
 from zsim_bridges.observer_process import ObserverProcess
 
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
-POLL_S = 0.25  # wall; rarely, since a message of each gate costs the world time
-ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
-SILENT_S = 1.7  # wall; without an answer for so long what is shown may be long past: a stop is shown within 2 s
 
 
 class ReceivedEstimate(NamedTuple):
@@ -40,6 +36,12 @@ class ReceivedEstimate(NamedTuple):
     t_ns: int
     estimate: EstimateView
     fresh: bool
+
+    @property
+    def sigma_m(self) -> float:
+        """Root of the mean variance of the position over its axes; 0 where that is negative, so none."""
+        xx, _, _, yy, _, zz = self.estimate.covariance_m2
+        return math.sqrt(max(0.0, xx + yy + zz) / 3)
 
 
 class ReceivedLink(NamedTuple):
@@ -144,6 +146,11 @@ class ViewBuffer:
         key = keys.link(drone)
         return ReceivedLink(self._links[key], self._wall_s() - self._received_s[key]) if key in self._links else None
 
+    def active_faults(self) -> list[Fault]:
+        """Return the injected faults that act at the time of the newest view."""
+        now_ns = self.drones.t_ns if self.drones else 0
+        return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
+
     def lag_ms(self, received: ReceivedEstimate) -> float:
         """Return how far an estimator is behind: by its health, or by its view where that is old."""
         health = self.healths.get(received.process)
@@ -216,84 +223,3 @@ class ViewBuffer:
 def _drone(event: Event) -> str:
     """Return the drone that a command was for: of a refused one, the subject is the key."""
     return keys.thing(event.subject) if event.kind == "refused" and "/" in event.subject else event.subject
-
-
-class TimeMonitor:
-    """Polls the run's clock, in a thread of its own: drawing waits for no answer.
-
-    Args:
-        link: an open session.
-        observer: of the console in the run; it follows the run's clock.
-        stamp_age_s: simulated; how old the time of a stamp may be.
-        wall_s: monotonic.
-
-    Attributes:
-        clock: the newest answer.
-    """
-
-    def __init__(
-        self,
-        link: Session,
-        observer: ObserverProcess,
-        stamp_age_s: float = math.inf,
-        wall_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._link = link
-        self._observer = observer
-        self._stamp_age_s = stamp_age_s
-        self._wall_s = wall_s
-        self._one = threading.RLock()
-        self._is_polling = False
-        self._answered_s = wall_s()
-        self._known_s = -math.inf
-        self.clock: run_messages.Clock | None = None
-
-    @contextmanager
-    def polling(self) -> Iterator[None]:
-        """Poll again and again meanwhile."""
-        over = threading.Event()
-        thread = threading.Thread(target=self._poll_repeatedly, args=(over,), name="watch", daemon=True)
-        self._answered_s, self._is_polling = self._wall_s(), True
-        thread.start()
-        try:
-            yield
-        finally:
-            self._is_polling = False
-            over.set()
-            thread.join(ANSWER_TIMEOUT_S)
-
-    def poll(self) -> None:
-        """Poll once; one poll runs at a time."""
-        with self._one:
-            start_s = self._wall_s()
-            try:
-                samples = self._link.get(keys.CLOCK, timeout_s=ANSWER_TIMEOUT_S)
-            except ZsimError:
-                return  # the link is lost, and comes back
-            for sample in samples:
-                clock = self._observer.update_clock(sample.payload)
-                if clock is not None:
-                    self.clock, self._known_s, self._answered_s = clock, start_s, self._wall_s()
-
-    def now_ns(self) -> int:
-        """Return simulated time for a stamp, polling where it may be too old; within 2 ANSWER_TIMEOUT_S."""
-        if self._is_old():
-            with self._one:
-                if self._is_old():  # no other thread has polled meanwhile
-                    self.poll()
-        return self._observer.now_ns
-
-    @property
-    def silent_s(self) -> float:
-        """For how long the world has not answered; 0 where that is not long [s, wall]."""
-        silent_s = self._wall_s() - self._answered_s
-        return silent_s if self._is_polling and silent_s >= SILENT_S else 0.0
-
-    def _poll_repeatedly(self, over: threading.Event) -> None:
-        while not over.is_set():
-            self.poll()
-            over.wait(POLL_S)
-
-    def _is_old(self) -> bool:
-        rate = max(1.0, self.clock.rate) if self.clock else 1.0  # as measured: of a run that has just begun, 0
-        return (self._wall_s() - self._known_s) * rate > self._stamp_age_s

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsim.contract.run_messages import Clock
-from zsim_bridges.console.run_condition import RunCondition, fleet_refusals
+from zsim_bridges.console.monitoring.run_condition import RunCondition, fleet_refusals
 
 WAITING_SHOWN = 4  # processes that are named
 SOON_S = 0.5  # wall; a running world waits for so long now and then
