@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SCENARIO ?= scenarios/step.yaml
 PARTS ?=
 WORKERS ?= 4
-COMPILED = @$(MAKE) --no-print-directory $(VENV)/.compiled
+COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
 
 .PHONY: run test setup lint soak bench clean help
 
@@ -60,5 +60,5 @@ $(VENV)/.compiled: pyproject.toml
 	@$(BIN)/python -m compileall -q zsim agents world deploy
 	@echo "compiling what flies (once on this machine, about a minute)"
 	@folder=$$(mktemp -d) && $(BIN)/zsim run scenarios/step.yaml --in-process --duration 0.1 --no-report \
-		--out $$folder/run 2>/dev/null && rm -r $$folder
+		--out $$folder/run >/dev/null 2>&1 && rm -r $$folder
 	@touch $@
