@@ -10,6 +10,7 @@ import os
 import platform
 from collections.abc import Callable, Iterable
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import threadpoolctl
@@ -100,9 +101,21 @@ def _cpu_features() -> str:
 
 
 def _blas() -> str:
-    """Return the kinds of BLAS that are loaded, and for which processor each computes."""
+    """Return the kinds of BLAS with which the numeric packages compute, and for which processor each does."""
     loaded = (each for each in threadpoolctl.threadpool_info() if each["user_api"] == "blas")
-    return " ".join(sorted({f"{each['internal_api']}-{each.get('architecture', '')}" for each in loaded})) or "none"
+    used = (each for each in loaded if _bundled_with(Path(each["filepath"])) in (None, *PACKAGES))
+    return " ".join(sorted({f"{each['internal_api']}-{each.get('architecture', '')}" for each in used})) or "none"
+
+
+def _bundled_with(library: Path) -> str | None:
+    """Return the package in whose wheel a library lies; None of one of the system.
+
+    OpenCV brings a BLAS of its own, with which nothing here computes, and which may choose another processor.
+    """
+    folder = library.parent
+    if folder.suffix == ".libs":  # as auditwheel and delvewheel name it
+        return folder.stem
+    return folder.parent.name if folder.name == ".dylibs" else None  # as delocate does
 
 
 class TruthHash:

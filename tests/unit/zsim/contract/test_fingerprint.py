@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+import threadpoolctl
 
 from zsim.contract import fingerprint as module
 from zsim.contract.fingerprint import PACKAGES, fingerprint, parts
@@ -44,6 +45,25 @@ def test_another_version_of_a_package_is_another_fingerprint(package: str, monke
     parts.cache_clear()
     fingerprint.cache_clear()
     assert fingerprint() != here
+
+
+@pytest.mark.parametrize(
+    ("library", "counts"),
+    [
+        ("opencv_python_headless.libs/libopenblas-r0.so", False),
+        ("cv2/.dylibs/libopenblas.0.dylib", False),
+        ("numpy.libs/libscipy_openblas64_.so", True),
+        ("scipy/.dylibs/libscipy_openblas.dylib", True),
+        ("x86_64-linux-gnu/libopenblas.so.0", True),
+    ],
+)
+def test_a_blas_that_another_package_brings_is_none_of_it(library: str, counts: bool, monkeypatch: pytest.MonkeyPatch):
+    here, known = fingerprint(), threadpoolctl.threadpool_info()
+    other = {"user_api": "blas", "internal_api": "openblas", "architecture": "Other", "filepath": f"/usr/lib/{library}"}
+    monkeypatch.setattr(threadpoolctl, "threadpool_info", lambda: [*known, other])
+    parts.cache_clear()
+    fingerprint.cache_clear()
+    assert (fingerprint() != here) == counts
 
 
 def test_another_processor_is_another_fingerprint(monkeypatch: pytest.MonkeyPatch):
