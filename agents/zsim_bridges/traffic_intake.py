@@ -14,11 +14,13 @@ from zsim.runtime.health import HealthMeter
 from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import Passed, Traffic, samples
 
-BACKLOG = 250  # times that something arrived, some seconds of realtime
+BACKLOG = 100  # times that something arrived, a second or two of realtime
 
 
 class TrafficIntake:
-    """Messages in the order in which they passed the world; a reader that is too slow loses the oldest gates.
+    """Messages in the order in which they passed the world; a reader that is too slow goes on with the newest.
+
+    What it has not read is left out then: what flies by old messages flies worse than what misses some.
 
     Args:
         link: an open session.
@@ -34,7 +36,7 @@ class TrafficIntake:
         self._traffic = Traffic(link, run_key_table(info), self._count_refused)
         self._health = health
         self._loop = loop
-        self._backlog: deque[Sequence[Passed]] = deque(maxlen=BACKLOG)
+        self._backlog: deque[Sequence[Passed]] = deque()
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
         self.news = asyncio.Event()
         for sample in link.get(keys.CLOCK):  # a world that stands, or has ended, publishes it no more
@@ -51,7 +53,11 @@ class TrafficIntake:
         """Yield what has come until now, in the parts in which it came."""
         self.news.clear()
         for _ in range(len(self._backlog)):
-            yield list(samples(self._backlog.popleft()))
+            try:
+                passed = self._backlog.popleft()
+            except IndexError:  # left out meanwhile
+                return
+            yield list(samples(passed))
 
     def _run(self) -> None:
         while True:
@@ -60,7 +66,9 @@ class TrafficIntake:
             except SessionError:
                 return
             if passed:
-                self._health.dropped += len(self._backlog) == BACKLOG
+                if len(self._backlog) >= BACKLOG:
+                    self._health.dropped += len(self._backlog)
+                    self._backlog.clear()
                 self._health.received += 1
                 self._backlog.append(passed)
                 with contextlib.suppress(RuntimeError):  # the reader is gone

@@ -27,6 +27,8 @@ clusters:
   - {name: main, drones: [drone1, drone2, drone3], plan: {takeoff_s: 8}}
 """
 """Three drones that take off when the estimators know where they are."""
+PATIENT = "silence: {hover_s: 5, land_s: 60}\n"
+"""Of a run that must not land its drones because a loaded machine pauses."""
 EXTERNAL, SIMULATED = FORMATION.replace("BODY", ", body: external"), FORMATION.replace("BODY", "")
 UNFLOWN = """
 name: unflown

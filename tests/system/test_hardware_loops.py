@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -56,12 +57,12 @@ def test_test_1_is_flown_as_well_as_without(
     with hardware.federation, Federation(tmp_path) as federation:
         served = hardware.serve(wire)
         link, ports = through_radio(wire, served, (delay_ms / rate, jitter_ms / rate, loss))
-        mixed = Mixed(federation, STEP.read_text(), (*pace, *sets))
-        for drone in external:
-            mixed.drive(drone, wire, ports[DRONES.index(drone)])
-        mixed.run.ends(with_code=0, within_s=600)
-        hardware.ends()
-        link.close()
+        with closing(link):
+            mixed = Mixed(federation, STEP.read_text(), (*pace, *sets))
+            for drone in external:
+                mixed.drive(drone, wire, ports[DRONES.index(drone)])
+            mixed.run.ends(with_code=0, within_s=600)
+            hardware.ends()
         rms = kinds(true_rms(mixed, hardware, external, WINDOW_S, rate))
     ratios = {name: rms[name] / direct[name] for name in JUDGED}
     print({name: f"{rms[name]:.4f} ({ratios[name]:.2f})" for name in JUDGED})
@@ -108,11 +109,11 @@ def flown(tmp_path: Path, compiled: None, request: Any) -> Iterator[Flight]:
     with hardware.federation, Federation(tmp_path) as federation:
         served = hardware.serve(request.param)
         radio, ports = through_radio(request.param, served, (0.0, 0.0, 0.0))
-        mixed = Mixed(federation)
-        mixed.drive("drone3", request.param, ports[2])
-        mixed.engaged_ns(mixed.engaged_ns() + 5 * SECOND_NS)
-        yield Flight(mixed, hardware, radio)
-        radio.close()
+        with closing(radio):
+            mixed = Mixed(federation)
+            mixed.drive("drone3", request.param, ports[2])
+            mixed.engaged_ns(mixed.engaged_ns() + 5 * SECOND_NS)
+            yield Flight(mixed, hardware, radio)
 
 
 @pytest.mark.parametrize("flown", ["px4", "ardupilot"], indirect=True)

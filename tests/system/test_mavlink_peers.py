@@ -62,9 +62,7 @@ def test_a_stranger_flies_nothing_and_the_peer_does(lab: Lab, federation: Federa
 
 @pytest.mark.soak
 @pytest.mark.parametrize("key", KEYS)
-def test_a_driver_obeys_and_flies_a_vehicle_of_its_own_key_alone(
-    federation: Federation, tmp_path: Path, key: str
-) -> None:
+def test_a_driver_arms_a_vehicle_of_its_own_key_alone(federation: Federation, tmp_path: Path, key: str) -> None:
     for name, data in KEYS.items():
         (tmp_path / name).write_bytes(data)
     api, gcs, local = free_udp_ports(2), free_udp_ports(1), free_udp_ports(4)

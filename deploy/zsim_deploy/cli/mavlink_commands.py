@@ -52,7 +52,7 @@ def serve(
     from zsim_bridges.mavlink.serve.mavlink_server import MavlinkOptions
     from zsim_bridges.mavlink.serve.mavlink_server import serve as serve_vehicles
     from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import lower_priority, serve_runs
+    from zsim_deploy.roles.roles import serve_runs
 
     options = MavlinkOptions(
         autopilot=autopilot,
@@ -68,7 +68,6 @@ def serve(
     )
     if options.key and options.version == 1:
         raise typer.BadParameter("--signing-key needs MAVLink 2; leave out --protocol 1")
-    lower_priority()
     serve_runs(process_name("mavlink", name, reach.who), partial(serve_vehicles, options=options), reach)
 
 
