@@ -6,6 +6,7 @@ The rules, for the clock of the run:
 - No setpoint for `silence.hover_s`: it holds. For `silence.land_s` more: it lands.
 - The world silent for as long, whoever flies: it lands.
 - Outside the fence: it lands. Killed: its motors stop, until it is armed again.
+- Down without a command to land: disarmed. A commander that asks for take-off again and again starts no motor then.
 """
 
 from math import cos, sin
@@ -62,6 +63,7 @@ class Failsafe:
         self.phase: Phase = "idle"
         self.commander: str | None = None
         self.reason = ""
+        self._uncommanded = False  # the landing that goes on
         self._setpoint: flight_messages.Velocity | None = None
         self._setpoint_ns = self._clock_ns = self._began_ns = 0
 
@@ -71,7 +73,7 @@ class Failsafe:
         """Obey from now on; return None, or why not."""
         if vehicle.received_ns is None or now_ns - vehicle.received_ns > LINK_LOST_S * 1e9:
             return "nothing comes from the aircraft; check its address, and that it is switched on"
-        self.armed = True
+        self.armed, self._uncommanded = True, False
         if self.phase == "killed":
             self._enter("idle", now_ns)
         return None
@@ -93,7 +95,7 @@ class Failsafe:
         """Land, if it flies for this driver."""
         if self.phase in ("taking_off", "airborne"):
             self._enter("landing", now_ns)
-            self.reason = reason
+            self.reason, self._uncommanded = reason, True
 
     # What comes
 
@@ -156,7 +158,7 @@ class Failsafe:
         elif self.phase == "taking_off" and now_ns - self._began_ns > TAKEOFF_S * 1e9:
             self.land(f"the take-off took longer than {TAKEOFF_S:g} s", now_ns)
         elif self.phase == "landing" and vehicle.state in ("landed", "emergency") and self._settled(now_ns):
-            self._enter("idle", now_ns)
+            self._settle(now_ns)
         elif self.phase == "idle" and self.armed and airborne:
             self._enter("airborne", now_ns)  # a driver that is started again in flight
         elif self.phase == "airborne":
@@ -166,9 +168,16 @@ class Failsafe:
         """Tell whether an aircraft has had the time to show that it obeys."""
         return now_ns - self._began_ns > LINK_LOST_S * 1e9
 
+    def _settle(self, now_ns: int) -> None:
+        """It is down: after a landing that nobody commanded, only an operator lets it fly again."""
+        self._enter("idle", now_ns)
+        if self._uncommanded:
+            self.armed, self._uncommanded = False, False
+
     def _watch(self, now_ns: int, vehicle: AircraftState) -> None:
         if vehicle.state == "landed" and self._settled(now_ns):
-            self._enter("idle", now_ns)
+            self.reason, self._uncommanded = "the aircraft landed without a command", True
+            self._settle(now_ns)
         elif vehicle.pose is not None and self._limits.is_breached(vehicle.pose.position_m):
             self.land("it is outside the fence", now_ns)
         elif self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:

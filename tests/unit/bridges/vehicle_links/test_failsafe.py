@@ -122,6 +122,27 @@ def test_a_silent_world_is_a_landing():
     assert "world" in flight.failsafe.reason
 
 
+@pytest.mark.parametrize("landing", ["its own", "the driver's"])
+def test_who_came_down_without_a_command_is_not_started_by_one_until_it_is_armed_again(landing: str):
+    flight = Flight().takes_off()
+    flight.after(2)
+    flight.fly(1, 0, 0)
+    if landing == "the driver's":
+        assert flight.after(3) == "land"
+    flight.state = "landed"
+    assert flight.after(2) == "none"
+    assert not flight.failsafe.armed
+    assert flight.mode("takeoff")
+    assert flight.after(1) == "none"
+    assert flight.failsafe.arm(flight.now_ns, flight.vehicle) is None
+    flight.takes_off()
+    flight.mode("land")
+    flight.after(2)
+    flight.state = "landed"
+    assert flight.after(2) == "none"
+    assert flight.failsafe.armed
+
+
 def test_outside_the_fence_it_lands():
     flight = Flight().takes_off()
     flight.position = (9.99, 0, 1)
