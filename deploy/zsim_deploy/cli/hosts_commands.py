@@ -44,6 +44,7 @@ def up(
 
     --only and --sort are of the table that is shown; every role is started whatever they are.
     """
+    from zsim.scenario.rights import ROUTER
     from zsim.transport.open_files import host_launcher_files, require_files
     from zsim_deploy.cli.record_commands import conclude
     from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
@@ -54,7 +55,9 @@ def up(
     placed = inventory.load(hosts)
     placed = inventory.insecure(placed) if insecure else placed
     choice = RowChoice(only or (), sort)
-    choice.check([{"role": role, "host": host} for role, host in inventory.placement(placed, loaded).items()])
+    routers = {f"{ROUTER}.{name}": router.host for name, router in placed.inventory.routers.items()}
+    hosts_of = {**routers, **inventory.placement(placed, loaded)}
+    choice.check([{"role": role, "host": host} for role, host in hosts_of.items()])
     mode, pace = flight.mode_and_rate()
     count, hosts_count = len(inventory.roles(loaded)), len(placed.inventory.hosts)
     require_files(host_launcher_files(count, hosts_count), f"{count} processes on {hosts_count} hosts")
@@ -100,7 +103,7 @@ def ps(
 
     A narrow terminal shows fewer columns, --json all of them.
     """
-    from zsim.runtime.progress import PipedConsole
+    from zsim.terminal.fitted_table import print_table
     from zsim_deploy.hosts import control_socket
     from zsim_deploy.hosts.status_table import table
 
@@ -111,7 +114,7 @@ def ps(
     if as_json:
         print(json.dumps(status))
     else:
-        PipedConsole().print(table(status["rows"]))
+        print_table(table(status["rows"]))
 
 
 def logs(
