@@ -92,7 +92,7 @@ class PageConnection:
     """
 
     def __init__(self, address: str) -> None:
-        viser = pytest.importorskip("viser", reason="viser is not installed; pip install 'zsim[console]'")
+        viser = pytest.importorskip("viser", reason="viser is not installed; pip install '.[console]'")
         subprotocols: Any = [f"viser-v{viser.__version__}"]
         where = f"ws://{urlsplit(address).netloc}{urlsplit(address).path}"
         self._socket = connect(where, subprotocols=subprotocols, compression=None, max_size=None)

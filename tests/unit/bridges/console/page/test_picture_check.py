@@ -12,7 +12,7 @@ from refused import has_terms
 from zsim.sensors.jpeg_header import PictureError, frame_of
 from zsim_bridges.console.page.picture_check import PICTURE_BYTES_MAX, check_picture
 
-Image = pytest.importorskip("PIL.Image", reason="Pillow comes with viser; pip install 'zsim[console]'")
+Image = pytest.importorskip("PIL.Image", reason="Pillow comes with viser; pip install '.[console]'")
 
 
 def encoded(width: int = 40, height: int = 30, kind: str = "JPEG", **options: Any) -> bytes:
