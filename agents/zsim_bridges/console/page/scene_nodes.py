@@ -9,6 +9,7 @@ import viser
 from numpy.typing import NDArray
 
 from zsim.contract.messages import DroneInfo
+from zsim.drone_colours import drone_colours, rgb
 from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console.page import airframe
@@ -25,9 +26,6 @@ from zsim_bridges.console.page.picture import (
 NAMED_MAX = 60  # drones with their names beside them; more would hide each other
 LARGE_MAX = 12  # names in full, at full size; of more drones what tells them apart, smaller
 SMALL = 0.8  # of the size of a name
-TRAIL_COLOURS = np.array(
-    [(25, 113, 194), (232, 137, 12), (47, 158, 68), (156, 54, 181), (224, 49, 49), (12, 133, 153)], np.uint8
-)
 SOLID = (134, 142, 150)
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
 SIDE_PX = 2.0  # of a formation's sides: as wide from afar
@@ -69,6 +67,7 @@ class SceneNodes:
         self._count = len(drones)
         names = tuple(drone.name for drone in drones)
         self._trail_node: Any = None
+        self._trail_colours = np.array([rgb(each) for each in drone_colours(max(1, len(drones)))], np.uint8)
         self._trails_shown = True
         server.scene.reset()
         server.scene.set_up_direction("+z")
@@ -159,7 +158,7 @@ class SceneNodes:
         """Draw the drones' trails."""
         if not len(segments):  # after a replay went back, the old ones must be removed
             segments, owners = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
-        colours = np.repeat(TRAIL_COLOURS[owners % len(TRAIL_COLOURS)][:, None], 2, axis=1)
+        colours = np.repeat(self._trail_colours[owners][:, None], 2, axis=1)
         if self._trail_node is None:
             self._trail_node = self._scene.add_line_segments(
                 "/trails", segments, colours, thickness=2.0, thickness_units="screen", visible=self._trails_shown
