@@ -33,7 +33,6 @@ def serve(
     from zsim_bridges.ardrone.server.addresses import peer_addresses
     from zsim_bridges.ardrone.server.ardrone_server import ArdroneOptions
     from zsim_bridges.ardrone.server.ardrone_server import serve as serve_run
-    from zsim_deploy.roles.priority import lower_priority
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import serve_runs
 

@@ -51,7 +51,6 @@ def serve(
     """Offer each drone as a vehicle: QGroundControl, MAVSDK, DroneKit, MAVProxy fly it."""
     from zsim_bridges.mavlink.serve.mavlink_server import MavlinkOptions
     from zsim_bridges.mavlink.serve.mavlink_server import serve as serve_vehicles
-    from zsim_deploy.roles.priority import lower_priority
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import serve_runs
 

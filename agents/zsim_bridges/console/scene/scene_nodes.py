@@ -12,8 +12,8 @@ from zsim.contract.messages import DroneInfo
 from zsim.drone_colours import drone_colours, rgb
 from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
-from zsim_bridges.console.page import airframe
-from zsim_bridges.console.page.picture import (
+from zsim_bridges.console.scene import airframe
+from zsim_bridges.console.scene.picture import (
     Array,
     DronePoses,
     Ellipsoids,
