@@ -62,7 +62,7 @@ def console(
     from zsim.runtime.progress import JsonProgress
     from zsim.transport.open_files import SERVER_FILES, require_files
     from zsim_bridges.console.console_server import Console
-    from zsim_bridges.console.http_proxy import ListenAddress
+    from zsim_bridges.console.server.http_proxy import ListenAddress
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import log_printer, lower_priority, serve_runs
 

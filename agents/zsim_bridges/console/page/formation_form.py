@@ -14,8 +14,8 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
-from zsim_bridges.console.page.picture import SHAPED_PHASES
 from zsim_bridges.console.page.run_forms import refusal_lines, set_refusals
+from zsim_bridges.console.scene.picture import SHAPED_PHASES
 
 STILL_S = 2.0  # wall; a formation whose goal has not changed for so long is not on its way: the slider shows its goal
 

@@ -10,9 +10,9 @@ from zsim_bridges.console.console_tables import event_table
 from zsim_bridges.console.monitoring import event_log
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.run_condition import RunCondition
-from zsim_bridges.console.page.chosen_ring import ChosenRing
-from zsim_bridges.console.page.picture import Array, DronePoses
 from zsim_bridges.console.page.run_forms import DroneForm
+from zsim_bridges.console.scene.chosen_ring import ChosenRing
+from zsim_bridges.console.scene.picture import Array, DronePoses
 
 ROWS_SHOWN = 60  # events
 

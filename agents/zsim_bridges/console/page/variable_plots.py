@@ -11,7 +11,8 @@ from zsim.contract.views import EstimateView
 from zsim.math import frames
 from zsim.scenario.scenario import Cluster
 from zsim_bridges.console.page.operator_input import SliderRange
-from zsim_bridges.console.page.picture import SERIES, SPAN_S, DronePoses, VariableHistory
+from zsim_bridges.console.page.variable_history import SERIES, SPAN_S, VariableHistory
+from zsim_bridges.console.scene.picture import DronePoses
 
 PLOTS_SHOWN = 3  # plots
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # of SERIES

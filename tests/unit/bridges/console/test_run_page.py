@@ -18,14 +18,14 @@ from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.console_server import PrivateViser
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
-from zsim_bridges.console.page import scene_nodes as stages
-from zsim_bridges.console.page.camera_follow import CameraFollow
-from zsim_bridges.console.page.camera_frustums import CameraFrustums
-from zsim_bridges.console.page.picture import drone_poses
-from zsim_bridges.console.picture_rate import picture_rate_hz
 from zsim_bridges.console.run_page import RunPage
+from zsim_bridges.console.scene import scene_nodes as stages
+from zsim_bridges.console.scene.camera_follow import CameraFollow
+from zsim_bridges.console.scene.camera_frustums import CameraFrustums
+from zsim_bridges.console.scene.picture import drone_poses
+from zsim_bridges.console.scene.picture_rate import picture_rate_hz
+from zsim_bridges.console.server.private_viser import PrivateViser
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
 SCENARIO = scenario_file.load(STEP)
@@ -230,8 +230,8 @@ def test_trails_of_a_replay_that_goes_back_before_anybody_looks_go_too(viser: Pr
 
 
 def trails(seen: Seen) -> np.ndarray:
-    assert seen.show._drones is not None
-    return seen.show._trails.segments(seen.show._drones.p_W)[0]
+    assert seen.show._scene.drones is not None
+    return seen.show._scene.trails.segments(seen.show._scene.drones.p_W)[0]
 
 
 def test_what_the_world_refuses_of_the_console_s_commands_is_shown_in_the_corner(seen: Seen):

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import viser
 
-from zsim_bridges.console.page import airframe
-from zsim_bridges.console.page.picture import Array, DronePoses
-from zsim_bridges.console.page.scene_nodes import HIDDEN
+from zsim_bridges.console.scene import airframe
+from zsim_bridges.console.scene.picture import Array, DronePoses
+from zsim_bridges.console.scene.scene_nodes import HIDDEN
 
 CHOSEN = (25, 113, 194)
 

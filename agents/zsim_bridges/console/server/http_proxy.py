@@ -15,8 +15,8 @@ from aiohttp import ClientError, ClientSession, WSMsgType, web
 from msgspec import Struct
 
 from zsim.errors import RunError
-from zsim_bridges.console import page_html
-from zsim_bridges.console.page_tokens import OPERATOR, VIEW_PATH, VIEWER, PageRequest, PageTokens
+from zsim_bridges.console.frame import page_html
+from zsim_bridges.console.server.page_tokens import OPERATOR, VIEW_PATH, VIEWER, PageRequest, PageTokens
 from zsim_bridges.web_server import ServedSite, open_on_thread, start_site, url_host
 
 MESSAGE_MAX = 100_000  # bytes of one message of a page

@@ -8,8 +8,8 @@ import msgspec
 from aiohttp import WSMsgType, web
 from msgspec import Meta, Struct
 
-from zsim_bridges.console.camera_feed import CameraFeed
-from zsim_bridges.console.page.camera_frustums import CameraFrustums
+from zsim_bridges.console.cameras.camera_feed import CameraFeed
+from zsim_bridges.console.scene.camera_frustums import CameraFrustums
 
 PERIOD_S = 0.1  # wall, from a picture of a camera to the next, at least
 WANTED_MAX = 16  # pictures on one page

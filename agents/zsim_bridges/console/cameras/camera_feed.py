@@ -12,9 +12,9 @@ from zsim.errors import DecodeError, ZsimError
 from zsim.sensors.camera import CAMERAS
 from zsim.sensors.jpeg_header import PictureError
 from zsim.transport.session import RawSample, Session
-from zsim_bridges.console.page import camera_marks
-from zsim_bridges.console.page.camera_marks import Mark
-from zsim_bridges.console.page.picture_check import PICTURE_BYTES_MAX, check_picture
+from zsim_bridges.console.cameras import camera_marks
+from zsim_bridges.console.cameras.camera_marks import Mark
+from zsim_bridges.console.cameras.picture_check import PICTURE_BYTES_MAX, check_picture
 from zsim_bridges.observer_process import ObserverProcess
 
 ASKED_S = 15.0  # wall; a page that has shown nothing for so long sleeps: a slow one takes seconds for a picture

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from zsim.contract.messages import DroneInfo
 from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
-from zsim_bridges.console.page import airframe
-from zsim_bridges.console.page.picture import (
+from zsim_bridges.console.scene import airframe
+from zsim_bridges.console.scene.picture import (
     Array,
     DronePoses,
     Ellipsoids,

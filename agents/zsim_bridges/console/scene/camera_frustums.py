@@ -9,9 +9,9 @@ import viser
 
 from zsim.contract.camera_messages import CameraImage, CameraInfo
 from zsim.math import frames, rotation
-from zsim_bridges.console.page.camera_marks import field_of_view
-from zsim_bridges.console.page.page_camera import bring_into_view
-from zsim_bridges.console.page.picture import Array, DronePoses
+from zsim_bridges.console.cameras.camera_marks import field_of_view
+from zsim_bridges.console.scene.page_camera import bring_into_view
+from zsim_bridges.console.scene.picture import Array, DronePoses
 
 NODE = "/camera_frustum"
 SCALE = 0.8  # of a frustum: the picture on it is about a metre wide; chosen: beside a hull of half a metre

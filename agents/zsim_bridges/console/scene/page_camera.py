@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import viser
 
-from zsim_bridges.console.page.picture import Array
+from zsim_bridges.console.scene.picture import Array
 
 OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a camera, from what it looks at, where that is not larger than EXTENT_M
 DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))

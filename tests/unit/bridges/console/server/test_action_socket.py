@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from zsim_bridges.console.action_socket import ActionSockets
-from zsim_bridges.console.page_tokens import OPERATOR, VIEWER
+from zsim_bridges.console.server.action_socket import ActionSockets
+from zsim_bridges.console.server.page_tokens import OPERATOR, VIEWER
 
 LOOK = {"do": "look", "page": "key", "follows": True, "fits": False, "direction": "top"}
 

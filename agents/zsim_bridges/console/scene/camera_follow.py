@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import viser
 
-from zsim_bridges.console.page.page_camera import DISTANCE_MIN_M, OFFSET_M, aim, fit_distance_m
-from zsim_bridges.console.page.picture import Array
+from zsim_bridges.console.scene.page_camera import DISTANCE_MIN_M, OFFSET_M, aim, fit_distance_m
+from zsim_bridges.console.scene.picture import Array
 
 UP_W = np.array([0.0, 0.0, 1.0])
 DIRECTIONS = {  # from the centre to the camera; not quite from above, since a camera has to know which way is up

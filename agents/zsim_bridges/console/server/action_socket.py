@@ -7,9 +7,9 @@ import msgspec
 from aiohttp import WSMsgType, web
 from msgspec import Meta, Struct
 
-from zsim_bridges.console.page.camera_follow import CameraFollow
-from zsim_bridges.console.page_tokens import OPERATOR
 from zsim_bridges.console.record_player import RecordPlayer
+from zsim_bridges.console.scene.camera_follow import CameraFollow
+from zsim_bridges.console.server.page_tokens import OPERATOR
 
 ACTION_MAX = 2_000  # bytes
 HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed

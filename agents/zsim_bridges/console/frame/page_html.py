@@ -28,7 +28,7 @@ def viewer_page() -> bytes:
 
 def _page(style: str) -> bytes:
     html = importlib.resources.files("viser").joinpath("client/build/index.html").read_text()
-    folder = importlib.resources.files("zsim_bridges.console.page")
+    folder = importlib.resources.files("zsim_bridges.console.frame")
     parts = "".join(folder.joinpath(name).read_text("utf-8") for name in PARTS)
     head, end, tail = html.rpartition("</body>")
     whole = f"{head}{parts}{end}{tail}" if end else f"{html}{parts}"

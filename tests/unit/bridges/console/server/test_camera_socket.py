@@ -10,8 +10,8 @@ import pytest
 import synthetic_camera
 from aiohttp import WSMsgType
 
-from zsim_bridges.console import camera_socket
-from zsim_bridges.console.camera_socket import CameraSockets, PicturesRequest
+from zsim_bridges.console.server import camera_socket
+from zsim_bridges.console.server.camera_socket import CameraSockets, PicturesRequest
 
 INFO = synthetic_camera.info_of("front")
 CAMERA = "drone1/front"
