@@ -228,8 +228,8 @@ class RampPlanner:
 class Places:
     """Where the robots of a held formation belong, and how each gets there by itself.
 
-    A robot that is far out of step (landed, and flown low again) makes a shape in which no formation can be led. It flies
-    over the ground first, at its height and so below or above the others, then straight up or down.
+    A robot that is far out of step (landed, and flown low again) makes a shape in which no formation can be led. It
+    flies over the ground first, at its height and so below or above the others, then straight up or down.
 
     Args:
         p_W: (n, 3) m; the places.

@@ -6,7 +6,14 @@ Viewers see its controls disabled.
 import gzip
 import importlib.resources
 
-PARTS = ("head_bar.html", "camera_windows.html", "scene_tools.html")  # of the page beside viser's
+PARTS = (  # of the page beside viser's; of the last three, each uses those before it
+    "head_bar.html",
+    "camera_windows.html",
+    "scene_tools.html",
+    "flight_bar.html",
+    "plan_drawing.html",
+    "plan_view.html",
+)
 STYLE = "<style>div:has(> .uplot) {contain: inline-size}</style>"
 """A plot takes the width that its panel has: else the panel grows with its plots where no box around it may clip."""
 VIEW_STYLE = (

@@ -37,6 +37,7 @@ class RunMonitor:
         self._single = [drone.name for drone in scenario.drones if drone.name not in in_formation]
         self._replayed = replayed
         self._ended = ""
+        self._members = {cluster.name: tuple(cluster.drones) for cluster in scenario.clusters}
         self.condition = RunCondition(replayed=replayed)
         self.board = AlarmBoard()
         self.flight = FlightMeter()
@@ -52,7 +53,7 @@ class RunMonitor:
         drones = {drone.name: drone.state for drone in views.drones.drones} if views.drones else {}
         phases = {name: (view.phase, view.reason) for name, view in views.clusters.items()}
         state, silent_s = clock.state if clock else None, self._time_monitor.silent_s
-        self.condition = RunCondition(state, silent_s, self._ended, self._replayed, drones, phases)
+        self.condition = RunCondition(state, silent_s, self._ended, self._replayed, drones, phases, self._members)
         self.board.update(self._alarms(), wall_s)
         return self.pending.pop_done(views.clusters, drones)
 
