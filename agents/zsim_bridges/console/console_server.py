@@ -9,6 +9,7 @@ import viser
 
 from zsim.contract.messages import Info
 from zsim.transport.session import Session
+from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.monitoring.page_head import no_run_head
 from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.run_page import RunPage
@@ -59,7 +60,7 @@ class Console:
         controls = PageControls(self._viser.server.gui, self._pages)
         permits = partial(is_permitted, controls=controls)
         sockets = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
-        actions = ActionSockets(self._frustums.client_id, self._camera_follow, self._record)
+        actions = ActionSockets(self._frustums.client_id, self._camera_follow, self._record, self._flying)
         answers = permits, sockets.respond, actions.respond, self._head, self._command
         backend = ViserBackend(self._viser.port, self._viser.secret, self._state, *answers)
         self._proxy = HttpProxy(address, token, backend)
@@ -99,6 +100,9 @@ class Console:
 
     def _record(self) -> RecordPlayer | None:
         return self._run_page.record if self._run_page else None
+
+    def _flying(self) -> PageFlying | None:
+        return self._run_page.flying if self._run_page else None
 
     def _pages(self) -> list[viser.GuiApi]:
         return [page.gui for page in self._viser.server.get_clients().values()]

@@ -24,6 +24,7 @@ from zsim_bridges.console import console_tables
 from zsim_bridges.console.cameras.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows
+from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 from zsim_bridges.console.monitoring.run_monitor import RunMonitor
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
@@ -72,6 +73,7 @@ class RunPage:
         views: the newest of everything.
         cameras: of the drones.
         record: what is played, of a replay.
+        flying: what pages may do with single drones.
     """
 
     def __init__(
@@ -114,6 +116,8 @@ class RunPage:
         page = self._page
         folders = page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
         self._page_forms = PageForms(server, self._client, list(names), self._scene.nodes.radii_m, *folders)
+        seen = self.views, self._time_monitor, self._monitor, self._scene, self._page_forms
+        self.flying = PageFlying(info, self._scenario, self._spaces, self._client, observer.name, *seen)
 
     def close(self) -> None:
         """Send nothing any more."""
@@ -131,7 +135,7 @@ class RunPage:
         self._monitor.record_end_s = self.record.timeline.get("to_s", math.inf)
         pause = threading.Event()
         next_s = time.monotonic()
-        with self._time_monitor.polling():
+        with self._time_monitor.polling(), self.flying.running():
             while not self._observer.end_reason and not stopped():
                 self._update(time.monotonic())
                 next_s = max(next_s + self._period_s(), time.monotonic())

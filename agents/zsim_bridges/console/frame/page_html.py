@@ -6,7 +6,15 @@ Viewers see its controls disabled.
 import gzip
 import importlib.resources
 
-PARTS = ("layout.html", "head_bar.html", "camera_windows.html", "scene_tools.html")  # of the page beside viser's
+PARTS = (  # of the page beside viser's; of the last three, each uses those before it
+    "layout.html",
+    "head_bar.html",
+    "camera_windows.html",
+    "scene_tools.html",
+    "flight_bar.html",
+    "plan_drawing.html",
+    "plan_view.html",
+)
 VIEW_STYLE = (
     "<style>.mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"
 )

@@ -41,6 +41,7 @@ class RunMonitor:
         self._single = [drone.name for drone in scenario.drones if drone.name not in in_formation]
         self._replayed = replayed
         self._ended = ""
+        self._members = {cluster.name: tuple(cluster.drones) for cluster in scenario.clusters}
         self.condition = RunCondition(replayed=replayed)
         self.board = AlarmBoard()
         self.flight = FlightMeter()
@@ -58,7 +59,9 @@ class RunMonitor:
         phases = {name: (view.phase, view.reason) for name, view in views.clusters.items()}
         state, silent_s = clock.state if clock else None, self._time_monitor.silent_s
         at_end = clock is not None and state == "paused" and clock.t_ns >= self.record_end_s * 1e9 - ROUNDING_NS
-        self.condition = RunCondition(state, silent_s, self._ended, self._replayed, at_end, drones, phases)
+        self.condition = RunCondition(
+            state, silent_s, self._ended, self._replayed, at_end, drones, phases, self._members
+        )
         self.board.update(self._alarms(), wall_s)
         return self.pending.pop_done(views.clusters, drones)
 

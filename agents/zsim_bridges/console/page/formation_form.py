@@ -11,7 +11,7 @@ from zsim.contract.views import ViewCluster
 from zsim.scenario.scenario import Cluster, Trajectory
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
-from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals
+from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals, is_held_by_fault
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
 from zsim_bridges.console.page.run_forms import refusal_lines, set_refusals
@@ -105,12 +105,13 @@ class VariableSlider:
 
 REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
-OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Land": "land"}
+OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
 LABELS = {**{op: label for label, op in OPERATIONS.items()}, "target": "sliders", "trajectory": "Trajectory"}
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
     "engage": viser.Icon.TRIANGLE,
     "hold": viser.Icon.HAND_STOP,
+    "rejoin": viser.Icon.ARROWS_JOIN,
     "land": viser.Icon.PLANE_ARRIVAL,
 }
 EXAMPLES = {
@@ -163,9 +164,17 @@ class FormationForm:
         """Grey out what the controller would refuse, with its reason; a slider shows all the same where it stands."""
         refusals = formation_refusals(run, self._cluster.name)
         set_refusals(self._controls, refusals)
+        self._offer_rejoin(run)
         for slider in self._sliders.values():
             slider.lock(bool(refusals["target"]))
-        self._reasons.content = refusal_lines(LABELS, refusals)
+        shown = {op: label for op, label in LABELS.items() if op != "rejoin" or self._controls[op].visible}
+        self._reasons.content = refusal_lines(shown, refusals)
+
+    def _offer_rejoin(self, run: RunCondition) -> None:
+        """Let Rejoin be there only while a fault holds the formation."""
+        held = is_held_by_fault(run, self._cluster.name)
+        if self._controls["rejoin"].visible != held:
+            self._controls["rejoin"].visible = held
 
     def refresh(self, view: ViewCluster | None, wall_s: float) -> None:
         """Let the sliders that were not moved follow the formation."""

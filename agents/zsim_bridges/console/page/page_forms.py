@@ -67,6 +67,11 @@ class PageForms:
         if form is not None:
             form.drone.choose(drone)
 
+    def chosen(self, client_id: int | None) -> str:
+        """Return the drone that one page has chosen; empty of one that is not open."""
+        form = self._forms.get(-1 if client_id is None else client_id)
+        return form.drone.chosen if form is not None else ""
+
     def move_rings(self, drones: DronePoses) -> None:
         """Put the ring of each page about the drone that it has chosen."""
         for form in list(self._forms.values()):

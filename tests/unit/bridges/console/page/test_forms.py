@@ -14,7 +14,7 @@ from zsim.contract.views import ViewCluster
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import KINDS
 from zsim.scenario.scenario import Scenario
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE
+from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, REJOINING
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition
@@ -272,6 +272,11 @@ def flown(phase: str = "engaged", reason: str = "", **more: Any) -> RunCondition
         (flown("assembling", READY_TO_ENGAGE), {"Take off", "Hold"}),
         (flown("held", HELD_ON_REQUEST), {"Take off", "Hold"}),
         (flown("held", "drone2 is in state landed"), {"Take off", "Engage", "Hold"}),
+        (flown("held", f"{REJOINING}: drone2"), {"Take off", "Engage", "Rejoin"}),
+        (
+            flown("held", "drone2 is in state landed", drones={"drone2": "landed"}, members={"main": ("drone2",)}),
+            {"Take off", "Engage", "Hold", "Rejoin"},
+        ),
         (flown(silent_s=79.0), {"Take off", "Engage", "Hold", "Land"}),
         (flown(ended="the run ended"), {"Take off", "Engage", "Hold", "Land"}),
         (flown(replayed=True), {"Take off", "Engage", "Hold", "Land"}),
@@ -279,11 +284,26 @@ def flown(phase: str = "engaged", reason: str = "", **more: Any) -> RunCondition
 )
 def test_a_formation_is_offered_what_its_controller_would_grant(bench: Bench, run: RunCondition, off: set[str]):
     bench.formation().offer(run)
-    locked = {label for label in OPERATIONS if bench.gui.at[label].disabled}
+    locked = {label for label in OPERATIONS if bench.gui.at[label].visible and bench.gui.at[label].disabled}
     assert locked == off
     assert all(bench.gui.at[label].hint for label in locked)
     steered = run.off() == "" and not run.replayed and run.phases["main"] in STEERED
     assert bench.gui.at["p [m]"].disabled is not steered
+
+
+@pytest.mark.parametrize(
+    ("run", "there"),
+    [
+        (flown("engaged"), False),
+        (flown("held", HELD_ON_REQUEST), False),
+        (flown("held", "roll of the formation is 60.0 deg"), True),
+    ],
+)
+def test_rejoin_is_there_while_a_fault_holds_the_formation(bench: Bench, run: RunCondition, there: bool):
+    form = bench.formation()
+    form.offer(run)
+    button = bench.gui.at["Rejoin"]
+    assert (button.visible, button.disabled and button.visible) == (there, False)
 
 
 STEERED = {("engaged", ""), ("held", HELD_ON_REQUEST)}
