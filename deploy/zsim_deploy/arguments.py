@@ -40,6 +40,13 @@ def not_negative(value: float | None) -> float | None:
     return value
 
 
+def finite(value: float | None) -> float | None:
+    """Return the value of an option that is None or a finite number."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"is {value:g}; must be a finite number")
+    return value
+
+
 def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
     """Refuse to begin without what a command needs.
 

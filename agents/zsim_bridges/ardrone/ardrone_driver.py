@@ -10,8 +10,8 @@ from zsim.transport.session import Session
 from zsim_bridges.ardrone.drive.aircraft_session import AircraftSession
 from zsim_bridges.ardrone.drive.navdata_readings import NavdataReadings
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.vehicle_links.driver_options import DriverOptions
-from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external
+from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_run
+from zsim_bridges.vehicle_links.driver_process import DriverProcess
 
 
 def drive(
@@ -37,7 +37,7 @@ def drive(
     Raises:
         RunError: the drone is not external, or the run does not keep the pace of the wall clock.
     """
-    check_external(info, options.drone)
+    check_run(info, observer.name, options.drone)
     scenario = scenario_file.from_text(info.scenario)
     place = options.origin_m or scenario.drone(options.drone).position_m
     origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m

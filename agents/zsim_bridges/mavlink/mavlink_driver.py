@@ -8,8 +8,8 @@ from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges.mavlink.drive.autopilot_session import AutopilotSession
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.vehicle_links.driver_options import DriverOptions
-from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external
+from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_run
+from zsim_bridges.vehicle_links.driver_process import DriverProcess
 from zsim_bridges.vehicle_links.vehicle_session import UdpChannel
 
 
@@ -40,7 +40,7 @@ def drive(
     Raises:
         RunError: the drone is not external, or the run does not keep the pace of the wall clock.
     """
-    check_external(info, options.drone)
+    check_run(info, observer.name, options.drone)
     drone = scenario_file.from_text(info.scenario).drone(options.drone)
     origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
     session = AutopilotSession(channel, origin, drone.takeoff_height_m, system, options.origin_m, key)

@@ -6,6 +6,7 @@ from zsim.contract.flight_messages import DroneState
 from zsim.math.rotation import LEVEL, Quaternion, Vector
 
 AIRBORNE: tuple[DroneState, ...] = ("hovering", "flying")
+STANDING: tuple[DroneState, ...] = ("landed", "emergency")  # states in which no rotor turns
 STILL: Vector = (0.0, 0.0, 0.0)
 
 

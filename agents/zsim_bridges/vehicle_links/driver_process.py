@@ -6,6 +6,7 @@ sockets, keys, and the event loop.
 
 import asyncio
 import contextlib
+import errno
 import math
 import time
 from collections.abc import Callable
@@ -17,20 +18,20 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED, ControlAnswer
 from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file
-from zsim.scenario.scenario import Drone
 from zsim.transport.session import Query, RawSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.vehicle_links.aircraft_state import AIRBORNE, AircraftState
+from zsim_bridges.vehicle_links.aircraft_state import AircraftState
 from zsim_bridges.vehicle_links.driver_clock import DriverClock
 from zsim_bridges.vehicle_links.driver_options import DriverOptions
-from zsim_bridges.vehicle_links.external_drone import ExternalDrone
+from zsim_bridges.vehicle_links.external_drone import ExternalDrone, hover_speed
 from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe
 from zsim_bridges.vehicle_links.vehicle_session import LinkFigures, UdpChannel, VehicleSession
 
 TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
 REPORT_S = 1.0  # s, wall; of the link's figures
 LANDING_S = 30.0  # s, wall; how long it waits for the aircraft to be down before it leaves
+PATIENCE_S = 5.0  # s, wall, chosen: heartbeats come once a second; then it prints what may be amiss
 Say = Callable[[str], None]
 
 
@@ -67,6 +68,8 @@ class DriverProcess:
         self._reported_s = 0.0
         self._reported: tuple[Connection, str, str] | None = None
         self._report_seq = self._ignored = 0
+        self._hint_s = time.monotonic() + PATIENCE_S
+        self._socket_fault = "nothing comes"
 
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Carry messages both ways until the run is over or a stop is requested; then land."""
@@ -86,12 +89,12 @@ class DriverProcess:
         for number, channel in enumerate(self._session.channels):
             try:
                 transport, _ = await loop.create_datagram_endpoint(
-                    lambda number=number: ChannelSocket(number, self._receive),
+                    lambda number=number: ChannelSocket(number, self._receive, self._on_socket_fault),
                     remote_addr=(channel.host, channel.port),
                     local_addr=_local(channel),
                 )
             except OSError as error:
-                raise RunError(f"{channel.host}:{channel.port} cannot be reached: {error.strerror or error}") from error
+                raise RunError(f"{self._observer.name}: {_not_opened(channel, error)}") from error
             self._sockets.append(transport)
 
     def _subscribe(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -116,6 +119,9 @@ class DriverProcess:
     def _receive(self, channel: int, datagram: bytes) -> None:
         self._session.receive(channel, datagram, self._clock.now_ns())
         self._external.add(self._session.take_readings())
+
+    def _on_socket_fault(self, error: OSError) -> None:
+        self._socket_fault = error.strerror or str(error)
 
     def _on_clock(self, _: str, payload: bytes) -> None:
         """Publish the gate that the world has reached."""
@@ -160,13 +166,14 @@ class DriverProcess:
             self._observer.health.refused += 1
             query.answer(ControlAnswer(False, str(error)))
             return
-        error = self._operate(request.op, now_ns)
+        source = request.source or "somebody"
+        error = self._operate(request.op, source, now_ns)
         query.answer(ControlAnswer(error is None, error or ""))
-        self._say(f"{self._observer.name}: {request.source or 'somebody'} asks {request.op}: {error or 'done'}")
+        self._say(f"{self._observer.name}: {source} asks {request.op}: {error or 'done'}")
         self._send()
         self._report(now_ns)
 
-    def _operate(self, op: str, now_ns: int) -> str | None:
+    def _operate(self, op: str, source: str, now_ns: int) -> str | None:
         """Do what an operator asks; return None, or why not."""
         match op:
             case "arm":
@@ -174,7 +181,7 @@ class DriverProcess:
             case "disarm":
                 return self._failsafe.disarm(self._session.state)
             case "kill":
-                self._failsafe.kill(now_ns)
+                self._failsafe.kill(now_ns, source)
                 return None
             case _:
                 return f"op is {op[:40]!r}; must be one of arm, disarm, kill"
@@ -187,8 +194,20 @@ class DriverProcess:
         for text in self._session.texts:
             self._say(f"{self._observer.name}: {text}")
         self._session.texts.clear()
+        self._hint()
         if time.monotonic() - self._reported_s > REPORT_S or self._reported != self._reported_now():
             self._report(self._clock.now_ns())
+
+    def _hint(self) -> None:
+        """Print once what may be amiss where an aircraft does not show itself."""
+        if time.monotonic() < self._hint_s:
+            return
+        self._hint_s = math.inf
+        if self._session.state.received_ns is None:
+            channel, refused = self._session.channels[0], self._session.figures(self._clock.now_ns()).refused
+            what = f"{refused} messages came that are not its own" if refused else self._socket_fault.lower()
+            advice = "check its address, its system id and key, and that it is switched on"
+            self._say(f"{self._observer.name}: no aircraft at {channel.host}:{channel.port} ({what}); {advice}")
 
     def _send(self) -> None:
         """Send the aircraft what is due."""
@@ -232,7 +251,7 @@ class DriverProcess:
         self._link.put(keys.link(self._drone), message)
 
     async def _land_and_leave(self, interrupted: bool) -> None:
-        """Land what still flies for this driver, and wait for it; another driver that took its place has it already."""
+        """Land what still flies for this driver, or stop it where it is killed; another driver in its place has it."""
         if self._observer.superseded:
             return
         reason = "its driver is stopped" if interrupted else self._observer.end_reason or RUN_ENDED
@@ -241,45 +260,36 @@ class DriverProcess:
         self._failsafe.land(reason, self._clock.now_ns())
         until_s = time.monotonic() + LANDING_S
         if self._failsafe.phase == "landing":
-            self._say(f"{self._observer.name}: {reason}; it lands")
-        while self._failsafe.phase == "landing" and time.monotonic() < until_s:
+            self._say(f"{self._observer.name}: {reason}; it lands; a second Ctrl-C leaves it to itself")
+        while (stopping := self._failsafe.is_stopping(self._session.state)) and time.monotonic() < until_s:
             self._tick()
             await asyncio.sleep(TICK_S)
-        if self._session.state.state in AIRBORNE and self._failsafe.armed:
-            self._say(f"{self._observer.name}: it is still in the air; take it over by hand")
+        if stopping:
+            state = self._session.state.state
+            self._say(f"{self._observer.name}: it is still {state} after {LANDING_S:g} s; take it over by hand")
 
 
 class ChannelSocket(asyncio.DatagramProtocol):
-    """Hands datagrams on, with the number of their channel."""
+    """Hands datagrams on, with the number of their channel, and the faults of sending."""
 
-    def __init__(self, number: int, receive: Callable[[int, bytes], None]) -> None:
-        self._number, self._receive = number, receive
+    def __init__(self, number: int, receive: Callable[[int, bytes], None], on_fault: Callable[[OSError], None]) -> None:
+        self._number, self._receive, self._on_fault = number, receive, on_fault
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         self._receive(self._number, data)
 
     def error_received(self, exc: Exception) -> None:
-        """Nobody listens there yet; what is due is sent again."""
+        """Note that nobody listens there yet; what is due is sent again."""
+        if isinstance(exc, OSError):
+            self._on_fault(exc)
 
 
-def check_external(info: Info, drone: str) -> None:
-    """Refuse a drone that has no driver, and a run at another pace than the wall clock's.
-
-    Raises:
-        RunError: with the reason.
-    """
-    bodies = {each.name: each.body for each in info.drones}
-    if drone not in bodies:
-        raise RunError(f"drone is {drone!r}; must be one of {', '.join(bodies)}")
-    if bodies[drone] != "external":
-        raise RunError(f"{drone} is simulated; a driver needs `body: external` of it in the scenario")
-    if info.mode != "realtime":
-        raise RunError("the run is in lockstep; a driver needs one that is started with --realtime")
-
-
-def hover_speed(drone: Drone, rotors: int, gravity_m_s2: float) -> float:
-    """Return the speed [rad/s] of each of so many rotors that carries a drone."""
-    return math.sqrt(drone.mass_kg * gravity_m_s2 / (rotors * drone.thrust_n_s2))
+def _not_opened(channel: UdpChannel, error: OSError) -> str:
+    """Return why there is no socket for a channel, and what to do."""
+    why = error.strerror or str(error)
+    if error.errno == errno.EADDRINUSE:
+        return f"UDP port {channel.local_port} here cannot be had: {why}; give another --local-port, or end who has it"
+    return f"{channel.host}:{channel.port} cannot be reached: {why}; give the address of the aircraft"
 
 
 def _local(channel: UdpChannel) -> tuple[str, int] | None:

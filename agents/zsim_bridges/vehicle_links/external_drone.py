@@ -1,16 +1,17 @@
 """A real aircraft's readings as the messages of one drone, gate by gate. Pure."""
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
 from zsim.contract import flight_messages, keys
+from zsim.scenario.scenario import Drone
 from zsim.sensors.sensor_catalogue import STOCK
-from zsim_bridges.vehicle_links.aircraft_state import STILL, AircraftPose, AircraftState, Reading
+from zsim_bridges.vehicle_links.aircraft_state import STANDING, STILL, AircraftPose, AircraftState, Reading
 
 WAITING_MAX = 4000  # readings, 10 s of an IMU at 200 Hz and all else; then the oldest go
 EXTRAPOLATED_NS = 500_000_000  # chosen: how old a pose may be; it then says where the aircraft was, not where it is
-STANDING = ("landed", "emergency")  # states in which no rotor turns
 
 
 class ExternalDrone:
@@ -73,3 +74,8 @@ class ExternalDrone:
     def _next(self, key: str) -> int:
         self._seq[key] = self._seq.get(key, -1) + 1
         return self._seq[key]
+
+
+def hover_speed(drone: Drone, rotors: int, gravity_m_s2: float) -> float:
+    """Return the speed [rad/s] of each of so many rotors that carries a drone."""
+    return math.sqrt(drone.mass_kg * gravity_m_s2 / (rotors * drone.thrust_n_s2))

@@ -5,7 +5,8 @@ The rules, for the clock of the run:
 - Nothing before an operator has armed the driver on purpose.
 - No setpoint for `silence.hover_s`: it holds. For `silence.land_s` more: it lands.
 - The world silent for as long, whoever flies: it lands.
-- Outside the fence: it lands. Killed: its motors stop, until it is armed again.
+- Outside the fence: it lands; from there it does not take off.
+- Killed, by an operator or an accepted emergency, armed or not: its motors stop, and it is disarmed.
 - Down without a command to land: disarmed. A commander that asks for take-off again and again starts no motor then.
 """
 
@@ -16,7 +17,7 @@ from zsim.contract import flight_messages
 from zsim.math.frames import heading
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Silence
-from zsim_bridges.vehicle_links.aircraft_state import AIRBORNE, STILL, AircraftState
+from zsim_bridges.vehicle_links.aircraft_state import AIRBORNE, STANDING, STILL, AircraftState
 from zsim_bridges.vehicle_links.flight_limits import FlightLimits
 
 TAKEOFF_S = 20.0  # chosen: four times what an AR.Drone takes; then it is given up
@@ -80,16 +81,20 @@ class Failsafe:
 
     def disarm(self, vehicle: AircraftState) -> str | None:
         """Obey no longer; return None, or why not."""
-        if vehicle.state not in ("landed", "emergency"):
+        if vehicle.state not in STANDING:
             return f"the aircraft is {vehicle.state}; land first, or kill"
         self.armed, self.phase = False, "idle"
         return None
 
-    def kill(self, now_ns: int) -> None:
-        """Stop the motors, armed or not, until it is armed again."""
+    def kill(self, now_ns: int, source: str) -> None:
+        """Stop the motors, armed or not, and be disarmed."""
         self.armed = False
         self._enter("killed", now_ns)
-        self.reason = "killed by an operator"
+        self.reason = f"killed by {source}"
+
+    def is_stopping(self, vehicle: AircraftState) -> bool:
+        """Tell whether a landing or a stop of the motors goes on."""
+        return self.phase == "landing" or (self.phase == "killed" and vehicle.state not in STANDING)
 
     def land(self, reason: str, now_ns: int) -> None:
         """Land, if it flies for this driver."""
@@ -105,9 +110,14 @@ class Failsafe:
 
     def on_command(self, command: flight_messages.Command, now_ns: int, vehicle: AircraftState) -> str | None:
         """Take an accepted command; return None, or why it is not obeyed."""
-        if not self.armed:
-            return "its driver is not armed; an operator asks `arm` of it"
         match command:
+            case flight_messages.Mode(mode="emergency"):
+                self.kill(now_ns, command.source)
+                return None
+            case flight_messages.Mode(mode="reset"):
+                return self._reset(now_ns, vehicle)
+            case _ if not self.armed:
+                return "its driver is not armed; an operator asks `arm` of it"
             case flight_messages.Mode():
                 return self._on_mode(command.mode, now_ns, vehicle)
             case flight_messages.Velocity():
@@ -120,16 +130,22 @@ class Failsafe:
                 return f"a driver does not take {type(command).__name__}; send velocity"
 
     def _on_mode(self, mode: str, now_ns: int, vehicle: AircraftState) -> str | None:
-        if mode == "takeoff":
-            if vehicle.state != "landed":
-                return f"the aircraft is {vehicle.state}; a take-off needs it landed"
-            self._setpoint = self.commander = None
-            self._enter("taking_off", now_ns)
-        elif mode == "land":
+        if mode == "land":
             self._enter("landing", now_ns)
-        elif mode == "emergency":
-            self._enter("killed", now_ns)
-        elif self.phase == "killed":
+            return None
+        if vehicle.state != "landed":
+            return f"the aircraft is {vehicle.state}; a take-off needs it landed"
+        if self._is_outside(vehicle):
+            return "the aircraft stands outside the fence; carry it inside, or start the driver with another fence"
+        self._setpoint = self.commander = None
+        self._enter("taking_off", now_ns)
+        return None
+
+    def _reset(self, now_ns: int, vehicle: AircraftState) -> str | None:
+        """Leave the emergency, once no motor turns; return None, or why not."""
+        if self.is_stopping(vehicle):
+            return f"the aircraft is {vehicle.state}; its motors are being stopped"
+        if self.phase == "killed":
             self._enter("idle", now_ns)
         return None
 
@@ -157,7 +173,9 @@ class Failsafe:
             self._enter("airborne", now_ns)
         elif self.phase == "taking_off" and now_ns - self._began_ns > TAKEOFF_S * 1e9:
             self.land(f"the take-off took longer than {TAKEOFF_S:g} s", now_ns)
-        elif self.phase == "landing" and vehicle.state in ("landed", "emergency") and self._settled(now_ns):
+        elif self.phase == "taking_off":
+            self._watch_bounds(now_ns, vehicle)
+        elif self.phase == "landing" and vehicle.state in STANDING and self._settled(now_ns):
             self._settle(now_ns)
         elif self.phase == "idle" and self.armed and airborne:
             self._enter("airborne", now_ns)  # a driver that is started again in flight
@@ -178,12 +196,20 @@ class Failsafe:
         if vehicle.state == "landed" and self._settled(now_ns):
             self.reason, self._uncommanded = "the aircraft landed without a command", True
             self._settle(now_ns)
-        elif vehicle.pose is not None and self._limits.is_breached(vehicle.pose.position_m):
-            self.land("it is outside the fence", now_ns)
         elif self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:
             self.land(f"{self.commander} is silent", now_ns)
+        else:
+            self._watch_bounds(now_ns, vehicle)
+
+    def _watch_bounds(self, now_ns: int, vehicle: AircraftState) -> None:
+        """Land outside the fence, and without the world, also during a take-off."""
+        if self._is_outside(vehicle):
+            self.land("it is outside the fence", now_ns)
         elif now_ns - max(self._clock_ns, self._began_ns) > self._land_ns:
             self.land("the world is silent", now_ns)
+
+    def _is_outside(self, vehicle: AircraftState) -> bool:
+        return vehicle.pose is not None and self._limits.is_breached(vehicle.pose.position_m)
 
     def _airborne(self, now_ns: int, vehicle: AircraftState) -> Demand:
         setpoint, pose = self._setpoint, vehicle.pose

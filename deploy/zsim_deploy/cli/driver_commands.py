@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_deploy.arguments import WorldAccess, participant_options, positive
+from zsim_deploy.arguments import WorldAccess, finite, participant_options, positive
 from zsim_deploy.cli.mavlink_commands import read_key
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ Speed = Annotated[float, typer.Option(callback=positive, help="Greatest horizont
 Climb = Annotated[float, typer.Option(callback=positive, help="Greatest vertical speed, m/s.")]
 Radius = Annotated[float | None, typer.Option(callback=positive, help="Fence about the origin of W, m.")]
 Ceiling = Annotated[float | None, typer.Option(callback=positive, help="Greatest height over the origin of W, m.")]
-Name = Annotated[str, typer.Option(help="Process name (default driver.DRONE, or the certificate's).")]
 
 
 @participant_options
@@ -41,7 +40,6 @@ def drive_mavlink(
     climb: Climb = 1.0,
     radius: Radius = None,
     ceiling: Ceiling = None,
-    name: Name = "",
 ) -> None:
     """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
     from zsim_bridges.mavlink.mavlink_driver import drive
@@ -50,7 +48,7 @@ def drive_mavlink(
     options = _options(drone, (speed, climb), (radius, ceiling), armed, origin, None)
     channel = udp_channel(address, local_port)
     key = read_key(signing_key) if signing_key else None
-    _serve(partial(drive, options=options, channel=channel, system=system, key=key), reach, drone, name)
+    _serve(partial(drive, options=options, channel=channel, system=system, key=key), reach, drone)
 
 
 @participant_options
@@ -62,20 +60,21 @@ def drive_ardrone(
         str | None, typer.Option(help="Where it stands at the start, X,Y,Z m in W (default: the scenario's place).")
     ] = None,
     yaw: Annotated[
-        float | None, typer.Option(help="Its heading at the start, deg from east (default: by its magnetometer).")
+        float | None,
+        typer.Option(callback=finite, help="Its heading at the start, deg from east (default: by its magnetometer)."),
     ] = None,
     armed: Armed = False,
     speed: Speed = 2.0,
     climb: Climb = 1.0,
     radius: Radius = None,
     ceiling: Ceiling = None,
-    name: Name = "",
 ) -> None:
     """Let an AR.Drone 2.0 fly as a drone of the run."""
     from zsim_bridges.ardrone.ardrone_driver import drive
+    from zsim_bridges.vehicle_links.driver_options import aircraft_host
 
     options = _options(drone, (speed, climb), (radius, ceiling), armed, origin, yaw)
-    _serve(partial(drive, options=options, address=address), reach, drone, name)
+    _serve(partial(drive, options=options, address=aircraft_host(address)), reach, drone)
 
 
 def _options(
@@ -95,8 +94,8 @@ def _options(
     return DriverOptions(drone, limits, armed, position(origin) if origin else None, yaw_deg)
 
 
-def _serve(drive: "Serve", reach: WorldAccess, drone: str, name: str) -> None:
+def _serve(drive: "Serve", reach: WorldAccess, drone: str) -> None:
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import serve_runs
 
-    serve_runs(process_name("driver", name, reach.who, drone), drive, reach)
+    serve_runs(process_name("driver", "", reach.who, drone), drive, reach)

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from fake_link import FakeLink
+from refused import has_terms
 
 from zsim.contract import flight_messages, keys, messages
 from zsim.contract.messages import DroneInfo, Info, Origin
@@ -14,9 +15,17 @@ from zsim.contract.run_messages import Clock, Event
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.vehicle_links import driver_process
 from zsim_bridges.vehicle_links.aircraft_state import AircraftPose, AircraftState, Reading
-from zsim_bridges.vehicle_links.driver_options import DriverOptions, position, udp_channel
-from zsim_bridges.vehicle_links.driver_process import DriverProcess, check_external, hover_speed
+from zsim_bridges.vehicle_links.driver_options import (
+    DriverOptions,
+    aircraft_host,
+    check_run,
+    position,
+    udp_channel,
+)
+from zsim_bridges.vehicle_links.driver_process import DriverProcess
+from zsim_bridges.vehicle_links.external_drone import hover_speed
 from zsim_bridges.vehicle_links.failsafe import Demand
 from zsim_bridges.vehicle_links.vehicle_session import LinkFigures, UdpChannel
 
@@ -206,6 +215,70 @@ def test_kill_reaches_the_aircraft_at_once_and_shows():
     fly(test)
 
 
+def test_a_stop_of_the_motors_goes_on_after_the_run_until_they_stand():
+    async def test() -> None:
+        async with Flight(armed=True) as flight:
+            flight.aircraft.state = "flying"
+            await flight.aircraft.until("hold")
+            assert (await flight.answered("kill")).ok
+            flight.stop = True
+            for _ in range(20):
+                await flight.aircraft.next()
+            assert not flight.task.done()
+            assert flight.aircraft.demands[-1] == "kill"
+            flight.aircraft.state = "landed"
+            await asyncio.wait_for(flight.task, 30)
+
+    fly(test)
+
+
+def test_who_cannot_land_is_left_to_a_person_with_a_line(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(driver_process, "LANDING_S", 0.1)
+
+    async def test() -> None:
+        async with Flight(armed=True) as flight:
+            flight.aircraft.state = "flying"
+            await flight.aircraft.until("hold")
+            flight.aircraft.state, flight.stop = "landing", True
+            await asyncio.wait_for(flight.task, 30)
+            assert has_terms(flight.lines[-1], ME, "landing", "by hand")
+
+    fly(test)
+
+
+def test_an_aircraft_that_does_not_show_itself_is_reported_once_with_the_reason(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(driver_process, "PATIENCE_S", 0.0)
+
+    async def test() -> None:
+        link, lines = FakeLink(), []
+        observer = ObserverProcess(link, info(), ME)  # type: ignore[arg-type]
+        stopped = iter([False] * 30)
+        args: Any = link, info(), observer, DriverOptions("drone2"), Session(9), lines.append
+        await DriverProcess(*args).run(lambda: next(stopped, True))
+        (hint,) = (line for line in lines if "127.0.0.1:9" in line)
+        assert has_terms(hint, ME, "address")
+
+    fly(test)
+
+
+@pytest.mark.parametrize("taken", [True, False])
+def test_a_socket_that_cannot_be_had_is_refused_with_what_to_change(taken: bool):
+    async def test() -> None:
+        loop = asyncio.get_running_loop()
+        other, _ = await loop.create_datagram_endpoint(asyncio.DatagramProtocol, local_addr=("0.0.0.0", 0))
+        port = other.get_extra_info("sockname")[1] if taken else 0
+        session = Session(9)
+        session.channels = (UdpChannel("127.0.0.1" if taken else "nowhere.invalid", 9, port),)
+        link = FakeLink()
+        observer = ObserverProcess(link, info(), ME)  # type: ignore[arg-type]
+        args: Any = link, info(), observer, DriverOptions("drone2"), session, print
+        with pytest.raises(RunError, match=f"{port}.*--local-port" if taken else "nowhere.invalid.*address"):
+            await DriverProcess(*args).run(lambda: True)
+        other.close()
+
+    fly(test)
+
+
 def test_a_driver_whose_place_another_has_taken_does_not_land_the_aircraft():
     async def test() -> None:
         async with Flight(armed=True) as flight:
@@ -238,14 +311,15 @@ def test_what_is_no_request_is_answered_with_the_reason(name: str):
 
 
 def test_what_cannot_be_driven_is_refused():
-    for drone, run, term in (
-        ("ghost", info(), "drone1, drone2"),
-        ("drone1", info(), "body: external"),
-        ("drone2", info("lockstep"), "--realtime"),
+    for drone, run, name, term in (
+        ("ghost", info(), ME, "drone1, drone2"),
+        ("drone1", info(), ME, "body: external"),
+        ("drone2", info("lockstep"), ME, "--realtime"),
+        ("drone2", info(), "driver.drone1", ME),
     ):
         with pytest.raises(RunError, match=term):
-            check_external(run, drone)
-    check_external(info(), "drone2")
+            check_run(run, name, drone)
+    check_run(info(), ME, "drone2")
 
 
 def test_addresses_and_places():
@@ -254,9 +328,13 @@ def test_addresses_and_places():
     for bad in ("", "192.168.1.20", "tcp://a:1", "udp://a", "udp://:14540", "udp://a:x", "udp://a:99999"):
         with pytest.raises(RunError):
             udp_channel(bad)
-    for bad in ("", "1,2", "1,2,x", "1 2 3"):
+    for bad in ("", "1,2", "1,2,x", "1 2 3", "nan,0,0", "0,inf,0"):
         with pytest.raises(RunError):
             position(bad)
+    assert [aircraft_host(good) for good in ("192.168.1.12", "drone-2.local")] == ["192.168.1.12", "drone-2.local"]
+    for bad in ("", "udp://192.168.1.12", "192.168.1.12:5556", "-a", "a b"):
+        with pytest.raises(RunError):
+            aircraft_host(bad)
 
 
 def test_the_link_is_a_message_of_the_contract():

@@ -152,6 +152,22 @@ def test_outside_the_fence_it_lands():
     assert flight.after(0.1) == "land"
 
 
+def test_a_takeoff_is_watched_as_a_flight():
+    flight = Flight()
+    flight.position = (11.5, 0, 0)
+    assert flight.mode("takeoff")
+    flight.position = (0, 0, 0)
+    assert flight.mode("takeoff") is None
+    assert flight.after(1) == "take_off"
+    flight.position = (11.5, 0, 1)
+    assert flight.after(0.1) == "land"
+    other = Flight()
+    other.mode("takeoff")
+    other.hears_clock = False
+    assert other.after(2.0) == "take_off"
+    assert other.after(1.0) == "land"
+
+
 def test_a_driver_that_begins_in_flight_holds():
     flight = Flight(state="flying")
     assert flight.after(0.1) == "hold"
@@ -162,7 +178,7 @@ def test_a_driver_that_begins_in_flight_holds():
 def test_kill_stops_the_motors_armed_or_not_until_it_is_armed_again():
     for armed in (True, False):
         flight = Flight(armed=armed, state="flying")
-        flight.failsafe.kill(flight.now_ns)
+        flight.failsafe.kill(flight.now_ns, "operator")
         assert flight.after(5) == "kill"
         flight.state = "landed"
         assert flight.after(5) == "kill"
@@ -171,13 +187,21 @@ def test_kill_stops_the_motors_armed_or_not_until_it_is_armed_again():
         assert flight.after(0.1) == "none"
 
 
-def test_an_emergency_is_left_by_reset():
-    flight = Flight().takes_off()
-    flight.mode("emergency")
+@pytest.mark.parametrize("armed", [True, False])
+def test_an_accepted_emergency_stops_the_motors_armed_or_not_and_disarms(armed: bool):
+    flight = Flight(armed=armed, state="flying")
+    assert flight.mode("emergency") is None
     assert flight.after(1) == "kill"
+    assert "controller.main" in flight.failsafe.reason
+    assert flight.mode("reset")  # its motors still turn
+    assert flight.after(0.1) == "kill"
+    flight.state = "emergency"
+    assert flight.mode("reset") is None
     flight.state = "landed"
-    flight.mode("reset")
-    assert flight.after(1) == "none"
+    assert flight.after(0.1) == "none"
+    assert flight.mode("takeoff")
+    assert flight.failsafe.arm(flight.now_ns, flight.vehicle) is None
+    flight.takes_off()
 
 
 def test_it_is_disarmed_on_the_ground_alone():
