@@ -8,13 +8,13 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 
+from rich.box import HEAVY_HEAD
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from zsim.errors import RecordError, ReportError, printable
 from zsim.record.record_reader import RECORD
-from zsim.runtime.progress import cell
+from zsim.terminal.fitted_table import Column, FittedTable
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.flight import RecordedFlight, read_flight
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
@@ -40,6 +40,15 @@ NAMED, NAMES_MAX = 3, 100  # runs whose names the page's own name holds, and cha
 MARK, MARK_WITHIN = b": comparison</title>", 4_000  # of a page of ours, within its first bytes
 PAPER_COLUMN = "paper std"
 COLUMNS = ("parameter", PAPER_COLUMN, "est. std", "est. mean", "true std", "true RMS", "true mean")
+TERMINAL_COLUMNS = {
+    "parameter": Column("parameter", "name"),
+    PAPER_COLUMN: Column("paper\nstd", worth=4, right=True),
+    "est. std": Column("est.\nstd", worth=3, right=True),
+    "est. mean": Column("est.\nmean", worth=1, right=True),
+    "true std": Column("true\nstd", right=True),
+    "true RMS": Column("true\nRMS", right=True),
+    "true mean": Column("true\nmean", worth=2, right=True),
+}
 NOT_AS_PLANNED = "NOT AS PLANNED"
 
 
@@ -150,7 +159,7 @@ def marks_of(summary: RunSummary) -> list[tuple[str, bool]]:
     ]
 
 
-def table(summary: RunSummary, cluster: str) -> Table:
+def table(summary: RunSummary, cluster: str) -> FittedTable:
     """Return the errors of one cluster, with the paper's Table I beside Test 1, for the terminal."""
     start, end = summary.window_s
     judged = summary.clusters[cluster]
@@ -158,13 +167,8 @@ def table(summary: RunSummary, cluster: str) -> Table:
     beside = ", beside Table I of the paper" if judged.paper_std else ""
     mark = "" if summary.as_planned else f" ({NOT_AS_PLANNED})"
     caption = "est. = estimate − desired, true = truth − desired"
-    shown = Table(title=cell(f"{title}{beside}{mark}"), caption=caption, title_justify="left")
-    for column in columns(judged):
-        is_name = column == COLUMNS[0]
-        shown.add_column(column, justify="left" if is_name else "right", no_wrap=is_name, min_width=5)
-    for row in rows(judged):
-        shown.add_row(*map(cell, row))
-    return shown
+    shown = [TERMINAL_COLUMNS[column] for column in columns(judged)]
+    return FittedTable(shown, rows(judged), f"{title}{beside}{mark}", caption, lines=HEAVY_HEAD)
 
 
 def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) -> str:

@@ -25,6 +25,7 @@ SWEEP_NEEDS = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "
 DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
 WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy", Format.FOXGLOVE: "foxglove"}
 
+GATE = "a gate: an instant at which the processes meet"
 app = typer.Typer()
 Place = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)]
 
@@ -73,7 +74,7 @@ def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
 
 def _show_record(complete: bool, state: str) -> str:
     """Print whether a record is complete; return what it lacks, empty if nothing."""
-    print(printable(f"record: {state}"))
+    print(printable(f"record: {state}{f' ({GATE})' if 'gates' in state else ''}"))
     return "" if complete else f"the record is {state}"
 
 
