@@ -1,6 +1,6 @@
 """A picture of a recorded formation, by a camera that follows it; docs/pictures/formation.jpg is one.
 
-    python examples/formation_picture.py runs/first 60 formation.jpg
+    python examples/formation_picture.py runs/first formation.jpg 60
 
 The camera is carried by a drone that nobody sees: it hangs behind the formation and above it, and looks at its middle.
 """
@@ -45,8 +45,8 @@ class Instant(NamedTuple):
     states: DroneStates
 
 
-def recorded(record: Path, t_ns: int) -> Instant:
-    """Return the drones at the first gate from t_ns on.
+def recorded(record: Path, t_ns: int | None) -> Instant:
+    """Return the drones at the first gate from t_ns on, None: at the last one.
 
     Raises:
         SystemExit: the record ends before it.
@@ -55,10 +55,14 @@ def recorded(record: Path, t_ns: int) -> Instant:
         info = msgspec.msgpack.decode(next(m.payload for m in reader.messages([keys.INFO])), type=Info)
         names = [drone.name for drone in info.drones]
         wanted = [keys.truth(name) for name in names]
-        come = (message for message in reader.messages(wanted, from_ns=t_ns) if message.t_ns >= t_ns)
-        payloads = {message.key: message.payload for message in islice(come, len(names))}  # a gate has one of each
-    if payloads.keys() < set(wanted):
-        raise SystemExit(f"{record}: ends before {t_ns / 1e9:g} s; look at an earlier instant")
+        if t_ns is None:
+            last = (reader.last(key) for key in wanted)
+            payloads = {message.key: message.payload for message in last if message}
+        else:
+            come = (message for message in reader.messages(wanted, from_ns=t_ns) if message.t_ns >= t_ns)
+            payloads = {message.key: message.payload for message in islice(come, len(names))}  # a gate has one of each
+    if payloads.keys() != set(wanted):
+        raise SystemExit(f"{record}: ends before that instant; look at an earlier one, or leave it out for the last")
     truths = [msgspec.msgpack.decode(payloads[key], type=Truth) for key in wanted]
     return Instant(names, scene_of(info, scenario_file.from_text(info.scenario)), states(truths))
 
@@ -121,10 +125,14 @@ def label(drawn: Picture, text: str, at: Array) -> None:
 
 
 def main() -> None:
-    if len(sys.argv) != 4:
-        raise SystemExit("usage: python examples/formation_picture.py DIR SECONDS PICTURE    e.g. runs/first 60 a.jpg")
-    place, seconds, out = Path(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
-    cv2.imwrite(out, picture(recorded(record_at(place), round(seconds * 1e9)), seconds), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    if len(sys.argv) not in (3, 4):
+        raise SystemExit(
+            "usage: python examples/formation_picture.py DIR PICTURE [SECONDS]    e.g. runs/first a.jpg 60"
+        )
+    place, out = Path(sys.argv[1]), sys.argv[2]
+    seconds = float(sys.argv[3]) if len(sys.argv) > 3 else None
+    instant = recorded(record_at(place), None if seconds is None else round(seconds * 1e9))
+    cv2.imwrite(out, picture(instant, seconds or 0.0), [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
 if __name__ == "__main__":

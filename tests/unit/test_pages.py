@@ -20,7 +20,3 @@ def test_a_gate_is_defined_where_it_is_first_read(page: str) -> None:
 def test_a_run_that_counts_gates_says_what_one_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert record_commands._show_record(True, "complete: 10 gates") == ""
     assert "gate: an instant" in capsys.readouterr().out
-
-
-def test_the_first_page_stays_short() -> None:
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
