@@ -108,7 +108,7 @@ def test_table_figures_page_and_exit_code_show_it(tmp_path: Path, capsys: pytest
     flight, formations, summary = judge(tmp_path / "run.mcap")
     assert not summary.as_planned
     assert any(fails and NOT_AS_PLANNED in mark for mark, fails in marks_of(summary.shortfalls))
-    assert NOT_AS_PLANNED in str(table(summary, "main").title)
+    assert NOT_AS_PLANNED in (table(summary, "main").title or "")
     for figure in figures(flight, formations, summary):
         assert "too fast" in " ".join(figure.drawing.get_suptitle().split())  # on as many lines as it takes
     assert "too fast" in page(summary, [])
