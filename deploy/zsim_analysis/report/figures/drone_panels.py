@@ -1,6 +1,6 @@
 """Altitude, state of the firmware and battery of every drone, on one time axis."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -80,7 +80,7 @@ def drone_panel_heights(count: int) -> tuple[float, float, float]:
     return 3.0, 0.5 + min(0.28 * count, LANES_IN), 2.0
 
 
-def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: dict[str, str], named: int) -> None:
+def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: Mapping[str, str], named: int) -> None:
     """Draw drones into the axes of DRONE_PANELS.
 
     Args:

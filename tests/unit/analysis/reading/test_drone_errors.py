@@ -14,6 +14,7 @@ from synthetic_record import Flown
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate, Status, Truth, Velocity
 from zsim.record import RecordWriter
+from zsim.schema.message import Vector3
 from zsim_analysis.reading.distances import distances, separations
 from zsim_analysis.reading.drone_errors import YAW, estimate_errors, nees, velocity_responses
 from zsim_analysis.reading.flight import FlightReader, read_flight
@@ -44,12 +45,14 @@ def traffic(flown: Flown) -> Iterator[tuple[str, Any, int]]:
 def estimate_of(truth: Truth) -> Estimate:
     w, _, _, z = truth.orientation_wxyz
     yaw = 2 * math.atan2(z, w) + YAW_RAD
-    position, velocity = (
-        tuple(a + b for a, b in zip(*pair, strict=True))
-        for pair in ((truth.position_m, OFFSET_M), (truth.velocity_m_s, VELOCITY_M_S))
-    )
-    pose = (position, velocity, truth.orientation_wxyz, math.remainder(yaw, 2 * math.pi))
+    position, velocity = moved(truth.position_m, OFFSET_M), moved(truth.velocity_m_s, VELOCITY_M_S)
+    heading = math.remainder(yaw, 2 * math.pi)
+    pose = (position, velocity, truth.orientation_wxyz, heading)
     return Estimate(truth.t_ns, truth.seq, *pose, COVARIANCE, SIGMA_RAD, (0.0, 0.0, 0.0), {})
+
+
+def moved(vector: Vector3, by: Vector3) -> Vector3:
+    return vector[0] + by[0], vector[1] + by[1], vector[2] + by[2]
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from zsim_analysis.reading.drone_errors import EstimateErrors, VelocityResponse
 from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
 from zsim_analysis.reading.goal import goal_errors
+from zsim_analysis.reading.recorded_flight import Array
 from zsim_analysis.report import FORMATS
 from zsim_analysis.report.figures.estimate_figures import draw_estimates
 from zsim_analysis.report.figures.formation_figures import ROWS_MAX, draw_errors, draw_parameters
@@ -66,7 +67,7 @@ def large(count: int) -> Formation:
     """Return a formation of so many drones whose variables err by their number in millimetres."""
     own = [f"{what}_{i}" for i in range(1, count) for what in ("w", "h", "v", "phi")]
     named = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", *own)[: 4 * count]
-    error = np.tile(1e-3 * np.arange(len(named)), (len(T_S), 1))
+    error: Array = np.tile(1e-3 * np.arange(len(named)), (len(T_S), 1))
     desired = np.outer(T_S, np.arange(len(named), 0, -1.0))
     pair = (desired, desired + error, desired + error, error, error)
     return Formation("main", tuple(names(count)), named, T_S, *pair, ["engaged"] * len(T_S))
@@ -78,7 +79,7 @@ def fits(figure: Figure) -> None:
     assert width in (COLUMN_IN, PAGE_IN)
     assert height <= PAGE_HEIGHT_IN
     figure.draw_without_rendering()
-    sizes = {text.get_fontsize() for text in figure.findobj(Text) if isinstance(text, Text) and text.get_text()}
+    sizes = {float(text.get_fontsize()) for text in figure.findobj(Text) if isinstance(text, Text) and text.get_text()}
     assert READABLE_PT <= min(sizes) <= max(sizes) <= PAPER_PT
     box = figure.bbox
     for legend in figure.legends:
