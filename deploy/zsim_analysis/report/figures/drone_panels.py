@@ -30,7 +30,7 @@ from zsim_analysis.report.pages import (
     text_pt,
 )
 
-LANES_IN = 8.0  # of states: half of it on the page; more drones share it
+LANES_IN = 5.0  # of states: half of it on the page; more drones share it
 LANES_NAMED = 12  # of them, at most
 DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
 STATES = {
@@ -97,7 +97,7 @@ def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: 
         draw_states(state, track, lane)
     step = -(-len(tracks) // LANES_NAMED)
     state.set_yticks(range(0, len(tracks), step), [track.name for track in tracks[::step]])
-    state.invert_yaxis()
+    state.set_ylim(len(tracks) - 0.5, -0.5)
     state.grid(False)
     label_time([battery])
 

@@ -15,6 +15,7 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate, Status, Truth, Velocity
 from zsim.record import RecordWriter
 from zsim.schema.message import Vector3
+from zsim_analysis.reading import drone_errors
 from zsim_analysis.reading.distances import distances, separations
 from zsim_analysis.reading.drone_errors import YAW, estimate_errors, nees, velocity_responses
 from zsim_analysis.reading.flight import FlightReader, read_flight
@@ -73,6 +74,17 @@ def test_errors_of_estimates_and_what_is_stated_of_them(flight: RecordedFlight) 
         assert each.sigma[0] == pytest.approx([SIGMA_M] * 3 + [SIGMA_RAD], rel=1e-6)
         assert each.nees == pytest.approx(NEES, rel=1e-3)
         assert each.share_inside(np.ones(151, bool)).tolist() == [1.0, 0.0, 1.0, 0.0]
+
+
+def test_of_very_many_estimates_the_same_instants_of_all_drones_count(
+    flight: RecordedFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = estimate_errors(flight)
+    monkeypatch.setattr(drone_errors, "ESTIMATES_MAX", 200)  # of 3 x 151
+    some = estimate_errors(flight)
+    for name, each in some.items():
+        assert each.t_s == pytest.approx(whole[name].t_s[::3])
+        assert each.error == pytest.approx(whole[name].error[::3])
 
 
 def test_nees_of_a_covariance_that_is_none_is_not_known() -> None:

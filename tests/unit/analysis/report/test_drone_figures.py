@@ -16,7 +16,6 @@ from zsim_analysis.reading.drone_errors import EstimateErrors, VelocityResponse
 from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
 from zsim_analysis.reading.goal import goal_errors
-from zsim_analysis.reading.recorded_flight import Array
 from zsim_analysis.report import FORMATS
 from zsim_analysis.report.figures.estimate_figures import draw_estimates
 from zsim_analysis.report.figures.formation_figures import ROWS_MAX, draw_errors, draw_parameters
@@ -67,7 +66,7 @@ def large(count: int) -> Formation:
     """Return a formation of so many drones whose variables err by their number in millimetres."""
     own = [f"{what}_{i}" for i in range(1, count) for what in ("w", "h", "v", "phi")]
     named = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", *own)[: 4 * count]
-    error: Array = np.tile(1e-3 * np.arange(len(named)), (len(T_S), 1))
+    error = np.tile(1e-3 * np.arange(len(named)), (len(T_S), 1)).astype(np.float64)
     desired = np.outer(T_S, np.arange(len(named), 0, -1.0))
     pair = (desired, desired + error, desired + error, error, error)
     return Formation("main", tuple(names(count)), named, T_S, *pair, ["engaged"] * len(T_S))
