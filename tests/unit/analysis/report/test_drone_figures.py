@@ -1,8 +1,10 @@
 """Figures for a paper: of few drones one by one, of many as their spread; each fits the page of a conference paper."""
 
 import re
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import synthetic_record
@@ -22,8 +24,9 @@ from zsim_analysis.report.figures.formation_figures import ROWS_MAX, draw_errors
 from zsim_analysis.report.figures.motion_figures import draw_distances, draw_velocities
 from zsim_analysis.report.figures.spread import INSTANTS, draw_spread
 from zsim_analysis.report.figures.time_marks import TimeMarks
+from zsim_analysis.report.make_report import page
 from zsim_analysis.report.pages import COLUMN_IN, PAGE_IN, PAPER_PT, ReportFigure, new_figure
-from zsim_analysis.report.summary import ClusterErrors
+from zsim_analysis.report.summary import ClusterErrors, summarise
 from zsim_analysis.report.tables import error_table
 
 PAGE_HEIGHT_IN = 9.25  # of the text of an IEEE page
@@ -179,3 +182,20 @@ def test_vector_files_have_true_fonts_and_the_same_bytes_each_time() -> None:
     size = re.search(rb'<svg [^>]*width="([\d.]+)pt"', files["svg"])
     assert size is not None
     assert float(size[1]) == pytest.approx(72 * COLUMN_IN)
+
+
+def test_a_page_of_a_large_formation_has_all_its_parameters_behind_the_figures() -> None:
+    each = ParameterErrors(0.1, 0.1, 0.0, 0.2, 0.2, 0.0)
+    reader = FlightReader()
+    for key, message, wall_ns in synthetic_record.traffic(
+        Flown(duration_s=2.0, end={"reason": "over", "command_age_ms": None})
+    ):
+        reader.add_message(key, message, wall_ns)
+    flight = reader.flight()
+    summary = summarise(flight, formations_of(flight), Path())
+    cluster = ClusterErrors(tuple(names(10)), dict.fromkeys(large(10).names, each))
+    text = page(msgspec.structs.replace(summary, clusters={"main": cluster}), [])
+    groups, figures, every = (text.index(mark) for mark in (">headings (rad)<", "<h2>Figures</h2>", ">phi_3 (rad)<"))
+    assert groups < figures < every
+    assert 'href="#all-main"' in text
+    assert 'id="all-main"' in text
