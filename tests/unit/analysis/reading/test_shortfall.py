@@ -147,11 +147,11 @@ def test_the_verdict_is_the_same_with_and_without_a_report(
 
 def write(record: Path, state: State, events: Sequence[Event]) -> None:
     """Write a record that is complete."""
+    flown = list(traffic(state, events))
+    clock = next(message for _, message, _ in reversed(flown) if isinstance(message, Clock))
     with RecordWriter(record) as writer:
-        for key, message, wall_ns in traffic(state, events):
+        for key, message, wall_ns in flown:
             writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
-            if isinstance(message, Clock):
-                clock = message
         stopped = msgspec.structs.replace(clock, seq=clock.seq + 1, state="stopped")
         writer.add(keys.CLOCK, messages.encode(stopped), messages.encoding(keys.CLOCK), clock.t_ns, 0)
 
