@@ -28,7 +28,7 @@ def several(flight):
     return {"drones": len(flight.tracks), "unknown_m": float("nan"), "nothing": None}
 
 def crash(flight):
-    raise KeyError("two\\nlines")
+    raise ValueError("two\\nlines")
 
 def leave(flight):
     sys.exit(3)
@@ -96,7 +96,7 @@ def test_a_mapping_is_a_column_for_each_name(beside: Path) -> None:
 @pytest.mark.parametrize(
     ("function", "terms"),
     [
-        ("crash", ("KeyError", "lines")),
+        ("crash", ("ValueError", "two", "lines")),
         ("leave", ("SystemExit", "3")),
         ("words", ("drones", "number")),
         ("bad_name", ("'a b'", "63")),
@@ -121,7 +121,7 @@ def test_what_goes_wrong_in_it_is_one_line_and_the_run_is_kept(
 @pytest.mark.parametrize("function", ["sweep_figures_of_mine:nowhere", "no_such_module:f", "sweep_figures_of_mine"])
 def test_a_function_that_is_not_there_is_refused_before_anything_flies(beside: Path, function: str) -> None:
     document, _ = read_document(beside / "one.yaml", [f"report.metrics={function}"])
-    with refused(ScenarioError, "report.metrics", function):
+    with refused(ScenarioError, "report.metrics", f"'{function}'"):
         make_plan("one.yaml", document, ["seed"], 2)
 
 
