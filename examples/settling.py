@@ -1,7 +1,6 @@
 """Figures of a user's own for a sweep: when the formation's shape had settled, and how far it overshot.
 
-    PYTHONPATH=examples zsim sweep scenarios/step.yaml --vary wind.gust_m_s=0,1,2 \
-      --set report.metrics=settling:settling
+    PYTHONPATH=examples zsim sweep scenarios/step.yaml --vary wind.gust_m_s=0,1 --set report.metrics=settling:settling
 
 See docs/sweep.md.
 """
