@@ -139,8 +139,8 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
     from zsim_analysis.sweep.design import is_sweep
 
     if is_sweep(folder):
-        from zsim_analysis.sweep.make_sweep_report import make_sweep_report as make
-        from zsim_analysis.sweep.make_sweep_report import terminal_text
+        from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report as make
+        from zsim_analysis.sweep.report.terminal_tables import terminal_text
     else:
         from zsim_analysis.report.make_report import make_report as make
         from zsim_analysis.report.tables import terminal_text
