@@ -132,6 +132,7 @@ class RunPage:
         self.views.open()
         self.cameras.open()
         self.record.load()
+        self._monitor.record_end_s = self.record.timeline.get("to_s", math.inf)
         pause = threading.Event()
         next_s = time.monotonic()
         with self._time_monitor.polling(), self.flying.running():
@@ -144,7 +145,7 @@ class RunPage:
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
         state = console_state(self._info.run_id, self.views, self._time_monitor, dict(self._scene.shapes))
-        return {**state, "cameras": self.cameras.state(), "timeline": self.record.timeline}
+        return {**state, "cameras": self.cameras.state(), "timeline": self.record.state(self._monitor.condition)}
 
     def head(self) -> dict[str, Any]:
         """Return the head of the page, as plain data."""

@@ -13,6 +13,7 @@ from zsim_agents.formation.flight_data import (
     REJOINING,
 )
 
+AT_END = "the record is at its end; go back on the timeline"
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
 
 
@@ -24,6 +25,7 @@ class RunCondition(NamedTuple):
         silent_s: for how long the world has not answered; 0 while it does [s, wall].
         ended: why the run is over; empty while it goes on.
         replayed: whether a record is played back: nobody can be flown.
+        at_end: whether that stands still at the end of the record.
         drones: state of each drone by name, of those that were seen.
         phases: phase and reason of each formation by name.
         members: names of the drones of each formation.
@@ -33,6 +35,7 @@ class RunCondition(NamedTuple):
     silent_s: float = 0.0
     ended: str = ""
     replayed: bool = False
+    at_end: bool = False
     drones: Mapping[str, str] = {}
     phases: Mapping[str, tuple[str, str]] = {}
     members: Mapping[str, Collection[str]] = {}
@@ -64,7 +67,8 @@ def run_refusals(run: RunCondition) -> dict[str, str]:
     off, state = run.off(), run.clock or "unknown"
     running = "" if state == "running" else f"the run is {state}"
     paused = "" if state == "paused" else f"the run is {state}, not paused"
-    return {"pause": off or running, "resume": off or paused, "step": off or paused, "rate": off}
+    onward = off or paused or (AT_END if run.at_end else "")
+    return {"pause": off or running, "resume": onward, "step": onward, "rate": off, "seek": off}
 
 
 def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """Points of variables over time, as plots show them. Pure."""
 
+import threading
 from collections import deque
 from collections.abc import Sequence
 
@@ -24,6 +25,7 @@ class VariableHistory:
         self._size = size
         self._times: deque[float] = deque(maxlen=HISTORY_POINTS_MAX)
         self._rows: deque[Array] = deque(maxlen=HISTORY_POINTS_MAX)
+        self._lock = threading.Lock()  # curves are also asked for in threads of pages
 
     def is_due(self, t_s: float) -> bool:
         """Return whether a point of that time [s] would be added."""
@@ -38,18 +40,19 @@ class VariableHistory:
             t_s: simulated time; back in time, as a replay may go, all points are removed.
             desired, value, true: (size,) each, m and rad; None for what is not known.
         """
-        if self._times and t_s < self._times[-1]:
-            self._times.clear()
-            self._rows.clear()
-        if not self.is_due(t_s):
-            return False
         unknown = np.full(self._size, np.nan)
         columns = (unknown if each is None else np.asarray(each, dtype=float) for each in (desired, value, true))
-        self._times.append(t_s)
-        self._rows.append(np.array(list(columns)))
-        while t_s - self._times[0] > SPAN_S:  # points of a fast run are far apart
-            self._times.popleft()
-            self._rows.popleft()
+        with self._lock:
+            if self._times and t_s < self._times[-1]:
+                self._times.clear()
+                self._rows.clear()
+            if not self.is_due(t_s):
+                return False
+            self._times.append(t_s)
+            self._rows.append(np.array(list(columns)))
+            while t_s - self._times[0] > SPAN_S:  # points of a fast run are far apart
+                self._times.popleft()
+                self._rows.popleft()
         return True
 
     def curves(self, index: int, angular: bool, span_s: float = SPAN_S, less: int | None = None) -> tuple[Array, ...]:
@@ -63,8 +66,9 @@ class VariableHistory:
             span_s: how far the curves go back.
             less: the one of `SERIES` whose values are taken off the others, which then are errors; None for values.
         """
-        t = np.array(self._times)
-        table = np.array(self._rows)[:, :, index] if self._rows else np.zeros((0, 3))
+        with self._lock:
+            t = np.array(self._times)
+            table = np.array([row[:, index] for row in self._rows]).reshape(-1, len(SERIES))
         recent = t >= (t[-1] if len(t) else 0.0) - span_s
         t, table = t[recent], table[recent]
         if less is not None:

@@ -317,6 +317,16 @@ def test_pause_becomes_resume(bench: Bench):
         assert bench.gui.at["Step"].disabled is not paused
 
 
+@pytest.mark.parametrize(
+    "run", [{"clock": "paused", "at_end": True}, {"clock": "stopped", "ended": "the record is over"}]
+)
+def test_a_replay_at_its_end_is_not_offered_to_go_on(bench: Bench, run: dict[str, Any]):
+    RunForm(bench.gui, bench.client, 1.0).refresh(RunCondition(replayed=True, **run))
+    assert bench.gui.at["Step"].disabled
+    assert all(bench.gui.at[label].disabled for label in ("Pause", "Resume") if bench.gui.at[label].visible)
+    assert has_terms(bench.gui.at["Step"].hint, "record")
+
+
 def test_all_drones_that_stopped_are_reset_at_once(bench: Bench):
     form = FleetForm(bench.gui, bench.client, bench.scenario)
     form.refresh(flown())
@@ -348,8 +358,10 @@ def test_a_drone_is_offered_what_its_state_takes_and_always_its_emergency(bench:
 def test_a_value_out_of_range_stands_beside_its_slider(bench: Bench):
     form = bench.formation()
     slider = bench.gui.at["p [m]"]
+    assert has_terms(slider.label, "p", "not known")
     form.refresh(bench.view(p=25.37), LATER_S)
     assert has_terms(slider.label, "p", "25.4 m")
+    assert slider.value == 20.0
     form.refresh(bench.view(p=4.0), LATER_S)
     assert slider.label == "p [m]"
 
@@ -357,7 +369,7 @@ def test_a_value_out_of_range_stands_beside_its_slider(bench: Bench):
 def test_waypoints_begin_where_the_formation_is_in_the_units_of_the_page(bench: Bench):
     form = bench.formation()
     form.refresh(bench.view(x_c=3.0, z_c=2.5, yaw=math.pi / 2), LATER_S)
-    assert has_terms(bench.gui.at["waypoints"].value, "0:", "x_c = 3", "z_c = 2.5", "yaw = 90")
+    assert has_terms(bench.gui.at["waypoints [s, m, deg]"].value, "0:", "x_c = 3", "z_c = 2.5", "yaw = 90")
     bench.gui.press("Fly the waypoints")
     ((_, op, args),) = bench.client.asked
     assert op == "trajectory"
@@ -540,21 +552,25 @@ def test_of_many_variables_the_others_are_moved_one_at_a_time():
     bench = Bench("grid30")
     bench.formation()
     hidden = next(name for name in bench.space.names if f"{name} [m]" not in bench.gui.at and name.startswith("w"))
-    bench.gui.at["variable"].value = hidden
-    bench.gui.at["value [m or deg]"].value = 0.5
+    value = next(control for label, control in bench.gui.at.items() if label.startswith("value ["))
+    bench.gui.at["variable"].put(next(name for name in bench.space.names if name.startswith("phi")))
+    assert value.label == "value [deg]"
+    bench.gui.at["variable"].put(hidden)
+    assert value.label == "value [m]"
+    value.value = 0.5
     bench.gui.press("Move it")
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}})]
 
 
 def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
     bench.formation()
-    bench.gui.at["expressions"].value = "x_c = R*cos(0.1*t)\nR = 5"
+    bench.gui.at["expressions [m, deg]"].value = "x_c = R*cos(0.1*t)\nyaw = 6*t\nR = 5"
     bench.gui.press("Fly the expressions")
-    bench.gui.at["waypoints"].value = "20: x_c = 5"
+    bench.gui.at["waypoints [s, m, deg]"].value = "20: x_c = 5"
     bench.gui.press("Fly the waypoints")
     name = bench.cluster.name
     assert bench.client.asked == [
-        (name, "trajectory", {"expressions": {"x_c": "R*cos(0.1*t)"}, "constants": {"R": 5.0}}),
+        (name, "trajectory", {"expressions": {"x_c": "R*cos(0.1*t)", "yaw_deg": "6*t"}, "constants": {"R": 5.0}}),
         (name, "trajectory", {"waypoints": [{"at_s": 20.0, "values": {"x_c": 5.0}}]}),
     ]
 
@@ -572,7 +588,7 @@ def test_the_trajectory_of_the_scenario_is_flown_as_it_stands_there():
 
 def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
     bench.formation()
-    bench.gui.at["waypoints"].value = "soon"
+    bench.gui.at["waypoints [s, m, deg]"].value = "soon"
     bench.gui.press("Fly the waypoints")
     assert bench.client.asked == []
     assert bench.outcomes[0].request == f"{bench.cluster.name}: trajectory"
