@@ -68,6 +68,7 @@ class DriverProcess:
         self._reported_s = 0.0
         self._reported: tuple[Connection, str, str] | None = None
         self._report_seq = self._ignored = 0
+        self._has_clock = False  # until it has, nothing can be stamped
         self._hint_s = time.monotonic() + PATIENCE_S
         self._socket_fault = "nothing comes"
 
@@ -126,6 +127,7 @@ class DriverProcess:
     def _on_clock(self, _: str, payload: bytes) -> None:
         """Publish the gate that the world has reached."""
         clock = self._observer.update_clock(payload)
+        self._has_clock = self._has_clock or clock is not None
         if clock is None or clock.state != "running":
             return
         now_ns = self._clock.now_ns()
@@ -195,7 +197,8 @@ class DriverProcess:
             self._say(f"{self._observer.name}: {text}")
         self._session.texts.clear()
         self._hint()
-        if time.monotonic() - self._reported_s > REPORT_S or self._reported != self._reported_now():
+        is_due = time.monotonic() - self._reported_s > REPORT_S or self._reported != self._reported_now()
+        if is_due and self._has_clock:
             self._report(self._clock.now_ns())
 
     def _hint(self) -> None:

@@ -16,6 +16,7 @@ from zsim.errors import RecordError, ReportError, printable
 from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import cell
 from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.driver_links import link_text
 from zsim_analysis.reading.flight import RecordedFlight, read_flight
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
 from zsim_analysis.report.comparison import (
@@ -123,6 +124,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
         ("Deadlines missed", _misses(summary)),
         ("Command age", ages),
+        *((f"Link of {drone}", link_text(link)) for drone, link in summary.links.items()),
         ("Least separation", "no two drones in the air" if separation is None else f"{separation:.2f} m in truth"),
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
         ("Fingerprint", summary.fingerprint or "not known"),
