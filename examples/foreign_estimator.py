@@ -10,7 +10,7 @@ import math
 import os
 import sys
 import time
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import msgpack
@@ -19,6 +19,8 @@ import zenoh
 ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
 ME, DRONE = "foreign.drone1", "zsim/drone/drone1"
 BEARING = math.atan2(17.8, -2.8)  # rad, of the default environment.magnetic_field_ut
+START_S = 60.0  # wall; a world that is still starting, and compiling its kernel
+SILENCE_S = 10.0  # wall; even while simulated time stands, the world publishes its clock once a second
 FIX_GAIN, HEIGHT_GAIN = 0.02, 0.1
 SIGMAS = (0.2, 0.2, 0.05, 0.1, 0.1, 0.1)  # m, m/s: what the gains leave of the noise of preset `paper`
 YAW_SIGMA_RAD = 0.06
@@ -61,7 +63,7 @@ class State:
 
 
 class Participant:
-    """Joins the run, answers every gate, leaves when the clock stops."""
+    """Joins the run, answers every gate, leaves when the clock stops or the world is silent."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
@@ -86,28 +88,44 @@ class Participant:
         self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def run(self) -> int:
-        """Return how many gates it answered."""
+        """Return how many gates it answered.
+
+        Raises:
+            SystemExit: the world is silent.
+        """
         state, gates = State(), 0
         while True:
-            sample = self._inbox.get()
+            sample = self._next(gates)
             kind, m = str(sample.key_expr).rsplit("/", 1)[1], msgpack.unpackb(sample.payload.to_bytes())
             state.take(kind, m)
             if kind == "status":  # the last sensor message of a gate: everything before it has come
                 gates += 1
-                self._put(f"{DRONE}/estimate", t_ns=m["t_ns"], **state.estimate(self._gate_ns / 1e9))
-                self._put(f"zsim/process/{ME}/done", t_ns=m["t_ns"], **self._run, done_ns=m["t_ns"], sent=1)
+                self._answer(m["t_ns"], state)
             elif m.get("state") == "stopped":
                 self._put(f"zsim/process/{ME}/bye", t_ns=m["t_ns"], reason="the run ended")
                 return gates
 
+    def _next(self, gates: int) -> zenoh.Sample:
+        try:
+            return self._inbox.get(timeout=SILENCE_S)
+        except Empty:
+            text = f"the world on {ENDPOINT} is silent for {SILENCE_S:g} s; answered {gates} gates until then"
+            raise SystemExit(f"{ME}: {text}") from None
+
+    def _answer(self, t_ns: int, state: State) -> None:
+        self._put(f"{DRONE}/estimate", t_ns=t_ns, **state.estimate(self._gate_ns / 1e9))
+        self._put(f"zsim/process/{ME}/done", t_ns=t_ns, **self._run, done_ns=t_ns, sent=1)
+
 
 def world_info(session: zenoh.Session) -> dict[str, Any]:
     """Return `world/info`; wait for a world that listens already but does not answer yet."""
-    while True:
+    until_s = time.monotonic() + START_S
+    while time.monotonic() < until_s:
         for reply in session.get("zsim/world/info", timeout=1.0):
             if reply.ok is not None:
                 return msgpack.unpackb(reply.ok.payload.to_bytes())
         time.sleep(0.1)
+    raise SystemExit(f"{ME}: no world answers on {ENDPOINT} within {START_S:g} s")
 
 
 def main() -> None:
@@ -116,7 +134,7 @@ def main() -> None:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')
-    config.insert_json5("connect/timeout_ms", "60000")  # a world that is still starting
+    config.insert_json5("connect/timeout_ms", f"{1000 * START_S:.0f}")
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
         print(f"answered {Participant(session).run()} gates")

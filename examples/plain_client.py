@@ -1,6 +1,7 @@
 """Reads drone1's IMU, flies it by velocity commands, and keeps the lockstep: with zenoh and msgpack alone."""
 
 import os
+import queue
 import sys
 
 import msgpack
@@ -9,13 +10,10 @@ import zenoh
 ENDPOINT, SECONDS = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447", 10.0
 ME, DRONE = "plain.client", "zsim/drone/drone1"
 _ = "/" in ENDPOINT or sys.exit("usage: python examples/plain_client.py [ENDPOINT]     e.g. tcp/127.0.0.1:7447")
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')
-config.insert_json5("scouting/multicast/enabled", "false")
-seq, last, t_ns = {}, {}, 0
+config = f'{{mode: "client", connect: {{endpoints: ["{ENDPOINT}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
+seq, last, inbox, gates = {}, {}, queue.SimpleQueue(), 0
 
-with zenoh.open(config) as session:
+with zenoh.open(zenoh.Config.from_json5(config)) as session:
 
     def put(key, **fields):  # BLOCK: for a message that zenoh drops the world would wait
         seq[key] = seq.get(key, -1) + 1
@@ -23,18 +21,20 @@ with zenoh.open(config) as session:
 
     info = next(msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in session.get("zsim/world/info") if reply.ok)
     run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
-    sensors = session.declare_subscriber(f"{DRONE}/sensor/*", zenoh.handlers.FifoChannel(10_000))
+    in_order = zenoh.handlers.Callback(inbox.put, indirect=False)
+    kept = [session.declare_subscriber(key, in_order) for key in (f"{DRONE}/sensor/*", "zsim/clock")]
     token = session.liveliness().declare_token(f"zsim/process/{ME}")
     put(f"zsim/process/{ME}/join", t_ns=0, **run, role="plain", host="here", pid=os.getpid(), period_ns=info["gate_ns"])
-    while t_ns < SECONDS * 1e9:
-        sample = sensors.recv()
-        last[str(sample.key_expr).rsplit("/", 1)[1]] = msgpack.unpackb(sample.payload.to_bytes())
-        if str(sample.key_expr).endswith("/status"):  # the gate is complete: answer it, then say done
-            t_ns, flying = last["status"]["t_ns"], last["status"]["state"] in ("hovering", "flying")
-            if flying:
-                put(f"{DRONE}/cmd/velocity", t_ns=t_ns, source=ME, velocity_m_s=[0.5, 0, 0], yaw_rate_rad_s=0)
-            else:
-                put(f"{DRONE}/cmd/mode", t_ns=t_ns, source=ME, mode="takeoff")
+    while gates * info["gate_ns"] <= SECONDS * 1e9 and last.get("clock", {}).get("state") != "stopped":
+        try:
+            sample = inbox.get(timeout=10)  # s: even while time stands, the clock comes once a second
+        except queue.Empty:
+            sys.exit("the world is silent")
+        last[kind := str(sample.key_expr).rsplit("/", 1)[1]] = msgpack.unpackb(sample.payload.to_bytes())
+        if kind == "status":  # the gate is complete: answer it, then say done
+            t_ns, gates, flying = last["status"]["t_ns"], gates + 1, last["status"]["state"] in ("hovering", "flying")
+            command = {"velocity_m_s": [0.5, 0, 0], "yaw_rate_rad_s": 0} if flying else {"mode": "takeoff"}
+            put(f"{DRONE}/cmd/{'velocity' if flying else 'mode'}", t_ns=t_ns, source=ME, **command)
             put(f"zsim/process/{ME}/done", t_ns=t_ns, **run, done_ns=t_ns, sent=1)
     print(f"t = {t_ns / 1e9:.2f} s, {last['status']['state']}, accelerometer {last['imu']['accel_m_s2']}")
     put(f"zsim/process/{ME}/bye", t_ns=t_ns, reason="shown")

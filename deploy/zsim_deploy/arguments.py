@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from zsim.errors import RunError
+from zsim.extras import install_command
 
 if TYPE_CHECKING:
     from zsim.transport.tls import Identity
@@ -58,8 +59,7 @@ def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
     """
     missing = {module: extra for extra, modules in needs.items() for module in modules if find_spec(module) is None}
     if missing:
-        extras = ",".join(sorted(set(missing.values())))
-        raise RunError(f"{command}: {' and '.join(missing)} is not installed; pip install 'zsim[{extras}]'")
+        raise RunError(f"{command}: {' and '.join(missing)} is not installed; {install_command(missing.values())}")
 
 
 def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[str, str]) -> str:

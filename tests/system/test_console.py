@@ -26,7 +26,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from wire import PATIENCE_S
 
-from zsim_bridges.console.console_server import ViewerCamera
+from zsim_bridges.console.server.page_messages import ViewerCamera
 
 STRIP = {"width": 860, "height": 120}  # of a page whose picture nobody looks at
 STEER = "a-good-token"
@@ -92,7 +92,7 @@ class PageConnection:
     """
 
     def __init__(self, address: str) -> None:
-        viser = pytest.importorskip("viser", reason="viser is not installed; pip install 'zsim[console]'")
+        viser = pytest.importorskip("viser", reason="viser is not installed; pip install '.[console]'")
         subprotocols: Any = [f"viser-v{viser.__version__}"]
         where = f"ws://{urlsplit(address).netloc}{urlsplit(address).path}"
         self._socket = connect(where, subprotocols=subprotocols, compression=None, max_size=None)

@@ -1,4 +1,4 @@
-"""examples/plain_client.py: a page of code by docs/protocol.md takes part as ours do."""
+"""examples/plain_client.py and foreign_estimator.py: code by docs/protocol.md takes part as ours do."""
 
 import ast
 import os
@@ -7,13 +7,17 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 from federation import ONE, Federation
 from forked_commands import ROOT
-from wire import PATIENCE_S
+from refused import has_terms
+from wire import PATIENCE_S, Subscription
 
 PROGRAM = ROOT / "examples" / "plain_client.py"
+ESTIMATOR = ROOT / "examples" / "foreign_estimator.py"
 NAME = "plain.client"
 
 
@@ -31,7 +35,7 @@ def test_it_is_a_page_of_zenoh_and_msgpack() -> None:
     assert len(text.splitlines()) <= 40
     imported = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import | ast.ImportFrom)]
     names = {alias.name for node in imported if isinstance(node, ast.Import) for alias in node.names}
-    assert names <= {"os", "sys", "zenoh", "msgpack"}
+    assert names <= {"os", "queue", "sys", "zenoh", "msgpack"}
     assert not [node for node in imported if isinstance(node, ast.ImportFrom)]
     puts = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)]
     puts = [node for node in puts if ast.unparse(node.func) == "session.put"]
@@ -40,8 +44,18 @@ def test_it_is_a_page_of_zenoh_and_msgpack() -> None:
         assert "congestion_control=zenoh.CongestionControl.BLOCK" in ast.unparse(put)
 
 
+def standing(clock: Subscription) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return how the program is waited for, twice at one instant: what it sent before it was stopped has been used."""
+    former = None
+    while True:
+        now = clock.until(lambda m: [w["name"] for w in m["waiting_for"]] == [NAME]).message
+        if former is not None and former["t_ns"] == now["t_ns"]:
+            return former["waiting_for"][0], now["waiting_for"][0]
+        former = now
+
+
 def test_it_flies_and_holds_time(federation: Federation, request: pytest.FixtureRequest) -> None:
-    world = federation.world(ONE, "--rate", "0.25", "--duration", "11", "--set", "processes.expect=[]")
+    world = federation.world(ONE, "--rate", "0.25", "--duration", "3600", "--set", "processes.expect=[]")
     client = federation.client()
     clock, events = client.subscribe("clock"), client.subscribe("world/event")
     truth = client.subscribe("drone/drone1/truth")
@@ -54,19 +68,52 @@ def test_it_flies_and_holds_time(federation: Federation, request: pytest.Fixture
     assert commander.message["source"] == NAME
 
     os.kill(program.pid, signal.SIGSTOP)
-    first, later = (clock.until(lambda m: NAME in [w["name"] for w in m["waiting_for"]]) for _ in range(2))
-    assert first.message["t_ns"] == later.message["t_ns"]
-    (entry,) = later.message["waiting_for"]
-    assert entry["host"] == "here"
-    assert entry["since_wall_s"] > first.message["waiting_for"][0]["since_wall_s"]
+    first, later = standing(clock)
+    assert later["host"] == "here"
+    assert later["since_wall_s"] > first["since_wall_s"]
     os.kill(program.pid, signal.SIGCONT)
 
     output, _ = program.communicate(timeout=PATIENCE_S)
     assert program.returncode == 0, output
-    assert re.fullmatch(r"t = 10\.0\d s, flying, accelerometer \[.*\]\n", output)
+    shown = re.fullmatch(r"t = (\d+\.\d\d) s, flying, accelerometer \[.*\]\n", output)
+    assert shown is not None, output
+    assert float(shown[1]) >= 10.0
     flown = truth.until(lambda m: m["t_ns"] >= 10 * 10**9)  # the run may be over by now
     east, north, _ = flown.message["velocity_m_s"]
     assert north == pytest.approx(0.5, abs=0.3)  # m/s forward, the drone looks north
     assert east == pytest.approx(0.0, abs=0.3)
     assert events.until(lambda m: m["kind"] == "leave").message["data"]["reason"] == "shown"
+    assert client.request("world/control", "stop")["ok"]
     world.ends(with_code=0)
+
+
+def test_it_flies_ten_seconds_beside_a_world_that_has_run_for_longer(
+    federation: Federation, request: pytest.FixtureRequest
+) -> None:
+    world = federation.world(ONE, "--rate", "10", "--duration", "36000")
+    client = federation.client()
+    begun = client.subscribe("clock").until(lambda m: m["t_ns"] > 15e9).message["t_ns"]
+    program: subprocess.Popen[str] = request.getfixturevalue("plain_client")
+    output, _ = program.communicate(timeout=PATIENCE_S)
+    assert program.returncode == 0, output
+    shown = re.fullmatch(r"t = (\d+\.\d\d) s, flying, accelerometer \[.*\]\n", output)
+    assert shown is not None, output
+    assert float(shown[1]) >= begun / 1e9 + 10.0
+    assert client.request("world/control", "stop")["ok"]
+    world.ends(with_code=0)
+
+
+@pytest.mark.parametrize(("program", "name"), [(PROGRAM, NAME), (ESTIMATOR, "foreign.drone1")])
+def test_it_ends_with_a_line_when_its_world_is_killed(program: Path, name: str, federation: Federation) -> None:
+    """The world dies without a word while the program answers its gates."""
+    world = federation.world(ONE.replace("expect: []", f"expect: [{name}]"), "--rate", "1", "--duration", "3600")
+    clock = federation.client().subscribe("clock")
+    clock.until(lambda _: True)
+    command = [sys.executable, str(program), federation.endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        clock.until(lambda m: m["t_ns"] > 0)  # it has answered
+        world.signal(signal.SIGKILL)
+        output, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1, output
+    assert has_terms(output.splitlines()[-1], "world", "silent")
+    assert "Traceback" not in output

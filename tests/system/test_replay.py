@@ -102,7 +102,7 @@ def test_the_same_payloads(federation: Federation, flown: Path) -> None:
 
 def test_a_console_beside_it_has_a_timeline(federation: Federation, flown: Path) -> None:
     """Played to its end, where it stands: nothing is over before somebody ends it."""
-    pytest.importorskip("viser", reason="viser is not installed; pip install 'zsim[console]'")
+    pytest.importorskip("viser", reason="viser is not installed; pip install '.[console]'")
     role = replay(federation, flown, "--console", "--rate", "0")
     client = federation.client()
     clock = client.subscribe("clock")

@@ -13,13 +13,14 @@ import numpy as np
 
 from zsim.contract.snapshot import State
 from zsim_agents.formation.control_law import ControlLaw, FormationCommand, FormationGains, ProportionalLaw
-from zsim_agents.formation.flight_check import FlightCheck, place_fault
+from zsim_agents.formation.flight_check import FlightCheck, place_fault, shape_fault
 from zsim_agents.formation.flight_data import (
     AIRBORNE,
     DOWN,
     GUARD_PARTS,
     HELD_ON_REQUEST,
     READY_TO_ENGAGE,
+    REJOINING,
     TOO_NEAR,
     EngagementLimits,
     GateInput,
@@ -38,11 +39,12 @@ from zsim_agents.formation.flight_plan import (
     MoveTo,
     Pause,
     RefusalError,
+    Rejoin,
     Scheduled,
     TakeOff,
     refuse,
 )
-from zsim_agents.formation.guidance import Guidance
+from zsim_agents.formation.guidance import IN_PLACE_M, Guidance, Places
 from zsim_agents.formation.robot_limits import Pairs, RobotLimits, guard
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
@@ -91,6 +93,7 @@ class Engagement:
         self._landing_s = -math.inf
         self._fault = ""  # why an engaged formation does not close its loop
         self._well_since_s = math.inf
+        self._places: Places | None = None  # while the drones of a held formation are led back to them
         self._checked = np.empty(0)  # the last reference without a fault; one at rest stays the same array
         self._wrapped = self._checked, self._checked  # the last reference and the same with wrapped angles
 
@@ -107,7 +110,7 @@ class Engagement:
         self.check.observe(gate)
         self.plan.run(gate.t_s, self._try)
         if self._phase in ("assembling", "engaged") and gate.down:
-            self._phase = "idle"
+            self._phase, self._places = "idle", None
         return _PHASES[self._phase](self, gate)
 
     def request(self, request: FlightRequest) -> str | None:
@@ -142,6 +145,8 @@ class Engagement:
             "well_since_s": self._well_since_s,
             "modes": self._modes.sent_s,
             "value": self.check.value,
+            "checked": self._checked,
+            "places": None if self._places is None else self._places.p_W,
             "guidance": self.guidance.snapshot(),
             "plan": self.plan.snapshot(),
             "law": law,
@@ -153,6 +158,8 @@ class Engagement:
         self._fault, self._well_since_s = state["fault"], state["well_since_s"]
         self._modes.sent_s = state["modes"]
         self.check.value = state["value"]
+        self._checked = state["checked"]
+        self._places = None if state["places"] is None else self._places_at(state["places"])
         self.guidance.restore(state["guidance"])
         self.plan.restore(state["plan"])
         self.law.restore(state["law"])
@@ -176,6 +183,10 @@ class Engagement:
             self._grant_engage(gate)
         elif isinstance(request, Land):
             self._grant_land(gate)
+        elif isinstance(request, Rejoin):
+            self._grant_rejoin(gate)
+        elif isinstance(request, Pause) and self._places is not None:
+            self._places = None
         elif self._phase != "engaged":
             raise RefusalError(f"phase is {self.phase}; possible when engaged")
         elif self._fault:
@@ -207,10 +218,26 @@ class Engagement:
         self._fault = ""
         self._phase = "engaged"
 
+    def _grant_rejoin(self, gate: GateInput) -> None:
+        if self._phase != "engaged" or not self._fault:
+            raise RefusalError(f"phase is {self.phase}; possible when held by a fault")
+        refuse(self._unflyable(gate))
+        c = self._checked if self._checked.size else self.guidance.value(gate.t_s)[0]
+        shape = self.limits.shape_in_flight
+        refuse(shape_fault(self.space, c, shape) or place_fault(self.space, c, self.gains, shape))
+        self._places = self._places_at(self.space.inverse(c)[0])
+
+    def _places_at(self, p_W: Array) -> Places:
+        return Places(p_W, self.gains, self._held_limits, self.limits.shape.share)
+
+    def _unflyable(self, gate: GateInput) -> str | None:
+        """Return why the drones cannot be led one by one."""
+        return self.check.state_fault(gate, AIRBORNE) or self.check.estimate_fault(gate)
+
     def _grant_land(self, gate: GateInput) -> None:
         if self._phase == "idle" and gate.down:
             raise RefusalError("all drones are on the ground")
-        self._phase, self._landing_s = "landing", gate.t_s
+        self._phase, self._landing_s, self._places = "landing", gate.t_s, None
         self._modes.restart()
 
     def _taking_off(self, gate: GateInput) -> GateOutput:
@@ -244,7 +271,25 @@ class Engagement:
         return self._output(gate, reason, command=command, reference=(self._wrapped[1], c_dot_des))
 
     def _held(self, gate: GateInput) -> GateOutput:
-        return self._output(gate, self._fault, command=self._upright(gate, 0.0, self._held_limits))
+        command = self._upright(gate, 0.0, self._held_limits) if self._places is None else self._way_back(gate)
+        return self._output(gate, self._fault, command=command)
+
+    def _way_back(self, gate: GateInput) -> FormationCommand:
+        """Return the guarded velocities of drones that fly to their places, without turning."""
+        assert self._places is not None
+        v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, self._places.velocities(gate.p_W), self._held_limits)
+        return FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
+
+    def _way_fault(self, gate: GateInput) -> str | None:
+        """Return which drone is not in its place yet, while they are led; a drone that cannot be flown ends that."""
+        if self._places is None:
+            return None
+        if self._unflyable(gate):
+            self._places = None
+            return None
+        i, away_m = self._places.farthest(gate.p_W)
+        place = f"{self.drones[i]} is {away_m:.1f} m from its place; allowed: {IN_PLACE_M:g} m"
+        return f"{REJOINING}: {place}" if away_m > IN_PLACE_M else None
 
     def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
         """Return a guarded climb (n,) without turning; rest where the estimates cannot be flown on."""
@@ -264,7 +309,8 @@ class Engagement:
 
     def _judge(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or heal it when all has been well for a while."""
-        fault = self.check.flight_fault(gate) or (None if self._fault else self._reference_fault(gate.t_s))
+        fault = self._way_fault(gate) or self.check.flight_fault(gate)
+        fault = fault or (None if self._fault else self._reference_fault(gate.t_s))
         if fault:
             self._fault, self._well_since_s = fault, math.inf
         elif self._fault:
@@ -278,7 +324,7 @@ class Engagement:
         except REFUSALS as refusal:
             self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
         else:
-            self._fault = ""
+            self._fault, self._places = "", None
             self.law.reset()
 
     def _reference_fault(self, t_s: float) -> str | None:

@@ -21,6 +21,7 @@ HELD_ON_REQUEST = "held on request"  # reasons of a formation; a display reads f
 READY_TO_ENGAGE = "ready to engage"
 GUARD_PARTS = "the guard parts"
 TOO_NEAR = "ALARM"
+REJOINING = "rejoining"
 
 
 @dataclass(frozen=True)

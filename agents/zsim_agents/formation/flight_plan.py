@@ -55,6 +55,11 @@ class Pause:
 
 
 @dataclass(frozen=True)
+class Rejoin:
+    """Lead the drones of a formation that a fault holds back to their places, each by itself; then it goes on."""
+
+
+@dataclass(frozen=True)
 class Land:
     """Land all drones where they are."""
 
@@ -102,7 +107,7 @@ class Follow:
         return ExpressionTrajectory(space, self.expressions, base, self.constants, self.duration_s)
 
 
-FlightRequest = TakeOff | Engage | Pause | Land | MoveTo | Follow
+FlightRequest = TakeOff | Engage | Pause | Rejoin | Land | MoveTo | Follow
 
 
 REFUSALS = (RefusalError, TrajectoryError, ExpressionError, SingularClusterError)
@@ -297,6 +302,7 @@ _READERS: dict[str, tuple[Callable[..., Any], _Fields]] = {
     "takeoff": (TakeOff, {}),
     "engage": (Engage, {}),
     "hold": (Pause, {}),
+    "rejoin": (Rejoin, {}),
     "land": (Land, {}),
     "target": (MoveTo, _TARGET),
     "trajectory": (Follow, _TRAJECTORY),

@@ -1,6 +1,7 @@
 """Where a formation is to be at every instant: the reference, and the ramps by which requests change it smoothly.
 
-Order of this file: the reference in flight, ramps within the robots' limits and their checks.
+Order of this file: the reference in flight, ramps within the robots' limits and their checks, the places of robots
+that have to come back one by one.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.flight_check import place_fault, shape_fault
 from zsim_agents.formation.flight_data import ShapeLimits
 from zsim_agents.formation.flight_plan import Follow, MoveTo
-from zsim_agents.formation.robot_limits import load
+from zsim_agents.formation.robot_limits import RobotLimits, load
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, robot_rates
 from zsim_agents.formation.trajectory import (
     Hold,
@@ -34,6 +35,8 @@ RAMP_MIN_S, RAMP_MAX_S = 2.0, 3600.0
 RAMP_GROWTH = 1.2  # least step of the search for a ramp that is slow enough
 RAMP_SAMPLES = 33  # odd: one falls on the peak rate of a ramp, its middle
 LOAD_TOLERANCE = 1.02  # of the share: ramps are sampled, and one may start at the limit
+BENEATH_M = 1.0  # over the ground; a robot nearer to its place than this climbs or sinks to it; chosen
+IN_PLACE_M = 1.0  # from its place, where the formation takes a robot over; chosen: half of the least separation
 
 
 class Guidance:
@@ -220,3 +223,36 @@ class RampPlanner:
         if share > limits.share * LOAD_TOLERANCE:
             return f"a robot moves at {share:.2f} of its limits; allowed: {limits.share:g}"
         return None
+
+
+class Places:
+    """Where the robots of a held formation belong, and how each gets there by itself.
+
+    A robot that is far out of step (landed, and flown low again) makes a shape in which no formation can be led. It
+    flies over the ground first, at its height and so below or above the others, then straight up or down.
+
+    Args:
+        p_W: (n, 3) m; the places.
+        gains: of the formation.
+        limits: of its robots.
+        share: of those limits that is used.
+    """
+
+    def __init__(self, p_W: Array, gains: FormationGains, limits: RobotLimits, share: float) -> None:
+        self.p_W = p_W
+        self._gain_1_s = gains.k_1_s
+        self._speed_max_m_s, self._climb_max_m_s = share * limits.speed_max_m_s, share * limits.climb_max_m_s
+
+    def velocities(self, p_W: Array) -> Array:
+        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], before the guard."""
+        v_W = self._gain_1_s * (self.p_W - p_W)
+        aside_m = np.linalg.norm((self.p_W - p_W)[:, :2], axis=1)
+        speed_m_s = self._gain_1_s * aside_m
+        v_W[:, :2] *= np.minimum(1.0, self._speed_max_m_s / np.maximum(speed_m_s, self._speed_max_m_s))[:, None]
+        v_W[:, 2] = np.clip(v_W[:, 2], -self._climb_max_m_s, self._climb_max_m_s) * (aside_m <= BENEATH_M)
+        return v_W
+
+    def farthest(self, p_W: Array) -> tuple[int, float]:
+        """Return which robot is farthest from its place, and how far [m]."""
+        away_m = np.linalg.norm(self.p_W - p_W, axis=1)
+        return int(np.argmax(away_m)), float(away_m.max())

@@ -26,12 +26,7 @@ class _DroneTasks:
 
 
 class DroneQueue:
-    """Runs tasks in order of submission for each drone; drones do not wait for each other.
-
-    Args:
-        pool: runs tasks in their order.
-        urgent: runs tasks that wait for no other.
-    """
+    """Runs tasks in order of submission for each drone, in `pool`, urgent ones in `urgent`; drones do not wait."""
 
     def __init__(self, pool: Executor, urgent: Executor) -> None:
         self._pool = pool
@@ -145,9 +140,10 @@ class CommandClient:
         self._views = views
         self._now_ns = now_ns
         self._report = report
-        self._seqs: Counter[str] = Counter()  # modes sent to each drone
+        self._seqs: Counter[str] = Counter()  # messages sent on each key
+        self._modes: Counter[str] = Counter()  # modes requested of each drone
         self._emergencies: Counter[str] = Counter()  # emergencies requested of each drone
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._pools = [
             ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"console-{kind}")
             for kind in ("request", "mode", "emergency", "release")
@@ -191,6 +187,7 @@ class CommandClient:
         was requested before it is sent after it.
         """
         for drone in drones:
+            self._modes[drone] += 1
             what = RequestOutcome(f"{drone}: {mode}", "", drone, mode)
             if mode == "emergency":
                 with self._lock:
@@ -199,6 +196,32 @@ class CommandClient:
             else:
                 turn, stops = partial(self._queue.submit, drone), self._emergencies[drone]
                 self._submit(turn, what, self._acquire_and_send, drone, mode, stops)
+
+    def modes_requested(self, drone: str) -> int:
+        """Return how many modes were requested of a drone so far."""
+        return self._modes[drone]
+
+    def take(self, drone: str, done: Callable[[str], None]) -> None:
+        """Acquire a drone with an operator's priority; `done` receives why that is refused, empty where it is not."""
+        with suppress(RuntimeError):  # closed; the run has ended
+            self._requests.submit(lambda: done(_refusal_of(self._acquire, drone, PRIORITY)))
+
+    def give_back(self, drone: str) -> None:
+        """Release a drone that was taken: it hovers, until somebody else flies it."""
+        with suppress(RuntimeError):
+            self._releases.submit(_refusal_of, self._request, keys.CONTROL, "release", {"drone": drone})
+
+    def send_velocity(self, drone: str, velocity_m_s: tuple[float, float, float], yaw_rate_rad_s: float) -> None:
+        """Command a drone that was taken: a velocity in its heading frame."""
+        key, v = keys.command(drone, "velocity"), velocity_m_s
+        with suppress(ZsimError):  # the link is lost: the world lets the drone hover
+            message = flight_messages.Velocity(self._now_ns(), self._next_seq(key), self._name, v, yaw_rate_rad_s)
+            self._link.put(key, message)
+
+    def _next_seq(self, key: str) -> int:
+        with self._lock:
+            seq, self._seqs[key] = self._seqs[key], self._seqs[key] + 1
+        return seq
 
     def _submit(
         self, begin: Callable[[Callable[[], None]], Any], what: RequestOutcome, act: Callable[..., str], *args: Any
@@ -240,9 +263,9 @@ class CommandClient:
         with self._lock:
             overtaken = stops is not None and self._emergencies[drone] > stops
             if not overtaken:
-                seq, self._seqs[drone] = self._seqs[drone], self._seqs[drone] + 1
-                message = flight_messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
-                self._link.put(keys.command(drone, "mode"), message)
+                key = keys.command(drone, "mode")
+                message = flight_messages.Mode(now_ns, self._next_seq(key), self._name, mode)  # type: ignore[arg-type]
+                self._link.put(key, message)
         with suppress(RuntimeError):  # closed: who leaves a run gives back what it has
             self._releases.submit(self._release, drone, before)
         return OVERTAKEN if overtaken else ""

@@ -46,6 +46,8 @@ ONE_LINE = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
 NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
+BESIDE = "padding:2px 10px"  # of a text in a panel, which viser lets touch the edge; as wide as of its controls
+TABLE_BESIDE = "padding:2px 6px;overflow-x:auto"  # and of a table, whose cells are 4 px apart
 
 
 class DroneRow(NamedTuple):
@@ -114,12 +116,12 @@ def battery_left_text(left_s: float | None) -> str:
 def figure_lines(figures: FlightFigures | None) -> str:
     """Return position, velocity and attitude of one drone."""
     if figures is None:
-        return f"<div style='{STYLE};padding:2px 0'>not seen yet</div>"
+        return f"<div style='{STYLE};{BESIDE}'>not seen yet</div>"
     x, y, z = figures.position_m
     place = f"position {x:.2f}, {y:.2f}, {z:.2f} m"
     speed = f"speed {figures.speed_m_s:.2f} m/s, climb {figures.climb_m_s:+.2f} m/s"
     turn = f"roll {figures.roll_deg:+.1f}°, pitch {figures.pitch_deg:+.1f}°, heading {figures.heading_deg:.0f}°"
-    return f"<div style='{STYLE};padding:2px 0'>{place}<br>{speed}<br>{turn}</div>"
+    return f"<div style='{STYLE};{BESIDE}'>{place}<br>{speed}<br>{turn}</div>"
 
 
 def link_note(link: ReceivedLink | None) -> tuple[str, str]:
@@ -148,7 +150,7 @@ def sensor_table(
         for kind, (used, refused) in counts.items()
     ]
     others = [(kind, "–", "–", f"{rate:.0f} Hz as set") for kind, rate in own_rates.items() if kind not in counts]
-    title = f"<div style='{STYLE};padding:2px 0'><b>{escape(name)}</b>: {escape(uncertainty)}</div>"
+    title = f"<div style='{STYLE};{BESIDE}'><b>{escape(name)}</b>: {escape(uncertainty)}</div>"
     head = _head(
         ("sensor", "of the drone"),
         ("used", "measurements that its estimator used"),
@@ -164,7 +166,7 @@ def formation_lines(states: Mapping[str, tuple[str, str]]) -> str:
         f"<b>{escape(name)}</b>: {escape(phase.replace('_', ' '))}" + (f" – {escape(reason)}" if reason else "")
         for name, (phase, reason) in states.items()
     ]
-    return f"<div style='{STYLE};{FEW_LINES};padding:2px 4px'>{'<br>'.join(lines) or 'no formation'}</div>"
+    return f"<div style='{STYLE};{FEW_LINES};{BESIDE}'>{'<br>'.join(lines) or 'no formation'}</div>"
 
 
 def event_table(newest_first: Iterable[EventRow]) -> str:
@@ -191,12 +193,13 @@ def _times(times: int) -> str:
 def fault_lines(faults: Sequence[str]) -> str:
     """Return the active faults."""
     lines = "<br>".join(f"⚠ {escape(fault)}" for fault in faults)
-    style = f"{STYLE};{FEW_LINES};padding:2px 4px;color:{AMBER if faults else GREY}"
+    style = f"{STYLE};{FEW_LINES};{BESIDE};color:{AMBER if faults else GREY}"
     return f"<div style='{style}'>{lines or NO_FAULT}</div>"
 
 
 def _table(body: str, wrap: str = "white-space:nowrap") -> str:
-    return f"<table style='{STYLE};{wrap};border-spacing:4px 1px;width:100%'>{body}</table>"
+    table = f"<table style='{STYLE};{wrap};border-spacing:4px 1px;width:100%'>{body}</table>"
+    return f"<div style='{TABLE_BESIDE}'>{table}</div>"
 
 
 def _head(*titles: tuple[str, str]) -> str:

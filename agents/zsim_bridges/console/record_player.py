@@ -3,6 +3,7 @@
 from typing import Any
 
 from zsim_bridges.console.command_client import CommandClient
+from zsim_bridges.console.monitoring.run_condition import RunCondition, run_refusals
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 
 
@@ -28,6 +29,10 @@ class RecordPlayer:
         """Request the timeline."""
         if self._is_replay:
             self.timeline = self._client.timeline()
+
+    def state(self, run: RunCondition) -> dict[str, Any]:
+        """Return the timeline, with why each operation of `play` would be refused; empty of a flight."""
+        return {**self.timeline, "refusals": run_refusals(run)} if self.timeline else {}
 
     def play(self, op: str, value: float) -> None:
         """Seek [s], pause, resume, step [gates] or set the rate; do nothing in a flight."""

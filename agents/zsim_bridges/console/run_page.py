@@ -7,15 +7,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-import numpy as np
 import viser
 from msgspec import UNSET
 
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
-from zsim.contract.views import ViewDrones
 from zsim.errors import RunError
-from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Hats
@@ -24,31 +21,23 @@ from zsim.transport.session import Session
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
-from zsim_bridges.console.camera_feed import CameraFeed
+from zsim_bridges.console.cameras.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows
+from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 from zsim_bridges.console.monitoring.run_monitor import RunMonitor
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
-from zsim_bridges.console.page.camera_follow import CameraFollow
-from zsim_bridges.console.page.camera_frustums import CameraFrustums
 from zsim_bridges.console.page.console_page import ConsolePage
 from zsim_bridges.console.page.page_forms import PageForms
-from zsim_bridges.console.page.picture import (
-    CanvasTrails,
-    DronePoses,
-    FormationShape,
-    drone_on_ray,
-    drone_poses,
-    ellipsoids,
-    formation_shape,
-    ghosts,
-)
-from zsim_bridges.console.page.scene_nodes import SceneNodes
-from zsim_bridges.console.picture_rate import picture_rate_hz
 from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.run_state import console_state
+from zsim_bridges.console.scene.camera_follow import CameraFollow
+from zsim_bridges.console.scene.camera_frustums import CameraFrustums
+from zsim_bridges.console.scene.picture import DronePoses
+from zsim_bridges.console.scene.picture_rate import picture_rate_hz
+from zsim_bridges.console.scene.run_scene import RunScene
 from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
@@ -84,6 +73,7 @@ class RunPage:
         views: the newest of everything.
         cameras: of the drones.
         record: what is played, of a replay.
+        flying: what pages may do with single drones.
     """
 
     def __init__(
@@ -99,8 +89,6 @@ class RunPage:
         self._server = server
         self._info = info
         self._observer = observer
-        self._camera_follow = camera_follow
-        camera_follow.restart()
         self._scenario = scenario_file.from_text(info.scenario)
         names = tuple(drone.name for drone in info.drones)
         self._rate_hz = rate_hz
@@ -116,26 +104,20 @@ class RunPage:
         self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
         self._frustums = frustums
         self._names = names
-        self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
-        self._trails = CanvasTrails(len(names))
         rates = {drone.name: own_rates(drone) for drone in self._scenario.drones}
         self._table_rows = TableRows(self.views, rates, self._monitor.board.severity_of)
-        self._shapes: dict[str, FormationShape | None] = {}
-        self._drones: DronePoses | None = None
-        self._drawn_ghosts: dict[str, Any] = {}
-        self._drawn_ns = self._table_s = self._monitor_s = 0.0
-        robots = sum(space.n for space in self._spaces.values())
-        arms_m = [drone.arm_m for drone in self._scenario.drones]
-        self._scene = SceneNodes(server, info.drones, arms_m, robots, len(self._spaces))
-        self._scene.on_click(self._on_click)
-        self._scene.obstacles(self._scenario.environment.obstacles)
-        show = self._scene.show
+        self._table_s = self._monitor_s = 0.0
+        self._scene = RunScene(server, info, self._scenario, self._spaces, self.views, camera_follow)
+        self._scene.nodes.on_click(self._on_click)
+        show = self._scene.nodes.show
         self._page = ConsolePage(
             server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones
         )
         page = self._page
         folders = page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
-        self._page_forms = PageForms(server, self._client, list(names), self._scene.radii_m, *folders)
+        self._page_forms = PageForms(server, self._client, list(names), self._scene.nodes.radii_m, *folders)
+        seen = self.views, self._time_monitor, self._monitor, self._scene, self._page_forms
+        self.flying = PageFlying(info, self._scenario, self._spaces, self._client, observer.name, *seen)
 
     def close(self) -> None:
         """Send nothing any more."""
@@ -143,16 +125,17 @@ class RunPage:
         self._page_forms.close()
         self.cameras.close()
         self._frustums.clear()
-        self._scene.close()
+        self._scene.nodes.close()
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Draw pictures until the run is over or `stopped` returns true."""
         self.views.open()
         self.cameras.open()
         self.record.load()
+        self._monitor.record_end_s = self.record.timeline.get("to_s", math.inf)
         pause = threading.Event()
         next_s = time.monotonic()
-        with self._time_monitor.polling():
+        with self._time_monitor.polling(), self.flying.running():
             while not self._observer.end_reason and not stopped():
                 self._update(time.monotonic())
                 next_s = max(next_s + self._period_s(), time.monotonic())
@@ -161,8 +144,8 @@ class RunPage:
 
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
-        state = console_state(self._info.run_id, self.views, self._time_monitor, dict(self._shapes))
-        return {**state, "cameras": self.cameras.state(), "timeline": self.record.timeline}
+        state = console_state(self._info.run_id, self.views, self._time_monitor, dict(self._scene.shapes))
+        return {**state, "cameras": self.cameras.state(), "timeline": self.record.state(self._monitor.condition)}
 
     def head(self) -> dict[str, Any]:
         """Return the head of the page, as plain data."""
@@ -202,7 +185,7 @@ class RunPage:
         with self._server.atomic():
             if new:
                 self._draw()
-            self._frustums.draw(self._drones, self.cameras.shown)
+            self._frustums.draw(self._scene.drones, self.cameras.shown)
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
                 self._update_tables(wall_s)
@@ -213,9 +196,7 @@ class RunPage:
             self._note("done", done.subject, f"{done.text}: done")
 
     def _on_click(self, event: viser.SceneClickEvent) -> None:
-        if self._drones is None:
-            return
-        drone = drone_on_ray(self._drones, self._scene.radii_m, event.ray_origin, event.ray_direction)
+        drone = self._scene.clicked(event)
         if drone is not None:
             self._page_forms.choose(event.client_id, drone)
             self._frustums.click(event.client_id, drone)
@@ -234,63 +215,24 @@ class RunPage:
     def _store_unseen(self, new: bool) -> None:
         """Store what pages show of the time before they were opened."""
         if new and self.views.drones is not None:
-            self._camera_follow.set_target(self._camera_targets(self._store_drones(self.views.drones)))
-
-    def _store_drones(self, view: ViewDrones) -> DronePoses:
-        """Store the drones' newest poses, and return them."""
-        drones = drone_poses(view, self._names)
-        if drones.t_ns < self._drawn_ns:
-            self._trails.clear()  # a replay has gone back
-        self._drones, self._drawn_ns = drones, drones.t_ns
-        self._trails.add(drones.p_W)
-        self._update_shapes(drones)
-        return drones
+            self._add_points(self._scene.store(self.views.drones))
 
     def _draw(self) -> None:
         assert self.views.drones is not None
-        before_ns = self._drawn_ns
-        drones = self._store_drones(self.views.drones)
-        dt_s = min(self._period_s(), max(0.0, (drones.t_ns - before_ns) / 1e9))
-        self._scene.drones(drones, dt_s)
+        drones = self._scene.draw(self.views.drones, self._period_s(), self._page.chosen)
         self._page_forms.move_rings(drones)
-        estimates = self.views.estimates().values()
-        self._scene.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
-        if self._shapes:
-            self._scene.shapes(list(self._shapes.values()), list(self._shapes).index(self._page.chosen))
-        self._draw_ghosts()
-        self._camera_follow.follow(self._camera_targets(drones))
+        self._add_points(drones)
 
-    def _draw_ghosts(self) -> None:
-        """Move the ghosts where a formation's desired shape has changed."""
-        wanted = {name: (view.phase, view.desired) for name, view in self.views.clusters.items()}
-        if wanted == self._drawn_ghosts:
-            return
-        self._drawn_ghosts = wanted
-        poses = [ghosts(self._spaces[name], view) for name, view in self.views.clusters.items()]
-        shown = [each for each in poses if each is not None]
-        p_W = np.concatenate([p for p, _ in shown]) if shown else np.zeros((0, 3))
-        self._scene.ghosts(p_W, np.concatenate([q for _, q in shown]) if shown else np.zeros((0, 4)))
-
-    def _update_shapes(self, drones: DronePoses) -> None:
-        """Compute the formations' true shapes, and add them to the plots."""
-        there, yaw = drones.present, frames.heading(drones.q_WB)
-        for name, space in self._spaces.items():
-            members = self._members[name]
-            whole = bool(there[members].all())
-            self._shapes[name] = true_shape = (
-                formation_shape(space, drones.p_W[members], yaw[members]) if whole else None
-            )
+    def _add_points(self, drones: DronePoses) -> None:
+        """Add the formations' variables and the drones' flight to the plots."""
+        t_s = drones.t_ns / 1e9
+        for name, true_shape in self._scene.shapes.items():
             view = self.views.clusters.get(name)
             if view is not None:
                 true_c = None if true_shape is None else true_shape.c
-                self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true_c)
+                self._page.plots[name].history.add(t_s, view.desired, view.value, true_c)
         estimates = self.views.estimates().items()
         self._page.flights.add(drones, {name: each.estimate for name, each in estimates if each.fresh})
-
-    def _camera_targets(self, drones: DronePoses) -> np.ndarray:
-        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""
-        members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
-        return drones.p_W[members][drones.present[members]]
 
     # Tables
 
@@ -306,9 +248,7 @@ class RunPage:
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
             page.plots[page.chosen].draw()
-        if self._drones is not None:
-            self._scene.trails(*self._trails.segments(self._drones.p_W))
-            self._scene.wind(self._drones)
+        self._scene.draw_trails()
 
     def _update_controls(self, flown: Mapping[str, FlightFigures]) -> None:
         """Grey out what would be refused, and show on each page the drone that it has chosen."""

@@ -7,7 +7,7 @@ from zsim.contract.run_messages import Fault
 from zsim.contract.views import ViewCluster, ViewDrones
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
-from zsim_bridges.console.page.picture import FormationShape
+from zsim_bridges.console.scene.picture import FormationShape
 
 EVENTS_MAX = 20
 SILENT = "silent"  # in place of the clock's state, where the world answers nothing

@@ -20,8 +20,8 @@ classdef Client < handle
     % Keys, messages, units and frames are those of docs/protocol.md. Lists of numbers are rows, 1 x n. Times t_ns are
     % doubles, exact up to 2^53 ns, 104 days.
     %
-    % Errors: zsim:connection (no gateway, or it is gone), zsim:refused (what was asked for; nothing has happened),
-    % zsim:timeout (no answer), zsim:argument (a value that cannot be sent, or an unknown option).
+    % Errors: zsim:connection (no gateway within Wait, or it is gone), zsim:refused (what was asked for; nothing has
+    % happened), zsim:timeout (no answer), zsim:argument (a value that cannot be sent, or an unknown option).
 
     properties (SetAccess = private)
         name = ''  % in whose name it speaks, e.g. client.laptop
@@ -43,14 +43,15 @@ classdef Client < handle
         function c = Client(host, varargin)
             % Connect to a gateway. Options by name and value:
             %   'Port' (7470), 'Token' (the variable ZSIM_TOKEN), 'Name' (what the gateway calls it),
-            %   'Timeout' (10 s, for an answer), 'Wait' (30 s, for a run to begin)
+            %   'Timeout' (10 s, for an answer), 'Wait' (30 s, for the gateway to come up and a run to begin)
             if nargin < 1
                 host = '127.0.0.1';
             end
             given = options(varargin);
             c.timeout_s = given.timeout;
-            c.talk = zsim.Conversation(char(host), given.port, given.timeout);
-            c.greet(given);
+            start = tic;
+            c.talk = zsim.Conversation(char(host), given.port, given.timeout, given.wait);
+            c.greet(given, start);
         end
 
         function reason = get.left(c), reason = c.talk.left; end
@@ -285,13 +286,13 @@ classdef Client < handle
     end
 
     methods (Access = private)
-        function greet(c, given)
-            % Say who it is, and wait for a run.
+        function greet(c, given, start)
+            % Say who it is, and wait for a run, until given.wait after start.
             said = ['"name":' text_of(given.name) ',"token":' text_of(given.token)];
             try
                 c.know(c.talk.request('hello', said));
                 if isempty(c.run)
-                    c.talk.await_run(given.wait);
+                    c.talk.await_run(max(0, given.wait - toc(start)), given.wait);
                     c.know(c.talk.request('hello', said));
                 end
             catch reason

@@ -25,10 +25,10 @@ classdef Conversation < handle
     end
 
     methods
-        function talk = Conversation(host, port, timeout_s)
+        function talk = Conversation(host, port, timeout_s, wait_s)
             talk.timeout_s = timeout_s;
             talk.queue = zsim.Queue();
-            talk.wire = zsim.Wire(host, port);
+            talk.wire = zsim.Wire(host, port, wait_s);
         end
 
         function answer = request(talk, op, fields, timeout_s)
@@ -70,14 +70,14 @@ classdef Conversation < handle
             key = said.key;
         end
 
-        function await_run(talk, timeout_s)
-            % Wait until a run has begun.
+        function await_run(talk, timeout_s, wait_s)
+            % Wait until a run has begun, for timeout_s, which is what is left of wait_s.
             start = tic;
             while ~talk.begun
                 line = talk.wire.receive(max(0, timeout_s - toc(start)));
                 if isempty(line)
                     error('zsim:timeout', 'no run on the gateway at %s within %g s; start one with: zsim run', ...
-                        talk.wire.address, timeout_s);
+                        talk.wire.address, wait_s);
                 end
                 talk.take_in(line, 0);
             end

@@ -1,7 +1,7 @@
 classdef Wire < handle
     % Lines of text on a TCP connection: MATLAB's tcpclient, or Octave's sockets package.
     %
-    %   wire = zsim.Wire('127.0.0.1', 7470)
+    %   wire = zsim.Wire('127.0.0.1', 7470, 30)      % waits 30 s for somebody to listen there
     %   wire.send('{"op":"hello"}')
     %   line = wire.receive(1.0)         % '' if none came within 1 s
     %
@@ -23,17 +23,15 @@ classdef Wire < handle
     end
 
     methods
-        function wire = Wire(host, port)
+        function wire = Wire(host, port, wait_s)
+            AGAIN_S = 0.1;  % between two tries: a gateway on its way up is there soon enough, and nobody is flooded
             wire.address = sprintf('%s:%d', host, port);
-            try
-                if exist('OCTAVE_VERSION', 'builtin')
-                    wire.socket = octave_connection(host, port);
-                else
-                    wire.device = matlab_connection(host, port);
+            start = tic;
+            while ~wire.dial(host, port)
+                if toc(start) >= wait_s
+                    error('zsim:connection', 'nobody answers on %s; start `zsim gateway` there', wire.address);
                 end
-            catch reason
-                error('zsim:connection', ...
-                    'no gateway on %s (%s); start one with: zsim gateway', wire.address, reason.message);
+                pause(AGAIN_S);
             end
         end
 
@@ -81,6 +79,23 @@ classdef Wire < handle
     end
 
     methods (Access = private)
+        function is_up = dial(wire, host, port)
+            % Return whether somebody took the connection; what no waiting mends is an error.
+            is_up = true;
+            try
+                if exist('OCTAVE_VERSION', 'builtin')
+                    wire.socket = octave_connection(host, port);
+                else
+                    wire.device = matlab_connection(host, port);
+                end
+            catch reason
+                if strcmp(reason.identifier, 'zsim:connection')
+                    rethrow(reason);
+                end
+                is_up = false;
+            end
+        end
+
         function line = fill(wire, timeout_s)
             % Wait for whole lines, keep them, and return the first. Each byte is looked at once.
             line = '';
@@ -166,10 +181,18 @@ function s = octave_connection(host, port)
     try
         pkg('load', 'sockets');
     catch
-        error('the package sockets is missing; on Debian: apt-get install octave-sockets');
+        error('zsim:connection', 'the package sockets is missing; on Debian: apt-get install octave-sockets');
     end
     s = socket(AF_INET, SOCK_STREAM, 0);
-    connect(s, struct('addr', host, 'port', port));
+    try
+        connect(s, struct('addr', host, 'port', port));
+    catch reason
+        disconnect(s);
+        if ~isempty(strfind(reason.message, 'gethostbyname'))
+            error('zsim:connection', '%s: no such host', host);
+        end
+        rethrow(reason);
+    end
 end
 
 function connection = matlab_connection(host, port)

@@ -33,7 +33,6 @@ from zsim.math.frames import heading, quaternion_from_rpy
 from zsim_analysis.export.foxglove_scene import (
     WORLD,
     colour,
-    drone_colour,
     frame,
     pose,
     quaternion,
@@ -184,8 +183,8 @@ def cluster_frame(names: Sequence[str], values: Sequence[float]) -> tuple[Values
     return x_c[:3], quaternion_from_rpy(x_c[3:])
 
 
-def location_fix(gps: Gps, drone: str, index: int) -> LocationFix:
-    """Return the position that a drone's GPS measured, in the colour of the scenario's drone `index`."""
+def location_fix(gps: Gps, drone: str, tint: str) -> LocationFix:
+    """Return the position that a drone's GPS measured, in the drone's colour."""
     variance = gps.sigma_m**2
     return LocationFix(
         timestamp=timestamp(max(0, gps.t_sample_ns)),
@@ -195,7 +194,7 @@ def location_fix(gps: Gps, drone: str, index: int) -> LocationFix:
         altitude=gps.altitude_m,
         position_covariance=[variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance],
         position_covariance_type=LocationFixPositionCovarianceType.DiagonalKnown,
-        color=colour(drone_colour(index)),
+        color=colour(tint),
     )
 
 

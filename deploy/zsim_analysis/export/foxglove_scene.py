@@ -5,7 +5,7 @@ Foxglove shows, at any time, the last message of a topic alone; so each message 
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, NamedTuple
@@ -33,14 +33,13 @@ from zsim.contract.camera_messages import CameraImage, CameraInfo
 from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth
 from zsim.contract.messages import Gps, Info
 from zsim.contract.run_messages import Event
+from zsim.drone_colours import drone_colours
 from zsim.math.frames import principal_axes
 from zsim.record import Recorded
 from zsim_analysis.export.message_columns import Values
 from zsim_analysis.export.selection import subject
 
 LEVEL = Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
-# Okabe and Ito's colours, distinct with every kind of colour vision.
-DRONES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 MAGENTA, DARK, GREY = "#d4008f", "#30363d", "#8c959f"
 DRAWN = (Truth, Estimate, Status, Gps, ClusterState, Event, CameraImage, CameraInfo)
 WORLD = "world"
@@ -141,8 +140,9 @@ def colour(text: str, opacity: float = 1.0) -> Color:
     return Color(r=red, g=green, b=blue, a=opacity)
 
 
-def drone_colour(index: int) -> str:
-    return DRONES[index % len(DRONES)]
+def colours_of(drones: Collection[str]) -> dict[str, str]:
+    """Return the colour of each drone, which are in the order of the scenario."""
+    return dict(zip(drones, drone_colours(len(drones)), strict=True))
 
 
 def frame(drone: str) -> str:
@@ -158,9 +158,7 @@ def camera_frame(drone: str, camera: str) -> str:
 def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> SceneUpdate:
     """Return the drones, each in its own frame, written once, as their frames move; `rotors` are theirs, by name."""
     at = timestamp(t_ns)
-    return SceneUpdate(
-        entities=[_drone(at, name, discs, drone_colour(i)) for i, (name, discs) in enumerate(rotors.items())]
-    )
+    return SceneUpdate(entities=[_drone(at, name, rotors[name], tint) for name, tint in colours_of(rotors).items()])
 
 
 def _drone(at: Timestamp, name: str, discs: Sequence[RotorDisc], mark: str) -> SceneEntity:
@@ -249,7 +247,7 @@ def formations(instant: Instant, desired_m: Mapping[str, Values]) -> SceneUpdate
     return SceneUpdate(entities=entities)
 
 
-def estimates(instant: Instant, order: Mapping[str, int]) -> SceneUpdate:
+def estimates(instant: Instant, colours: Mapping[str, str]) -> SceneUpdate:
     """Return the ellipsoids within which the estimators believe their drones to be, at two standard deviations."""
     at, entities = timestamp(instant.t_ns), []
     for name, estimate in instant.estimates.items():
@@ -258,7 +256,7 @@ def estimates(instant: Instant, order: Mapping[str, int]) -> SceneUpdate:
         shown = SpherePrimitive(
             pose=pose(estimate.position_m, axes),
             size=vector([2.0 * SIGMAS * each for each in sigma_m]),
-            color=colour(drone_colour(order.get(name, 0)), 0.25),
+            color=colour(colours.get(name, GREY), 0.25),
         )
         entities.append(_entity(at, name, WORLD, spheres=[shown]))
     return SceneUpdate(entities=entities)
@@ -271,13 +269,13 @@ class DroneTrails:
         self._paths: dict[str, deque[Sequence[float]]] = {}
         self._length = round(TRAIL_S * 1e9) // TRAIL_STEP_NS + 1
 
-    def update(self, instant: Instant, order: Mapping[str, int]) -> SceneUpdate:
+    def update(self, instant: Instant, colours: Mapping[str, str]) -> SceneUpdate:
         """Add the positions of an instant, return the trails."""
         at, entities = timestamp(instant.t_ns), []
         for name, truth in instant.truth.items():
             path = self._paths.setdefault(name, deque(maxlen=self._length))
             path.append(truth.position_m)
-            trail = _line(path, colour(drone_colour(order.get(name, 0)), 0.7), LinePrimitiveLineType.LineStrip)
+            trail = _line(path, colour(colours.get(name, GREY), 0.7), LinePrimitiveLineType.LineStrip)
             entities.append(_entity(at, name, WORLD, lines=[trail]))
         return SceneUpdate(entities=entities)
 

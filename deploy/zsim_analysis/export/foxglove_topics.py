@@ -27,7 +27,7 @@ from zsim.math.frames import heading
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_analysis.export import foxglove_messages, foxglove_scene
 from zsim_analysis.export.foxglove_messages import NumericMessageType
-from zsim_analysis.export.foxglove_scene import MAGENTA, Instant, RotorDisc, drone_colour, pose, timestamp
+from zsim_analysis.export.foxglove_scene import GREY, MAGENTA, Instant, RotorDisc, colours_of, pose, timestamp
 
 TF, LOG, DRONES, GROUND, TRAILS = "/tf", "/log", "/scene/drones", "/scene/ground", "/scene/trails"
 FORMATIONS, ESTIMATES = "/scene/formations", "/scene/estimates"
@@ -125,7 +125,7 @@ class FoxgloveFile:
         self._file = foxglove.open_mcap(self._checked_file, context=self._context)
         self._rotors = rotors
         self._spaces = spaces
-        self._order = {name: i for i, name in enumerate(rotors)}
+        self._colours = colours_of(rotors)
         self._channels: dict[str, Any] = {}
         self._variables: dict[str, NumericMessageType] = {}
         self._drone = NumericMessageType("Drone", foxglove_messages.DRONE_NUMBERS, ("state",))
@@ -164,7 +164,7 @@ class FoxgloveFile:
         for name in dict.fromkeys([*instant.truth, *instant.estimates]):
             self._write_drone(instant, name)
         for name, gps in instant.gps.items():
-            fix = foxglove_messages.location_fix(gps, name, self._order.get(name, 0))
+            fix = foxglove_messages.location_fix(gps, name, self._colours.get(name, GREY))
             self._log(f"/drone/{name}/gps", LocationFixChannel, fix, gps.t_ns)
         for name, state in instant.states.items():
             self._write_cluster(instant, name, state)
@@ -241,9 +241,9 @@ class FoxgloveFile:
 
     def _write_scene(self, instant: Instant) -> None:
         if instant.truth and self._is_due(TRAILS, instant.t_ns, foxglove_scene.TRAIL_STEP_NS):
-            self._log(TRAILS, SceneUpdateChannel, self._trails.update(instant, self._order), instant.t_ns)
+            self._log(TRAILS, SceneUpdateChannel, self._trails.update(instant, self._colours), instant.t_ns)
         if instant.truth and self._is_due(POINTS, instant.t_ns, SCENE_STEP_NS):
-            places = [(truth.position_m, drone_colour(self._order.get(d, 0))) for d, truth in instant.truth.items()]
+            places = [(truth.position_m, self._colours.get(d, GREY)) for d, truth in instant.truth.items()]
             self._log(POINTS, PointCloudChannel, foxglove_messages.points(instant.t_ns, places), instant.t_ns)
         if instant.states and self._is_due(FORMATIONS, instant.t_ns, SCENE_STEP_NS):
             desired = {c: m for c, state in instant.states.items() if (m := self._places(c, state)) is not None}
@@ -252,7 +252,7 @@ class FoxgloveFile:
                 places = [(place, MAGENTA) for each in desired.values() for place in each.tolist()]
                 self._log(DESIRED, PointCloudChannel, foxglove_messages.points(instant.t_ns, places), instant.t_ns)
         if instant.estimates and self._is_due(ESTIMATES, instant.t_ns, SCENE_STEP_NS):
-            self._log(ESTIMATES, SceneUpdateChannel, foxglove_scene.estimates(instant, self._order), instant.t_ns)
+            self._log(ESTIMATES, SceneUpdateChannel, foxglove_scene.estimates(instant, self._colours), instant.t_ns)
 
     def _places(self, name: str, state: ClusterState) -> Any:
         """Return the desired positions of a cluster's drones (n, 3), None where they are not known."""

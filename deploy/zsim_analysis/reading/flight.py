@@ -2,14 +2,12 @@
 
 from array import array
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from zsim.contract import keys
 from zsim.contract.flight_messages import Quaternion
@@ -17,117 +15,16 @@ from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Bye, Event, Join
 from zsim.record import Completeness, Recorded, RecordReader, completeness
-from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Vector3
+from zsim_analysis.reading.drone_answers import DroneAnswers, EstimateFields, VelocityFields
+from zsim_analysis.reading.recorded_flight import (
+    TRUTH_WIDTH,
+    ClusterStates,
+    RecordedFlight,
+    RecordedProcess,
+    Track,
+)
 from zsim_analysis.reading.recorded_run import scenario_of
-
-Array = NDArray[np.float64]
-Times = NDArray[np.int64]
-
-TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
-
-
-@dataclass
-class Track:
-    """One drone as it truly flew, W and B as in the contract.
-
-    Attributes:
-        t_ns: (T,) instants of truth, ascending, without doubles.
-        truth: (T, 13) position [m], velocity [m/s], orientation w first, angular velocity [rad/s; B].
-        status_t_ns: (S,) instants of status.
-        states: (S,) state of the firmware by name.
-        battery_percent: (S,).
-        external: whether it is the pose that a driver has published: the best that it had, not the truth.
-    """
-
-    name: str
-    t_ns: Times
-    truth: Array
-    status_t_ns: Times
-    states: list[str]
-    battery_percent: Array
-    external: bool = False
-
-    @property
-    def p_W(self) -> Array:
-        return self.truth[:, :3]
-
-    @property
-    def yaw(self) -> Array:
-        """Return the heading (T,) [rad]."""
-        w, x, y, z = self.truth[:, 6:10].T
-        return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-@dataclass
-class ClusterStates:
-    """What the controller of one cluster published: K instants, n names; `reasons` (K,) why it waits or is held."""
-
-    name: str
-    drones: tuple[str, ...]
-    names: tuple[str, ...] = ()
-    t_ns: Times = field(default_factory=lambda: np.zeros(0, np.int64))
-    value: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    desired: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    phases: list[str] = field(default_factory=list)
-    reasons: list[str] = field(default_factory=list)
-
-
-@dataclass
-class RecordedProcess:
-    """A process that joined."""
-
-    name: str
-    role: str = ""
-    host: str = ""
-    pid: int = 0
-    version: str = ""
-    fingerprint: str = ""
-    incarnations: int = 0
-    left: str = ""
-
-
-@dataclass
-class RecordedFlight:
-    """Everything of a record that a report needs; what is not on record is None or empty.
-
-    Attributes:
-        messages: on record, all keys.
-        completeness: of the record.
-        wall_s: wall time from the first truth to the last, as they reached the recorder.
-        undecoded: payloads that are not of the type of their key.
-    """
-
-    info: Info | None
-    scenario: Scenario | None
-    tracks: list[Track]
-    clusters: list[ClusterStates]
-    events: list[Event]
-    processes: list[RecordedProcess]
-    messages: int
-    completeness: Completeness
-    wall_s: float
-    undecoded: int = 0
-
-    @property
-    def end(self) -> dict[str, Any] | None:
-        """Return the data of the world's last `end` event, None if there is none on record."""
-        return next((event.data for event in reversed(self.events) if event.kind == "end"), None)
-
-    @property
-    def replay_of(self) -> str:
-        """Return the run_id of the run that was played back, "" for a flight."""
-        return self.info.replay_of if self.info else ""
-
-    @property
-    def first_ns(self) -> int:
-        """Return the first instant of truth."""
-        return min((int(track.t_ns[0]) for track in self.tracks if len(track.t_ns)), default=0)
-
-    @property
-    def last_ns(self) -> int:
-        """Return the last instant of truth."""
-        return max((int(track.t_ns[-1]) for track in self.tracks if len(track.t_ns)), default=0)
 
 
 class _Truth(Struct):
@@ -144,6 +41,7 @@ class _Status(Struct):
     t_ns: int
     state: str
     battery_percent: float
+    commander: str | None = None
 
 
 class _State(Struct):
@@ -156,24 +54,39 @@ class _State(Struct):
     reason: str = ""
 
 
-def read_flight(path: Path) -> RecordedFlight:
+def read_flight(path: Path, answers: bool = False, motion: bool = True) -> RecordedFlight:
     """Return the flight of a record.
+
+    Args:
+        path: of the record.
+        answers: with the drones' estimates and velocity commands.
+        motion: with all of truth and status, not the last truth of each drone alone.
 
     Raises:
         RecordError: no such record.
     """
     with RecordReader(path) as reader:
-        flight = FlightReader()
+        flight = FlightReader(answers)
         wanted = [key for key in reader.topics() if flight.handler(key)]
+        if not motion:
+            ends = [reader.last(key) for key in wanted if keys.leaf(key) == "truth"]
+            wanted = [key for key in wanted if keys.parts(key)[0] != "drone"]
+            for message in filter(None, ends):
+                flight.add(message)
         for message in reader.messages(wanted, by_time=False):
             flight.add(message)
         return flight.flight(sum(reader.topics().values()), completeness(reader))
 
 
 class FlightReader:
-    """The flight while its record is read, or while it is flown in this process, message by message."""
+    """The flight while its record is read, or while it is flown in this process, message by message.
 
-    def __init__(self) -> None:
+    Args:
+        answers: take the drones' estimates and velocity commands too.
+    """
+
+    def __init__(self, answers: bool = False) -> None:
+        self._answers = DroneAnswers() if answers else None
         self._infos: list[Info] = []
         self._events: list[Event] = []
         self._truth: dict[str, tuple[array[int], array[float]]] = {}
@@ -198,6 +111,9 @@ class FlightReader:
                 "drone/sensor/status": (_Status, self._store_status),
                 "cluster/state": (_State, lambda name, message: self._states.setdefault(name, []).append(message)),
             }
+            if answers := self._answers:
+                kinds["drone/estimate"] = (EstimateFields, answers.add_estimate)
+                kinds["drone/cmd/velocity"] = (VelocityFields, answers.add_command)
             kind, store = kinds.get(f"{group}/{what}" if what else key, (None, None))
             self._handlers[key] = (msgspec.msgpack.Decoder(kind), store) if kind and store else None
         return self._handlers[key]
@@ -243,6 +159,8 @@ class FlightReader:
         times.append(status.t_ns)
         states.append(status.state)
         battery.append(status.battery_percent)
+        if self._answers:
+            self._answers.add_commander(name, status.t_ns, status.commander)
 
     def _store_process(self, name: str, message: Join | Bye) -> None:
         process = self._processes.setdefault(name, RecordedProcess(name))
@@ -271,6 +189,8 @@ class FlightReader:
             completeness=completeness or Completeness(),
             wall_s=(self._last_wall_ns - (self._first_wall_ns or 0)) / 1e9,
             undecoded=self._undecoded,
+            estimates=self._answers.estimates() if self._answers else {},
+            commands=self._answers.commands() if self._answers else {},
         )
 
     def _track(self, name: str, external: bool) -> Track:

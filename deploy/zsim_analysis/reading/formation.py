@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
-from zsim_analysis.reading.flight import Array, ClusterStates, RecordedFlight, Times, Track
+from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, Times, Track
 
 BLOCK = 512  # instants whose distances are held at once
 

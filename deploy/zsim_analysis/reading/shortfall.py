@@ -7,7 +7,7 @@ from msgspec import Struct
 
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.flight_plan import waiting_step
-from zsim_analysis.reading.flight import ClusterStates, RecordedFlight
+from zsim_analysis.reading.recorded_flight import ClusterStates, RecordedFlight
 
 ENGAGES_S = 20.0  # chosen: a formation engages 4 to 12 s after its take-off; a run may end before
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import msgspec
 
-from zsim_analysis.reading.flight import RecordedFlight
 from zsim_analysis.reading.formation import Formation
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.summary import RunSummary
 
 ABSENT = "–"

@@ -8,17 +8,13 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
-
-from zsim.errors import RecordError, ReportError, printable
+from zsim.errors import RecordError, ReportError
 from zsim.record.record_reader import RECORD
-from zsim.runtime.progress import cell
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.driver_links import link_text
-from zsim_analysis.reading.flight import RecordedFlight, read_flight
+from zsim_analysis.reading.flight import read_flight
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.comparison import (
     ABSENT,
     ComparedRun,
@@ -34,26 +30,24 @@ from zsim_analysis.report.figures.comparison_figures import comparison_figures
 from zsim_analysis.report.figures.report_figures import figures
 from zsim_analysis.report.pages import Picture, sources, template, write_page, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
-from zsim_analysis.report.summary import ClusterErrors, RunSummary, summarise
+from zsim_analysis.report.summary import RunSummary, summarise
+from zsim_analysis.report.tables import PAPER_COLUMN, error_table
 
 STATISTICS = ("est. std", "true std", "true RMS", "true mean")
 NAMED, NAMES_MAX = 3, 100  # runs whose names the page's own name holds, and characters of them
 MARK, MARK_WITHIN = b": comparison</title>", 4_000  # of a page of ours, within its first bytes
-PAPER_COLUMN = "paper std"
-COLUMNS = ("parameter", PAPER_COLUMN, "est. std", "est. mean", "true std", "true RMS", "true mean")
-NOT_AS_PLANNED = "NOT AS PLANNED"
 
 
 def judge(
-    record: Path, progress: Callable[[str], None] = lambda _: None
+    record: Path, progress: Callable[[str], None] = lambda _: None, answers: bool = False
 ) -> tuple[RecordedFlight, list[Formation], RunSummary]:
-    """Return what a record holds and its figures of merit; nothing is written.
+    """Return what a record holds, with the drones' estimates and commands if asked for, and its figures of merit.
 
     Raises:
         RecordError: there is no record, or it holds no truth of any drone.
     """
     progress("reading the record")
-    flight = read_flight(record)
+    flight = read_flight(record, answers)
     if all(len(track.t_ns) == 0 for track in flight.tracks):
         content = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
         raise RecordError(f"{record}: {content} ({flight.completeness}); there is nothing to report")
@@ -62,20 +56,23 @@ def judge(
     return flight, formations, summarise(flight, formations, record)
 
 
-def make_report(directory: Path, progress: Callable[[str], None] = lambda _: None) -> RunSummary:
+def make_report(
+    directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
+) -> RunSummary:
     """Read DIR/run.mcap, write DIR/summary.json, DIR/figures/*.png and DIR/report.html.
 
     Args:
         directory: the run directory.
         progress: called with a text at each step.
+        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written too.
 
     Raises:
         RecordError: there is no record, or it holds no truth of any drone.
         ReportError: the directory cannot be written.
     """
-    flight, formations, summary = judge(directory / RECORD, progress)
+    flight, formations, summary = judge(directory / RECORD, progress, answers=True)
     drawings = figures(flight, formations, summary)
-    write_report(directory, summary.json(), drawings, partial(page, summary), progress)
+    write_report(directory, summary.json(), drawings, partial(page, summary), progress, formats)
     return summary
 
 
@@ -85,27 +82,10 @@ def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
         summary=summary,
         facts=facts(summary),
         paper_column=PAPER_COLUMN,
-        tables={name: (columns(cluster), rows(cluster)) for name, cluster in summary.clusters.items()},
+        tables={name: error_table(cluster) for name, cluster in summary.clusters.items()},
         paper_note=PAPER_NOTE if any(cluster.paper_std for cluster in summary.clusters.values()) else "",
         figures=sources(pictures),
     )
-
-
-def columns(cluster: ClusterErrors) -> list[str]:
-    """Return the columns of a cluster's table; the paper's stands beside a flight of its Test 1 alone."""
-    return [column for column in COLUMNS if column != PAPER_COLUMN or cluster.paper_std]
-
-
-def rows(cluster: ClusterErrors) -> list[list[str]]:
-    """Return a cluster's table, on the page and on the terminal."""
-    return [_row(cluster, parameter, errors) for parameter, errors in cluster.errors.items()]
-
-
-def _row(cluster: ClusterErrors, parameter: str, errors: ParameterErrors) -> list[str]:
-    printed = cluster.paper_std.get(parameter)
-    paper = ["" if printed is None else f"{printed:g}"] if cluster.paper_std else []
-    values = (errors.est_std, errors.est_mean, errors.true_std, errors.true_rms, errors.true_mean)
-    return [f"{parameter} ({unit(parameter)})", *paper, *("–" if value is None else f"{value:.4f}" for value in values)]
 
 
 def facts(summary: RunSummary) -> list[tuple[str, str]]:
@@ -136,37 +116,6 @@ def _misses(summary: RunSummary) -> str:
         return "not known"
     by = ", ".join(f"{name} {count}" for name, count in summary.deadline_misses_by.items() if count)
     return f"{summary.deadline_misses} of {summary.deadlines or 0}{f' ({by})' if by else ''}"
-
-
-def terminal_text(summary: RunSummary) -> Group:
-    """Return what the flight did not do of its plan, and a table of errors for each cluster, for the terminal."""
-    marks = [Text(printable(mark), style="bold red" if fails else "yellow") for mark, fails in marks_of(summary)]
-    return Group(*marks, *(table(summary, name) for name in summary.clusters))
-
-
-def marks_of(summary: RunSummary) -> list[tuple[str, bool]]:
-    """Return a line for each shortfall, and whether the flight fails by it."""
-    return [
-        (printable(f"{NOT_AS_PLANNED if each.fails else 'note'}: {each.text}"), each.fails)
-        for each in summary.shortfalls
-    ]
-
-
-def table(summary: RunSummary, cluster: str) -> Table:
-    """Return the errors of one cluster, with the paper's Table I beside Test 1, for the terminal."""
-    start, end = summary.window_s
-    judged = summary.clusters[cluster]
-    title = f"Formation errors of {cluster} from {start:g} to {end:g} s"
-    beside = ", beside Table I of the paper" if judged.paper_std else ""
-    mark = "" if summary.as_planned else f" ({NOT_AS_PLANNED})"
-    caption = "est. = estimate − desired, true = truth − desired"
-    shown = Table(title=cell(f"{title}{beside}{mark}"), caption=caption, title_justify="left")
-    for column in columns(judged):
-        is_name = column == COLUMNS[0]
-        shown.add_column(column, justify="left" if is_name else "right", no_wrap=is_name, min_width=5)
-    for row in rows(judged):
-        shown.add_row(*map(cell, row))
-    return shown
 
 
 def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) -> str:

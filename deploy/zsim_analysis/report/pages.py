@@ -6,28 +6,34 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from textwrap import fill
+from typing import Any, cast
 
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from msgspec import Struct
 
 from zsim.errors import ReportError
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.reading.flight import Array
+from zsim_analysis.reading.recorded_flight import Array
 
-DPI = 120
+DPI = 120  # of figures that are for the screen alone
+COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's conference papers
+PAPER_DPI = 200  # of figures as wide as these
+PAPER_PT, SCREEN_PT = 8.0, 10.0  # of text, points
+LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of an entry of a legend besides its name, in its text's size
+FONTS: dict[str, Any] = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE takes no Type 3
 POINTS = 2000  # per line: more than a page has pixels
 # Okabe and Ito's colours, distinct with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, VERMILION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
 GREY, DARK = "#8c959f", "#444c56"
-DRONES = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
-DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.2, "ls": (0, (5, 3)), "zorder": 4}
-MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 0.8, "zorder": 3}
-TRUE: dict[str, Any] = {"color": BLUE, "lw": 1.1, "zorder": 2}
+DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.0, "ls": (0, (5, 3)), "zorder": 4}
+MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 0.6, "zorder": 3}
+TRUE: dict[str, Any] = {"color": BLUE, "lw": 0.9, "zorder": 2}
 
 
 SYMBOLS = {
@@ -58,10 +64,24 @@ class ReportFigure(Struct, frozen=True):
         width, height = self.drawing.get_size_inches() * self.drawing.dpi
         return round(width), round(height)
 
+    @property
+    def is_column(self) -> bool:
+        """Tell whether it is as wide as a column, of which a page holds two."""
+        return self.drawing.get_size_inches()[0] <= COLUMN_IN
+
     def png(self) -> bytes:
-        """Return the figure as a PNG file."""
+        """Return the figure as a PNG file; it is laid out then, once for all its files."""
         file = io.BytesIO()
         self.drawing.savefig(file, format="png")
+        self.drawing.set_layout_engine("none")
+        return file.getvalue()
+
+    def vector(self, form: str) -> bytes:
+        """Return the figure as a file of one of `zsim_analysis.report.FORMATS`, the same bytes each time."""
+        file = io.BytesIO()
+        stamp = "CreationDate" if form == "pdf" else "Date"
+        with rc_context(FONTS):
+            self.drawing.savefig(file, format=form, metadata={stamp: None})
         return file.getvalue()
 
 
@@ -70,7 +90,17 @@ Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 
 def new_figure(width_in: float, height_in: float) -> Figure:
     """Return an empty figure that lays itself out; nothing of matplotlib's global state is used."""
-    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    dpi = PAPER_DPI if width_in <= PAGE_IN else DPI
+    return Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained")
+
+
+def text_pt(figure: Figure) -> float:
+    """Return the size of a figure's text [points]: that of a paper's captions in one that fits its page."""
+    return PAPER_PT if figure.get_size_inches()[0] <= PAGE_IN else SCREEN_PT
+
+
+def _text_pt(axes: Axes) -> float:
+    return text_pt(cast(Figure, axes.get_figure(root=True)))
 
 
 def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
@@ -85,7 +115,8 @@ def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
 def mark_figure(figure: Figure, text: str) -> None:
     """Write above a figure that its flight is not what it may be taken for; nothing without a text."""
     if text:
-        figure.suptitle(text, color=VERMILION, fontsize=10, fontweight="bold")
+        width = int(18 * figure.get_size_inches()[0] * SCREEN_PT / text_pt(figure))  # characters of a line
+        figure.suptitle(fill(text, width), color=VERMILION, fontsize=text_pt(figure), fontweight="bold")
 
 
 def dress(axes: Axes, label: str = "") -> None:
@@ -93,16 +124,16 @@ def dress(axes: Axes, label: str = "") -> None:
     axes.grid(True, color="#d8dee4", lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=9)
+    axes.tick_params(which="both", labelsize=_text_pt(axes) - 1)
     axes.margins(x=0.01)
     if label:
-        axes.set_ylabel(label, fontsize=10)
+        axes.set_ylabel(label, fontsize=_text_pt(axes))
 
 
 def label_time(axes: Iterable[Axes]) -> None:
     """Label the time axis of axes."""
     for each in axes:
-        each.set_xlabel("simulated time (s)", fontsize=10)
+        each.set_xlabel("simulated time (s)", fontsize=_text_pt(each))
 
 
 def label(name: str) -> str:
@@ -121,13 +152,17 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
     """Put the legend of some axes above all axes of the figure, where it covers no data."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
+        longest = (ENTRY_EMS + LETTER_EMS * max(map(len, labels))) * text_pt(figure) / 72  # inches
+        columns = min(columns, max(1, int(figure.get_size_inches()[0] / longest)))
         figure.legend(
             handles,
             labels,
             loc="outside upper center",
             ncols=min(columns, len(handles)),
             frameon=False,
-            fontsize=10,
+            fontsize=text_pt(figure),
+            columnspacing=1.2,
+            handlelength=1.6,
         )
 
 
@@ -147,40 +182,13 @@ def _extremes(y: Array, start: int) -> Sequence[int]:
     return (start + int(np.nanargmin(y)), start + int(np.nanargmax(y)))
 
 
-def drone_colour(index: int) -> str:
-    return DRONES[index % len(DRONES)]
-
-
-class RunStyle(NamedTuple):
-    """Colour, dashes and mark of a run of a comparison: runs are distinct in black and white as well."""
-
-    color: str
-    dashes: Any
-    marker: str
-
-
-STYLES = (
-    RunStyle(BLUE, "-", "o"),
-    RunStyle(VERMILION, (0, (6, 2)), "s"),
-    RunStyle(GREEN, (0, (6, 2, 1.5, 2)), "^"),
-    RunStyle(PURPLE, (0, (2.5, 1.5)), "D"),
-    RunStyle(ORANGE, (0, (10, 3)), "v"),
-    RunStyle(SKY, (0, (6, 2, 1.5, 2, 1.5, 2)), "P"),
-)
-
-
-def run_style(index: int) -> RunStyle:
-    """Return how a run is drawn; from the seventh on colours repeat with other dashes."""
-    repeats, place = divmod(index, len(STYLES))
-    return STYLES[place]._replace(dashes=STYLES[(index + repeats) % len(STYLES)].dashes)
-
-
 def write_report(
     directory: Path,
     summary: bytes,
     figures: Iterable[ReportFigure],
     page: Callable[[Sequence[Picture]], str],
     progress: Callable[[str], None],
+    formats: Sequence[str] = (),
 ) -> None:
     """Write DIR/summary.json, DIR/figures/*.png and DIR/report.html, all or none of them.
 
@@ -190,14 +198,15 @@ def write_report(
         figures: drawn one by one.
         page: makes the page of the pictures.
         progress: called with a text at each step.
+        formats: of `zsim_analysis.report.FORMATS`, in which figures are written beside their PNG files.
 
     Raises:
         ReportError: the directory cannot be written.
     """
     with _put_in_place(directory, directory) as new:
-        pictures = render(figures, progress)
-        progress("writing the page")
         (new / "figures").mkdir()
+        pictures = render(_kept(figures, new / "figures", formats), progress)
+        progress("writing the page")
         for figure, png in pictures:
             (new / "figures" / figure.name).write_bytes(png)
         (new / "summary.json").write_bytes(summary)
@@ -215,6 +224,14 @@ def write_page(
         pictures = render(figures, progress)
         progress("writing the page")
         (new / out.name).write_text(page(pictures), encoding="utf-8")
+
+
+def _kept(figures: Iterable[ReportFigure], folder: Path, formats: Sequence[str]) -> Iterator[ReportFigure]:
+    """Yield figures when their files in other formats are written."""
+    for figure in figures:
+        yield figure
+        for form in formats:
+            (folder / figure.name).with_suffix(f".{form}").write_bytes(figure.vector(form))
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import numpy as np
 from msgspec import Struct
 
 from zsim.contract.fingerprint import TruthHash
-from zsim_analysis.reading.flight import TRUTH_WIDTH, RecordedFlight, Track
+from zsim_analysis.reading.recorded_flight import TRUTH_WIDTH, RecordedFlight, Track
 
 
 class RecordFacts(Struct, frozen=True):

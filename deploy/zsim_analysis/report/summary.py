@@ -10,10 +10,11 @@ from msgspec import Struct
 from zsim import __version__
 from zsim.contract.run_messages import Event
 from zsim_analysis.reading.driver_links import DriverLink, driver_links
-from zsim_analysis.reading.flight import RecordedFlight, RecordedProcess
-from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m, window
+from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m
+from zsim_analysis.reading.recorded_flight import RecordedFlight, RecordedProcess
 from zsim_analysis.reading.recorded_run import command_age_ms
 from zsim_analysis.reading.shortfall import Shortfall, shortfalls
+from zsim_analysis.reading.verdict import window_of
 from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
 from zsim_analysis.report.record_facts import RecordFacts, facts_of_record
 
@@ -86,8 +87,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     end = flight.end or {}
     info = flight.info
     record_facts = facts_of_record(flight, end.get("last_ns", flight.last_ns))
-    asked = flight.scenario.report.window_s if flight.scenario else None
-    window_s, window_note = window(asked, flight.last_ns / 1e9)
+    window_s, window_note = window_of(flight)
     clusters = {
         f.name: ClusterErrors(f.drones, f.errors(window_s), dict(paper_table(flight.scenario, f.name)))
         for f in formations

@@ -62,9 +62,10 @@ def console(
     from zsim.runtime.progress import JsonProgress
     from zsim.transport.open_files import SERVER_FILES, require_files
     from zsim_bridges.console.console_server import Console
-    from zsim_bridges.console.http_proxy import ListenAddress
+    from zsim_bridges.console.server.http_proxy import ListenAddress
+    from zsim_deploy.roles.priority import lower_priority
     from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import log_printer, lower_priority, serve_runs
+    from zsim_deploy.roles.roles import log_printer, serve_runs
 
     lower_priority(only_viewed=True)
     own_name = process_name("console", name, reach.who, "*")
@@ -94,8 +95,9 @@ def gateway(
     from zsim.transport.open_files import SERVER_FILES, allow_files, require_files
     from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
     from zsim_bridges.http_connections import CONNECTIONS_MAX
+    from zsim_deploy.roles.priority import lower_priority
     from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import log_printer, lower_priority, serve_runs
+    from zsim_deploy.roles.roles import log_printer, serve_runs
 
     lower_priority()
     who = reach.who
@@ -142,8 +144,9 @@ def ros1(
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     require("ros1", ROS1_NEEDS)
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
+    from zsim_deploy.roles.priority import lower_priority
     from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import lower_priority, serve_runs
+    from zsim_deploy.roles.roles import serve_runs
 
     lower_priority()
     own_name = process_name("ros1", name, reach.who)
@@ -174,8 +177,9 @@ def ros2(
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
+    from zsim_deploy.roles.priority import lower_priority
     from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import lower_priority, serve_runs
+    from zsim_deploy.roles.roles import serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"

@@ -89,6 +89,7 @@ def run(
     """Fly a scenario: start every process, show progress, record, report."""
     from zsim.runtime.progress import Screen
     from zsim_agents.hosting import check_plans
+    from zsim_deploy.launch.camera_children import with_cameras
     from zsim_deploy.launch.run import (
         RunOptions,
         check_endpoint,
@@ -96,7 +97,6 @@ def run(
         options_of,
         run_in_process,
         run_processes,
-        with_cameras,
     )
     from zsim_deploy.launch.run_folder import make_directory
     from zsim_deploy.launch.supervisor import Outcome

@@ -201,14 +201,16 @@ def clear(
 def list_(reach: WorldAccess) -> None:
     """List the faults that are planned or act."""
     from zsim.contract import keys, messages
+    from zsim.terminal.fitted_table import Column, FittedTable, print_table
 
     with connected(reach) as (link, _):
         now_ns = max((messages.decode(keys.CLOCK, s.payload).t_ns for s in link.get(keys.CLOCK)), default=0)
         answers = [messages.decode(keys.FAULTS, sample.payload) for sample in link.get(keys.FAULTS)]
     rows = [row(fault, now_ns) for message in answers for fault in message.faults if not _is_over(fault, now_ns)]
-    for cells in rows:
-        print(printable("  ".join(cells)))
-    if not rows:
+    if rows:
+        kinds = ("figure", "figure", "name", "name", "figure", "text")
+        print_table(FittedTable([Column("", kind) for kind in kinds], rows))
+    else:
         print("no fault is planned or acts", file=sys.stderr)
 
 
@@ -221,10 +223,13 @@ def kinds(
     """List the kinds of faults: whom they strike, and their parameters."""
     from zsim.scenario import fault_kinds, scenario_file
     from zsim.sensors.sensor_catalogue import declarations
+    from zsim.terminal.fitted_table import Column, FittedTable, print_table
 
     own = declarations(scenario_file.load(scenario).drones) if scenario else {}
-    for name, kind in fault_kinds.kinds_of(own).items():
-        print(printable(f"{name:<17} {kind.strikes:<8} {'  '.join(_parameters(kind)) or '-'}"))
+    rows = [
+        (name, kind.strikes, "  ".join(_parameters(kind)) or "-") for name, kind in fault_kinds.kinds_of(own).items()
+    ]
+    print_table(FittedTable([Column("", "name"), Column(""), Column("", "text")], rows))
 
 
 def selector(which: str, scenario: str) -> dict[str, Any]:
@@ -246,7 +251,7 @@ def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:
     state = "acts" if fault.from_ns <= now_ns else "planned"
     parameters = " ".join(f"{name}={value}" for name, value in fault.parameters.items() if value is not None)
     times = f"{fault.from_ns / 1e9:.2f} to {until} s"
-    return (f"{fault.id:>3}", f"{state:<7}", f"{fault.target:<16}", f"{fault.kind:<17}", f"{times:<20}", parameters)
+    return (str(fault.id), state, fault.target, fault.kind, times, parameters)
 
 
 def _is_over(fault: "Fault", now_ns: int) -> bool:

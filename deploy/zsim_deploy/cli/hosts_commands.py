@@ -13,6 +13,7 @@ import typer
 
 from zsim.errors import printable
 from zsim_deploy.arguments import HOSTS, FlightOptions, Force, Insecure, flight_options
+from zsim_deploy.hosts.row_choice import RowChoice, RowOrder
 
 app = typer.Typer()
 
@@ -20,6 +21,11 @@ FOLLOW_S = 0.2  # between two looks at a log that is followed
 
 Hosts = Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
 Federation = Annotated[str, typer.Option(help="Federation that is up.")]
+Only = Annotated[
+    list[str] | None,
+    typer.Option("--only", help="Only roles that match, or what they work for, or hosts: 'drone1*'. Repeatable."),
+]
+Sort = Annotated[RowOrder | None, typer.Option("--sort", help="By what rows are sorted, the greatest figure first.")]
 Role = Annotated[str, typer.Argument(help="Process name, e.g. estimator.drone2.", show_default=False)]
 
 
@@ -30,9 +36,15 @@ def up(
     out: Annotated[Path | None, typer.Option(help="Folder of the run (default runs/NAME-TIME).")] = None,
     insecure: Insecure = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
+    only: Only = None,
+    sort: Sort = None,
     force: Force = False,
 ) -> None:
-    """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
+    """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything.
+
+    --only and --sort are of the table that is shown; every role is started whatever they are.
+    """
+    from zsim.scenario.rights import ROUTER
     from zsim.transport.open_files import host_launcher_files, require_files
     from zsim_deploy.cli.record_commands import conclude
     from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
@@ -42,12 +54,15 @@ def up(
     loaded = flight.scenario(elsewhere=True)
     placed = inventory.load(hosts)
     placed = inventory.insecure(placed) if insecure else placed
-    inventory.placement(placed, loaded)
+    choice = RowChoice(only or (), sort)
+    routers = {f"{ROUTER}.{name}": router.host for name, router in placed.inventory.routers.items()}
+    hosts_of = {**routers, **inventory.placement(placed, loaded)}
+    choice.check([{"role": role, "host": host} for role, host in hosts_of.items()])
     mode, pace = flight.mode_and_rate()
     count, hosts_count = len(inventory.roles(loaded)), len(placed.inventory.hosts)
     require_files(host_launcher_files(count, hosts_count), f"{count} processes on {hosts_count} hosts")
     with _folder(out, loaded, force) as folder:
-        with StatusTable(loaded.duration_s) as status:
+        with StatusTable(loaded.duration_s, choice=choice) as status:
             outcome = HostRun(HostRunOptions(loaded, placed, folder, mode, pace), status).run()
         conclude(outcome, folder, report)
 
@@ -77,25 +92,29 @@ def down(federation: Federation = "zsim") -> None:
 def ps(
     roles: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[ROLE]...", help="Only these, or patterns: 'estimator.*2'.", show_default=False),
+        typer.Argument(metavar="[ROLE]...", help="The same as --only.", show_default=False),
     ] = None,
+    only: Only = None,
+    sort: Sort = None,
     federation: Federation = "zsim",
     as_json: Annotated[bool, typer.Option("--json", help="As a JSON line.")] = False,
 ) -> None:
-    """Show the processes of the run that is up: role, host, pid, state, lag, messages/s, round trip, restarts."""
-    from zsim.runtime.progress import PipedConsole
-    from zsim_agents.hosting import chosen
+    """Show the processes of the run that is up: role, host, pid, state, lag, age, messages/s, round trip, restarts.
+
+    A narrow terminal shows fewer columns, --json all of them.
+    """
+    from zsim.terminal.fitted_table import print_table
     from zsim_deploy.hosts import control_socket
     from zsim_deploy.hosts.status_table import table
 
     status = control_socket.ask(federation, "ps")
-    if roles:
-        named = chosen("role", roles, [row["role"] for row in status["rows"]])
-        status["rows"] = [row for row in status["rows"] if row["role"] in named]
+    choice = RowChoice([*(roles or ()), *(only or ())], sort)
+    choice.check(status["rows"])
+    status["rows"] = choice.of(status["rows"])
     if as_json:
         print(json.dumps(status))
     else:
-        PipedConsole().print(table(status["rows"]))
+        print_table(table(status["rows"]))
 
 
 def logs(

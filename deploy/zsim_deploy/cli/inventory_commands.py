@@ -79,6 +79,7 @@ def init(
 def show(hosts: Inventory) -> None:
     """List the certificates that are there: for whom, for which addresses, until when."""
     from zsim.errors import RunError
+    from zsim.terminal.fitted_table import Column, FittedTable, print_table
     from zsim_deploy.inventory import certificates, inventory
     from zsim_deploy.inventory.enrolment import folder_of, init_command
 
@@ -87,12 +88,17 @@ def show(hosts: Inventory) -> None:
     statuses = certificates.show(folder, now)
     if not statuses:
         raise RunError(f"{folder}: has no certificates; make them with `{init_command(placed)}`")
-    for status in statuses:
-        until = f"{status.until:%Y-%m-%d %H:%M}Z"
-        where = ", ".join(status.addresses)
-        state = status.fault or _soon(status, now)
-        cells = f"{status.host:<16} {status.process:<32} {until:<18} {where:<40} {state}"
-        print(printable(cells.rstrip()))
+    rows = [
+        (
+            status.host,
+            status.process,
+            f"{status.until:%Y-%m-%d %H:%M}Z",
+            ", ".join(status.addresses),
+            status.fault or _soon(status, now),
+        )
+        for status in statuses
+    ]
+    print_table(FittedTable([Column("", kind) for kind in ("name", "name", "figure", "text", "text")], rows))
     over = any(_soon(status, now) or certificates.EXPIRED in status.fault for status in statuses)
     if over or any(status.fault for status in statuses):
         print(printable(f"make them anew with `{init_command(placed, renew=over)}`"), file=sys.stderr)

@@ -11,12 +11,14 @@ import typer
 
 from zsim.errors import ZsimError, printable
 from zsim_analysis.export import Format
+from zsim_analysis.report import FORMATS
 from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import RUN, Duration, Force, From, Keys, ScenarioPath, Seed, Set, To, check_range, require
 from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:
     from zsim_analysis.export.make_export import ExportResult
+    from zsim_analysis.reading.shortfall import Shortfall
     from zsim_analysis.sweep.design import SweepPlan
 
 RERUN_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy", "filterpy")}
@@ -54,13 +56,8 @@ def _failed(cause: str) -> typer.Exit:
 
 def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
     """Make the report of a run if that is wanted; return what the run did not do or lacks, empty if nothing."""
-    from zsim.record.completeness import record_completeness
-
     try:
-        if report:
-            return _report(out)
-        state = record_completeness(out / "run.mcap")
-        return _show_record(state.complete, str(state))
+        return _report(out) if report else _judge(out / "run.mcap")
     except ZsimError as error:
         if not failed:
             raise
@@ -71,10 +68,21 @@ def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
         sys.exit(INTERRUPTED)
 
 
-def _show_record(complete: bool, state: str) -> str:
-    """Print whether a record is complete; return what it lacks, empty if nothing."""
+def _judge(record: Path) -> str:
+    """Print what a flight did not do of its plan; return what `_report` returns of it."""
+    from zsim_analysis.reading.verdict import marks_of, verdict
+
+    judged = verdict(record)
+    for mark, _ in marks_of(judged.shortfalls):
+        print(printable(mark))
+    return _fault_of(judged.completeness.complete, str(judged.completeness), judged.shortfalls)
+
+
+def _fault_of(complete: bool, state: str, shortfalls: "Sequence[Shortfall]") -> str:
+    """Print whether the record is complete; return what it lacks, or what the flight did not do, empty if nothing."""
     print(printable(f"record: {state}"))
-    return "" if complete else f"the record is {state}"
+    lacking = "" if complete else f"the record is {state}"
+    return lacking or next((each.text for each in shortfalls if each.fails), "")
 
 
 @app.command(rich_help_panel=RUN)
@@ -85,11 +93,18 @@ def report(
     out: Annotated[
         Path | None, typer.Option(help="Page that compares (default compare-NAMES.html beside the first).")
     ] = None,
+    formats: Annotated[
+        str | None,
+        typer.Option("--format", help="pdf, svg or pdf,svg: a run's figures are written so too.", show_default=False),
+    ] = None,
 ) -> None:
     """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
     from zsim.record.record_reader import record_in
     from zsim_analysis.sweep.design import is_sweep
 
+    wanted = _formats(formats)
+    if wanted and (len(directories) > 1 or is_sweep(directories[0])):
+        raise typer.BadParameter("--format is for the figures of one run; leave it out")
     if len(directories) > 1:
         _compare(directories, out)
         return
@@ -98,11 +113,24 @@ def report(
         raise typer.BadParameter("--out is for the page that compares several runs; leave it out")
     if not is_sweep(directory):
         record_in(directory)
-    _report(directory)
+    _report(directory, wanted)
 
 
-def _report(folder: Path) -> str:
-    """Make the report of a run or of a sweep, and print its table; return what the run did not do, or lacks."""
+def _formats(text: str | None) -> tuple[str, ...]:
+    """Return the formats of figures in a text, with commas between them."""
+    wanted = tuple(text.split(",")) if text else ()
+    if not set(wanted) <= set(FORMATS):
+        raise typer.BadParameter(f"--format is {text!r}; must be {' or '.join(FORMATS)}, or both with a comma between")
+    return wanted
+
+
+def _report(folder: Path, formats: Sequence[str] = ()) -> str:
+    """Make the report of a run or of a sweep, and print its table; return what the run did not do, or lacks.
+
+    Args:
+        folder: of the run or the sweep.
+        formats: of figures, beside PNG; a sweep's have none.
+    """
     require("report", REPORT_NEEDS)
     from rich.console import Console
 
@@ -114,19 +142,14 @@ def _report(folder: Path) -> str:
         from zsim_analysis.sweep.make_sweep_report import terminal_text
     else:
         from zsim_analysis.report.make_report import make_report as make
-        from zsim_analysis.report.make_report import terminal_text
+        from zsim_analysis.report.tables import terminal_text
     with Console(stderr=True).status("reading …") as status:
-        summary: Any = make(folder, lambda text: status.update(cell(text)))
+        options = {"formats": formats} if formats else {}
+        summary: Any = make(folder, lambda text: status.update(cell(text)), **options)
     PipedConsole().print(terminal_text(summary))
-    fault = "" if is_sweep(folder) else _fault_of(summary)
+    fault = "" if is_sweep(folder) else _fault_of(summary.record.complete, summary.record.state, summary.shortfalls)
     print(printable(f"report: {folder / 'report.html'}"))
     return fault
-
-
-def _fault_of(summary: Any) -> str:
-    """Print whether the record is complete; return what it lacks, or what the flight did not do, empty if nothing."""
-    fault = _show_record(summary.record.complete, summary.record.state)
-    return fault or next((each.text for each in summary.shortfalls if each.fails), "")
 
 
 def _compare(directories: list[Path], out: Path | None) -> None:

@@ -132,8 +132,9 @@ def record(
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
+    from zsim_deploy.roles.priority import lower_priority
 
-    roles.lower_priority()
+    lower_priority()
     roles.recorder(out, reach)
 
 
@@ -179,7 +180,7 @@ def replay(
         list[str] | None,
         typer.Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
     ] = None,
-    paused: Annotated[bool, typer.Option("--paused", help="Stand at the first gate until asked to resume.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Stand at the first instant until asked to resume.")] = False,
     console: Annotated[
         bool, typer.Option("--console", help="Show it in the browser, with a timeline; stand still at its end.")
     ] = False,

@@ -8,15 +8,13 @@ from contextlib import AbstractAsyncContextManager
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
-from rich.table import Table
-
 from zsim import __version__
 from zsim.errors import HostsError, ZsimError
-from zsim.runtime.progress import cell
+from zsim.terminal.fitted_table import FittedTable
+from zsim_deploy.hosts.doctor_tables import hosts_table, paths_table
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.host_links import ProgramEndedError, RemoteProgram, open_program
 from zsim_deploy.hosts.host_plan import leftovers, port_in_use
-from zsim_deploy.hosts.name_cell import NameCell
 from zsim_deploy.hosts.ssh_connection import shell_line, shell_word
 from zsim_deploy.inventory import enrolment
 from zsim_deploy.inventory import inventory as inv
@@ -215,7 +213,7 @@ def _path_fault(path: NetworkPath) -> str:
 class CheckResult(NamedTuple):
     """What is to be shown of the hosts, and what is wrong with them, a line each."""
 
-    tables: list[Table]
+    tables: list[FittedTable]
     faults: list[str]
     warnings: list[str]
 
@@ -250,7 +248,7 @@ async def _check_up(placed: InventoryFile, places: dict[str, str] | None) -> Che
         paths = await _paths(placed, places, links, pythons, set(reports)) if places else []
         cut, slow = path_faults(paths)
         left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
-        tables = [_hosts_table(reports), *([_paths_table(paths)] if paths else [])]
+        tables = [hosts_table(reports), *([paths_table(paths)] if paths else [])]
         return CheckResult(
             tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)]
         )
@@ -269,39 +267,3 @@ async def _paths(
             chosen = [links[name] for name in sorted(sources & there)]
             paths += await network_paths(chosen, links[target], pythons, port)
     return paths
-
-
-def _hosts_table(reports: dict[str, HostReport]) -> Table:
-    shown = Table("host", box=None, pad_edge=False)
-    for column in ("python", "zsim", "round\ntrip", "clock", "load", "cores"):
-        shown.add_column(column, no_wrap=True)
-    shown.add_column("governor")
-    shown.add_column("finger\nprint", no_wrap=True)
-    for name, report in reports.items():
-        facts = report.facts
-        cells = (
-            facts["python"],
-            facts["zsim"],
-            f"{1e3 * report.round_trip_s:.1f} ms",
-            f"{1e3 * report.clock_offset_s:+.1f} ms",
-            f"{facts['load']:.2f}",
-            str(facts["cores"]),
-            ", ".join(facts["governors"]) or "-",
-            facts["fingerprint"][:8],
-        )
-        shown.add_row(NameCell(name), *map(cell, cells))
-    return shown
-
-
-def _paths_table(paths: list[NetworkPath]) -> Table:
-    shown = Table("from", "to", "port", "round trip", "bandwidth", box=None)
-    for path in paths:
-        figures = map(cell, (str(path.port), *_path_figures(path.figures)))
-        shown.add_row(NameCell(path.source), NameCell(path.target), *figures)
-    return shown
-
-
-def _path_figures(figures: dict[str, Any]) -> tuple[str, str]:
-    if "error" in figures:
-        return figures["error"], "-"
-    return f"{1e3 * figures['round_trip_s']:.2f} ms", f"{figures['bits_per_s'] / 1e6:.0f} Mbit/s"

@@ -159,5 +159,5 @@ async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
         try:
             await link.run(command, timeout_s=IMPORT_S, what=code)
         except HostsError as error:
-            remedy = f"install zsim[{extra}] there, as `zsim push --extra {extra}` does"
+            remedy = f"install its extra {extra} there, as `zsim push --extra {extra}` does"
             raise HostsError(f"{error}; {role} cannot run on {link.name}; {remedy}") from error

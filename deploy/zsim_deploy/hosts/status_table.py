@@ -1,18 +1,19 @@
 """What `zsim up` shows and `zsim ps` prints: one table of all processes on all hosts, kept while the run goes on."""
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.table import Table
 
 from zsim.runtime.progress import Screen, cell, describe
 from zsim.scenario.rights import WORLD
+from zsim.terminal.fitted_table import Column, FittedTable
 from zsim_deploy.hosts.host_link import HostLink
-from zsim_deploy.hosts.name_cell import NameCell
 from zsim_deploy.hosts.remote_process import RemoteProcess
+from zsim_deploy.hosts.row_choice import RowChoice, needs_attention
 
 FIRST_S = 1.0  # simulated; from then on it flies
 SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second …
@@ -20,8 +21,18 @@ ROUND_TRIPS = 2.0  # … and so many of its round trips more: over a slow link e
 WAITED_S = 0.5  # a process that is waited for longer is shown so; waiting for less is what lockstep is
 SILENT_PROCESS_S = 1.8  # health comes once a second; so one that is stopped is shown within 2 s
 STALE_S = 3.0  # health comes once a second; older figures are not shown
-FIGURES = ("lag", "messages\n/s", "round\ntrip", "restarts")  # columns that are never narrower
-COLUMNS = ("role", "host", "pid", "state", *FIGURES)
+AROUND = 4  # lines of a terminal beside the rows: progress, two of the head, and how many rows are not shown
+COLUMNS = (
+    Column("role", "name"),
+    Column("host", "name"),
+    Column("pid", worth=3, right=True),
+    Column("state", "text"),
+    Column("lag", worth=5, right=True),
+    Column("age", worth=6, right=True),
+    Column("msg/s", worth=2, right=True),
+    Column("round\ntrip", worth=1, right=True),
+    Column("re-\nstarts", worth=4, right=True),
+)
 
 
 class StatusTable(Screen):
@@ -31,10 +42,16 @@ class StatusTable(Screen):
         members: the processes; to be given before it is shown.
         links: to the hosts.
         stages_s: how long each step before the processes' start took.
+
+    Args:
+        duration_s: simulated time of the run.
+        console: the terminal.
+        choice: which rows the live table has, in which order.
     """
 
-    def __init__(self, duration_s: float, console: Console | None = None) -> None:
+    def __init__(self, duration_s: float, console: Console | None = None, choice: RowChoice | None = None) -> None:
         super().__init__(duration_s, console)
+        self._choice = choice or RowChoice()
         self.members: Sequence[Any] = ()
         self.links: dict[str, HostLink] = {}
         self.stages_s: dict[str, float] = {}
@@ -96,11 +113,19 @@ class StatusTable(Screen):
             "host": member.host,
             "pid": member.pid or None,
             "state": self._state(member, link),
+            "age_s": self._age_s(member.name),
             "lag_ms": health["lag_ns"] / 1e6 if health and fresh else None,
             "messages_per_s": health["per_s"] if health and fresh else None,
             "round_trip_ms": 1e3 * link.round_trip_s if link.answered_s and not _is_silent(link) else None,
             "restarts": member.restarts,
         }
+
+    def _age_s(self, name: str) -> float | None:
+        """Return for how long nothing has come of a process [s, wall], None if nothing ever has."""
+        last_s = self._health[name]["wall_s"] if name in self._health else None
+        if name == WORLD and self._clock is not None:
+            last_s = max(last_s or 0.0, self._clock["wall_s"])
+        return None if last_s is None else time.monotonic() - last_s
 
     def _state(self, member: RemoteProcess, link: HostLink) -> str:
         if member.state == "running" and _is_silent(link):
@@ -130,30 +155,42 @@ class StatusTable(Screen):
     def _render(self) -> Group:
         clock = self._clock
         head = cell(describe(clock, self._duration_s) if clock else "starting …")
-        return Group(head, table(self.rows()))
+        rows = self._choice.of(self.rows())
+        lines = max(1, self.console.height - AROUND)
+        if len(rows) <= lines:
+            return Group(head, table(rows, one_line=True))
+        first = rows if self._choice.sort else sorted(rows, key=needs_attention)
+        return Group(head, table(first[:lines], one_line=True), cell(_more(first[lines:])))
+
+
+def _more(rows: Sequence[dict[str, Any]]) -> str:
+    """Return what is known of rows that a terminal has no lines for."""
+    states = Counter(row["state"] for row in rows)
+    counted = ", ".join(f"{count} {state}" for state, count in states.most_common(3))
+    return f"… and {len(rows)} more: {counted}{', …' if len(states) > 3 else ''}; `zsim ps` shows all"
 
 
 def _is_silent(link: HostLink) -> bool:
     return link.silent_s() > SILENT_S + ROUND_TRIPS * link.round_trip_s
 
 
-def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Return the rows as a table for people."""
-    shown = Table(box=None, pad_edge=False)
-    for column in COLUMNS:
-        shown.add_column(column, no_wrap=column in ("pid", *FIGURES))
-    for row in rows:
-        shown.add_row(
-            NameCell(row["role"]),
-            NameCell(row["host"]),
-            str(row["pid"] or "-"),
-            cell(row["state"]),  # it may hold output of a process
-            _figure(row["lag_ms"], "{:.0f} ms"),
-            _figure(row["messages_per_s"], "{:.0f}"),
-            _figure(row["round_trip_ms"], "{:.1f} ms"),
-            str(row["restarts"]),
-        )
-    return shown
+def table(rows: Sequence[dict[str, Any]], one_line: bool = False) -> FittedTable:
+    """Return the rows as a table for people; `one_line`: what a line has no room for is cut."""
+    return FittedTable(COLUMNS, [_cells(row) for row in rows], one_line=one_line)
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        row["role"],
+        row["host"],
+        str(row["pid"] or "-"),
+        row["state"],  # it may hold output of a process
+        _figure(row["lag_ms"], "{:.0f} ms"),
+        _figure(row.get("age_s"), "{:.1f} s"),
+        _figure(row["messages_per_s"], "{:.0f}"),
+        _figure(row["round_trip_ms"], "{:.1f} ms"),
+        str(row["restarts"]),
+    )
 
 
 def _figure(value: float | None, form: str) -> str:

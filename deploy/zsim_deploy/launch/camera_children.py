@@ -1,9 +1,12 @@
-"""Which cameras and detectors a run starts, and of which drones each is."""
+"""The cameras of a run: which drones have any, and which cameras and detectors are started, each of which drones."""
 
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from zsim.scenario.rights import watched
 from zsim.scenario.scenario import Scenario
+from zsim.sensors.camera import BottomCamera, FrontCamera
 
 
 class CameraChild(NamedTuple):
@@ -20,6 +23,15 @@ class CameraChild(NamedTuple):
     drones: tuple[str, ...] = ()
 
 
+def with_cameras(scenario: Scenario) -> Scenario:
+    """Return a scenario in which some drone has a camera: where none has, all get the AR.Drone's two."""
+    if any(drone.sensors.cameras() for drone in scenario.drones):
+        return scenario
+    two = {"front_camera": FrontCamera(), "bottom_camera": BottomCamera()}
+    drones = [replace(drone, sensors=replace(drone.sensors, **two)) for drone in scenario.drones]
+    return replace(scenario, drones=drones)
+
+
 def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[CameraChild]:
     """Return the cameras and detectors that a scenario expects, as far as they are known by name, or that a user wants.
 
@@ -27,11 +39,11 @@ def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[Cam
         cameras: whether all that have cameras are to have their pictures drawn.
         detect: whether hats are to be found in the pictures of all.
     """
-    with_cameras = watched("", scenario)
+    having = watched("", scenario)
     everybody = [drone.name for drone in scenario.drones]  # a detector's cameras need not be zsim's
     return [
-        *_of_role("camera", with_cameras, with_cameras, scenario, cameras),
-        *_of_role("detector", everybody, with_cameras or everybody, scenario, detect),
+        *_of_role("camera", having, having, scenario, cameras),
+        *_of_role("detector", everybody, having or everybody, scenario, detect),
     ]
 
 

@@ -7,8 +7,6 @@ import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from msgspec.structs import replace
-
 from zsim.errors import RecordError, RunError, SessionError
 from zsim.record import repair
 from zsim.record.record_reader import RECORD
@@ -16,7 +14,6 @@ from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.external_bodies import driver_lines
 from zsim.scenario.scenario import Scenario
-from zsim.sensors.camera import BottomCamera, FrontCamera
 from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
@@ -99,15 +96,6 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
         children.append(ChildProcess(name, draw, logs, launcher))
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
-
-
-def with_cameras(scenario: Scenario) -> Scenario:
-    """Return a scenario in which some drone has a camera: where none has, all get the AR.Drone's two."""
-    if any(drone.sensors.cameras() for drone in scenario.drones):
-        return scenario
-    two = {"front_camera": FrontCamera(), "bottom_camera": BottomCamera()}
-    drones = [replace(drone, sensors=replace(drone.sensors, **two)) for drone in scenario.drones]
-    return replace(scenario, drones=drones)
 
 
 def check_endpoint(endpoint: str | None, insecure: bool) -> None:

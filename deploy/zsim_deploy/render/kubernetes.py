@@ -5,49 +5,44 @@ inventory, so Pods use the network of their node, and the names of the hosts are
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from zsim import __version__
 from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import RECORDER, ROUTER, WORLD
+from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim.transport.tls import CERTIFICATES as IDENTITY_FILES
-from zsim_deploy.arguments import RUN_ID
 from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.inventory.processes import (
-    STOP_S,
     PlannedProcess,
-    ProcessFiles,
     Rendered,
     access_file,
-    command,
     extras,
     own_programs,
     processes,
     used_hosts,
 )
 from zsim_deploy.launch.death_policy import RESTARTS_MAX, SUPERSEDED, USER_FAULT
+from zsim_deploy.render.kubernetes_pod import (
+    RECORDS,
+    label,
+    labels,
+    locked,
+    meta,
+    mount,
+    pod_template,
+    secret_name,
+    user,
+)
 from zsim_deploy.render.rendered_files import (
-    ACCESS,
-    CACHE,
-    CERTIFICATES,
-    ENVIRONMENT,
     RUNS,
-    SCENARIO,
-    USER,
     dockerfile,
     document,
     documents,
     unused,
 )
 
-NAME_MAX = 63  # RFC 1123 label
-CPU = "250m"  # to find a node by; in lockstep a role takes what there is
-# Measured with three drones and all extras installed: world 227, estimator 252, controller 232, recorder 86 MiB.
-MEMORY_MIB, MEMORY_MAX_MIB = 256, 1024
-RECORDS = {"persistentVolumeClaim": {"claimName": "records"}}
 IMAGE = f"zsim:{__version__}"
 CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
 RECORD_GIB = 10  # 186 runs of 330 s with three drones, 58 MB each
@@ -73,7 +68,7 @@ def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), 
     planned = processes(placed, scenario, pace)
     text = scenario_file.to_text(scenario)
     _refuse(placed, planned, text)
-    space = _label(scenario.federation)
+    space = label(scenario.federation)
     texts = {
         "namespace.yaml": documents([_namespace(space), _records_claim(space)], NAMESPACE_REMARKS),
         "zsim.yaml": documents(_run(space, text, planned, image), _remarks(placed, scenario, planned)),
@@ -94,7 +89,7 @@ def _refuse(placed: InventoryFile, planned: Sequence[PlannedProcess], text: str)
     ]
     first: dict[str, str] = {}
     for process in planned:
-        other = first.setdefault(_label(process.name), process.name)
+        other = first.setdefault(label(process.name), process.name)
         if other != process.name:
             lines.append(f"{process.name} and {other} have the same name in Kubernetes; rename a drone or cluster")
     if len(text.encode()) > CONFIG_BYTES_MAX:
@@ -152,7 +147,7 @@ def _secrets(space: str, planned: Sequence[PlannedProcess]) -> str:
         files = [f'--from-file="$certs/{process.host}/{process.name}"']
         if process.port is not None:
             files.append(f'--from-file=access.json="$certs/{process.host}/{access_file(process)}"')
-        lines.append(f"put {_secret_name(process)} {' '.join(files)}")
+        lines.append(f"put {secret_name(process)} {' '.join(files)}")
     return "\n".join(lines) + "\n"
 
 
@@ -162,12 +157,12 @@ def _records_pod(space: str, image: str) -> dict[str, Any]:
         "image": image,
         "command": ["sleep", "infinity"],
         "resources": {"requests": {"cpu": "10m", "memory": "16Mi"}, "limits": {"memory": "64Mi"}},
-        "securityContext": _locked(),
-        "volumeMounts": [_mount("runs", RUNS, read_only=True)],
+        "securityContext": locked(),
+        "volumeMounts": [mount("runs", RUNS, read_only=True)],
     }
     spec = {
         "automountServiceAccountToken": False,
-        "securityContext": _user(),
+        "securityContext": user(),
         "terminationGracePeriodSeconds": 1,
         "containers": [box],
         "volumes": [{"name": "runs", **RECORDS}],
@@ -198,7 +193,7 @@ def _service(space: str, world: PlannedProcess) -> dict[str, Any]:
         "apiVersion": "v1",
         "kind": "Service",
         "metadata": {"name": WORLD, "namespace": space},
-        "spec": {"selector": _labels(world), "ports": [port]},
+        "spec": {"selector": labels(world), "ports": [port]},
     }
 
 
@@ -209,9 +204,9 @@ def _job(space: str, process: PlannedProcess, image: str) -> dict[str, Any]:
         "backoffLimit": RESTARTS_MAX if process.is_restarted else 0,
         "podFailurePolicy": {"rules": [{"action": "FailJob", "onExitCodes": codes}]},
         "podReplacementPolicy": "Failed",
-        "template": _pod_template(process, image, "Never"),
+        "template": pod_template(process, image, "Never"),
     }
-    return {"apiVersion": "batch/v1", "kind": "Job", "metadata": _meta(space, process), "spec": spec}
+    return {"apiVersion": "batch/v1", "kind": "Job", "metadata": meta(space, process), "spec": spec}
 
 
 def _deployment(space: str, process: PlannedProcess, image: str) -> dict[str, Any]:
@@ -219,99 +214,7 @@ def _deployment(space: str, process: PlannedProcess, image: str) -> dict[str, An
     spec = {
         "replicas": 1,
         "strategy": {"type": "Recreate"},
-        "selector": {"matchLabels": _labels(process)},
-        "template": _pod_template(process, image, "Always"),
+        "selector": {"matchLabels": labels(process)},
+        "template": pod_template(process, image, "Always"),
     }
-    return {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": _meta(space, process), "spec": spec}
-
-
-def _meta(space: str, process: PlannedProcess) -> dict[str, Any]:
-    return {"name": _label(process.name), "namespace": space, "labels": _labels(process)}
-
-
-def _label(name: str) -> str:
-    """Return a name as Kubernetes takes it (RFC 1123 label)."""
-    return re.sub(r"[^a-z0-9]+", "-", name).strip("-")[:NAME_MAX].rstrip("-") or "zsim"
-
-
-def _labels(process: PlannedProcess) -> dict[str, str]:
-    return {
-        "app.kubernetes.io/name": "zsim",
-        "app.kubernetes.io/component": process.role,
-        "app.kubernetes.io/instance": _label(process.name),
-    }
-
-
-def _secret_name(process: PlannedProcess) -> str:
-    return f"certs-{_label(process.name)}"
-
-
-def _pod_template(process: PlannedProcess, image: str, restart: str) -> dict[str, Any]:
-    spec = {
-        "nodeSelector": {"kubernetes.io/hostname": process.host},
-        "hostNetwork": True,
-        "dnsPolicy": "ClusterFirstWithHostNet",
-        "restartPolicy": restart,
-        "terminationGracePeriodSeconds": STOP_S,
-        "automountServiceAccountToken": False,
-        "enableServiceLinks": False,
-        "securityContext": _user(),
-        "containers": [_box(process, image)],
-        "volumes": [{"name": name, **source} for name, _, _, source in _mounted(process)],
-    }
-    return {"metadata": {"labels": _labels(process)}, "spec": spec}
-
-
-def _box(process: PlannedProcess, image: str) -> dict[str, Any]:
-    files = ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, f"{RUNS}/{RUN_ID}")
-    box = {
-        "name": process.role,
-        "image": image,
-        "args": command(process, files),
-        "env": [{"name": key, "value": value} for key, value in ENVIRONMENT.items()],
-        "resources": {
-            "requests": {"cpu": CPU, "memory": f"{MEMORY_MIB}Mi"},
-            "limits": {"memory": f"{MEMORY_MAX_MIB}Mi"},
-        },
-        "securityContext": _locked(),
-        "volumeMounts": [_mount(*mounted[:3]) for mounted in _mounted(process)],
-    }
-    if process.port is not None:
-        box["ports"] = [{"name": "zenoh", "containerPort": process.port, "hostPort": process.port, "protocol": "TCP"}]
-    return box
-
-
-def _user() -> dict[str, Any]:
-    profile = {"type": "RuntimeDefault"}
-    return {"runAsNonRoot": True, "runAsUser": USER, "runAsGroup": USER, "fsGroup": USER, "seccompProfile": profile}
-
-
-def _locked() -> dict[str, Any]:
-    return {
-        "allowPrivilegeEscalation": False,
-        "readOnlyRootFilesystem": True,
-        "capabilities": {"drop": ["ALL"]},
-    }
-
-
-def _mounted(process: PlannedProcess) -> Iterator[tuple[str, str, bool, dict[str, Any]]]:
-    """Yield name, path, whether it is read only, and source of each volume of a process."""
-    yield "cache", CACHE, False, {"emptyDir": {}}
-    yield "tmp", "/tmp", False, {"emptyDir": {}}
-    if process.name == WORLD:
-        yield "scenario", SCENARIO.rpartition("/")[0], True, {"configMap": {"name": "scenario"}}
-    if process.name == RECORDER:
-        yield "runs", RUNS, False, RECORDS
-    if process.secure:
-        yield "certs", CERTIFICATES, True, _secret(process, IDENTITY_FILES)
-    if process.secure and process.port is not None:
-        yield "access", ACCESS.rpartition("/")[0], True, _secret(process, ("access.json",))
-
-
-def _mount(name: str, path: str, read_only: bool) -> dict[str, Any]:
-    return {"name": name, "mountPath": path, **({"readOnly": True} if read_only else {})}
-
-
-def _secret(process: PlannedProcess, keys: Sequence[str]) -> dict[str, Any]:
-    items = [{"key": key, "path": key} for key in keys]
-    return {"secret": {"secretName": _secret_name(process), "defaultMode": 0o440, "items": items}}
+    return {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": meta(space, process), "spec": spec}

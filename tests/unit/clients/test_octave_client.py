@@ -2,12 +2,13 @@
 
 import json
 import socket
+import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from octave import needs_octave, run
+from octave import command, needs_octave, run
 from refused import has_terms
 
 pytestmark = needs_octave
@@ -24,10 +25,10 @@ Answer = Callable[[JsonMap], list[JsonMap | bytes]]
 class FakeGateway:
     """Takes one connection and answers each line as it is told, everything after `hello` by `answer`."""
 
-    def __init__(self, answer: Answer, hello: Answer | None = None) -> None:
+    def __init__(self, answer: Answer, hello: Answer | None = None, listener: socket.socket | None = None) -> None:
         self._answer = answer
         self._hello = hello or (lambda asked: [{"op": "hello", "name": "client.test", **RUN}])
-        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener = listener or socket.create_server(("127.0.0.1", 0))
         self._listener.settimeout(PATIENCE_S)
         self.port = self._listener.getsockname()[1]
         self.requests: list[JsonMap] = []
@@ -300,14 +301,36 @@ def test_the_lockstep() -> None:
     assert all(isinstance(done["t_ns"], int) for done in dones)
 
 
+def test_a_gateway_that_comes_up_later() -> None:
+    """Until somebody listens the client tries again, as that in C does; then it goes on."""
+    listener = socket.socket()
+    listener.bind(("127.0.0.1", 0))  # nobody listens on it yet: a connection is refused
+    port = listener.getsockname()[1]
+    code = FAILS.format(code=f"zsim.Client('127.0.0.1', 'Port', {port}, 'Wait', 0);")
+    code += f"fflush(stdout); c = zsim.Client('127.0.0.1', 'Port', {port}, 'Wait', {PATIENCE_S}); disp(c.name);"
+    with subprocess.Popen(command(code), stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        nobody = program.stdout.readline()
+        listener.listen()
+        fake = FakeGateway(echo, listener=listener)
+        after, _ = program.communicate(timeout=PATIENCE_S)
+    fake.close()
+    assert has_terms(nobody, "zsim:connection", f"127.0.0.1:{port}", "`zsim gateway`")
+    assert after == "client.test\n"
+
+
 def test_faults_before_there_is_a_connection() -> None:
+    """Nobody is there within `Wait`; what no waiting mends is an error at once."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-    code = FAILS.format(code=f"zsim.Client('127.0.0.1', 'Port', {port});") + FAILS.format(
-        code="zsim.Client('127.0.0.1', 'Prt', 1);"
+    tried = (
+        f"zsim.Client('127.0.0.1', 'Port', {port}, 'Wait', 0.2);",
+        "zsim.Client('no.such.host.invalid');",
+        "zsim.Client('127.0.0.1', 'Prt', 1);",
     )
-    nobody, wrong = run(code).splitlines()
-    assert has_terms(nobody, "zsim:connection", f"127.0.0.1:{port}", "zsim gateway")
+    nobody, unknown, wrong = run("".join(FAILS.format(code=each) for each in tried)).splitlines()
+    assert has_terms(nobody, "zsim:connection", f"127.0.0.1:{port}", "`zsim gateway`")
+    assert has_terms(unknown, "zsim:connection", "no.such.host.invalid")
     assert has_terms(wrong, "zsim:argument", "'Prt'", "unknown", "Port", "Token", "Name", "Timeout", "Wait")
 
 

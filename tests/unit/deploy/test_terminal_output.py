@@ -12,7 +12,7 @@ from rich.console import Console
 from zsim.errors import printable
 from zsim.runtime.progress import cell
 from zsim_deploy.cli import hosts_commands
-from zsim_deploy.hosts import control_socket, doctor, status_table
+from zsim_deploy.hosts import control_socket, doctor, doctor_tables, status_table
 from zsim_deploy.hosts.doctor import CheckResult, HostReport, NetworkPath
 from zsim_deploy.push.push import PushProgress
 
@@ -66,8 +66,8 @@ ROW = {"role": NASTY, "host": NASTY, "pid": 1, "state": NASTY, "lag_ms": None, "
 @pytest.mark.parametrize(
     "table",
     [
-        doctor._hosts_table({NASTY: HostReport(FACTS, 0.001, 0.0)}),
-        doctor._paths_table([NetworkPath(NASTY, NASTY, 7447, {"error": NASTY})]),
+        doctor_tables.hosts_table({NASTY: HostReport(FACTS, 0.001, 0.0)}),
+        doctor_tables.paths_table([NetworkPath(NASTY, NASTY, 7447, {"error": NASTY})]),
         status_table.table([{**ROW, "round_trip_ms": None, "restarts": 0}]),
         cell(NASTY),
     ],

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError
+from zsim.extras import install_command
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges.ardrone.server.addresses import AllowedHosts, drone_addresses
@@ -112,7 +113,7 @@ class ArdroneServer:
 
     def _can_stream(self) -> bool:
         if not self._has_encoder:
-            self._refuse("video: av is not installed, no pictures are streamed; pip install 'zsim[video]'")
+            self._refuse(f"video: av is not installed, no pictures are streamed; {install_command(['video'])}")
         return self._has_encoder
 
     async def _forward_all(self, intake: TrafficIntake) -> None:

@@ -11,6 +11,7 @@ PHASES_DONE = {
     "takeoff": frozenset({"assembling", "engaged"}),
     "engage": frozenset({"engaged"}),
     "hold": frozenset({"held"}),
+    "rejoin": frozenset({"engaged"}),
     "land": frozenset({"idle"}),
 }
 STATES_DONE = {

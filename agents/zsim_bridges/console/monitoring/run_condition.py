@@ -4,8 +4,16 @@ from collections.abc import Collection, Mapping
 from typing import Literal, NamedTuple
 
 from zsim.contract.state_rules import state_refusal
-from zsim_agents.formation.flight_data import DOWN, GUARD_PARTS, HELD_ON_REQUEST, READY_TO_ENGAGE
+from zsim_agents.formation.flight_data import (
+    AIRBORNE,
+    DOWN,
+    GUARD_PARTS,
+    HELD_ON_REQUEST,
+    READY_TO_ENGAGE,
+    REJOINING,
+)
 
+AT_END = "the record is at its end; go back on the timeline"
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
 
 
@@ -17,16 +25,20 @@ class RunCondition(NamedTuple):
         silent_s: for how long the world has not answered; 0 while it does [s, wall].
         ended: why the run is over; empty while it goes on.
         replayed: whether a record is played back: nobody can be flown.
+        at_end: whether that stands still at the end of the record.
         drones: state of each drone by name, of those that were seen.
         phases: phase and reason of each formation by name.
+        members: names of the drones of each formation.
     """
 
     clock: str | None = None
     silent_s: float = 0.0
     ended: str = ""
     replayed: bool = False
+    at_end: bool = False
     drones: Mapping[str, str] = {}
     phases: Mapping[str, tuple[str, str]] = {}
+    members: Mapping[str, Collection[str]] = {}
 
     @property
     def level(self) -> Level:
@@ -55,7 +67,8 @@ def run_refusals(run: RunCondition) -> dict[str, str]:
     off, state = run.off(), run.clock or "unknown"
     running = "" if state == "running" else f"the run is {state}"
     paused = "" if state == "paused" else f"the run is {state}, not paused"
-    return {"pause": off or running, "resume": off or paused, "step": off or paused, "rate": off}
+    onward = off or paused or (AT_END if run.at_end else "")
+    return {"pause": off or running, "resume": onward, "step": onward, "rate": off, "seek": off}
 
 
 def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
@@ -67,22 +80,37 @@ def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
     return {**refused, "emergency": run.grounded()}  # never kept back: what is shown may be older than what is
 
 
+def is_held_by_fault(run: RunCondition, cluster: str) -> bool:
+    """Return whether a formation is held, and not on request."""
+    phase, reason = run.phases.get(cluster, ("", ""))
+    on_request = any(note in reason for note in (HELD_ON_REQUEST, GUARD_PARTS)) and REJOINING not in reason
+    return phase == "held" and not on_request
+
+
 def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
     """Return why each operation of a formation would be refused, as far as its phase says; empty where it would not."""
     phase, reason = run.phases.get(cluster, ("", ""))
     off = run.grounded() or ("" if phase else f"{cluster} has no controller yet")
     flown = "" if phase == "engaged" else f"{cluster} is {_words(phase)}, not engaged"
-    on_request = phase == "held" and any(note in reason for note in (HELD_ON_REQUEST, GUARD_PARTS))
-    held = f"{cluster} is held: {reason}" if phase == "held" and not on_request else ""
+    held = f"{cluster} is held: {reason}" if is_held_by_fault(run, cluster) else ""
+    on_request = phase == "held" and not held
     steered = off or held or ("" if phase == "held" else flown)
     return {
         "takeoff": off or ("" if phase == "idle" else f"{cluster} is {_words(phase)}, not idle"),
         "engage": off or _engage_refusal(cluster, phase, reason, on_request),
-        "hold": off or held or flown,
+        "hold": off or ("" if REJOINING in reason else held or flown),
+        "rejoin": off or _rejoin_refusal(run, cluster, reason if held else ""),
         "land": off or ("all drones are on the ground" if phase == "idle" and _all_down(run) else ""),
         "target": steered,
         "trajectory": steered,
     }
+
+
+def _rejoin_refusal(run: RunCondition, cluster: str, fault: str) -> str:
+    if not fault or REJOINING in fault:
+        return f"{cluster} is {'rejoining' if fault else 'not held by a fault'}"
+    down = [(name, state) for name in run.members.get(cluster, ()) if (state := run.drones.get(name)) not in AIRBORNE]
+    return f"{down[0][0]} is {_words(down[0][1] or 'not seen')}; take it off first" if down else ""
 
 
 def _engage_refusal(cluster: str, phase: str, reason: str, on_request: bool) -> str:

@@ -1,5 +1,6 @@
 """What the page knows of a run beyond the newest views: its condition, figures of flight, alarms, pending requests."""
 
+import math
 from typing import Any
 
 from zsim.scenario.scenario import Scenario
@@ -11,6 +12,8 @@ from zsim_bridges.console.monitoring.pending_requests import PendingRequest, Pen
 from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ReceivedEstimate, ViewBuffer
+
+ROUNDING_NS = 1_000.0  # of a time that is told in seconds
 
 
 class RunMonitor:
@@ -27,6 +30,7 @@ class RunMonitor:
         board: its alarms; `severity_of` a drone is for its colour.
         flight: figures of the drones.
         pending: requests that are not done yet.
+        record_end_s: simulated time of the last gate on record, of a replay.
     """
 
     def __init__(self, views: ViewBuffer, time_monitor: TimeMonitor, scenario: Scenario, replayed: bool) -> None:
@@ -37,10 +41,12 @@ class RunMonitor:
         self._single = [drone.name for drone in scenario.drones if drone.name not in in_formation]
         self._replayed = replayed
         self._ended = ""
+        self._members = {cluster.name: tuple(cluster.drones) for cluster in scenario.clusters}
         self.condition = RunCondition(replayed=replayed)
         self.board = AlarmBoard()
         self.flight = FlightMeter()
         self.pending = PendingRequests()
+        self.record_end_s = math.inf
 
     def end(self, reason: str) -> None:
         """Note that the run is over."""
@@ -52,7 +58,10 @@ class RunMonitor:
         drones = {drone.name: drone.state for drone in views.drones.drones} if views.drones else {}
         phases = {name: (view.phase, view.reason) for name, view in views.clusters.items()}
         state, silent_s = clock.state if clock else None, self._time_monitor.silent_s
-        self.condition = RunCondition(state, silent_s, self._ended, self._replayed, drones, phases)
+        at_end = clock is not None and state == "paused" and clock.t_ns >= self.record_end_s * 1e9 - ROUNDING_NS
+        self.condition = RunCondition(
+            state, silent_s, self._ended, self._replayed, at_end, drones, phases, self._members
+        )
         self.board.update(self._alarms(), wall_s)
         return self.pending.pop_done(views.clusters, drones)
 

@@ -1,1 +1,1 @@
-"""What the operator's page consists of: the 3-D scene, the plots, and the forms that send requests. Imports viser."""
+"""The panels of the operator's page: plots, tables and the forms that send requests. Imports viser."""

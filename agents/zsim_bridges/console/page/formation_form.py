@@ -11,11 +11,11 @@ from zsim.contract.views import ViewCluster
 from zsim.scenario.scenario import Cluster, Trajectory
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
-from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals
+from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals, is_held_by_fault
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
-from zsim_bridges.console.page.picture import SHAPED_PHASES
 from zsim_bridges.console.page.run_forms import refusal_lines, set_refusals
+from zsim_bridges.console.scene.picture import SHAPED_PHASES
 
 STILL_S = 2.0  # wall; a formation whose goal has not changed for so long is not on its way: the slider shows its goal
 
@@ -43,6 +43,7 @@ class VariableSlider:
         self._out_of_range = False
         self._held: _HeldValue | None = None
         self._slider: Any = gui.add_slider(range_.label, range_.low, range_.high, range_.step, range_.to_display(0.0))
+        self._slider.label = range_.label_unknown
         self._slider.on_update(self._on_update)
 
     def lock(self, locked: bool) -> None:
@@ -104,15 +105,21 @@ class VariableSlider:
 
 REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
-OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Land": "land"}
+OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
 LABELS = {**{op: label for label, op in OPERATIONS.items()}, "target": "sliders", "trajectory": "Trajectory"}
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
     "engage": viser.Icon.TRIANGLE,
     "hold": viser.Icon.HAND_STOP,
+    "rejoin": viser.Icon.ARROWS_JOIN,
     "land": viser.Icon.PLANE_ARRIVAL,
 }
-EXAMPLES = {"expressions": "x_c = 5 + 3*cos(0.1*t)", "waypoints": "0: x_c = 5, y_c = 0\n20: x_c = 5, y_c = 6"}
+EXAMPLES = {
+    "expressions": "x_c = 5 + 3*cos(0.1*t)\nyaw = 90 + 6*t",
+    "waypoints": "0: x_c = 5, y_c = 0\n20: x_c = 5, y_c = 6",
+}
+EXPRESSION_UNITS = "t in seconds, lengths in metres, angles in degrees as on the sliders; sin and cos are of radians"
+WAYPOINT_UNITS = "seconds from the start, lengths in metres, angles in degrees as on the sliders"
 Report = Callable[[RequestOutcome], None]
 
 
@@ -157,9 +164,17 @@ class FormationForm:
         """Grey out what the controller would refuse, with its reason; a slider shows all the same where it stands."""
         refusals = formation_refusals(run, self._cluster.name)
         set_refusals(self._controls, refusals)
+        self._offer_rejoin(run)
         for slider in self._sliders.values():
             slider.lock(bool(refusals["target"]))
-        self._reasons.content = refusal_lines(LABELS, refusals)
+        shown = {op: label for op, label in LABELS.items() if op != "rejoin" or self._controls[op].visible}
+        self._reasons.content = refusal_lines(shown, refusals)
+
+    def _offer_rejoin(self, run: RunCondition) -> None:
+        """Let Rejoin be there only while a fault holds the formation."""
+        held = is_held_by_fault(run, self._cluster.name)
+        if self._controls["rejoin"].visible != held:
+            self._controls["rejoin"].visible = held
 
     def refresh(self, view: ViewCluster | None, wall_s: float) -> None:
         """Let the sliders that were not moved follow the formation."""
@@ -203,8 +218,12 @@ class FormationForm:
     def _single_variable(self, gui: viser.GuiApi, names: list[str]) -> None:
         with gui.add_folder("Other variables", expand_by_default=False):
             name = gui.add_dropdown("variable", names)
-            value = gui.add_number("value [m or deg]", 0.0, step=0.1)
+            value = gui.add_number(self._value_label(names[0]), 0.0, step=0.1)
+            name.on_update(lambda _: setattr(value, "label", self._value_label(name.value)))
             gui.add_button("Move it").on_click(lambda _: self._move(name.value, float(value.value)))
+
+    def _value_label(self, name: str) -> str:
+        return f"value [{self._ranges[name].unit}]"
 
     def _move(self, name: str, shown: float) -> None:
         self.request_target({name: shown})
@@ -214,12 +233,12 @@ class FormationForm:
             if planned is not None:
                 planned_button = gui.add_button("Fly the scenario's")
                 planned_button.on_click(lambda _: self._fly(lambda: _planned_trajectory(planned)))
-            gui.add_markdown("<sub>expressions: t in seconds, lengths in metres, angles in radians</sub>")
-            text = gui.add_text("expressions", EXAMPLES["expressions"], multiline=True)
+            gui.add_markdown(f"<sub>{EXPRESSION_UNITS}</sub>")
+            text = gui.add_text("expressions [m, deg]", EXAMPLES["expressions"], multiline=True)
             fly = gui.add_button("Fly the expressions")
-            fly.on_click(lambda _: self._fly(lambda: operator_input.parse_expressions(text.value, self._space.names)))
-            gui.add_markdown("<sub>waypoints: seconds, metres, degrees, as the sliders</sub>")
-            self._points = gui.add_text("waypoints", EXAMPLES["waypoints"], multiline=True)
+            fly.on_click(lambda _: self._fly(lambda: self._read_expressions(text.value)))
+            gui.add_markdown(f"<sub>{WAYPOINT_UNITS}</sub>")
+            self._points = gui.add_text("waypoints [s, m, deg]", EXAMPLES["waypoints"], multiline=True)
             here = gui.add_button("Waypoints from here")
             here.on_click(lambda _: self._prefill())
             gui.add_button("Fly the waypoints").on_click(lambda _: self._fly(self._read_waypoints))
@@ -228,6 +247,10 @@ class FormationForm:
         """Write where the formation is as the first waypoint, and the same place as the next, to be changed."""
         if self._shown is not None:
             self._points.value = operator_input.waypoints_from(self._shown, list(self._ranges.values()))
+
+    def _read_expressions(self, text: str) -> dict[str, Any]:
+        angles = [each.name for each in self._ranges.values() if each.unit == "deg"]
+        return operator_input.parse_expressions(text, self._space.names, angles)
 
     def _read_waypoints(self) -> dict[str, Any]:
         return operator_input.waypoints_in_si(operator_input.parse_waypoints(self._points.value), self._ranges)

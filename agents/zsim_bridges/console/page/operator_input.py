@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from zsim.scenario.scenario import Cluster, Scenario
 from zsim.schema import yaml_file
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
+from zsim_agents.formation.variable_values import DEGREES
 
 SIDEWAYS_M = 50.0  # of the drones' starts, sideways; chosen: as far as a page shows a formation well
 HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and within sight
@@ -38,6 +39,11 @@ class SliderRange(NamedTuple):
     @property
     def label(self) -> str:
         return f"{self.name} [{self.unit}]"
+
+    @property
+    def label_unknown(self) -> str:
+        """The label while nothing is known of the variable: where the slider stands then means nothing."""
+        return f"{self.label}: not known"
 
     def to_display(self, value: float) -> float:
         """Return a value [m, rad] in the unit of the range, to its step, within it."""
@@ -99,8 +105,13 @@ class InputError(ValueError):
     """A text of the operator that cannot be parsed; the message has the line and what is allowed."""
 
 
-def parse_expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
+def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] = ()) -> dict[str, Any]:
     """Return the arguments of a trajectory of lines `variable = expression`; other names are constants.
+
+    Args:
+        text: of the operator.
+        names: of the formation's variables.
+        angles: those of them whose expressions are in degrees; `NAME_deg` is the same as `NAME`.
 
     Raises:
         InputError: a line is neither.
@@ -112,7 +123,10 @@ def parse_expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
         if not sign or not name or not value:
             allowed = "VARIABLE = EXPRESSION, such as x_c = 5*cos(0.1*t)"
             raise InputError(f"line {number} is {line[:40]!r}; must be {allowed}")
-        if name in names:
+        variable = name.removesuffix(DEGREES)
+        if variable in angles:
+            by_variable[f"{variable}{DEGREES}"] = value
+        elif name in names:
             by_variable[name] = value
         else:
             constants[name] = _number(value, f"line {number}: {name} is no variable, and as a constant")

@@ -10,9 +10,9 @@ from zsim_bridges.console.console_tables import event_table
 from zsim_bridges.console.monitoring import event_log
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.run_condition import RunCondition
-from zsim_bridges.console.page.chosen_ring import ChosenRing
-from zsim_bridges.console.page.picture import Array, DronePoses
 from zsim_bridges.console.page.run_forms import DroneForm
+from zsim_bridges.console.scene.chosen_ring import ChosenRing
+from zsim_bridges.console.scene.picture import Array, DronePoses
 
 ROWS_SHOWN = 60  # events
 
@@ -66,6 +66,11 @@ class PageForms:
         form = self._forms.get(-1 if client_id is None else client_id)
         if form is not None:
             form.drone.choose(drone)
+
+    def chosen(self, client_id: int | None) -> str:
+        """Return the drone that one page has chosen; empty of one that is not open."""
+        form = self._forms.get(-1 if client_id is None else client_id)
+        return form.drone.chosen if form is not None else ""
 
     def move_rings(self, drones: DronePoses) -> None:
         """Put the ring of each page about the drone that it has chosen."""

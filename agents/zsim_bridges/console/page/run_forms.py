@@ -15,7 +15,9 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, drone_refusals, fleet_refusals, run_refusals
 from zsim_bridges.console.page import operator_input
 
-REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 8px;overflow-wrap:anywhere"
+REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
+"""The row of tabs below stands 9 px higher than what is above it ends."""
+
 DURATION_S = 30.0  # of a fault, unless another time is typed
 WEAK_THRUST_SHARE = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
 GUST_M_S = (4.0, 0.0, 0.0)  # about what the drones of the formation can still hold against
@@ -164,7 +166,8 @@ class RunForm:
         paused = run.clock == "paused"
         if self._controls["resume"].visible != paused:
             self._controls["pause"].visible, self._controls["resume"].visible = not paused, paused
-        self._reasons.content = refusal_lines({"step": "Step", "rate": "Set rate"}, refusals)
+        toggle = {"resume": "Resume"} if paused else {"pause": "Pause"}
+        self._reasons.content = refusal_lines({**toggle, "step": "Step", "rate": "Set rate"}, refusals)
 
 
 class FleetForm:

@@ -1,5 +1,7 @@
 """Plots of a formation's variables and of its drones' flight, three at a time."""
 
+import math
+import threading
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,13 +13,18 @@ from zsim.contract.views import EstimateView
 from zsim.math import frames
 from zsim.scenario.scenario import Cluster
 from zsim_bridges.console.page.operator_input import SliderRange
-from zsim_bridges.console.page.picture import SERIES, SPAN_S, DronePoses, VariableHistory
+from zsim_bridges.console.page.variable_history import SERIES, SPAN_S, VariableHistory
+from zsim_bridges.console.scene.picture import Array, DronePoses
 
 PLOTS_SHOWN = 3  # plots
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # of SERIES
 HEIGHT_PX = 150
+PADDING_PX = (8, 24, 0, 0)  # above, so that the highest figure is whole; to the right as viser has it
 AXIS_PX = 56  # of figures such as -12.5, which would be clipped
+BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # of a plot without points yet
 NONE = "none"
+STEPS_PER_WINDOW = 6  # by which the time axis moves on; chosen: plots are made anew every 30 s at most
+LEAST_POINTS = 2  # of a curve
 WINDOWS_S = (SPAN_S, 60.0, 20.0)  # simulated
 FLIGHT = {"x": "m", "y": "m", "z": "m", "yaw": "deg", "roll": "deg", "pitch": "deg"}  # of each drone, with units
 ESTIMATED = 4  # of them, the first ones: views of estimates have no roll and pitch
@@ -75,6 +82,28 @@ def flight_history(names: Sequence[str]) -> FlightHistory:
     return FlightHistory(tuple(names), VariableHistory(len(names) * len(FLIGHT)))
 
 
+class AxisRange(NamedTuple):
+    """What of the time axis is shown [s], simulated.
+
+    Viser keeps an automatic range by its share of the former data, read before the first range has been committed: a
+    page that draws slowly then shows a stretch without data for ever. So the range is set; it moves on by whole steps,
+    since a plot with another range is made anew.
+    """
+
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, t_s: Array, span_s: float) -> "AxisRange":
+        """Return the range of points of those times (M,), M > 0, in a window of `span_s`."""
+        step_s = span_s / STEPS_PER_WINDOW
+        return cls(math.floor(t_s[0] / step_s) * step_s, (math.floor(t_s[-1] / step_s) + 1) * step_s)
+
+    def scales(self) -> dict[str, uplot.Scale]:
+        """Return it as uPlot takes it."""
+        return {"x": uplot.Scale(time=False, range=(self.low, self.high))}
+
+
 class VariablePlots:
     """Plots of one formation and of its drones, three variables at a time.
 
@@ -107,27 +136,43 @@ class VariablePlots:
         gui.add_markdown(f"<sub>{_legend()} over time [s]; below a plot, the values at the cursor</sub>")
         self._plots = [_plot(gui, each) for each in of_all[:PLOTS_SHOWN]]
         self._shown: tuple[PlottedVariable, ...] = tuple(of_all[:PLOTS_SHOWN])
+        self._ranges: dict[int, AxisRange] = {}  # by plot
+        self._lock = threading.Lock()
+        for control in (self._choice, self._window, self._errors):
+            control.on_update(lambda _: self._redraw())
 
     def draw(self) -> None:
-        """Send the curves that are chosen."""
-        shown = self._choices.get(self._choice.value, ())
-        if shown != self._shown:
-            self._shown = shown
-            self._retitle()
-        elif self._still.value:
+        """Send the curves that are chosen, unless they are to stand still."""
+        if not self._still.value:
+            self._redraw()
+
+    def _redraw(self) -> None:
+        """Send the curves that are chosen, as they are now: after the end of a run, too."""
+        with self._lock:
+            shown = self._choices.get(self._choice.value, ())
+            if shown != self._shown:
+                self._shown = shown
+                self._retitle()
+            for index, each in enumerate(shown):
+                self._send(index, each)
+
+    def _send(self, index: int, each: PlottedVariable) -> None:
+        plot, span_s = self._plots[index], self._windows[self._window.value]
+        less = each.reference if self._errors.value else None
+        curves = each.history.curves(each.column, each.angular, span_s, less)
+        if len(curves[0]) < LEAST_POINTS:
             return
-        for each, plot in zip(shown, self._plots, strict=False):
-            less, span_s = each.reference if self._errors.value else None, self._windows[self._window.value]
-            curves = each.history.curves(each.column, each.angular, span_s, less)
-            if len(curves[0]) > 1:
-                plot.data = curves
+        range_s = AxisRange.of(curves[0], span_s)
+        if range_s != self._ranges.get(index):
+            self._ranges[index] = range_s
+            plot.scales = range_s.scales()
+        plot.data = curves
 
     def _retitle(self) -> None:
         for index, plot in enumerate(self._plots):
             plot.visible = index < len(self._shown)
             if plot.visible:
-                plot.title = self._shown[index].label
-                plot.data = tuple(np.zeros(2) for _ in range(1 + len(SERIES)))
+                plot.title, plot.data = self._shown[index].label, BLANK
 
 
 def _triples(of: str, variables: list[PlottedVariable]) -> dict[str, tuple[PlottedVariable, ...]]:
@@ -142,13 +187,13 @@ def _legend() -> str:
 
 def _plot(gui: viser.GuiApi, variable: PlottedVariable) -> Any:
     curves = [uplot.Series(label=n, stroke=c, width=1.5) for n, c in zip(SERIES, COLOURS, strict=True)]
-    empty = tuple(np.array([0.0, 1.0]) for _ in range(1 + len(SERIES)))
     return gui.add_uplot(
-        empty,
+        BLANK,
         (uplot.Series(label="t [s]"), *curves),
         title=variable.label,
         height=HEIGHT_PX,
+        padding=PADDING_PX,
         axes=(uplot.Axis(), uplot.Axis(size=AXIS_PX)),
-        scales={"x": uplot.Scale(time=False, auto=True)},
+        scales=AxisRange(0.0, 1.0).scales(),
         legend=uplot.Legend(show=True, live=True),
     )

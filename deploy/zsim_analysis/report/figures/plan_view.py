@@ -8,32 +8,37 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, Rectangle
+from scipy.spatial import ConvexHull, QhullError
 
+from zsim.drone_colours import drone_colours
 from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, row_of
 from zsim.scenario.scenario import Scenario
-from zsim_analysis.reading.flight import Array, RecordedFlight, Track
 from zsim_analysis.reading.formation import Formation, common_instants
-from zsim_analysis.report.pages import BLACK, DARK, dress, drone_colour, legend_above, new_figure
+from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track
+from zsim_analysis.report.pages import BLACK, COLUMN_IN, DARK, PAPER_PT, dress, legend_above, new_figure
 
 OUTLINES = 7  # formations drawn into the plan, few enough to be distinct
 APART = 0.6  # of the formation's own size: outlines nearer than this would cover each other
 NAMED_MAX = 12  # drones that a legend names
+RING_MAX = 4  # drones whose outline is drawn through them in their order; of more it is their hull
 
 
 def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure:
     """Return the true paths from above with the outlines of the formations at some instants."""
-    figure = new_figure(9, 9)
+    figure = new_figure(COLUMN_IN, 1.15 * COLUMN_IN)
     axes = figure.subplots()
     dress(axes, "north y (m)")
-    axes.set_xlabel("east x (m)", fontsize=10)
+    axes.set_xlabel("east x (m)", fontsize=PAPER_PT)
     axes.set_aspect("equal", adjustable="datalim")
     draw_obstacles(axes, flight.scenario)
-    for i, track in enumerate(flight.tracks):
-        draw_path(axes, track, drone_colour(i), named=i < NAMED_MAX)
+    colours = drone_colours(len(flight.tracks))
+    few = len(flight.tracks) <= NAMED_MAX
+    for i, (track, colour) in enumerate(zip(flight.tracks, colours, strict=True)):
+        draw_path(axes, track, colour, named=few or i in (0, len(colours) - 1))
     for formation in formations:
         _draw_desired(axes, formation)
         _draw_outlines(axes, formation, flight.tracks)
-    legend_above(figure, axes, columns=4)
+    legend_above(figure, axes, columns=3)
     return figure
 
 
@@ -61,9 +66,9 @@ def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
         return
     step = max(1, len(track.t_ns) // 4000)  # a path has no extremes to keep, only a shape
     x, y = track.p_W[::step, 0], track.p_W[::step, 1]
-    axes.plot(x, y, color=colour, lw=0.8, alpha=0.6, zorder=2, label=track.name if named else None)
-    axes.plot(x[0], y[0], marker="s", color=colour, ms=7, mec="white", zorder=5)
-    axes.plot(*track.p_W[-1, :2], marker="o", color=colour, ms=7, mec="white", zorder=5)
+    axes.plot(x, y, color=colour, lw=0.6, alpha=0.7, zorder=2, label=track.name if named else None)
+    axes.plot(x[0], y[0], marker="s", color=colour, ms=4, mec="white", mew=0.5, zorder=5)
+    axes.plot(*track.p_W[-1, :2], marker="o", color=colour, ms=4, mec="white", mew=0.5, zorder=5)
 
 
 def _draw_desired(axes: Axes, formation: Formation) -> None:
@@ -72,27 +77,35 @@ def _draw_desired(axes: Axes, formation: Formation) -> None:
         desired = np.where(engaged[:, None], formation.desired, np.nan)
         x, y = (desired[:, formation.column(name)] for name in ("x_c", "y_c"))
         step = max(1, len(x) // 4000)
-        axes.plot(x[::step], y[::step], color=BLACK, lw=1.3, zorder=3, label=f"desired centroid of {formation.name}")
+        axes.plot(x[::step], y[::step], color=BLACK, lw=0.9, zorder=3, label=f"desired centroid of {formation.name}")
 
 
 def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
     members = [track for name in formation.drones for track in tracks if track.name == name]
     for t_s, p_W in outlines(members):
-        ring = np.vstack([p_W, p_W[:1]])
-        axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=DARK, lw=1.2, zorder=4)
+        ring = p_W if len(p_W) <= RING_MAX else _hull(p_W)
+        axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=DARK, lw=0.7, zorder=4)
         out = p_W[0] - p_W.mean(axis=0)
         away = out / max(float(np.linalg.norm(out)), 1e-9)
         axes.annotate(
             f"{t_s:.0f} s",
             p_W[0],
-            xytext=18 * away,
+            xytext=9 * away,
             textcoords="offset points",
             ha="center",
             va="center",
-            fontsize=9,
+            fontsize=PAPER_PT - 1.5,
             zorder=6,
             bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
         )
+
+
+def _hull(p_W: Array) -> Array:
+    """Return the corners (h, 2) of the convex hull of positions (n, 2); all of them where they stand in one line."""
+    try:
+        return p_W[ConvexHull(p_W).vertices]
+    except QhullError:
+        return p_W
 
 
 def outlines(members: Sequence[Track]) -> Iterator[tuple[float, Array]]:

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from msgspec import Struct
 
 from zsim.contract.run_messages import Event
-from zsim_analysis.reading.flight import RecordedFlight
 from zsim_analysis.reading.formation import Formation
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.pages import DARK, GREEN, ORANGE, PURPLE, SKY, VERMILION
 
 FAULT, TAKE_OVER = "fault", "taken over"

@@ -21,6 +21,7 @@ from zsim_agents.formation.flight_plan import (
     Land,
     MoveTo,
     Pause,
+    Rejoin,
     RequestError,
     Scheduled,
     TakeOff,
@@ -444,6 +445,100 @@ def test_a_reference_that_fails_after_its_check_holds_the_formation(monkeypatch)
     fleet.fly(20.0)
     assert has_terms(fleet.output.reason, "reference", "allowed")
     assert fleet.closest_m > 1.9
+
+
+# A drone that has landed, and flies again far below its formation
+
+
+def fleet_out_of_step(height_m=8.0, away_m=(0.0, 0.0)):
+    """Return a fleet of which drone2 was landed in formation flight, moved over the ground, and flown again."""
+    fleet = engaged_fleet()
+    assert fleet.engagement.request(MoveTo({"z_c": height_m})) is None
+    fleet.fly(40.0)
+    fleet.states[1] = "landing"
+    fleet.fly(20.0)
+    assert fleet.states[1] == "landed"
+    fleet.p_W[1, :2] += away_m
+    fleet.states[1] = "taking_off"
+    fleet.fly(10.0)
+    assert fleet.states[1] == "hovering"
+    assert fleet.output.phase == "held"
+    return fleet
+
+
+@pytest.mark.parametrize("away_m", [(0.0, 0.0), (6.0, 5.0)], ids=["beneath", "beyond the others"])
+def test_a_drone_far_below_its_formation_stays_there_until_it_is_to_rejoin(away_m):
+    fleet = fleet_out_of_step(away_m=away_m)
+    fleet.fly(10.0)
+    assert has_terms(fleet.output.reason, "roll")
+    assert fleet.p_W[1, 2] == pytest.approx(0.8, abs=0.1)
+    assert fleet.engagement.request(Rejoin()) is None
+    assert has_terms(fleet.step().reason, "drone2", "place", "1")
+    outputs = fleet.fly(60.0)
+    assert fleet.output.phase == "engaged"
+    assert fleet.output.value[2] == pytest.approx(8.0, abs=0.02)
+    assert fleet.closest_m > 2.0
+    speeds = [np.linalg.norm(s.v_W[:2]) for o in outputs for s in o.setpoints if s is not None]
+    assert max(speeds) <= 2.0
+
+
+def test_a_drone_rejoins_over_the_ground_first_and_then_straight_up():
+    fleet = fleet_out_of_step(away_m=(6.0, 5.0))
+    assert fleet.engagement.request(Rejoin()) is None
+    place = fleet.engagement.space.inverse(fleet.engagement.guidance.value(fleet.t_s)[0])[0][1]
+    low_m = fleet.p_W[1, 2]
+    while np.linalg.norm(fleet.p_W[1, :2] - place[:2]) > 1.0:
+        fleet.step()
+        assert fleet.t_s < 200.0
+        assert fleet.p_W[1, 2] == pytest.approx(low_m, abs=0.05)
+    fleet.fly_until("engaged")
+
+
+def test_to_rejoin_needs_a_formation_held_by_a_fault_and_drones_that_fly():
+    fleet = engaged_fleet()
+    assert_refused(fleet, Rejoin(), "phase", "engaged", "held")
+    fleet.engagement.request(Pause())
+    assert_refused(fleet, Rejoin(), "phase", "held", "fault")
+    fleet.states[1] = "landed"
+    fleet.fly(0.1)
+    assert_refused(fleet, Rejoin(), "drone2", "landed")
+    fleet.states[1] = "hovering"
+    fleet.spoil = {"age_s": np.full(3, 2.0)}
+    fleet.fly(0.1)
+    assert_refused(fleet, Rejoin(), "drone1", "2.00", "old")
+
+
+@pytest.mark.parametrize("end", [Pause(), "landing", "stale"])
+def test_a_hold_a_landing_and_a_lost_estimate_end_the_way_back(end):
+    fleet = fleet_out_of_step(away_m=(6.0, 5.0))
+    assert fleet.engagement.request(Rejoin()) is None
+    fleet.fly(1.0)
+    if isinstance(end, Pause):
+        assert fleet.engagement.request(end) is None
+    elif end == "landing":
+        fleet.states[1] = "landing"
+        fleet.fly(2.0)
+        fleet.states[1] = "taking_off"
+    else:
+        fleet.spoil = {"age_s": np.full(3, 2.0)}
+        fleet.fly(0.1)
+        fleet.spoil = {}
+    fleet.fly(3.0)
+    here = fleet.p_W.copy()
+    fleet.fly(3.0)
+    assert fleet.output.phase == "held"
+    assert np.array_equal(fleet.p_W, here)
+    assert fleet.engagement.request(Rejoin()) is None
+
+
+def test_one_that_is_restored_on_the_way_back_goes_on_to_the_same_bits():
+    fleet = fleet_out_of_step(away_m=(3.0, 0.0))
+    assert fleet.engagement.request(Rejoin()) is None
+    fleet.fly(2.0)
+    copied = restored(fleet, ())
+    for output, again in zip(fleet.fly(25.0), copied.fly(25.0), strict=True):
+        assert exact(again) == exact(output)
+    assert fleet.output.phase == "engaged"
 
 
 # Hold, resume, land

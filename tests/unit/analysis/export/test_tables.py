@@ -352,7 +352,7 @@ def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
 def test_what_is_not_installed_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arguments, "find_spec", lambda module: None if module == "foxglove" else module)
     done = CliRunner().invoke(app, ["export", str(run), "--format", "foxglove"])
-    assert has_terms(str(done.exception), "foxglove", "'zsim[export]'")
+    assert has_terms(str(done.exception), "foxglove", "'.[export]'")
 
 
 def test_the_command_line_starts_without_what_exports_need() -> None:

@@ -10,15 +10,17 @@ import synthetic_record
 import typer
 from synthetic_record import Flown
 
-from zsim.contract import messages
+from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState
-from zsim.contract.run_messages import Event
+from zsim.contract.run_messages import Clock, Event
 from zsim.record import RecordWriter
 from zsim_agents.formation.flight_plan import WAITS, waiting_step
 from zsim_analysis.reading.flight import FlightReader, RecordedFlight
 from zsim_analysis.reading.shortfall import Shortfall, shortfalls
+from zsim_analysis.reading.verdict import NOT_AS_PLANNED, marks_of, verdict
 from zsim_analysis.report.figures.report_figures import figures
-from zsim_analysis.report.make_report import NOT_AS_PLANNED, judge, marks_of, page, table
+from zsim_analysis.report.make_report import judge, page
+from zsim_analysis.report.tables import table
 from zsim_deploy.cli import record_commands
 
 State = Callable[[float], dict[str, Any]]
@@ -105,13 +107,62 @@ def test_table_figures_page_and_exit_code_show_it(tmp_path: Path, capsys: pytest
             writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
     flight, formations, summary = judge(tmp_path / "run.mcap")
     assert not summary.as_planned
-    assert any(fails and NOT_AS_PLANNED in mark for mark, fails in marks_of(summary))
+    assert any(fails and NOT_AS_PLANNED in mark for mark, fails in marks_of(summary.shortfalls))
     assert NOT_AS_PLANNED in str(table(summary, "main").title)
     for figure in figures(flight, formations, summary):
-        assert "too fast" in figure.drawing.get_suptitle()
+        assert "too fast" in " ".join(figure.drawing.get_suptitle().split())  # on as many lines as it takes
     assert "too fast" in page(summary, [])
     outcome = type("Outcome", (), {"interrupted": False, "failed": False, "reason": "over"})()
     with pytest.raises(typer.Exit) as exit_:
         record_commands.conclude(outcome, tmp_path, True)
     assert exit_.value.exit_code == 1
     assert "too fast" in " ".join(capsys.readouterr().out.split())  # whatever the width of the terminal
+
+
+CASES: dict[str, tuple[State, tuple[Event, ...], int]] = {
+    "a refused step": (refused, (), 1),
+    "never engaged": (lambda t_s: {"phase": "assembling"}, (), 1),
+    "a collision": (
+        lambda t_s: {"phase": "engaged"},
+        (Event(7 * 10**9, 0, "collision", "world", "drone1", "drone1 and drone2 collide"),),
+        1,
+    ),
+    "judged while not engaged": (lambda t_s: {"phase": "engaged" if t_s > 9 else "assembling"}, (), 0),
+    "as planned": (lambda t_s: {"phase": "engaged"}, (), 0),
+}
+
+
+@pytest.mark.usefixtures("unrendered")
+@pytest.mark.parametrize("what", CASES)
+def test_the_verdict_is_the_same_with_and_without_a_report(
+    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state, events, code = CASES[what]
+    write(tmp_path / "run.mcap", state, events)
+    assert verdict(tmp_path / "run.mcap").shortfalls == judge(tmp_path / "run.mcap")[-1].shortfalls
+    reported, plain = (end_of(tmp_path, report, capsys) for report in (True, False))
+    assert reported == plain
+    assert plain[0] == code
+
+
+def write(record: Path, state: State, events: Sequence[Event]) -> None:
+    """Write a record that is complete."""
+    with RecordWriter(record) as writer:
+        for key, message, wall_ns in traffic(state, events):
+            writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+            if isinstance(message, Clock):
+                clock = message
+        stopped = msgspec.structs.replace(clock, seq=clock.seq + 1, state="stopped")
+        writer.add(keys.CLOCK, messages.encode(stopped), messages.encoding(keys.CLOCK), clock.t_ns, 0)
+
+
+def end_of(folder: Path, report: bool, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, int]:
+    """Return a run's exit code, its last line on standard error, and how often what it did not do is marked."""
+    outcome = type("Outcome", (), {"interrupted": False, "failed": False, "reason": "over"})()
+    code = 0
+    try:
+        record_commands.conclude(outcome, folder, report)
+    except typer.Exit as end:
+        code = end.exit_code
+    out, err = capsys.readouterr()
+    return code, err.strip().rpartition("\n")[2], out.count(f"{NOT_AS_PLANNED}: ")

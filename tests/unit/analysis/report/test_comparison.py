@@ -28,8 +28,8 @@ from zsim_analysis.report.comparison import (
     scenario_rows,
 )
 from zsim_analysis.report.figures.comparison_figures import comparison_figures
+from zsim_analysis.report.figures.run_style import STYLES, run_style
 from zsim_analysis.report.make_report import STATISTICS, compare, comparison_path, fact_rows, judge, statistics_rows
-from zsim_analysis.report.pages import STYLES, run_style
 from zsim_deploy.cli.cli import app
 
 WINDOW = "report.window_s=[2, 9.98]"

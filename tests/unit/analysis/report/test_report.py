@@ -26,8 +26,9 @@ from zsim.errors import RecordError, ReportError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim_analysis.reading.formation import window
-from zsim_analysis.report.make_report import PAPER_COLUMN, judge, make_report, page, table, terminal_text
+from zsim_analysis.report.make_report import judge, make_report, page
 from zsim_analysis.report.pages import thinned
+from zsim_analysis.report.tables import PAPER_COLUMN, table, terminal_text
 
 NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
 AMPLITUDE = np.array([0.12, 0.13, 0.03, 0.02, 0.01, 0.07, 0.05, 0.06, 0.04, 0.28, 0.3, 0.08])
@@ -38,6 +39,7 @@ FIGURES = {
     "figure_7_orientation.png",
     "figure_8_shape.png",
     "plan_view.png",
+    "distances.png",
     "drones.png",
 }
 CONTRACT_FIELDS = {
@@ -270,7 +272,7 @@ def test_a_run_without_a_cluster(tmp_path):
     make_report(tmp_path)
     assert summary.errors == {}
     assert any("no cluster" in note for note in summary.notes)
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"plan_view.png", "drones.png"}
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"plan_view.png", "distances.png", "drones.png"}
     assert '<table class="numbers">' not in (tmp_path / "report.html").read_text()
     assert not any(isinstance(each, Table) for each in terminal_text(summary).renderables)
 
@@ -361,7 +363,7 @@ def test_figures_show_something(run):
     assert {path.name for path in (directory / "figures").iterdir()} == FIGURES
     for name in FIGURES:
         picture = matplotlib.image.imread(directory / "figures" / name)[:, :, :3]
-        assert picture.shape[1] >= 1000
+        assert picture.shape[1] in (700, 1432)  # 3.5 and 7.16 in, at 200 pixels each
         inked = (picture < 0.9).any(axis=2)
         assert 0.005 < inked.mean() < 0.6
         colours = (picture * 255).astype(int) @ (65_536, 256, 1)

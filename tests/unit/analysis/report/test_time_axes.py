@@ -14,8 +14,9 @@ from zsim.contract.flight_messages import ClusterState
 from zsim.contract.run_messages import Event
 from zsim_analysis.reading.flight import FlightReader, RecordedFlight
 from zsim_analysis.reading.formation import Formation, formations_of
+from zsim_analysis.report.figures.drone_panels import draw_drones
+from zsim_analysis.report.figures.formation_figures import curves, draw_errors, draw_parameters
 from zsim_analysis.report.figures.plan_view import draw_plan
-from zsim_analysis.report.figures.report_figures import curves, draw_drones, draw_errors, draw_parameters
 from zsim_analysis.report.figures.time_marks import time_marks
 
 ROLL, ENGAGED_S = 3, 4.0
@@ -66,7 +67,7 @@ def test_angles_are_unwrapped_from_the_engagement_on(formation: Formation) -> No
 
 def test_noise_before_the_engagement_does_not_set_the_scale(flight: RecordedFlight, formation: Formation) -> None:
     marks = time_marks(flight, formation)
-    (axes,) = draw_parameters(formation, ["roll"], "", marks).axes
+    (axes,) = draw_parameters(formation, ["roll"], marks).axes
     assert max(map(abs, axes.get_ylim())) < 0.1
     whole = draw_errors(formation, (5.0, 11.0), marks).axes[2 * ROLL]
     assert max(map(abs, whole.get_ylim())) < 0.1
@@ -81,7 +82,7 @@ def test_marks_stand_on_every_time_axis(flight: RecordedFlight, formation: Forma
     ]
     for figure in (
         draw_errors(formation, (0.0, 12.0), marks),
-        draw_parameters(formation, ["x_c", "y_c"], "", marks),
+        draw_parameters(formation, ["x_c", "y_c"], marks),
         draw_drones(flight, marks),
     ):
         assert all(len(bands_of(figure, place)) >= 3 for place in range(len(figure.axes)))

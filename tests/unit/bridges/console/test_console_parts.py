@@ -17,24 +17,18 @@ from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
+from zsim_agents.formation.trajectory import ExpressionTrajectory
 from zsim_bridges.console import console_tables
-from zsim_bridges.console.console_server import PageControls, ViewerCamera, is_permitted
-from zsim_bridges.console.http_proxy import ListenAddress
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.sensor_rates import SensorRates
 from zsim_bridges.console.page import operator_input
-from zsim_bridges.console.page import picture as pic
 from zsim_bridges.console.page.operator_input import primary_variables, slider_ranges
-from zsim_bridges.console.page.picture import (
-    HISTORY_POINTS_MAX,
-    INTERVAL_S,
-    POINTS_OF_ONE,
-    SPACING_M,
-    SPAN_S,
-    CanvasTrails,
-    VariableHistory,
-)
-from zsim_bridges.console.page_tokens import OPERATOR, VIEWER, PageRequest, PageTokens
+from zsim_bridges.console.page.variable_history import HISTORY_POINTS_MAX, INTERVAL_S, SPAN_S, VariableHistory
+from zsim_bridges.console.scene import picture as pic
+from zsim_bridges.console.scene.picture import POINTS_OF_ONE, SPACING_M, CanvasTrails
+from zsim_bridges.console.server.http_proxy import ListenAddress
+from zsim_bridges.console.server.page_messages import PageControls, ViewerCamera, is_permitted
+from zsim_bridges.console.server.page_tokens import OPERATOR, VIEWER, PageRequest, PageTokens
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -337,6 +331,17 @@ def test_expressions_are_read_with_their_constants():
         "expressions": {"x_c": "R*cos(0.1*t)", "y_c": "R*sin(0.1*t)"},
         "constants": {"R": 5.0},
     }
+
+
+def test_expressions_of_angles_are_in_degrees_as_the_sliders_are():
+    scenario = scenario_file.load(SCENARIOS / "step.yaml")
+    space = scenario_space(scenario, scenario.clusters[0])
+    text = "yaw = 90 + 6*t\nroll_deg = A\nx_c = 1\nA = 5"
+    read = operator_input.parse_expressions(text, space.names, ("roll", "pitch", "yaw"))
+    c, c_dot = ExpressionTrajectory(space, read["expressions"], np.zeros(space.size), read["constants"]).value(5.0)
+    found = {name: c[space.index(name)] for name in ("yaw", "roll", "x_c")}
+    assert found == pytest.approx({"yaw": math.radians(120.0), "roll": math.radians(5.0), "x_c": 1.0})
+    assert c_dot[space.index("yaw")] == pytest.approx(math.radians(6.0))
 
 
 def test_waypoints_are_read():

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.record_player import RecordPlayer
 
 TIMELINE = {"from_s": 0.0, "to_s": 9.0, "marks": []}
@@ -46,8 +47,26 @@ def test_a_replay_that_stands_shows_where_it_was_put():
     assert asked == [("seek", 4.0, True)]
 
 
+@pytest.mark.parametrize(
+    ("run", "refused"),
+    [
+        (RunCondition("running", replayed=True), {"resume", "step"}),
+        (RunCondition("paused", replayed=True), {"pause"}),
+        (RunCondition("paused", replayed=True, at_end=True), {"pause", "resume", "step"}),
+        (
+            RunCondition("stopped", replayed=True, ended="the record is over"),
+            {"pause", "resume", "step", "rate", "seek"},
+        ),
+    ],
+)
+def test_the_timeline_has_what_would_be_refused(run: RunCondition, refused: set[str]):
+    made, _ = player("paused")
+    refusals = made.state(run)["refusals"]
+    assert {op for op, reason in refusals.items() if reason} == refused
+
+
 def test_a_flight_has_no_timeline():
     made, asked = player("running", is_replay=False)
     made.play("pause", 1.0)
-    assert made.timeline == {}
+    assert made.timeline == made.state(RunCondition("running")) == {}
     assert asked == []

@@ -18,14 +18,14 @@ from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.console_server import PrivateViser
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
-from zsim_bridges.console.page import scene_nodes as stages
-from zsim_bridges.console.page.camera_follow import CameraFollow
-from zsim_bridges.console.page.camera_frustums import CameraFrustums
-from zsim_bridges.console.page.picture import drone_poses
-from zsim_bridges.console.picture_rate import picture_rate_hz
 from zsim_bridges.console.run_page import RunPage
+from zsim_bridges.console.scene import scene_nodes as stages
+from zsim_bridges.console.scene.camera_follow import CameraFollow
+from zsim_bridges.console.scene.camera_frustums import CameraFrustums
+from zsim_bridges.console.scene.picture import drone_poses
+from zsim_bridges.console.scene.picture_rate import picture_rate_hz
+from zsim_bridges.console.server.private_viser import PrivateViser
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
 SCENARIO = scenario_file.load(STEP)
@@ -89,7 +89,7 @@ class Seen:
         drones = DRONES
         scenario = STEP.read_text()
         info: Any = SimpleNamespace(
-            run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario, replay_of=""
+            run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario, replay_of="", gate_ns=20_000_000
         )
         server.get_clients = lambda: {0: None} if watched else {}
         self.show = RunPage(
@@ -139,6 +139,24 @@ def cluster(name: str = CLUSTER, names: tuple[str, ...] = SPACE.names) -> tuple[
 @pytest.mark.parametrize(("drones", "rate", "hz"), [(3, 1.0, 20.0), (50, 1.0, 10.0), (3, 25.0, 10.0), (3, 0.0, 20.0)])
 def test_pictures_are_as_many_as_an_eye_can_follow(drones: int, rate: float, hz: float):
     assert picture_rate_hz(drones, rate) == hz
+
+
+def test_the_view_from_above_has_the_newest_of_all(seen: Seen):
+    seen.draw(drones(*NAMES[:2]), cluster())
+    plan = seen.show.flying.plan(None, whole=True)
+    assert [each and each[:2] for each in plan["drones"]] == [[0.0, 0.0], [4.0, 0.0], None]
+    assert [(each["name"], each["drones"]) for each in plan["formations"]] == [(CLUSTER, [0, 1, 2])]
+    assert (plan["names"], plan["t_s"]) == (list(NAMES), pytest.approx(0.02))
+    assert "names" not in seen.show.flying.plan(None, whole=False)
+
+
+def test_a_drone_is_taken_from_a_page_and_given_back(seen: Seen):
+    seen.draw(drones(*NAMES))
+    flying = seen.show.flying.control
+    assert flying.take("page", NAMES[1], over=False).state in ("taking", "flying")
+    flying.leave("page")
+    seen.show.close()
+    assert ("world/control", "acquire", {"drone": NAMES[1], "priority": 10}) in seen.link.asked
 
 
 def test_a_whole_formation_is_shown(seen: Seen):
@@ -230,8 +248,8 @@ def test_trails_of_a_replay_that_goes_back_before_anybody_looks_go_too(viser: Pr
 
 
 def trails(seen: Seen) -> np.ndarray:
-    assert seen.show._drones is not None
-    return seen.show._trails.segments(seen.show._drones.p_W)[0]
+    assert seen.show._scene.drones is not None
+    return seen.show._scene.trails.segments(seen.show._scene.drones.p_W)[0]
 
 
 def test_what_the_world_refuses_of_the_console_s_commands_is_shown_in_the_corner(seen: Seen):

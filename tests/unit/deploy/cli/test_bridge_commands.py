@@ -52,5 +52,5 @@ def test_a_bridge_without_its_extra_is_a_line(
     monkeypatch: pytest.MonkeyPatch, command: Callable[[], None], module: str, extra: str
 ) -> None:
     monkeypatch.setattr("zsim_deploy.arguments.find_spec", lambda name: None if name == module else find_spec(name))
-    with refused(RunError, extra, module, f"pip install 'zsim[{extra}]'"):
+    with refused(RunError, extra, module, f"pip install '.[{extra}]'"):
         command()

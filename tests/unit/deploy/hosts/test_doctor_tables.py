@@ -6,7 +6,8 @@ import pytest
 from refused import has_terms
 from rich.console import Console
 
-from zsim_deploy.hosts.doctor import HostReport, NetworkPath, _hosts_table, _paths_table
+from zsim_deploy.hosts.doctor import HostReport, NetworkPath
+from zsim_deploy.hosts.doctor_tables import hosts_table, paths_table
 
 SAID = {"python": "3.11.2", "zsim": "1", "fingerprint": "abc", "cores": 2, "load": 0.1, "governors": ["[/x]"]}
 
@@ -14,8 +15,8 @@ SAID = {"python": "3.11.2", "zsim": "1", "fingerprint": "abc", "cores": 2, "load
 @pytest.mark.parametrize(
     ("table", "terms"),
     [
-        (_paths_table([NetworkPath("h2", "h1", 7447, {"error": "cannot open [/tmp/x]"})]), ("open [/tmp/x]",)),
-        (_hosts_table({"h1": HostReport(SAID, 0.001, 0.0)}), ("[/x]",)),
+        (paths_table([NetworkPath("h2", "h1", 7447, {"error": "cannot open [/tmp/x]"})]), ("open [/tmp/x]",)),
+        (hosts_table({"h1": HostReport(SAID, 0.001, 0.0)}), ("[/x]",)),
     ],
 )
 def test_brackets_are_no_markup(table, terms):

@@ -50,6 +50,7 @@ def test_a_row_says_where_and_how_a_process_is(board, monkeypatch):
         "host": "h1",
         "pid": 7,
         "state": "running",
+        "age_s": 0.0,
         "lag_ms": 40.0,
         "messages_per_s": 250.0,
         "round_trip_ms": 4.0,

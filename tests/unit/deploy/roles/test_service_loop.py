@@ -12,7 +12,7 @@ NICEST = 19  # of what Linux knows
 PROGRAM = """
 import os
 from pathlib import Path
-from zsim_deploy.roles.roles import lower_priority
+from zsim_deploy.roles.priority import lower_priority
 lower_priority({only_viewed})
 print(os.nice(0), os.sched_getscheduler(0) == os.SCHED_BATCH, Path("/proc/self/autogroup").read_text().split()[-1])
 """

@@ -14,7 +14,7 @@ from zsim.contract.views import ViewCluster
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import KINDS
 from zsim.scenario.scenario import Scenario
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE
+from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, REJOINING
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition
@@ -272,6 +272,11 @@ def flown(phase: str = "engaged", reason: str = "", **more: Any) -> RunCondition
         (flown("assembling", READY_TO_ENGAGE), {"Take off", "Hold"}),
         (flown("held", HELD_ON_REQUEST), {"Take off", "Hold"}),
         (flown("held", "drone2 is in state landed"), {"Take off", "Engage", "Hold"}),
+        (flown("held", f"{REJOINING}: drone2"), {"Take off", "Engage", "Rejoin"}),
+        (
+            flown("held", "drone2 is in state landed", drones={"drone2": "landed"}, members={"main": ("drone2",)}),
+            {"Take off", "Engage", "Hold", "Rejoin"},
+        ),
         (flown(silent_s=79.0), {"Take off", "Engage", "Hold", "Land"}),
         (flown(ended="the run ended"), {"Take off", "Engage", "Hold", "Land"}),
         (flown(replayed=True), {"Take off", "Engage", "Hold", "Land"}),
@@ -279,11 +284,26 @@ def flown(phase: str = "engaged", reason: str = "", **more: Any) -> RunCondition
 )
 def test_a_formation_is_offered_what_its_controller_would_grant(bench: Bench, run: RunCondition, off: set[str]):
     bench.formation().offer(run)
-    locked = {label for label in OPERATIONS if bench.gui.at[label].disabled}
+    locked = {label for label in OPERATIONS if bench.gui.at[label].visible and bench.gui.at[label].disabled}
     assert locked == off
     assert all(bench.gui.at[label].hint for label in locked)
     steered = run.off() == "" and not run.replayed and run.phases["main"] in STEERED
     assert bench.gui.at["p [m]"].disabled is not steered
+
+
+@pytest.mark.parametrize(
+    ("run", "there"),
+    [
+        (flown("engaged"), False),
+        (flown("held", HELD_ON_REQUEST), False),
+        (flown("held", "roll of the formation is 60.0 deg"), True),
+    ],
+)
+def test_rejoin_is_there_while_a_fault_holds_the_formation(bench: Bench, run: RunCondition, there: bool):
+    form = bench.formation()
+    form.offer(run)
+    button = bench.gui.at["Rejoin"]
+    assert (button.visible, button.disabled and button.visible) == (there, False)
 
 
 STEERED = {("engaged", ""), ("held", HELD_ON_REQUEST)}
@@ -295,6 +315,16 @@ def test_pause_becomes_resume(bench: Bench):
         form.refresh(RunCondition(clock=clock))
         assert (bench.gui.at["Resume"].visible, bench.gui.at["Pause"].visible) == (paused, not paused)
         assert bench.gui.at["Step"].disabled is not paused
+
+
+@pytest.mark.parametrize(
+    "run", [{"clock": "paused", "at_end": True}, {"clock": "stopped", "ended": "the record is over"}]
+)
+def test_a_replay_at_its_end_is_not_offered_to_go_on(bench: Bench, run: dict[str, Any]):
+    RunForm(bench.gui, bench.client, 1.0).refresh(RunCondition(replayed=True, **run))
+    assert bench.gui.at["Step"].disabled
+    assert all(bench.gui.at[label].disabled for label in ("Pause", "Resume") if bench.gui.at[label].visible)
+    assert has_terms(bench.gui.at["Step"].hint, "record")
 
 
 def test_all_drones_that_stopped_are_reset_at_once(bench: Bench):
@@ -328,8 +358,10 @@ def test_a_drone_is_offered_what_its_state_takes_and_always_its_emergency(bench:
 def test_a_value_out_of_range_stands_beside_its_slider(bench: Bench):
     form = bench.formation()
     slider = bench.gui.at["p [m]"]
+    assert has_terms(slider.label, "p", "not known")
     form.refresh(bench.view(p=25.37), LATER_S)
     assert has_terms(slider.label, "p", "25.4 m")
+    assert slider.value == 20.0
     form.refresh(bench.view(p=4.0), LATER_S)
     assert slider.label == "p [m]"
 
@@ -337,7 +369,7 @@ def test_a_value_out_of_range_stands_beside_its_slider(bench: Bench):
 def test_waypoints_begin_where_the_formation_is_in_the_units_of_the_page(bench: Bench):
     form = bench.formation()
     form.refresh(bench.view(x_c=3.0, z_c=2.5, yaw=math.pi / 2), LATER_S)
-    assert has_terms(bench.gui.at["waypoints"].value, "0:", "x_c = 3", "z_c = 2.5", "yaw = 90")
+    assert has_terms(bench.gui.at["waypoints [s, m, deg]"].value, "0:", "x_c = 3", "z_c = 2.5", "yaw = 90")
     bench.gui.press("Fly the waypoints")
     ((_, op, args),) = bench.client.asked
     assert op == "trajectory"
@@ -520,21 +552,25 @@ def test_of_many_variables_the_others_are_moved_one_at_a_time():
     bench = Bench("grid30")
     bench.formation()
     hidden = next(name for name in bench.space.names if f"{name} [m]" not in bench.gui.at and name.startswith("w"))
-    bench.gui.at["variable"].value = hidden
-    bench.gui.at["value [m or deg]"].value = 0.5
+    value = next(control for label, control in bench.gui.at.items() if label.startswith("value ["))
+    bench.gui.at["variable"].put(next(name for name in bench.space.names if name.startswith("phi")))
+    assert value.label == "value [deg]"
+    bench.gui.at["variable"].put(hidden)
+    assert value.label == "value [m]"
+    value.value = 0.5
     bench.gui.press("Move it")
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}})]
 
 
 def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
     bench.formation()
-    bench.gui.at["expressions"].value = "x_c = R*cos(0.1*t)\nR = 5"
+    bench.gui.at["expressions [m, deg]"].value = "x_c = R*cos(0.1*t)\nyaw = 6*t\nR = 5"
     bench.gui.press("Fly the expressions")
-    bench.gui.at["waypoints"].value = "20: x_c = 5"
+    bench.gui.at["waypoints [s, m, deg]"].value = "20: x_c = 5"
     bench.gui.press("Fly the waypoints")
     name = bench.cluster.name
     assert bench.client.asked == [
-        (name, "trajectory", {"expressions": {"x_c": "R*cos(0.1*t)"}, "constants": {"R": 5.0}}),
+        (name, "trajectory", {"expressions": {"x_c": "R*cos(0.1*t)", "yaw_deg": "6*t"}, "constants": {"R": 5.0}}),
         (name, "trajectory", {"waypoints": [{"at_s": 20.0, "values": {"x_c": 5.0}}]}),
     ]
 
@@ -552,7 +588,7 @@ def test_the_trajectory_of_the_scenario_is_flown_as_it_stands_there():
 
 def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
     bench.formation()
-    bench.gui.at["waypoints"].value = "soon"
+    bench.gui.at["waypoints [s, m, deg]"].value = "soon"
     bench.gui.press("Fly the waypoints")
     assert bench.client.asked == []
     assert bench.outcomes[0].request == f"{bench.cluster.name}: trajectory"

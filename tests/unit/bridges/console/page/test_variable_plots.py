@@ -1,6 +1,7 @@
 """What can be plotted, and what a plot shows."""
 
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,8 +13,16 @@ from zsim.contract.views import EstimateView
 from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim_bridges.console.page.operator_input import SliderRange
-from zsim_bridges.console.page.picture import SPAN_S, DronePoses
-from zsim_bridges.console.page.variable_plots import FlightHistory, VariablePlots, flight_history
+from zsim_bridges.console.page.variable_history import SPAN_S
+from zsim_bridges.console.page.variable_plots import (
+    STEPS_PER_WINDOW,
+    WINDOWS_S,
+    AxisRange,
+    FlightHistory,
+    VariablePlots,
+    flight_history,
+)
+from zsim_bridges.console.scene.picture import DronePoses
 
 CLUSTER = scenario_file.load(Path(__file__).parents[5] / "scenarios" / "step.yaml").clusters[0]
 RANGES = [SliderRange(name, "m", 0.0, 9.0, 0.1) for name in ("x_c", "y_c", "z_c", "p")]
@@ -34,6 +43,23 @@ def filled(seconds: int) -> FlightHistory:
     return flights
 
 
+class Choice:
+    """A control whose value a page changes."""
+
+    def __init__(self, value: Any, options: Sequence[str] = ()) -> None:
+        self.value = value
+        self.options = options
+        self.acts: list[Callable[[Any], None]] = []
+
+    def on_update(self, act: Callable[[Any], None]) -> None:
+        self.acts.append(act)
+
+    def put(self, value: Any) -> None:
+        self.value = value
+        for act in self.acts:
+            act(None)
+
+
 class Gui:
     """Controls that keep what they are given."""
 
@@ -42,17 +68,16 @@ class Gui:
         self.by_label: dict[str, Any] = {}
 
     def add_dropdown(self, label: str, options: list[str], initial_value: str | None = None) -> Any:
-        made = SimpleNamespace(value=initial_value or options[0], options=options)
-        return self.by_label.setdefault(label, made)
+        return self.by_label.setdefault(label, Choice(initial_value or options[0], options))
 
     def add_checkbox(self, label: str, value: bool, **_: Any) -> Any:
-        return self.by_label.setdefault(label, SimpleNamespace(value=value))
+        return self.by_label.setdefault(label, Choice(value))
 
     def add_markdown(self, _: str) -> None:
         return
 
-    def add_uplot(self, data: Any, series: Any, title: str, **_: Any) -> Any:
-        self.plots.append(SimpleNamespace(data=data, title=title, visible=True))
+    def add_uplot(self, data: Any, series: Any, title: str, scales: Any, **_: Any) -> Any:
+        self.plots.append(SimpleNamespace(data=data, title=title, visible=True, scales=scales))
         return self.plots[-1]
 
 
@@ -97,3 +122,45 @@ def test_plots_that_stand_still_keep_what_they_show():
     flights.add(poses(100.0), {})
     plots.draw()
     assert gui.plots[0].data is before
+
+
+def test_the_time_axis_holds_all_points_and_moves_on_by_whole_steps():
+    span_s = WINDOWS_S[0]
+    ends = np.arange(1.0, 900.0, 0.5)
+    times = [np.array([max(0.0, end - span_s), end]) for end in ends]
+    found = [AxisRange.of(t, span_s) for t in times]
+    assert all(each.low <= t[0] and t[-1] <= each.high for each, t in zip(found, times, strict=True))
+    assert max(each.high - each.low for each in found) <= span_s * (1.0 + 2.0 / STEPS_PER_WINDOW)
+    assert len(set(found)) == math.ceil(ends[-1] / (span_s / STEPS_PER_WINDOW))
+
+
+def test_a_plot_is_made_anew_only_where_its_time_axis_moves_on():
+    gui: Any = Gui()
+    flights = filled(10)
+    plots = VariablePlots(gui, CLUSTER, RANGES, flights)
+    gui.by_label["variables"].put(next(each for each in gui.by_label["variables"].options if "drone1" in each))
+    scales = gui.plots[0].scales
+    low, high = scales["x"]["range"]
+    flights.add(poses(10.0), {})
+    plots.draw()
+    assert gui.plots[0].scales is scales
+    assert low <= gui.plots[0].data[0][-1] == 10.0 <= high
+    flights.add(poses(high + 1.0), {})
+    plots.draw()
+    assert gui.plots[0].scales["x"]["range"][1] > high
+
+
+def test_what_is_chosen_is_shown_though_nothing_is_drawn_any_more():
+    gui: Any = Gui()
+    VariablePlots(gui, CLUSTER, RANGES, filled(100))
+    gui.by_label["variables"].put(next(each for each in gui.by_label["variables"].options if "drone3" in each))
+    assert gui.plots[0].data[3][-1] == pytest.approx(7.0)
+    gui.by_label["Errors"].put(True)
+    assert gui.plots[0].data[3][-1] == pytest.approx(0.0)
+
+
+def test_a_variable_of_which_nothing_is_known_has_no_curve():
+    gui: Any = Gui()
+    VariablePlots(gui, CLUSTER, RANGES, filled(0))
+    gui.by_label["variables"].put(gui.by_label["variables"].options[-1])
+    assert all(np.isnan(plot.data[1:]).all() for plot in gui.plots)

@@ -1,0 +1,268 @@
+"""Drones that are flown from pages: a drone is taken, commanded at a steady rate while its page is there, given back.
+
+What is not asked for all the time is hover: a stick that is no longer held, a page that is silent, hidden or gone.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from zsim.contract.state_rules import state_refusal
+from zsim.vehicles.vehicle import Limits
+from zsim_bridges.console.command_client import CommandClient
+from zsim_bridges.console.flying.flight_conditions import DroneSight, FlightAnswer, RunSight, too_fast
+from zsim_bridges.console.flying.flown_velocity import (
+    HOVER,
+    FlownVelocity,
+    Stick,
+    Vector,
+    stick_velocity,
+    velocity_to,
+)
+from zsim_bridges.console.flying.geofence import Geofence
+
+PERIOD_S = 0.05  # wall; of commands: at 5 × real time ten of them within a drone's silence of 0.5 s
+STALE_S = 0.5  # wall; a page that was silent for so long does not fly any more: as the firmware's silence
+GONE_S = 5.0  # wall; after which the drone of a page that is gone is given back: a page may be loaded anew meanwhile
+SETTLED_S = 1.5  # wall; after which a view shows who has taken a drone; views come 20 times a second
+
+
+@dataclass
+class _Flight:
+    """A drone that a page flies, or is about to.
+
+    Attributes:
+        modes: requested of the drone before; a later one ends the flight.
+        owned_s: since when it is commanded [s; wall], None before.
+        seen_s: when the page was heard last [s; wall].
+        sent_s: when it was commanded last [s; wall].
+        stick: that is held; None: hover, or on the way to `place_W`.
+        lost: whether the page's connection is gone.
+    """
+
+    drone: str
+    modes: int
+    seen_s: float
+    owned_s: float | None = None
+    sent_s: float = 0.0
+    stick: Stick | None = None
+    place_W: Vector | None = None
+    lost: bool = False
+
+
+class ManualControl:
+    """Flies drones for pages.
+
+    Args:
+        client: sends commands.
+        name: of the console's process.
+        limits: of each drone.
+        fence: of all.
+        gate_s: simulated seconds of a gate; of what is sent, no two commands are for the same one.
+        sight_of: returns what is known of a drone.
+        run_sight: returns what is known of the run.
+        wall_s: monotonic.
+    """
+
+    def __init__(
+        self,
+        client: CommandClient,
+        name: str,
+        limits: Mapping[str, Limits],
+        fence: Geofence,
+        gate_s: float,
+        sight_of: Callable[[str], DroneSight],
+        run_sight: Callable[[], RunSight],
+        wall_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._client = client
+        self._name = name
+        self._limits = limits
+        self._fence = fence
+        self._gate_s = gate_s
+        self._sight_of = sight_of
+        self._run_sight = run_sight
+        self._wall_s = wall_s
+        self._lock = threading.RLock()
+        self._flights: dict[Any, _Flight] = {}
+        self._texts: dict[Any, FlightAnswer] = {}  # why a page flies no more
+        self._released: dict[str, float] = {}  # drones that were given back, and when that is looked at again [s; wall]
+        self._wake = threading.Event()  # something has to be sent at once
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Send commands meanwhile, in a thread of its own."""
+        over = threading.Event()
+        thread = threading.Thread(target=self._run, args=(over,), name="manual", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            self._wake.set()
+            thread.join(STALE_S)
+            for page in list(self._flights):
+                self.leave(page)
+            self._give_back(self._wall_s())
+
+    def take(self, page: Any, drone: str, over: bool) -> FlightAnswer:
+        """Take a drone for a page; `over` from whoever flies it, with an operator's priority."""
+        with self._lock:
+            if page in self._flights:
+                self.leave(page)
+            self._texts.pop(page, None)
+            refusal = self._take_refusal(drone)
+            who = self._sight_of(drone).commander
+            if not refusal and not over and who not in (None, self._name):
+                return FlightAnswer(drone, text=f"{drone} is flown by {who}", over=True)
+            if refusal:
+                return FlightAnswer(drone, text=refusal)
+            self._flights[page] = flight = _Flight(drone, self._client.modes_requested(drone), self._wall_s())
+        self._client.take(drone, partial(self._on_taken, page, flight))
+        return self.answer(page)
+
+    def steer(self, page: Any, stick: Stick | None) -> FlightAnswer:
+        """Fly the page's drone by a stick; None: its dead-man key is not held, so hover, or go on to a place."""
+        with self._lock:
+            flight = self._flights.get(page)
+            if flight is not None:
+                if stick is not None:
+                    flight.place_W = None  # who takes the stick has done with the place
+                elif flight.stick is not None:
+                    self._send_soon(flight)
+                flight.stick, flight.seen_s = stick, self._wall_s()
+        return self.answer(page)
+
+    def go(self, page: Any, x_m: float, y_m: float) -> FlightAnswer:
+        """Fly the page's drone to a place, at the height that it has."""
+        with self._lock:
+            flight = self._flights.get(page)
+            if flight is None:
+                return self.answer(page)._replace(text="no drone is flown from this page; take one first")
+            pose, refusal = self._sight_of(flight.drone).pose, self._fence.refusal(x_m, y_m)
+            if refusal or pose is None:
+                return self.answer(page)._replace(text=refusal or f"no estimate of {flight.drone}")
+            flight.stick, flight.place_W, flight.seen_s = None, (x_m, y_m, pose.p_W[2]), self._wall_s()
+        return self.answer(page)
+
+    def leave(self, page: Any, text: str = "") -> FlightAnswer:
+        """Let the page's drone hover, and give it back; `text` says why."""
+        with self._lock:
+            flight = self._flights.pop(page, None)
+            if flight is not None:
+                self._released[flight.drone] = -math.inf
+                self._wake.set()
+                if not flight.lost:
+                    self._texts[page] = FlightAnswer(flight.drone, text=text)
+        return self.answer(page)
+
+    def lose(self, page: Any) -> None:
+        """Note that a page's connection is gone: its drone hovers at once, and is given back after a while."""
+        with self._lock:
+            flight = self._flights.get(page)
+            self._texts.pop(page, None)
+            if flight is not None:
+                flight.stick, flight.place_W, flight.lost = None, None, True
+                self._send_soon(flight)
+
+    def answer(self, page: Any) -> FlightAnswer:
+        """Return what the page shows."""
+        with self._lock:
+            flight = self._flights.get(page)
+            if flight is None:
+                return self._texts.get(page, FlightAnswer())
+            if flight.owned_s is None:
+                return FlightAnswer(flight.drone, "taking")
+            return FlightAnswer(flight.drone, "flying", self._text(flight))
+
+    def tick(self) -> None:
+        """Command every drone that is due; give back those that may not be flown any more.
+
+        All is sent from here, in one thread: no command follows a newer one, or comes after the drone was given back.
+        """
+        wall_s, run = self._wall_s(), self._run_sight()
+        for page, flight in list(self._flights.items()):
+            reason = self._end_reason(flight, run, wall_s)
+            if reason:
+                self.leave(page, reason)
+            elif flight.owned_s is not None and not run.paused and wall_s - flight.sent_s >= self._period_s(run):
+                flight.sent_s = wall_s
+                flown = self._velocity(flight, wall_s)
+                self._client.send_velocity(flight.drone, flown.velocity_m_s, flown.yaw_rate_rad_s)
+        self._give_back(wall_s)
+
+    def _give_back(self, wall_s: float) -> None:
+        """Release drones; once more where the world took a command after the release, which made us commander again."""
+        with self._lock:
+            due = [drone for drone, at_s in self._released.items() if wall_s >= at_s]
+            flown = {flight.drone for flight in self._flights.values()}
+            for drone in due:
+                first = self._released.pop(drone) == -math.inf
+                if drone not in flown and (first or self._sight_of(drone).commander == self._name):
+                    self._released[drone] = wall_s + SETTLED_S
+                    self._client.give_back(drone)
+
+    def _run(self, over: threading.Event) -> None:
+        while not over.is_set():
+            self.tick()
+            self._wake.wait(PERIOD_S)
+            self._wake.clear()
+
+    def _period_s(self, run: RunSight) -> float:
+        """Return the time between two commands [wall]; a slow run has few gates, and each takes one."""
+        return max(PERIOD_S * 0.9, self._gate_s / max(run.rate, 1e-3))
+
+    def _take_refusal(self, drone: str) -> str:
+        run, sight = self._run_sight(), self._sight_of(drone)
+        if drone not in self._limits:
+            return f"drone is {drone!r}; must be one of the run's"
+        if any(flight.drone == drone for flight in self._flights.values()):
+            return f"{drone} is flown from another page"
+        return run.off or too_fast(run.rate) or state_refusal(drone, sight.state or "unseen", "velocity") or ""
+
+    def _on_taken(self, page: Any, flight: _Flight, refusal: str) -> None:
+        with self._lock:
+            if self._flights.get(page) is not flight:
+                if not refusal:  # the page has given it up meanwhile
+                    self._released[flight.drone] = -math.inf
+            elif refusal:
+                del self._flights[page]
+                if not flight.lost:
+                    self._texts[page] = FlightAnswer(flight.drone, text=refusal)
+            else:
+                flight.owned_s = self._wall_s()
+
+    def _end_reason(self, flight: _Flight, run: RunSight, wall_s: float) -> str:
+        drone, sight = flight.drone, self._sight_of(flight.drone)
+        if wall_s - flight.seen_s > GONE_S:
+            return "the page was silent"
+        if self._client.modes_requested(drone) != flight.modes:
+            return f"another mode of {drone} was asked for"
+        if flight.owned_s is not None and wall_s - flight.owned_s > SETTLED_S and sight.commander != self._name:
+            return f"{drone} is flown by {sight.commander or 'nobody'} now"
+        return run.off or too_fast(run.rate / 2.0) or state_refusal(drone, sight.state, "velocity") or ""
+
+    def _velocity(self, flight: _Flight, wall_s: float) -> FlownVelocity:
+        pose, limits = self._sight_of(flight.drone).pose, self._limits[flight.drone]
+        if wall_s - flight.seen_s > STALE_S or pose is None:
+            return HOVER
+        if flight.stick is not None:
+            return stick_velocity(flight.stick, pose, limits, self._fence)
+        return HOVER if flight.place_W is None else velocity_to(flight.place_W, pose, limits, self._fence)
+
+    def _send_soon(self, flight: _Flight) -> None:
+        """Let a command be sent at once, not a period after the last one."""
+        flight.sent_s = -math.inf
+        self._wake.set()
+
+    def _text(self, flight: _Flight) -> str:
+        if self._sight_of(flight.drone).pose is None:
+            return f"hovers: no estimate of {flight.drone}"
+        if flight.place_W is not None:
+            return "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.place_W)
+        return "flown by hand" if flight.stick is not None else "hovers"

@@ -1,0 +1,109 @@
+"""What pages may do with single drones in one run: choose one, see all from above, fly one."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from zsim.contract.messages import Info
+from zsim.scenario.scenario import Scenario
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+from zsim_bridges.console.command_client import CommandClient
+from zsim_bridges.console.flying import plan_view
+from zsim_bridges.console.flying.flight_conditions import DroneSight, RunSight
+from zsim_bridges.console.flying.flown_velocity import DronePose
+from zsim_bridges.console.flying.geofence import geofence_of
+from zsim_bridges.console.flying.manual_control import ManualControl
+from zsim_bridges.console.monitoring.run_monitor import RunMonitor
+from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
+from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
+from zsim_bridges.console.page.page_forms import PageForms
+from zsim_bridges.console.scene.run_scene import RunScene
+
+
+class PageFlying:
+    """Single drones, for the pages of one run.
+
+    Args:
+        info: of the run.
+        scenario: of the run.
+        spaces: of its formations.
+        client: sends commands.
+        name: of the console's process.
+        views: the newest of everything.
+        time_monitor: of the run's clock.
+        monitor: has the run's condition.
+        scene: has the drones' poses and trails.
+        pages: have the drone that each has chosen.
+
+    Attributes:
+        control: of the drones that are flown from pages.
+    """
+
+    def __init__(
+        self,
+        info: Info,
+        scenario: Scenario,
+        spaces: dict[str, ClusterSpace],
+        client: CommandClient,
+        name: str,
+        views: ViewBuffer,
+        time_monitor: TimeMonitor,
+        monitor: RunMonitor,
+        scene: RunScene,
+        pages: PageForms,
+    ) -> None:
+        self._views = views
+        self._time_monitor = time_monitor
+        self._monitor = monitor
+        self._scene = scene
+        self._pages = pages
+        self._spaces = spaces
+        fence = geofence_of(scenario)
+        self._surroundings = plan_view.surroundings(scenario, fence)
+        names = self._surroundings["names"]
+        self._members = {each.name: [names.index(drone) for drone in each.drones] for each in scenario.clusters}
+        limits = {drone.name: drone.limits for drone in scenario.drones}
+        self.control = ManualControl(client, name, limits, fence, info.gate_ns / 1e9, self._sight, self._run_sight)
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Send commands meanwhile."""
+        with self.control.running():
+            yield
+
+    def choose(self, client_id: int | None, drone: str) -> None:
+        """Choose a drone on one page."""
+        if drone in self._surroundings["names"]:
+            self._pages.choose(client_id, drone)
+
+    def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
+        """Return the view from above; `whole`: with what does not change, and the trails of before."""
+        drones = self._scene.drones
+        if drones is None:
+            return {"t_s": None, "chosen": self._pages.chosen(client_id)}
+        states = {each.name: each.state for each in self._views.drones.drones} if self._views.drones else {}
+        shown = {
+            "t_s": drones.t_ns / 1e9,
+            "chosen": self._pages.chosen(client_id),
+            "drones": plan_view.positions(drones, states),
+            "formations": plan_view.formations(self._spaces, self._members, dict(self._views.clusters)),
+        }
+        if not whole:
+            return shown
+        return {**shown, **self._surroundings, "trails": plan_view.trail_lines(self._scene.trails, drones)}
+
+    def _sight(self, drone: str) -> DroneSight:
+        view = self._views.drones
+        seen = next((each for each in view.drones if each.name == drone), None) if view else None
+        if seen is None:
+            return DroneSight()
+        received = self._views.estimates().get(drone)
+        pose = None
+        if received is not None and received.fresh:
+            pose = DronePose(received.estimate.position_m, received.estimate.yaw_rad)
+        return DroneSight(seen.state, seen.commander, pose)
+
+    def _run_sight(self) -> RunSight:
+        clock = self._time_monitor.clock
+        run = self._monitor.condition._replace(silent_s=self._time_monitor.silent_s)
+        return RunSight(run.grounded(), clock.rate if clock else 1.0, clock is not None and clock.state != "running")

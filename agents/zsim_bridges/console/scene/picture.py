@@ -1,0 +1,225 @@
+"""The picture of a run as arrays: poses, ellipsoids, formations and trails, from the newest views. Pure.
+
+Axes, units and quaternions as everywhere: W east, north, up; quaternions w first, body to world.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import takewhile
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones
+from zsim.math import frames
+from zsim.vehicles.vehicle import ROTORS_MAX
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
+
+Array = NDArray[np.float64]
+
+ROTOR_SLOWDOWN = 50.0  # of the rotors' speed: at 10 pictures/s the fastest turn by 57 degrees, so not seen as backwards
+SIGMAS = 2.0  # of an ellipsoid
+SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
+"""Of a Gaussian in three dimensions, within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""
+RADIUS_MAX_M = 60.0  # of an ellipsoid: before the first fix nothing is known, and the page would be inside of it
+SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has somewhere to be
+CORNER_SHARE = (
+    0.25  # of the way from a corner to the opposite side; there its angle is written, clear of names and sides
+)
+CLICK_RAD = 0.012  # half the angle in which a click on a small, far drone is one on it; chosen: about five pixels
+SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at their ends; docs/conventions.md
+
+
+class DronePoses(NamedTuple):
+    """N drones at one instant, those of a run in its order."""
+
+    t_ns: int
+    names: tuple[str, ...]
+    p_W: Array  # (N, 3) m; NaN of a drone that is not in the view
+    q_WB: Array  # (N, 4)
+    rotor: Array  # (N, ROTORS_MAX) rad/s; 0 where a drone has fewer
+    wind_W: Array  # (3,) m/s, the mean over the drones
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """Return which drones are in the view, (N,)."""
+        return np.isfinite(self.p_W[:, 0])
+
+
+class Ellipsoids(NamedTuple):
+    """Ellipsoids: centres, attitudes and half axes."""
+
+    p_W: Array  # (M, 3) m
+    wxyz: Array  # (M, 4)
+    half_m: Array  # (M, 3)
+
+
+class FormationSide(NamedTuple):
+    """A side of a formation's triangle, or of its pair."""
+
+    name: str
+    ends_W: Array  # (2, 3) m
+
+
+class FormationShape(NamedTuple):
+    """A formation's true shape."""
+
+    c: Array  # (4n,)
+    p_c: Array  # (3,) m, its origin in W
+    q_WC: Array  # (4,)
+    sides: tuple[FormationSide, ...]
+    corner: tuple[Array, str] | None  # where beta is written
+
+
+def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
+    """Return a view as arrays of the drones of those names, which may not all be in it: a replay has some alone."""
+    count = len(names)
+    p_W, q_WB = np.full((count, 3), np.nan), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
+    rotor = np.zeros((count, ROTORS_MAX))
+    indices = {name: i for i, name in enumerate(names)}
+    for drone in view.drones:
+        i = indices.get(drone.name)
+        if i is not None:
+            p_W[i], q_WB[i] = drone.position_m, drone.orientation_wxyz
+            rotor[i, : len(drone.rotor_rad_s)] = drone.rotor_rad_s
+    wind = np.mean(view.wind_m_s, axis=0) if view.wind_m_s else np.zeros(3)
+    return DronePoses(view.t_ns, tuple(names), p_W, q_WB, rotor, wind)
+
+
+def drone_on_ray(
+    drones: DronePoses, radii_m: Array, origin_W: Sequence[float], direction_W: Sequence[float]
+) -> str | None:
+    """Return the drone that a ray hits, of several that whose centre is nearest to it; None where it hits none.
+
+    Args:
+        drones: N of them.
+        radii_m: (N,), of the balls around them that count as hit; of one far away, its ball is not below CLICK_RAD.
+        origin_W, direction_W: of the ray [m; W]; a direction without length hits nothing.
+    """
+    direction = np.array(direction_W)
+    length = float(np.linalg.norm(direction))
+    if not 0.0 < length < math.inf:
+        return None
+    away = drones.p_W - np.array(origin_W)
+    ahead_m = away @ (direction / length)
+    distances_m = np.linalg.norm(away - ahead_m[:, None] * (direction / length), axis=1)
+    hit = (ahead_m > 0.0) & (distances_m <= np.maximum(radii_m, CLICK_RAD * ahead_m))
+    return drones.names[int(np.argmin(np.where(hit, distances_m, math.inf)))] if hit.any() else None
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Return what tells names apart: without the letters with which all begin; in full where one would be empty."""
+    alike = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
+    stem = len(list(alike))
+    short = [name[stem:] for name in names]
+    return short if all(short) else list(names)
+
+
+def rotor_angles(angles: Array, speeds: Array, turns: Array, dt_s: float) -> Array:
+    """Return the angles [rad] to which rotors are drawn dt_s later: slowed down to be visible.
+
+    Args:
+        angles, speeds: (M,) rad, rad/s; turns: (M,), 1 of a rotor that turns clockwise seen from above, else -1.
+    """
+    return (angles - turns * speeds * (dt_s / ROTOR_SLOWDOWN)) % math.tau
+
+
+def rotor_poses(p_W: Array, q_WB: Array, hubs_B: Array, angles: Array) -> tuple[Array, Array]:
+    """Return centres (M, 3) [m] and quaternions (M, 4) of M rotors.
+
+    Args:
+        p_W, q_WB: of the drone of each, (M, 3) m and (M, 4).
+        hubs_B: (M, 3) m.
+        angles: (M,) rad.
+    """
+    p = p_W + np.einsum("mij,mj->mi", frames.rotation_matrix(q_WB), hubs_B)
+    w, x, y, z = q_WB.T
+    c, s = np.cos(angles / 2), np.sin(angles / 2)
+    return p, np.column_stack((w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s))
+
+
+def ellipsoids(estimates: Sequence[EstimateView]) -> Ellipsoids:
+    """Return the ellipsoids of 2 sigma of estimates of position."""
+    p = np.array([estimate.position_m for estimate in estimates]).reshape(-1, 3)
+    P = np.array([estimate.covariance_m2 for estimate in estimates]).reshape(-1, 6)
+    sigma_m, q = frames.principal_axes(P[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
+    return Ellipsoids(p, q, np.clip(SIGMAS * sigma_m, 0.01, RADIUS_MAX_M))
+
+
+def ghosts(space: ClusterSpace, view: ViewCluster) -> tuple[Array, Array] | None:
+    """Return positions (n, 3) and quaternions (n, 4) of the robots as the formation is to stand, None without one."""
+    if view.phase not in SHAPED_PHASES:
+        return None
+    try:
+        p_W, yaw = space.inverse(np.array(view.desired))
+    except SingularClusterError:
+        return None
+    return p_W, frames.quaternion_from_heading(yaw)
+
+
+def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationShape | None:
+    """Return the formation of robots at p_W (n, 3) with headings yaw (n,), None where it has no frame."""
+    try:
+        c = space.forward(p_W, yaw)
+    except SingularClusterError:
+        return None
+    roll, pitch, turn = (c[space.index(name)] if name in space.names else 0.0 for name in ("roll", "pitch", "yaw"))
+    of_groups = any("." in name for name in space.names)  # p and q are then between groups
+    known = [name for name in SIDES if name in space.names and not of_groups]
+    sides = [FormationSide(f"{name} {c[space.index(name)]:.2f} m", p_W[list(SIDES[name])]) for name in known]
+    corner = None
+    if "beta" in space.names and len(known) == 2:
+        sides.append(FormationSide("", p_W[[1, 2]]))
+        corner = (
+            p_W[0] + CORNER_SHARE * (p_W[1:].mean(axis=0) - p_W[0]),
+            f"β {math.degrees(c[space.index('beta')]):.1f}°",
+        )
+    return FormationShape(c, c[:3], frames.quaternion_from_rpy((roll, pitch, turn)), tuple(sides), corner)
+
+
+TRAIL_POINTS_MAX = 6_000  # of all trails together: 144 kB for a browser each time
+POINTS_OF_ONE = 300
+SPACING_M = 0.08  # of two points: a sixth of a hull
+
+
+class CanvasTrails:
+    """The trails of N drones: the last stretch of each one's path.
+
+    Args:
+        count: how many drones.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._capacity = min(POINTS_OF_ONE, max(2, TRAIL_POINTS_MAX // count))
+        self._points = np.zeros((count, self._capacity, 3))
+        self._lengths = np.zeros(count, dtype=np.int64)
+
+    def add(self, p_W: Array) -> bool:
+        """Add positions (N, 3) [m], NaN of a drone that is not in the view; return whether any has moved on."""
+        last = self._points[np.arange(len(p_W)), np.maximum(self._lengths - 1, 0)]
+        moved = (np.linalg.norm(p_W - last, axis=1) >= SPACING_M) | (self._lengths == 0)
+        moved &= np.isfinite(p_W[:, 0])
+        for i in np.flatnonzero(moved):
+            if self._lengths[i] == self._capacity:
+                self._points[i, :-1] = self._points[i, 1:]
+            else:
+                self._lengths[i] += 1
+            self._points[i, self._lengths[i] - 1] = p_W[i]
+        return bool(moved.any())
+
+    def segments(self, p_W: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Return segments (M, 2, 3) up to where the drones are now, (N, 3), and the index of its drone, (M,)."""
+        lines, owners = [np.zeros((0, 2, 3))], [np.zeros(0, dtype=np.int64)]
+        present = np.isfinite(p_W[:, 0])
+        for i, length in enumerate(self._lengths):
+            if not length or not present[i]:
+                continue
+            way = np.vstack((self._points[i, :length], p_W[i]))
+            lines.append(np.stack((way[:-1], way[1:]), axis=1))
+            owners.append(np.full(len(way) - 1, i))
+        return np.concatenate(lines), np.concatenate(owners)
+
+    def clear(self) -> None:
+        """Remove all points."""
+        self._lengths[:] = 0

@@ -1,0 +1,136 @@
+"""The scene of one run: its newest views as nodes, and what pages show of the time before they were opened."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import viser
+
+from zsim.contract.messages import Info
+from zsim.contract.views import ViewDrones
+from zsim.math import frames
+from zsim.scenario.scenario import Scenario
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
+from zsim_bridges.console.scene.camera_follow import CameraFollow
+from zsim_bridges.console.scene.picture import (
+    Array,
+    CanvasTrails,
+    DronePoses,
+    FormationShape,
+    drone_on_ray,
+    drone_poses,
+    ellipsoids,
+    formation_shape,
+    ghosts,
+)
+from zsim_bridges.console.scene.scene_nodes import SceneNodes
+
+
+class RunScene:
+    """The scene of one run.
+
+    Args:
+        server: viser's; what another run has left in its scene is removed.
+        info: of the run.
+        scenario: of the run.
+        spaces: of its formations.
+        views: the newest of everything.
+        camera_follow: moves the page's cameras that follow the formation.
+
+    Attributes:
+        nodes: viser's.
+        drones: their newest poses, None before the first view.
+        shapes: the formations as they truly stand, by name; None where a drone of one is missing.
+        trails: of the drones.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        info: Info,
+        scenario: Scenario,
+        spaces: Mapping[str, ClusterSpace],
+        views: ViewBuffer,
+        camera_follow: CameraFollow,
+    ) -> None:
+        self._names = tuple(drone.name for drone in info.drones)
+        self._spaces = spaces
+        self._views = views
+        self._camera_follow = camera_follow
+        self._members = {c.name: [self._names.index(d) for d in c.drones] for c in scenario.clusters}
+        self._drawn_ghosts: dict[str, Any] = {}
+        self.drones: DronePoses | None = None
+        self.shapes: dict[str, FormationShape | None] = {}
+        self.trails = CanvasTrails(len(self._names))
+        robots = sum(space.n for space in spaces.values())
+        arms_m = [drone.arm_m for drone in scenario.drones]
+        self.nodes = SceneNodes(server, info.drones, arms_m, robots, len(spaces))
+        self.nodes.obstacles(scenario.environment.obstacles)
+        camera_follow.restart()
+
+    def clicked(self, event: viser.SceneClickEvent) -> str | None:
+        """Return the drone that a click has hit."""
+        if self.drones is None:
+            return None
+        return drone_on_ray(self.drones, self.nodes.radii_m, event.ray_origin, event.ray_direction)
+
+    def store(self, view: ViewDrones) -> DronePoses:
+        """Store the drones' newest poses, and return them; cameras of later pages look at them."""
+        drones = drone_poses(view, self._names)
+        if self.drones is not None and drones.t_ns < self.drones.t_ns:
+            self.trails.clear()  # a replay has gone back
+        self.drones = drones
+        self.trails.add(drones.p_W)
+        self._update_shapes(drones)
+        self._camera_follow.set_target(self._camera_targets(drones))
+        return drones
+
+    def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
+        """Draw a view of the drones, and return their poses.
+
+        Args:
+            view: of the drones.
+            longest_s: for which rotors turn at most, from one picture to the next.
+            chosen: the formation whose figures are drawn.
+        """
+        before_ns = self.drones.t_ns if self.drones is not None else 0
+        drones = self.store(view)
+        self.nodes.drones(drones, min(longest_s, max(0.0, (drones.t_ns - before_ns) / 1e9)))
+        estimates = self._views.estimates().values()
+        self.nodes.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
+        if self.shapes:
+            self.nodes.shapes(list(self.shapes.values()), list(self.shapes).index(chosen))
+        self._draw_ghosts()
+        self._camera_follow.follow(self._camera_targets(drones))
+        return drones
+
+    def draw_trails(self) -> None:
+        """Draw trails and wind, which change slowly."""
+        if self.drones is not None:
+            self.nodes.trails(*self.trails.segments(self.drones.p_W))
+            self.nodes.wind(self.drones)
+
+    def _draw_ghosts(self) -> None:
+        """Move the ghosts where a formation's desired shape has changed."""
+        clusters = self._views.clusters
+        wanted = {name: (view.phase, view.desired) for name, view in clusters.items()}
+        if wanted == self._drawn_ghosts:
+            return
+        self._drawn_ghosts = wanted
+        poses = [ghosts(self._spaces[name], view) for name, view in clusters.items()]
+        shown = [each for each in poses if each is not None]
+        p_W = np.concatenate([p for p, _ in shown]) if shown else np.zeros((0, 3))
+        self.nodes.ghosts(p_W, np.concatenate([q for _, q in shown]) if shown else np.zeros((0, 4)))
+
+    def _update_shapes(self, drones: DronePoses) -> None:
+        there, yaw = drones.present, frames.heading(drones.q_WB)
+        for name, space in self._spaces.items():
+            members = self._members[name]
+            whole = bool(there[members].all())
+            self.shapes[name] = formation_shape(space, drones.p_W[members], yaw[members]) if whole else None
+
+    def _camera_targets(self, drones: DronePoses) -> Array:
+        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""
+        members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
+        return drones.p_W[members][drones.present[members]]

@@ -1,0 +1,96 @@
+"""The errors of formations as tables, on the page and on the terminal: of a large formation first by groups."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from msgspec import Struct
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from zsim.errors import printable
+from zsim.runtime.progress import cell
+from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.formation import ParameterErrors
+from zsim_analysis.reading.verdict import NOT_AS_PLANNED, marks_of
+from zsim_analysis.report.summary import ClusterErrors, RunSummary
+
+PAPER_COLUMN = "paper std"
+COLUMNS = ("parameter", PAPER_COLUMN, "est. std", "est. mean", "true std", "true RMS", "true mean")
+GROUP_COLUMNS = ("parameters", "count", "est. RMS", "true RMS", "worst", "of")
+SINGLY_MAX = 24  # parameters of a formation that need no table by groups: of 6 drones
+FRAME = {"x_c": "position", "y_c": "position", "z_c": "position"} | dict.fromkeys(("roll", "pitch", "yaw"), "attitude")
+
+
+class ErrorTable(Struct, frozen=True):
+    """Columns and rows of text; `rest` has every parameter where the rows are of groups."""
+
+    columns: list[str]
+    rows: list[list[str]]
+    rest: "ErrorTable | None" = None
+
+
+def error_table(cluster: ClusterErrors) -> ErrorTable:
+    """Return a cluster's errors: a row per parameter, or per group of them where there are many."""
+    columns = [column for column in COLUMNS if column != PAPER_COLUMN or cluster.paper_std]  # beside Test 1 alone
+    single = ErrorTable(columns, [_row(cluster, *item) for item in cluster.errors.items()])
+    if len(cluster.errors) <= SINGLY_MAX:
+        return single
+    return ErrorTable(list(GROUP_COLUMNS), list(_group_rows(cluster)), single)
+
+
+def _row(cluster: ClusterErrors, parameter: str, errors: ParameterErrors) -> list[str]:
+    printed = cluster.paper_std.get(parameter)
+    paper = ["" if printed is None else f"{printed:g}"] if cluster.paper_std else []
+    values = (errors.est_std, errors.est_mean, errors.true_std, errors.true_rms, errors.true_mean)
+    return [f"{parameter} ({unit(parameter)})", *paper, *map(_number, values)]
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4f}"
+
+
+def _group_rows(cluster: ClusterErrors) -> Iterator[list[str]]:
+    """Yield a row per group: how many, the root of their mean square errors, and the parameter that is worst."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name in cluster.errors:
+        kind = FRAME.get(name) or ("headings" if name.startswith("phi") else "shape")
+        groups.setdefault((kind, unit(name)), []).append(name)
+    for (kind, measure), names in groups.items():
+        est, true = ([getattr(cluster.errors[name], each) for name in names] for each in ("est_rms", "true_rms"))
+        known = {name: value for name, value in zip(names, true, strict=True) if value is not None}
+        worst = max(known, key=lambda name: known[name]) if known else ""
+        rest = (_number(_together(est)), _number(_together(true)), _number(known.get(worst)), worst or "–")
+        yield [f"{kind} ({measure})", str(len(names)), *rest]
+
+
+def _together(values: Sequence[float | None]) -> float | None:
+    """Return the root of the mean square of values that are known."""
+    known = [value for value in values if value is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else None
+
+
+def terminal_text(summary: RunSummary) -> Group:
+    """Return what the flight did not do of its plan, and a table of errors for each cluster, for the terminal."""
+    marks = marks_of(summary.shortfalls)
+    lines = [Text(printable(mark), style="bold red" if fails else "yellow") for mark, fails in marks]
+    return Group(*lines, *(table(summary, name) for name in summary.clusters))
+
+
+def table(summary: RunSummary, cluster: str) -> Table:
+    """Return the errors of one cluster, with the paper's Table I beside Test 1, for the terminal."""
+    start, end = summary.window_s
+    judged = summary.clusters[cluster]
+    content = error_table(judged)
+    title = f"Formation errors of {cluster} from {start:g} to {end:g} s"
+    beside = ", beside Table I of the paper" if judged.paper_std else ""
+    mark = "" if summary.as_planned else f" ({NOT_AS_PLANNED})"
+    caption = "est. = estimate − desired, true = truth − desired"
+    if content.rest:
+        caption += f"; all {len(content.rest.rows)} parameters: report.html, summary.json"
+    shown = Table(title=cell(f"{title}{beside}{mark}"), caption=caption, title_justify="left")
+    for place, column in enumerate(content.columns):
+        shown.add_column(column, justify="right" if place else "left", no_wrap=place == 0, min_width=5)
+    for row in content.rows:
+        shown.add_row(*map(cell, row))
+    return shown

@@ -1,0 +1,157 @@
+"""Estimates and commands of drones against their truth: known errors give their closed form."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import synthetic_record
+from synthetic_record import Flown
+
+from zsim.contract import keys, messages
+from zsim.contract.flight_messages import Estimate, Status, Truth, Velocity
+from zsim.record import RecordWriter
+from zsim_analysis.reading.distances import distances, separations
+from zsim_analysis.reading.drone_errors import YAW, estimate_errors, nees, velocity_responses
+from zsim_analysis.reading.flight import FlightReader, read_flight
+from zsim_analysis.reading.formation import formations_of
+from zsim_analysis.reading.goal import goal_errors
+from zsim_analysis.reading.recorded_flight import RecordedFlight
+
+OFFSET_M, VELOCITY_M_S, YAW_RAD = (0.1, -0.25, 0.05), (0.02, 0.0, -0.01), 0.03
+SIGMA_M, SIGMA_M_S, SIGMA_RAD = 0.1, 0.02, 0.01
+COVARIANCE = tuple(np.diag([SIGMA_M**2] * 3 + [SIGMA_M_S**2] * 3).ravel().tolist())
+NEES = (0.01 + 0.0625 + 0.0025) / SIGMA_M**2 + (0.0004 + 0.0001) / SIGMA_M_S**2
+EVE = "eve"
+
+
+def traffic(flown: Flown) -> Iterator[tuple[str, Any, int]]:
+    """Yield a flight whose estimates are off by constants, flown by `controller.main`, to which eve sends as well."""
+    for key, message, wall_ns in synthetic_record.traffic(flown):
+        if isinstance(message, Status):
+            message = msgspec.structs.replace(message, commander="controller.main")
+        yield key, message, wall_ns
+        if isinstance(message, Truth):
+            yield keys.estimate(keys.thing(key)), estimate_of(message), wall_ns
+            for source, forward in (("controller.main", 0.3), (EVE, 5.0)):
+                command = Velocity(message.t_ns, message.seq, source, (forward, 0.1, 0.2), 0.4)
+                yield keys.command(keys.thing(key), "velocity"), command, wall_ns
+
+
+def estimate_of(truth: Truth) -> Estimate:
+    w, _, _, z = truth.orientation_wxyz
+    yaw = 2 * math.atan2(z, w) + YAW_RAD
+    position, velocity = (
+        tuple(a + b for a, b in zip(*pair, strict=True))
+        for pair in ((truth.position_m, OFFSET_M), (truth.velocity_m_s, VELOCITY_M_S))
+    )
+    pose = (position, velocity, truth.orientation_wxyz, math.remainder(yaw, 2 * math.pi))
+    return Estimate(truth.t_ns, truth.seq, *pose, COVARIANCE, SIGMA_RAD, (0.0, 0.0, 0.0), {})
+
+
+@pytest.fixture(scope="module")
+def flight() -> RecordedFlight:
+    reader = FlightReader(answers=True)
+    for key, message, wall_ns in traffic(Flown(duration_s=3.0)):
+        reader.add_message(key, message, wall_ns)
+    return reader.flight()
+
+
+def test_errors_of_estimates_and_what_is_stated_of_them(flight: RecordedFlight) -> None:
+    errors = estimate_errors(flight)
+    assert list(errors) == ["drone1", "drone2", "drone3"]
+    for each in errors.values():
+        assert len(each.t_s) == 151
+        assert each.error[:, :YAW] == pytest.approx(np.tile(OFFSET_M, (151, 1)), abs=1e-5)
+        assert each.error[:, YAW] == pytest.approx(YAW_RAD, abs=1e-6)
+        assert each.sigma[0] == pytest.approx([SIGMA_M] * 3 + [SIGMA_RAD], rel=1e-6)
+        assert each.nees == pytest.approx(NEES, rel=1e-3)
+        assert each.share_inside(np.ones(151, bool)).tolist() == [1.0, 0.0, 1.0, 0.0]
+
+
+def test_nees_of_a_covariance_that_is_none_is_not_known() -> None:
+    error = np.ones((3, 6))
+    covariance = np.stack([np.eye(6), np.zeros((6, 6)), np.diag([1.0, 1, 1, 1, 1, -1])])
+    assert nees(error, covariance)[0] == pytest.approx(6.0)
+    assert np.isnan(nees(error, covariance)[1:]).all()
+
+
+def test_nees_of_its_own_noise_is_six() -> None:
+    rng = np.random.default_rng(5)
+    root = rng.standard_normal((6, 6))
+    error = rng.standard_normal((20_000, 6)) @ root.T
+    assert nees(error, np.tile(root @ root.T, (20_000, 1, 1))).mean() == pytest.approx(6, abs=0.1)
+
+
+def test_velocities_are_those_of_the_commander_by_the_heading(flight: RecordedFlight) -> None:
+    (first, *_) = velocity_responses(flight).values()
+    assert first.commanded == pytest.approx(np.tile([0.3, 0.1, 0.2, 0.4], (len(first.t_s), 1)), abs=1e-6)
+    yaw = flight.tracks[0].yaw[0]
+    x, y, z = 0.1, 0.2, 0.3  # of the synthetic truth
+    flown = (x * math.cos(yaw) + y * math.sin(yaw), y * math.cos(yaw) - x * math.sin(yaw), z, 0.6)
+    assert first.flown[0] == pytest.approx(flown, abs=1e-9)
+
+
+def test_nothing_is_collected_that_nobody_asked_for() -> None:
+    reader = FlightReader()
+    for key, message, wall_ns in traffic(Flown(duration_s=0.1)):
+        reader.add_message(key, message, wall_ns)
+    plain = reader.flight()
+    assert plain.estimates == plain.commands == {}
+    assert estimate_errors(plain) == velocity_responses(plain) == {}
+
+
+def test_what_is_read_of_a_record_is_what_was_flown(flight: RecordedFlight, tmp_path: Path) -> None:
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in traffic(Flown(duration_s=3.0)):
+            writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+    read = read_flight(tmp_path / "run.mcap", answers=True)
+    assert np.array_equal(read.estimates["drone2"].p_W, flight.estimates["drone2"].p_W)
+    assert np.array_equal(read.commands["drone2"].velocity, flight.commands["drone2"].velocity)
+    still = read_flight(tmp_path / "run.mcap", motion=False)
+    assert still.last_ns == read.last_ns
+    assert [len(track.t_ns) for track in still.tracks] == [1, 1, 1]
+
+
+def test_distances_of_the_paper_s_triangle(flight: RecordedFlight) -> None:
+    apart = distances(flight, pairs_max=6)
+    assert apart is not None
+    base = 8 * math.sin(math.pi / 8)  # 2 p sin(beta / 2), p = q = 4 m
+    assert apart.pairs == (("drone1", "drone2"), ("drone1", "drone3"), ("drone2", "drone3"))
+    assert apart.between[0] == pytest.approx([4, 4, base])
+    assert apart.nearest[-1] == pytest.approx([4, base, base])
+    many = distances(flight, pairs_max=2)
+    assert many is not None
+    assert many.pairs == ()
+    assert np.array_equal(many.nearest, apart.nearest)
+    assert separations(flight) == (2.0, 1.5, pytest.approx(0.52))
+
+
+def test_errors_against_the_goal_have_the_climb() -> None:
+    reader = FlightReader()
+    for key, message, wall_ns in synthetic_record.traffic(Flown(duration_s=6.0, climb_s=4.0)):
+        reader.add_message(key, message, wall_ns)
+    flight = reader.flight()
+    (formation,) = formations_of(flight)
+    goal = goal_errors(formation, flight.scenario)
+    assert goal is not None
+    z = formation.column("z_c")
+    assert goal.true[[0, 100, 200, 300], z] == pytest.approx([-15, -7.5, 0, 0], abs=1e-9)
+    assert np.abs(formation.true_error[:, z]).max() < 1e-9
+    later = flight.scenario and msgspec.convert(
+        msgspec.to_builtins(flight.scenario)
+        | {
+            "clusters": [
+                msgspec.to_builtins(flight.scenario.clusters[0])
+                | {"plan": {"takeoff_s": 1.0, "target": {"z_c": 15}, "land_s": 5}}
+            ]
+        },
+        type(flight.scenario),
+    )
+    some = goal_errors(formation, later)
+    assert some is not None
+    assert np.isnan(some.true[251:]).all()
+    assert [formation.names[i] for i in np.flatnonzero(np.isfinite(some.true[0]))] == ["z_c"]

@@ -1,0 +1,33 @@
+"""Extras can be installed as they are written: from a checkout, since no index has the distribution."""
+
+import re
+import tomllib
+from pathlib import Path
+
+from zsim.extras import install_command
+
+ROOT = Path(__file__).parents[3]
+WRITTEN = ("README.md", "docs/**/*.md", "deploy/**/*.py", "agents/**/*.py", "world/**/*.py", "zsim/**/*.py")
+WRITTEN += ("examples/**/*", "clients/**/*", "scenarios/*", "benchmarks/**/*.py", "tests/**/*.py")
+OF_AN_INDEX = re.compile(r"zsim\[[a-z{]")  # zsim[gateway], zsim[{extra}]
+OF_A_CHECKOUT = re.compile(r"pip install '\.\[([a-z0-9,]+)\]'")
+
+
+def texts() -> dict[str, str]:
+    files = {path for pattern in WRITTEN for path in ROOT.glob(pattern) if path.is_file()} - {Path(__file__)}
+    return {str(path.relative_to(ROOT)): path.read_text(errors="replace") for path in sorted(files)}
+
+
+def test_nothing_is_to_be_installed_from_an_index() -> None:
+    assert [place for place, text in texts().items() if OF_AN_INDEX.search(text)] == []
+
+
+def test_what_the_pages_install_is_an_extra() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = [name for text in texts().values() for names in OF_A_CHECKOUT.findall(text) for name in names.split(",")]
+    assert "gateway" in named
+    assert set(named) <= set(extras)
+
+
+def test_the_command_names_each_extra_once() -> None:
+    assert install_command(["world", "agents", "world"]).startswith("pip install '.[agents,world]' ")

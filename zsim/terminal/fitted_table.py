@@ -1,0 +1,142 @@
+"""A table that leaves out columns where the terminal is narrow, instead of breaking names, units and figures."""
+
+import os
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+from zsim.errors import printable
+from zsim.runtime.progress import PipedConsole
+from zsim.terminal.name_cell import NameCell
+
+NAME_WHOLE = 22  # characters of a name for whose sake columns are left out
+WORD_WHOLE = 40  # characters of a word in a text for whose sake columns are left out
+TEXT_LEAST = 18  # characters of a line of text that no column of figures takes away
+UNLIMITED = 10_000  # columns; wider than any table
+
+
+class Column(NamedTuple):
+    """A column of a table.
+
+    Attributes:
+        header: above it, its lines never broken; a table of which all are empty has no head.
+        kind: of its cells: where room is short a name keeps its end, a text wraps between words, a figure stays whole.
+        worth: what is worth least is left out first where room is short; None: never left out.
+        right: whether cells stand at its right edge.
+    """
+
+    header: str
+    kind: Literal["name", "text", "figure"] = "figure"
+    worth: int | None = None
+    right: bool = False
+
+
+class FittedTable:
+    """Rows of text under columns.
+
+    Args:
+        columns: in the order in which they are shown.
+        rows: of each, a cell for each column; codes that a terminal acts on are written out.
+        title: above the table.
+        caption: below it.
+        one_line: a row is never more than one line; what does not fit is cut.
+        lines: around the cells; none if not given.
+
+    Attributes:
+        columns: all of them.
+        title: as given.
+    """
+
+    def __init__(
+        self,
+        columns: Sequence[Column],
+        rows: Sequence[Sequence[str]],
+        title: str | None = None,
+        caption: str | None = None,
+        one_line: bool = False,
+        lines: box.Box | None = None,
+    ) -> None:
+        self.columns, self._rows = columns, rows
+        self.title, self._caption = title, caption
+        self._one_line, self._lines = one_line, lines
+
+    def left_out(self, width: int) -> list[str]:
+        """Return the headers that a terminal of so many columns has no room for."""
+        shown = self._shown(Console(width=width), width)
+        return [" ".join(each.header.split()) for i, each in enumerate(self.columns) if i not in shown]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield self._table(self._shown(console, options.max_width))
+
+    def _shown(self, console: Console, width: int) -> list[int]:
+        """Return the places of the columns that a width has room for."""
+        shown = list(range(len(self.columns)))
+        while self._least_width(shown, console) > width:
+            spare = [place for place in shown if self.columns[place].worth is not None]
+            if not spare:
+                break
+            shown.remove(min(spare, key=lambda place: (self.columns[place].worth, -place)))
+        return shown
+
+    def _least_width(self, shown: Sequence[int], console: Console) -> int:
+        """Return the width below which one more column is left out."""
+        table = self._empty()
+        for place in shown:
+            table.add_column(width=self._least(place))
+        return Measurement.get(console, console.options.update(width=UNLIMITED), table).minimum
+
+    def _table(self, shown: Sequence[int]) -> Table:
+        made = self._empty()
+        made.title = None if self.title is None else Text(printable(self.title))
+        made.caption = None if self._caption is None else Text(printable(self._caption))
+        for place in shown:
+            column = self.columns[place]
+            is_figure = column.kind == "figure"
+            made.add_column(
+                Text(printable(column.header), no_wrap=True),
+                justify="right" if column.right else "left",
+                no_wrap=is_figure,
+                min_width=self._least(place) if is_figure else None,
+            )
+        for row in self._rows:
+            made.add_row(*(self._cell(place, row[place]) for place in shown))
+        return made
+
+    def _empty(self) -> Table:
+        return Table(
+            box=self._lines,
+            pad_edge=self._lines is not None,
+            show_header=any(column.header for column in self.columns),
+            title_justify="left",
+            caption_justify="left",
+        )
+
+    def _least(self, place: int) -> int:
+        """Return the width of a column below which others are left out."""
+        column = self.columns[place]
+        header = max(map(len, column.header.split("\n")))
+        cells = [printable(row[place]) for row in self._rows]
+        longest = max(map(len, cells), default=0)
+        word = 0 if self._one_line else max((len(word) for cell in cells for word in cell.split()), default=0)
+        most = {"name": NAME_WHOLE, "text": max(TEXT_LEAST, min(word, WORD_WHOLE)), "figure": longest}[column.kind]
+        return max(header, min(longest, most))
+
+    def _cell(self, place: int, text: str) -> RenderableType:
+        kind = self.columns[place].kind
+        if kind == "name":
+            return NameCell(printable(text))
+        is_cut = self._one_line or kind == "figure"
+        return Text(printable(text), no_wrap=is_cut, overflow="ellipsis" if is_cut else "fold")
+
+
+def print_table(table: FittedTable) -> None:
+    """Print a table on the terminal; into a file or a pipe a row a line, nothing left out."""
+    console = PipedConsole()
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = UNLIMITED
+    console.print(table)
