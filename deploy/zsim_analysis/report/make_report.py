@@ -136,7 +136,8 @@ def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) ->
 def fact_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
     """Return the lines at the head of each run's own page, and more in which runs differ, a line for each label."""
     columns = [dict([*facts(run.summary), *_more(run)]) for run in runs]
-    return [ComparisonRow(name, tuple(column[name] for column in columns)) for name in columns[0]]
+    names = dict.fromkeys(name for column in sorted(columns, key=len, reverse=True) for name in column)
+    return [ComparisonRow(name, tuple(column.get(name, ABSENT) for column in columns)) for name in names]
 
 
 def _more(run: ComparedRun) -> list[tuple[str, str]]:

@@ -262,7 +262,7 @@ def _serve(serve: Serve, link: Session, presence: ObserverProcess, info: Info, s
     try:
         serve(link, info, presence, stop.stopped, say)
     except ZsimError as error:
-        presence.leave(str(error))  # else the world would take it for dead
+        presence.leave(str(error).removeprefix(f"{presence.name}: "))  # else the world would take it for dead
         raise
     reason = presence.end_reason or stop.reason() or "stopped"
     presence.leave(reason)

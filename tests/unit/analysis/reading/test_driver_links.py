@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import pytest
 import synthetic_record
 from synthetic_record import Flown
 
@@ -10,7 +9,8 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import LinkState
 from zsim.record import RecordWriter
 from zsim_analysis.reading.driver_links import DriverLink, driver_links, link_text
-from zsim_analysis.report.make_report import facts, judge
+from zsim_analysis.report.comparison import ABSENT, ComparedRun
+from zsim_analysis.report.make_report import fact_rows, facts, judge
 
 SECOND_NS = 1_000_000_000
 PEER = "192.168.1.20:14580"
@@ -37,7 +37,7 @@ def record(path: Path, reports: list[list[tuple]] = REPORTS) -> Path:
 
 def test_a_link_is_judged_over_all_drivers_of_its_drone(tmp_path: Path):
     (link,) = driver_links(record(tmp_path / "run.mcap")).values()
-    assert link == DriverLink(PEER, 1200.0, pytest.approx(2.0), 4.0, 6.0, lost=1, lost_s=1.0, refused=5)
+    assert link == DriverLink(PEER, 1200.0, 2.0, 4.0, 6.0, lost=1, lost_s=1.0, refused=5)
 
 
 def test_what_is_not_known_is_left_out(tmp_path: Path):
@@ -56,3 +56,15 @@ def test_a_run_without_external_drones_has_no_links(tmp_path: Path):
     synthetic_record.write(tmp_path / "run.mcap", Flown(duration_s=1.0))
     assert judge(tmp_path / "run.mcap")[-1].links == {}
     assert driver_links(tmp_path / "run.mcap") == {}
+
+
+def test_a_run_with_a_link_is_compared_with_one_without(tmp_path: Path):
+    directories = [tmp_path / name for name in ("simulated", "mixed")]
+    for directory in directories:
+        directory.mkdir()
+    synthetic_record.write(directories[0] / "run.mcap", Flown(duration_s=1.0))
+    record(directories[1] / "run.mcap")
+    rows = fact_rows([ComparedRun(d.name, d, *judge(d / "run.mcap")) for d in directories])
+    (link,) = (row.cells for row in rows if row.name == "Link of drone3")
+    assert link[0] == ABSENT
+    assert PEER in link[1]

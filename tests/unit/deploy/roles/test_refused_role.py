@@ -31,7 +31,7 @@ def test_who_refuses_a_run_says_bye_with_the_reason():
     stop: Any = NotStopped()
 
     def serve(*_: object) -> None:
-        raise RunError("no such drone")
+        raise RunError(f"{ME}: no such drone")
 
     with pytest.raises(RunError):
         roles._serve(serve, link, presence, info, stop, print)
