@@ -110,9 +110,12 @@ with zenoh.open(config) as session:
     while (clock := msgpack.unpackb(clocks.recv().payload.to_bytes()))["state"] != "stopped":
         t_ns = clock["t_ns"]
         while (sample := accepted.try_recv()) is not None:
-            if armed:
-                kind = str(sample.key_expr).rsplit("/", 1)[1]
-                aircraft.obey(kind, msgpack.unpackb(sample.payload.to_bytes()), t_ns / 1e9)
+            kind, command = str(sample.key_expr).rsplit("/", 1)[1], msgpack.unpackb(sample.payload.to_bytes())
+            is_stop = command.get("mode") == "emergency"
+            if armed or is_stop:
+                aircraft.obey(kind, command, t_ns / 1e9)
+            if is_stop:
+                armed.clear()
         if t_ns <= last_ns:
             continue  # time stands
         if last_ns >= 0:

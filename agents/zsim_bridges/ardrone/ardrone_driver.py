@@ -7,7 +7,7 @@ from collections.abc import Callable
 from zsim.contract.messages import Info
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
-from zsim_bridges.ardrone.drive.aircraft_session import AircraftSession
+from zsim_bridges.ardrone.drive.aircraft_session import AircraftSession, AircraftSettings
 from zsim_bridges.ardrone.drive.navdata_readings import NavdataReadings
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_run
@@ -22,6 +22,7 @@ def drive(
     say: Callable[[str], None],
     options: DriverOptions,
     address: str,
+    settings: AircraftSettings,
 ) -> None:
     """Drive one aircraft in one run until that is over.
 
@@ -33,6 +34,7 @@ def drive(
         say: prints a line.
         options: of the driver.
         address: of the aircraft.
+        settings: that it is given.
 
     Raises:
         RunError: the drone is not external, or the run does not keep the pace of the wall clock.
@@ -43,5 +45,5 @@ def drive(
     origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
     yaw_rad = None if options.yaw_deg is None else math.radians(options.yaw_deg)
     readings = NavdataReadings(origin, place, scenario.environment.magnetic_field_ut, yaw_rad)
-    session = AircraftSession(address, readings)
+    session = AircraftSession(address, readings, settings)
     asyncio.run(DriverProcess(link, info, observer, options, session, say).run(stopped))

@@ -1,6 +1,8 @@
-"""Which time of another clock is which of this one's, by the messages that arrive. Pure."""
+"""Which time of another clock is which of this one's, by the messages that arrive."""
 
+import time
 from collections import deque
+from collections.abc import Callable
 
 WINDOW_NS = 5_000_000_000  # chosen: long against queues, short against the drift of two clocks (50 ppm: 0.25 ms)
 
@@ -27,10 +29,6 @@ class ClockOffset:
     def add_round_trip(self, duration_ns: int, arrival_ns: int) -> None:
         """Take how long a request and its answer took together."""
         _keep_least(self._round_trips, arrival_ns, duration_ns, self._window_ns)
-
-    @property
-    def is_known(self) -> bool:
-        return bool(self._least)
 
     @property
     def offset_ns(self) -> int:
@@ -68,3 +66,27 @@ def _keep_least(kept: deque[tuple[int, int]], now_ns: int, value: int, window_ns
     kept.append((now_ns, value))
     while now_ns - kept[0][0] > window_ns:
         kept.popleft()
+
+
+class DriverClock:
+    """The clock of the driver, which goes as fast as the run's, and what the run's shows.
+
+    Args:
+        rate: simulated per wall seconds.
+        wall_ns: monotonic wall time.
+    """
+
+    def __init__(self, rate: float, wall_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._rate, self._wall_ns = rate, wall_ns
+        self._offset = ClockOffset()
+
+    def now_ns(self) -> int:
+        return round(self._wall_ns() * self._rate)
+
+    def on_gate(self, t_ns: int) -> None:
+        """A clock of the run has just arrived."""
+        self._offset.add(t_ns, self.now_ns())
+
+    def to_simulated(self, now_ns: int) -> int:
+        """Return simulated time at a time of this clock."""
+        return self._offset.to_remote(now_ns)

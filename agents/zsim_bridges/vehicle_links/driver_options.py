@@ -2,6 +2,7 @@
 
 import math
 import re
+import socket
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
@@ -74,6 +75,18 @@ def aircraft_host(text: str) -> str:
     if not _HOST.fullmatch(text):
         raise RunError(f"the address is {text!r}; must be that of a host, such as 192.168.1.12: the ports are fixed")
     return text
+
+
+def check_host(host: str) -> None:
+    """Refuse a host without an address, before the driver takes the place of one that flies.
+
+    Raises:
+        RunError: that is so.
+    """
+    try:
+        socket.getaddrinfo(host, None)
+    except (OSError, UnicodeError) as error:
+        raise RunError(f"the address is that of {host!r}, which is no host that is known here") from error
 
 
 def check_run(info: Info, process: str, drone: str) -> None:

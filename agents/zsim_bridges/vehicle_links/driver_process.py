@@ -1,32 +1,32 @@
 """The driver as a process: an aircraft at the other end of a wire is one drone of a run.
 
 The wire's session, the failsafe and what becomes of readings are pure and stand in files of their own; here are
-sockets, keys, and the event loop.
+keys and the event loop.
 """
 
 import asyncio
 import contextlib
-import errno
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 from zsim.contract import flight_messages, keys, messages
 from zsim.contract.flight_messages import Connection
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED, ControlAnswer
-from zsim.errors import DecodeError, RunError
+from zsim.errors import DecodeError
 from zsim.scenario import scenario_file
 from zsim.transport.session import Query, RawSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
 from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.vehicle_links.aircraft_socket import AircraftSocket
 from zsim_bridges.vehicle_links.aircraft_state import AircraftState
-from zsim_bridges.vehicle_links.driver_clock import DriverClock
+from zsim_bridges.vehicle_links.clock_offset import DriverClock
 from zsim_bridges.vehicle_links.driver_options import DriverOptions
 from zsim_bridges.vehicle_links.external_drone import ExternalDrone, hover_speed
 from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe
-from zsim_bridges.vehicle_links.vehicle_session import LinkFigures, UdpChannel, VehicleSession
+from zsim_bridges.vehicle_links.vehicle_session import LinkFigures, VehicleSession
 
 TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
 REPORT_S = 1.0  # s, wall; of the link's figures
@@ -64,38 +64,26 @@ class DriverProcess:
         rotors = next(len(drone.rotors) for drone in info.drones if drone.name == options.drone) or ROTORS_MIN
         hover_rad_s = hover_speed(scenario.drone(options.drone), rotors, scenario.environment.gravity_m_s2)
         self._external = ExternalDrone(options.drone, self._clock.to_simulated, (hover_rad_s,) * rotors)
-        self._sockets: list[asyncio.DatagramTransport] = []
+        self._sockets = [AircraftSocket(partial(self._receive, number)) for number in range(len(session.channels))]
         self._reported_s = 0.0
         self._reported: tuple[Connection, str, str] | None = None
         self._report_seq = self._ignored = 0
+        self._has_clock = False  # until it has, nothing can be stamped
         self._hint_s = time.monotonic() + PATIENCE_S
-        self._socket_fault = "nothing comes"
 
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Carry messages both ways until the run is over or a stop is requested; then land."""
-        loop = asyncio.get_running_loop()
-        await self._open(loop)
         try:
-            self._subscribe(loop)
+            for socket, channel in zip(self._sockets, self._session.channels, strict=True):
+                await socket.open(channel)
+            self._subscribe(asyncio.get_running_loop())
             while not (stopped() or self._observer.end_reason):
                 self._tick()
                 await asyncio.sleep(TICK_S)
             await self._land_and_leave(stopped())
         finally:
-            for transport in self._sockets:
-                transport.close()
-
-    async def _open(self, loop: asyncio.AbstractEventLoop) -> None:
-        for number, channel in enumerate(self._session.channels):
-            try:
-                transport, _ = await loop.create_datagram_endpoint(
-                    lambda number=number: ChannelSocket(number, self._receive, self._on_socket_fault),
-                    remote_addr=(channel.host, channel.port),
-                    local_addr=_local(channel),
-                )
-            except OSError as error:
-                raise RunError(f"{self._observer.name}: {_not_opened(channel, error)}") from error
-            self._sockets.append(transport)
+            for socket in self._sockets:
+                socket.close()
 
     def _subscribe(self, loop: asyncio.AbstractEventLoop) -> None:
         def in_loop(handle: Callable[[str, bytes], None]) -> Callable[[RawSample], None]:
@@ -120,12 +108,10 @@ class DriverProcess:
         self._session.receive(channel, datagram, self._clock.now_ns())
         self._external.add(self._session.take_readings())
 
-    def _on_socket_fault(self, error: OSError) -> None:
-        self._socket_fault = error.strerror or str(error)
-
     def _on_clock(self, _: str, payload: bytes) -> None:
         """Publish the gate that the world has reached."""
         clock = self._observer.update_clock(payload)
+        self._has_clock = self._has_clock or clock is not None
         if clock is None or clock.state != "running":
             return
         now_ns = self._clock.now_ns()
@@ -195,7 +181,8 @@ class DriverProcess:
             self._say(f"{self._observer.name}: {text}")
         self._session.texts.clear()
         self._hint()
-        if time.monotonic() - self._reported_s > REPORT_S or self._reported != self._reported_now():
+        is_due = time.monotonic() - self._reported_s > REPORT_S or self._reported != self._reported_now()
+        if is_due and self._has_clock:
             self._report(self._clock.now_ns())
 
     def _hint(self) -> None:
@@ -205,7 +192,8 @@ class DriverProcess:
         self._hint_s = math.inf
         if self._session.state.received_ns is None:
             channel, refused = self._session.channels[0], self._session.figures(self._clock.now_ns()).refused
-            what = f"{refused} messages came that are not its own" if refused else self._socket_fault.lower()
+            silence = self._sockets[0].fault.lower() or "nothing comes"
+            what = f"{refused} messages came that are not its own" if refused else silence
             advice = "check its address, its system id and key, and that it is switched on"
             self._say(f"{self._observer.name}: no aircraft at {channel.host}:{channel.port} ({what}); {advice}")
 
@@ -214,7 +202,7 @@ class DriverProcess:
         now_ns = self._clock.now_ns()
         demand = self._failsafe.demand(now_ns, self._session.state)
         for channel, datagram in self._session.advance(now_ns, demand):
-            self._sockets[channel].sendto(datagram)
+            self._sockets[channel].send(datagram)
 
     def _reported_now(self) -> tuple[Connection, str, str]:
         return self._link_state(self._clock.now_ns()), self._failsafe.phase, self._failsafe.reason
@@ -267,30 +255,3 @@ class DriverProcess:
         if stopping:
             state = self._session.state.state
             self._say(f"{self._observer.name}: it is still {state} after {LANDING_S:g} s; take it over by hand")
-
-
-class ChannelSocket(asyncio.DatagramProtocol):
-    """Hands datagrams on, with the number of their channel, and the faults of sending."""
-
-    def __init__(self, number: int, receive: Callable[[int, bytes], None], on_fault: Callable[[OSError], None]) -> None:
-        self._number, self._receive, self._on_fault = number, receive, on_fault
-
-    def datagram_received(self, data: bytes, addr: Any) -> None:
-        self._receive(self._number, data)
-
-    def error_received(self, exc: Exception) -> None:
-        """Note that nobody listens there yet; what is due is sent again."""
-        if isinstance(exc, OSError):
-            self._on_fault(exc)
-
-
-def _not_opened(channel: UdpChannel, error: OSError) -> str:
-    """Return why there is no socket for a channel, and what to do."""
-    why = error.strerror or str(error)
-    if error.errno == errno.EADDRINUSE:
-        return f"UDP port {channel.local_port} here cannot be had: {why}; give another --local-port, or end who has it"
-    return f"{channel.host}:{channel.port} cannot be reached: {why}; give the address of the aircraft"
-
-
-def _local(channel: UdpChannel) -> tuple[str, int] | None:
-    return ("0.0.0.0", channel.local_port) if channel.local_port else None

@@ -11,6 +11,7 @@ from pathlib import Path
 from zsim.errors import RecordError, ReportError
 from zsim.record.record_reader import RECORD
 from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.driver_links import link_text
 from zsim_analysis.reading.flight import read_flight
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
@@ -103,6 +104,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
         ("Deadlines missed", _misses(summary)),
         ("Command age", ages),
+        *((f"Link of {drone}", link_text(link)) for drone, link in summary.links.items()),
         ("Least separation", "no two drones in the air" if separation is None else f"{separation:.2f} m in truth"),
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
         ("Fingerprint", summary.fingerprint or "not known"),
@@ -134,7 +136,8 @@ def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) ->
 def fact_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
     """Return the lines at the head of each run's own page, and more in which runs differ, a line for each label."""
     columns = [dict([*facts(run.summary), *_more(run)]) for run in runs]
-    return [ComparisonRow(name, tuple(column[name] for column in columns)) for name in columns[0]]
+    names = dict.fromkeys(name for column in sorted(columns, key=len, reverse=True) for name in column)
+    return [ComparisonRow(name, tuple(column.get(name, ABSENT) for column in columns)) for name in names]
 
 
 def _more(run: ComparedRun) -> list[tuple[str, str]]:

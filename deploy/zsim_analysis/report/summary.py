@@ -9,6 +9,7 @@ from msgspec import Struct
 
 from zsim import __version__
 from zsim.contract.run_messages import Event
+from zsim_analysis.reading.driver_links import DriverLink, driver_links
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m
 from zsim_analysis.reading.recorded_flight import RecordedFlight, RecordedProcess
 from zsim_analysis.reading.recorded_run import command_age_ms
@@ -44,6 +45,7 @@ class RunSummary(Struct, frozen=True):
 
     Attributes:
         as_planned: the flight did what its plan says; `shortfalls` has what it did not do.
+        links: to the aircraft that flew as external drones, by drone.
     """
 
     scenario: str | None
@@ -62,6 +64,7 @@ class RunSummary(Struct, frozen=True):
     deadline_misses: int | None
     deadline_misses_by: dict[str, int]
     command_age_ms: dict[str, float] | None
+    links: dict[str, DriverLink]
     window_s: tuple[float, float]
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
@@ -110,6 +113,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         deadline_misses=end.get("deadline_misses"),
         deadline_misses_by=end.get("deadline_misses_by", {}),
         command_age_ms=end["command_age_ms"] if "command_age_ms" in end else command_age_ms(record),
+        links=driver_links(record) if any(track.external for track in flight.tracks) else {},
         window_s=window_s,
         errors=next((cluster.errors for cluster in clusters.values()), {}),
         clusters=clusters,

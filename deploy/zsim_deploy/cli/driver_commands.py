@@ -43,10 +43,11 @@ def drive_mavlink(
 ) -> None:
     """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
     from zsim_bridges.mavlink.mavlink_driver import drive
-    from zsim_bridges.vehicle_links.driver_options import udp_channel
+    from zsim_bridges.vehicle_links.driver_options import check_host, udp_channel
 
     options = _options(drone, (speed, climb), (radius, ceiling), armed, origin, None)
     channel = udp_channel(address, local_port)
+    check_host(channel.host)
     key = read_key(signing_key) if signing_key else None
     _serve(partial(drive, options=options, channel=channel, system=system, key=key), reach, drone)
 
@@ -63,6 +64,9 @@ def drive_ardrone(
         float | None,
         typer.Option(callback=finite, help="Its heading at the start, deg from east (default: by its magnetometer)."),
     ] = None,
+    ultrasound: Annotated[
+        int, typer.Option(min=7, max=8, help="Of its sonar, 7 or 8; neighbours that differ disturb each other less.")
+    ] = 8,
     armed: Armed = False,
     speed: Speed = 2.0,
     climb: Climb = 1.0,
@@ -71,10 +75,13 @@ def drive_ardrone(
 ) -> None:
     """Let an AR.Drone 2.0 fly as a drone of the run."""
     from zsim_bridges.ardrone.ardrone_driver import drive
-    from zsim_bridges.vehicle_links.driver_options import aircraft_host
+    from zsim_bridges.ardrone.drive.aircraft_session import AircraftSettings
+    from zsim_bridges.vehicle_links.driver_options import aircraft_host, check_host
 
     options = _options(drone, (speed, climb), (radius, ceiling), armed, origin, yaw)
-    _serve(partial(drive, options=options, address=aircraft_host(address)), reach, drone)
+    check_host(aircraft_host(address))
+    settings = AircraftSettings(ultrasound=ultrasound)
+    _serve(partial(drive, options=options, address=address, settings=settings), reach, drone)
 
 
 def _options(

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import NoWorldError, SessionError, SupersededError, printable
+from zsim.errors import NoWorldError, SessionError, SupersededError, ZsimError, printable
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
 from zsim.runtime.runner import Runner
@@ -259,7 +259,11 @@ def _serve(serve: Serve, link: Session, presence: ObserverProcess, info: Info, s
     if not presence.gates:
         presence.announce()
     say(f"{presence.name}: in run {info.run_id}")
-    serve(link, info, presence, stop.stopped, say)
+    try:
+        serve(link, info, presence, stop.stopped, say)
+    except ZsimError as error:
+        presence.leave(str(error).removeprefix(f"{presence.name}: "))  # else the world would take it for dead
+        raise
     reason = presence.end_reason or stop.reason() or "stopped"
     presence.leave(reason)
     say(f"{presence.name}: left, {reason}")

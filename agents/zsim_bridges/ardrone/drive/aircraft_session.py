@@ -24,9 +24,7 @@ NAVDATA, AT = 0, 1  # channels
 REQUEST_NS = 100_000_000  # chosen as npm ar-drone: navdata is asked for again after as long
 CONFIG_NS = 500_000_000  # chosen: an entry is sent again after as long without its acknowledgement
 WATCHDOG_NS = 1_000_000_000  # half of the aircraft's com_watchdog
-RESTARTED = (
-    100  # packets that a number may fall back before it counts as that of an aircraft that was switched on again
-)
+RESTARTED = 100  # packets, chosen: whose number falls back by more has been switched on again
 STATES: dict[int, DroneState] = {
     ControlState.FLYING: "flying",
     ControlState.HOVERING: "hovering",
@@ -38,19 +36,21 @@ STATES: dict[int, DroneState] = {
 OPTIONS_MASK = sum(1 << tag for tag in (*FULL_TAGS, GPS_TAG))
 
 
-class AircraftLimits(NamedTuple):
+class AircraftSettings(NamedTuple):
     """What its configuration is set to.
 
     Attributes:
         tilt_rad: euler_angle_max.
         climb_m_s, yaw_rate_rad_s: control_vz_max, control_yaw.
         altitude_m: altitude_max.
+        ultrasound: ultrasound_freq of its sonar: 7 (22.2 Hz) or 8 (25 Hz).
     """
 
     tilt_rad: float = 0.35  # outdoor default of the SDK
     climb_m_s: float = 1.0  # likewise
     yaw_rate_rad_s: float = 1.75  # indoor default of the SDK
     altitude_m: float = 100.0  # no limit of its own: the driver's fence stands
+    ultrasound: int = 8  # default of the SDK
 
 
 class AircraftSession:
@@ -59,7 +59,7 @@ class AircraftSession:
     Args:
         host: its address.
         readings: what becomes of its navdata.
-        limits: that it is given.
+        settings: that it is given.
         ports: of navdata and AT commands.
 
     Attributes:
@@ -70,14 +70,14 @@ class AircraftSession:
         self,
         host: str,
         readings: NavdataReadings,
-        limits: AircraftLimits = AircraftLimits(),  # noqa: B008
+        settings: AircraftSettings = AircraftSettings(),  # noqa: B008
         ports: tuple[int, int] = (navdata.PORT, at_commands.PORT),
     ) -> None:
         self.channels: tuple[UdpChannel, ...] = UdpChannel(host, ports[0]), UdpChannel(host, ports[1])
         self.texts: list[str] = []
         self._readings = readings
-        self._commands = FlightCommands(TiltControl(limits.tilt_rad, limits.climb_m_s, limits.yaw_rate_rad_s))
-        self._entries = _entries(limits)
+        self._commands = FlightCommands(TiltControl(settings.tilt_rad, settings.climb_m_s, settings.yaw_rate_rad_s))
+        self._entries = _entries(settings)
         self._pending: deque[Config] = deque(self._entries)
         self._loss = StreamLoss(1 << 32)
         self._sequence = 0
@@ -178,15 +178,16 @@ class AircraftSession:
         return LinkFigures(self._loss.percent, None, self._readings.clock.ahead_ms, self._refused)
 
 
-def _entries(limits: AircraftLimits) -> list[Config]:
+def _entries(settings: AircraftSettings) -> list[Config]:
     """Return what is set: `outdoor` first, which brings limits of its own."""
     entries = {
         "general:navdata_demo": "FALSE",
         "general:navdata_options": str(OPTIONS_MASK),
         "control:outdoor": "TRUE",
-        "control:euler_angle_max": f"{limits.tilt_rad:g}",
-        "control:control_vz_max": f"{1e3 * limits.climb_m_s:g}",
-        "control:control_yaw": f"{limits.yaw_rate_rad_s:g}",
-        "control:altitude_max": f"{1e3 * limits.altitude_m:g}",
+        "control:euler_angle_max": f"{settings.tilt_rad:g}",
+        "control:control_vz_max": f"{1e3 * settings.climb_m_s:g}",
+        "control:control_yaw": f"{settings.yaw_rate_rad_s:g}",
+        "control:altitude_max": f"{1e3 * settings.altitude_m:g}",
+        "pic:ultrasound_freq": str(settings.ultrasound),
     }
     return [Config(0, key, value) for key, value in entries.items()]

@@ -113,7 +113,7 @@ class ArdroneServer:
 
     def _can_stream(self) -> bool:
         if not self._has_encoder:
-            self._refuse(f"video: av is not installed, no pictures are streamed; {install_command(['video'])}")
+            self._report(f"video: av is not installed, no pictures are streamed; {install_command(['video'])}")
         return self._has_encoder
 
     async def _forward_all(self, intake: TrafficIntake) -> None:
@@ -169,9 +169,13 @@ class ArdroneServer:
     def _refuse(self, reason: str) -> None:
         """Count what is not done, and print the reason, once."""
         self._observer.health.refused += 1
-        if reason not in self._reported and len(self._reported) < REPORTED_MAX:
-            self._reported.add(reason)
-            self._say(f"{self._observer.name}: {reason}")
+        self._report(reason)
+
+    def _report(self, text: str) -> None:
+        """Print a text, once."""
+        if text not in self._reported and len(self._reported) < REPORTED_MAX:
+            self._reported.add(text)
+            self._say(f"{self._observer.name}: {text}")
 
 
 def is_onboard(leaf: str) -> bool:

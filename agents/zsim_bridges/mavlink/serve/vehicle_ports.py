@@ -1,6 +1,7 @@
 """The UDP ports of one vehicle, as PX4's simulation has them: one for ground stations, one for programs."""
 
 import asyncio
+import errno
 import socket
 import struct
 from collections import Counter
@@ -16,6 +17,7 @@ from zsim_bridges.mavlink.wire.wire_message import Message
 DATAGRAM_MAX = 1400  # bytes; fits into a frame of Ethernet
 READ_MAX = 65_536  # bytes
 READS_MAX = 64  # datagrams at once, then others have their turn
+TAKEN = (errno.EADDRINUSE, errno.EACCES)  # another process has the port, or only the system may
 OnReceived = Callable[[Received], None]
 
 
@@ -137,6 +139,7 @@ def _bound(local: Address) -> socket.socket:
         opened.bind(local)
     except OSError as error:
         opened.close()
-        what = f"UDP {local[0]}:{local[1]} cannot be opened ({error.strerror})"
-        raise RunError(f"{what}; give other ports with --gcs-local and --api-local, or end who has it") from error
+        taken = error.errno in TAKEN
+        advice = "other ports with --gcs-local and --api-local" if taken else "an address of this host with --listen"
+        raise RunError(f"UDP {local[0]}:{local[1]} cannot be opened ({error.strerror}); give {advice}") from error
     return opened

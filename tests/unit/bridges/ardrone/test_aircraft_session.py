@@ -7,7 +7,7 @@ import pytest
 from fake_aircraft import FIELD_UT, STEP_NS, FakeAircraft
 
 from zsim.math.frames import heading
-from zsim_bridges.ardrone.drive.aircraft_session import AircraftSession
+from zsim_bridges.ardrone.drive.aircraft_session import AircraftSession, AircraftSettings
 from zsim_bridges.ardrone.drive.navdata_readings import NavdataReadings
 from zsim_bridges.vehicle_links.aircraft_state import AircraftPose
 from zsim_bridges.vehicle_links.failsafe import Demand
@@ -19,9 +19,10 @@ S = 1_000_000_000
 class Loop:
     """A session and its aircraft; what the one sends reaches the other after a delay."""
 
-    def __init__(self, delay_s: float = 0.0, yaw: float = 1.0) -> None:
+    def __init__(self, delay_s: float = 0.0, yaw: float = 1.0, ultrasound: int = 8) -> None:
         self.aircraft = FakeAircraft(yaw)
-        self.session = AircraftSession("127.0.0.2", NavdataReadings(ORIGIN, (0.0, 0.0, 0.0), FIELD_UT))
+        readings, settings = NavdataReadings(ORIGIN, (0.0, 0.0, 0.0), FIELD_UT), AircraftSettings(ultrasound=ultrasound)
+        self.session = AircraftSession("127.0.0.2", readings, settings)
         self.now_ns = 100 * S
         self._delay_ns = round(delay_s * S)
         self._under_way: list[tuple[int, int, bytes]] = []
@@ -53,14 +54,15 @@ class Loop:
 
 
 def test_it_is_set_up_entry_by_entry():
-    loop = Loop()
+    loop = Loop(ultrasound=7)
     loop.run(5)
+    assert loop.aircraft.config["pic:ultrasound_freq"] == "7"
     assert loop.aircraft.config["general:navdata_demo"] == "FALSE"
     assert int(loop.aircraft.config["general:navdata_options"]) >> 27 & 1
     assert list(loop.aircraft.config).index("control:outdoor") < list(loop.aircraft.config).index(
         "control:euler_angle_max"
     )
-    assert len(loop.aircraft.config) == 7
+    assert len(loop.aircraft.config) == 8
     assert set(loop.aircraft.names) == {"Config", "Control", "ResetWatchdog"}  # nothing that moves it
 
 
@@ -69,7 +71,7 @@ def test_it_is_set_up_again_when_it_was_switched_on_again():
     loop.run(5)
     loop.aircraft, loop.aircraft.has_client = FakeAircraft(), True
     loop.run(5)
-    assert len(loop.aircraft.config) == 7
+    assert len(loop.aircraft.config) == 8
     assert loop.session.state.received_ns == loop.now_ns
 
 

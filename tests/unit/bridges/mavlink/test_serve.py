@@ -57,6 +57,15 @@ class OpenPort:
         self.program.close()
 
 
+@pytest.mark.parametrize("is_taken", [True, False])
+def test_a_port_that_cannot_be_had_is_refused_with_the_option_to_change(is_taken: bool) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        local = ("127.0.0.1" if is_taken else "nowhere.invalid", other.getsockname()[1])
+        with pytest.raises(RunError, match=f"{local[0]}.*{'--api-local' if is_taken else '--listen'}"):
+            VehiclePort(local, GCS, None, print)
+
+
 def test_messages_go_together_in_datagrams_of_a_frame_of_ethernet() -> None:
     async def send() -> None:
         opened = OpenPort()

@@ -1,0 +1,36 @@
+"""The server of a run's drones, without sockets: what it asks the run for, and what it prints."""
+
+from typing import Any
+
+import pytest
+from fake_link import FakeLink
+
+from zsim.contract import keys
+from zsim.contract.messages import DroneInfo, Info, Origin
+from zsim.extras import install_command
+from zsim_bridges.ardrone.server import ardrone_server
+from zsim_bridges.ardrone.server.ardrone_server import ArdroneOptions, ArdroneServer
+from zsim_bridges.observer_process import ObserverProcess
+
+SCENARIO = "{name: one, duration_s: 10, drones: [{name: drone1, position_m: [0, 0, 0]}]}"
+DRONES = (DroneInfo("drone1", "ardrone2"),)
+
+
+@pytest.mark.parametrize("is_installed", [True, False])
+def test_pictures_are_asked_for_where_they_can_be_encoded_else_the_extra_is_named_once(
+    monkeypatch: pytest.MonkeyPatch, is_installed: bool
+):
+    monkeypatch.setattr(ardrone_server, "find_spec", lambda _: object() if is_installed else None)
+    link: Any = FakeLink()
+    origin = Origin(0.0, 0.0, 0.0)
+    info = Info(0, 0, 1, "r", "zsim", "lockstep", 1.0, 1, 1, 1, 1, origin, DRONES, (), SCENARIO, "", "", "")
+    observer, lines = ObserverProcess(link, info, "ardrone.main"), []
+    server = ArdroneServer(link, info, observer, lines.append, ArdroneOptions("127.0.0.2", frozenset(), None))
+    assert list(server._wanted_pictures()) == []  # nobody is connected
+    watcher: Any = object()
+    server._drones["drone1"].video.port.writers.add(watcher)
+    wanted = [list(server._wanted_pictures()) for _ in range(2)]
+    assert wanted == ([[keys.camera("drone1", "front")]] * 2 if is_installed else [[], []])
+    assert len(lines) == (0 if is_installed else 1)
+    assert all(install_command(["video"]) in line for line in lines)
+    assert observer.health.refused == 0
