@@ -7,7 +7,7 @@ with it. Made by Rerun's own library where it is installed; established with 0.4
 """
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ import numpy as np
 
 from zsim_analysis.export.foxglove_file import CURVES, DRONE_PLOTS, DRONES_MAX, PICTURES, PICTURES_MAX, PLOTS_MAX, TAB
 from zsim_analysis.export.foxglove_messages import PACKAGE, tidy
-from zsim_analysis.export.foxglove_scene import DARK, MAGENTA, WORLD, RotorDisc, drone_colour, rgb
+from zsim_analysis.export.foxglove_scene import DARK, MAGENTA, WORLD, RotorDisc, colours_of, rgb
 from zsim_analysis.export.foxglove_topics import DESIRED, LOG, POINTS
 
 TIMELINE = "message_log_time"  # Rerun's name of the MCAP file's log time: simulated time
@@ -71,7 +71,7 @@ def write_blueprint(
     left = rrb.Vertical(_scene(present, rotors), rrb.TextLogView(name="log", origin=LOG), row_shares=[3, 1])
     plots = [
         rrb.TimeSeriesView(name=title, overrides=_series(curves), contents=list(_series(curves)))
-        for title, curves in panels(present, variables)
+        for title, curves in panels(present, variables, colours_of(rotors))
     ]
     tabs = [
         rrb.Vertical(*plots[i : i + TAB], name=", ".join(str(plot.name) for plot in plots[i : i + TAB]))
@@ -92,22 +92,22 @@ def write_blueprint(
     blueprint.save(application, path)
 
 
-def panels(topics: Iterable[str], variables: Mapping[str, Sequence[str]]) -> list[tuple[str, list[Curve]]]:
+def panels(
+    topics: Collection[str], variables: Mapping[str, Sequence[str]], colours: Mapping[str, str]
+) -> list[tuple[str, list[Curve]]]:
     """Return title and curves of every plot: the clusters' variables, then the drones' numbers."""
     found = [
         (name if len(variables) == 1 else f"{cluster}: {name}", _variable(cluster, name))
         for cluster, fields in variables.items()
         for name in [each.removeprefix("desired_") for each in fields if each.startswith("desired_")][:PLOTS_MAX]
     ]
-    drones = [topic for topic in sorted(topics) if topic.startswith("/drone/") and topic.endswith("/numbers")]
+    numbers = {f"/drone/{drone}/numbers": drone for drone in colours}
+    drones = [topic for topic in numbers if topic in topics]
     component = f"{PACKAGE}.Drone:message"
     return found + [
         (
             title,
-            [
-                Curve(topic, component, field, topic.split("/")[2], drone_colour(i))
-                for i, topic in enumerate(drones[:DRONES_MAX])
-            ],
+            [Curve(topic, component, field, numbers[topic], colours[numbers[topic]]) for topic in drones[:DRONES_MAX]],
         )
         for title, field in DRONE_PLOTS
         if drones
@@ -145,8 +145,8 @@ def _scene(topics: set[str], rotors: Mapping[str, Sequence[RotorDisc]]) -> Any:
     import rerun.blueprint as rrb
 
     meshes = {
-        _entity(f"/drone/{name}/pose"): drone_mesh(discs, drone_colour(i))
-        for i, (name, discs) in enumerate(rotors.items())
+        _entity(f"/drone/{name}/pose"): drone_mesh(discs, colours_of(rotors)[name])
+        for name, discs in rotors.items()
         if f"/drone/{name}/pose" in topics
     }
     drawn: dict[Any, Any] = {

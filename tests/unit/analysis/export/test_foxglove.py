@@ -414,7 +414,7 @@ def test_rerun_plays_pictures_with_their_camera_in_the_drone_s_tree(filmed: Path
 def test_the_blueprint_names_what_rerun_reads_of_the_file(run: Path, converted: Path) -> None:
     topics = shown(run / "foxglove.mcap")
     variables = {"main": tuple(topics["/cluster/main/variables"][0][1].DESCRIPTOR.fields_by_name)}
-    curves = [curve for _, curves in panels(topics, variables) for curve in curves]
+    curves = [curve for _, curves in panels(topics, variables, colours_of(DRONES)) for curve in curves]
     assert {curve.entity for curve in curves} == {"/cluster/main/variables", *(f"/drone/{d}/numbers" for d in DRONES)}
     for curve in curves:
         described = topics[curve.entity][0][1].DESCRIPTOR
