@@ -7,7 +7,10 @@ The rules, for the clock of the run:
 - The world silent for as long, whoever flies: it lands.
 - Outside the fence: it lands; from there it does not take off.
 - Killed, by an operator or an accepted emergency, armed or not: its motors stop, and it is disarmed.
-- Down without a command to land: disarmed. A commander that asks for take-off again and again starts no motor then.
+- Landing by itself: it is landed. Down, or in an emergency, without a command: disarmed. A commander that asks for
+  take-off again and again starts no motor then.
+- The aircraft silent: nothing but a landing or a stop is sent. One that was switched off and on again may take the next
+  setpoint, or the repetition of an old take-off, for a new one.
 """
 
 from math import cos, sin
@@ -21,10 +24,11 @@ from zsim_bridges.vehicle_links.aircraft_state import AIRBORNE, STANDING, STILL,
 from zsim_bridges.vehicle_links.flight_limits import FlightLimits
 
 TAKEOFF_S = 20.0  # chosen: four times what an AR.Drone takes; then it is given up
+RESET_S = 2.0  # chosen: ten times what an AR.Drone takes to leave its emergency
 LINK_LOST_S = 1.0  # chosen: heartbeats come once a second, telemetry ten times as often
 
-Phase = Literal["idle", "taking_off", "airborne", "landing", "killed"]
-Action = Literal["none", "take_off", "hold", "fly", "land", "kill"]
+Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resetting"]
+Action = Literal["none", "take_off", "hold", "fly", "land", "kill", "reset"]
 
 
 class Demand(NamedTuple):
@@ -72,7 +76,7 @@ class Failsafe:
 
     def arm(self, now_ns: int, vehicle: AircraftState) -> str | None:
         """Obey from now on; return None, or why not."""
-        if vehicle.received_ns is None or now_ns - vehicle.received_ns > LINK_LOST_S * 1e9:
+        if _is_lost(vehicle, now_ns):
             return "nothing comes from the aircraft; check its address, and that it is switched on"
         self.armed, self._uncommanded = True, False
         if self.phase == "killed":
@@ -145,8 +149,8 @@ class Failsafe:
         """Leave the emergency, once no motor turns; return None, or why not."""
         if self.is_stopping(vehicle):
             return f"the aircraft is {vehicle.state}; its motors are being stopped"
-        if self.phase == "killed":
-            self._enter("idle", now_ns)
+        if self.phase == "killed" or vehicle.state == "emergency":
+            self._enter("resetting", now_ns)
         return None
 
     # What is asked of the aircraft
@@ -157,10 +161,14 @@ class Failsafe:
         match self.phase:
             case "killed":
                 return Demand("kill")
-            case "taking_off":
-                return Demand("take_off")
             case "landing":
                 return Demand("land")
+            case "resetting":
+                return Demand("reset")
+            case _ if _is_lost(vehicle, now_ns):
+                return Demand("none")
+            case "taking_off":
+                return Demand("take_off")
             case "airborne":
                 return self._airborne(now_ns, vehicle)
             case _:
@@ -169,7 +177,10 @@ class Failsafe:
     def _advance(self, now_ns: int, vehicle: AircraftState) -> None:
         """Go on to the next phase where the aircraft has reached it, or somebody is silent."""
         airborne = vehicle.state in AIRBORNE
-        if self.phase == "taking_off" and airborne:
+        if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
+            self.reason, self._uncommanded = "the aircraft is in an emergency", True
+            self._settle(now_ns)
+        elif self.phase == "taking_off" and airborne:
             self._enter("airborne", now_ns)
         elif self.phase == "taking_off" and now_ns - self._began_ns > TAKEOFF_S * 1e9:
             self.land(f"the take-off took longer than {TAKEOFF_S:g} s", now_ns)
@@ -177,6 +188,8 @@ class Failsafe:
             self._watch_bounds(now_ns, vehicle)
         elif self.phase == "landing" and vehicle.state in STANDING and self._settled(now_ns):
             self._settle(now_ns)
+        elif self.phase == "resetting" and (vehicle.state != "emergency" or now_ns - self._began_ns > RESET_S * 1e9):
+            self._enter("idle", now_ns)
         elif self.phase == "idle" and self.armed and airborne:
             self._enter("airborne", now_ns)  # a driver that is started again in flight
         elif self.phase == "airborne":
@@ -196,6 +209,8 @@ class Failsafe:
         if vehicle.state == "landed" and self._settled(now_ns):
             self.reason, self._uncommanded = "the aircraft landed without a command", True
             self._settle(now_ns)
+        elif vehicle.state == "landing":
+            self.land("the aircraft lands by itself", now_ns)
         elif self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:
             self.land(f"{self.commander} is silent", now_ns)
         else:
@@ -226,6 +241,11 @@ class Failsafe:
             self.phase, self._began_ns = phase, now_ns
         if phase in ("landing", "killed"):
             self._setpoint = self.commander = None
+
+
+def _is_lost(vehicle: AircraftState, now_ns: int) -> bool:
+    """Tell whether nothing has come from an aircraft for too long, or ever."""
+    return vehicle.received_ns is None or now_ns - vehicle.received_ns > LINK_LOST_S * 1e9
 
 
 def turned(velocity: Vector, yaw_rad: float) -> Vector:

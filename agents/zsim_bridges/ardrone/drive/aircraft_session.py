@@ -120,6 +120,8 @@ class AircraftSession:
         if demo is not None:
             self._battery = float(min(100, demo.battery_percent))
             self._state = STATES.get(demo.ctrl_state >> 16, "landed")
+        elif StateBit.FLYING not in packet.state:  # a bootstrap has no more: it was switched on again, say
+            self._state = "landed"
         if StateBit.EMERGENCY in packet.state:
             self._state = "emergency"
         self._readings.receive(packet, now_ns)

@@ -49,8 +49,10 @@ class FlightCommands:
             case "land":
                 yield at_commands.ref(0, takes_off=False)
                 yield Pcmd(0, HOVER, 0.0, 0.0, 0.0, 0.0)
-            case "take_off" if emergency:
+            case "reset":
                 yield self._toggle(wanted=False, emergency=emergency)
+            case _ if emergency:
+                return
             case _:
                 yield at_commands.ref(0, takes_off=True)
                 yield self._pcmd(now_ns, demand, pose)

@@ -22,6 +22,7 @@ class ExternalControl(NamedTuple):
         takes_off: whether it takes off in it; else in a mode of its own.
         relative_takeoff: whether the height of a take-off is over home; else over the sea.
         own: further modes in which it is when nobody but this driver has control: it may be led back from them.
+        landing: in which it lands; its pilot's, or its own failsafe, where this driver does not land it.
     """
 
     custom_mode: int
@@ -29,10 +30,16 @@ class ExternalControl(NamedTuple):
     takes_off: bool
     relative_takeoff: bool
     own: tuple[int, ...]
+    landing: int
 
-    def is_taken_over(self, custom_mode: int) -> bool:
-        """Tell whether somebody else, its pilot first of all, has chosen a mode."""
-        return custom_mode != self.custom_mode and custom_mode not in self.own
+    def is_taken_over(self, custom_mode: int, lands: bool) -> bool:
+        """Tell whether somebody else, its pilot first of all, has chosen a mode.
+
+        Args:
+            lands: whether this driver lands it.
+        """
+        own = custom_mode in (self.custom_mode, *self.own)
+        return not (own or (lands and custom_mode == self.landing))
 
     def is_on(self, custom_mode: int) -> bool:
         return custom_mode == self.custom_mode
@@ -48,9 +55,10 @@ OFFBOARD = ExternalControl(
     (6, 0),
     takes_off=False,
     relative_takeoff=False,
-    own=(_AUTO | 2 << 24, _AUTO | 3 << 24, _AUTO | 6 << 24),  # take-off, loiter (also where setpoints stay away), land
+    own=(_AUTO | 2 << 24, _AUTO | 3 << 24),  # take-off, loiter (also where setpoints stay away)
+    landing=_AUTO | 6 << 24,
 )
-GUIDED = ExternalControl(4, (4,), takes_off=True, relative_takeoff=True, own=(9,))  # Mode::Number::GUIDED, LAND
+GUIDED = ExternalControl(4, (4,), takes_off=True, relative_takeoff=True, own=(), landing=9)  # Mode::Number
 CONTROL = {PX4: OFFBOARD, ARDUPILOT: GUIDED}
 
 

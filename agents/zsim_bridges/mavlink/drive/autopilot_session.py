@@ -9,7 +9,7 @@ from typing import Any
 
 from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.drive.autopilot_modes import ARDUPILOT, CONTROL, PX4
-from zsim_bridges.mavlink.drive.autopilot_state import CLIMBED, IN_AIR, AutopilotState
+from zsim_bridges.mavlink.drive.autopilot_state import CLIMBED, AutopilotState
 from zsim_bridges.mavlink.drive.demand_sequence import DemandSequence
 from zsim_bridges.mavlink.drive.telemetry_readings import TelemetryReadings
 from zsim_bridges.mavlink.wire import dialect
@@ -17,7 +17,7 @@ from zsim_bridges.mavlink.wire.frame import Link, Parser, Received
 from zsim_bridges.mavlink.wire.signing import Signing
 from zsim_bridges.mavlink.wire.wire_message import LAYOUTS
 from zsim_bridges.vehicle_links.aircraft_state import AircraftState, Reading
-from zsim_bridges.vehicle_links.failsafe import Demand
+from zsim_bridges.vehicle_links.failsafe import Action, Demand
 from zsim_bridges.vehicle_links.stream_loss import StreamLoss
 from zsim_bridges.vehicle_links.vehicle_session import LinkFigures, UdpChannel
 
@@ -88,7 +88,8 @@ class AutopilotSession:
         self._strangers: set[tuple[int, int]] = set()
         self._refused = 0
         self._ground_m: float | None = None
-        self._flies = self._taken_over = False
+        self._action: Action = "none"
+        self._taken_over = False
         self._answers: list[Any] = []
 
     # What arrives
@@ -136,8 +137,8 @@ class AutopilotSession:
 
     def _report_mode(self, autopilot: AutopilotState) -> None:
         """Print when somebody else takes the vehicle over in the air, and when it is given back."""
-        in_air = autopilot.armed and autopilot.landed == IN_AIR
-        taken_over = in_air and CONTROL[autopilot.autopilot].is_taken_over(autopilot.custom_mode)
+        control, lands = CONTROL[autopilot.autopilot], self._action == "land"
+        taken_over = autopilot.is_flying and control.is_taken_over(autopilot.custom_mode, lands)
         if taken_over != self._taken_over:
             self._taken_over = taken_over
             what = "somebody else has control" if taken_over else "it is given back"
@@ -154,7 +155,7 @@ class AutopilotSession:
 
     def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
         """Yield the datagrams that are due."""
-        self._flies = demand.action == "fly"
+        self._action = demand.action
         for message in self._messages(now_ns, demand):
             yield 0, self._link.pack(message)
 
@@ -195,7 +196,9 @@ class AutopilotSession:
         if self._autopilot is None:
             return AircraftState(received_ns=self._received_ns)
         pose, battery = self._telemetry.pose, self._telemetry.battery_percent
-        return AircraftState(self._autopilot.state(self._flies, self._climbed()), battery, pose, self._received_ns)
+        return AircraftState(
+            self._autopilot.state(self._action == "fly", self._climbed()), battery, pose, self._received_ns
+        )
 
     def _climbed(self) -> bool:
         """Tell whether the vehicle has reached the height of its take-off since it stood on the ground last."""

@@ -47,6 +47,11 @@ class AutopilotState:
                 return False
         return True
 
+    @property
+    def is_flying(self) -> bool:
+        """Whether it is up, or on its way down."""
+        return self.armed and self.landed in (IN_AIR, LANDING)
+
     def command(self, number: int, *parameters: float) -> dialect.CommandLong:
         """Return a command to it."""
         return command(*self.address, number, *parameters)

@@ -52,7 +52,7 @@ class DemandSequence:
         if demand.action != self._action:
             self._action = demand.action
             self._commanded_ns.clear()
-        taken_over = autopilot.landed == IN_AIR and control.is_taken_over(autopilot.custom_mode)
+        taken_over = autopilot.is_flying and control.is_taken_over(autopilot.custom_mode, demand.action == "land")
         match demand.action:
             case "hold" | "fly" | "land" if taken_over:
                 return

@@ -69,7 +69,10 @@ def test_it_is_set_up_entry_by_entry():
 def test_it_is_set_up_again_when_it_was_switched_on_again():
     loop = Loop()
     loop.run(5)
+    loop.until("hovering", Demand("take_off"))
     loop.aircraft, loop.aircraft.has_client = FakeAircraft(), True
+    loop.run(0.1)
+    assert loop.session.state.state == "landed"
     loop.run(5)
     assert len(loop.aircraft.config) == 8
     assert loop.session.state.received_ns == loop.now_ns
@@ -111,13 +114,16 @@ def test_the_velocity_answers_without_overshoot_to_speak_of():
     assert loop.aircraft.velocity[0] == pytest.approx(1.0, abs=0.03)
 
 
-def test_kill_stops_the_motors_and_a_take_off_leaves_the_emergency():
+def test_kill_stops_the_motors_and_a_reset_leaves_the_emergency():
     loop = Loop()
     loop.run(5)
     loop.until("hovering", Demand("take_off"))
     loop.until("emergency", Demand("kill"), 1)
     loop.run(2, Demand("kill"))
     assert loop.session.state.state == "emergency"
+    loop.run(1, Demand("take_off"))
+    assert loop.session.state.state == "emergency"
+    loop.until("landed", Demand("reset"), 1)
     loop.until("hovering", Demand("take_off"))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_autopilot import ARDUPILOT, HOLD, PX4, STEP_NS, FakeAutopilot
+from fake_autopilot import ARDUPILOT, HOLD, IN_AIR, LAND, LANDING, PX4, STEP_NS, FakeAutopilot
 from scipy.spatial.transform import Rotation
 
 from zsim.math.frames import heading
@@ -120,6 +120,33 @@ def test_a_pilot_who_takes_over_is_left_alone_until_the_next_take_off(autopilot:
     loop.until("hovering", Demand("take_off"))
     loop.run(3, Demand("fly", (1.0, 0.0, 0.0)))
     assert loop.pose.velocity_m_s[0] == pytest.approx(1.0, abs=0.01)
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize("landed", [IN_AIR, LANDING])
+def test_who_is_landed_by_somebody_else_is_not_led_back(autopilot: int, landed: int):
+    """Also before its landed state shows it."""
+    loop = Loop(autopilot)
+    loop.until("hovering", Demand("take_off"))
+    loop.run(2, Demand("hold"))
+    loop.vehicle.mode, loop.vehicle.landed = LAND if autopilot == PX4 else 9, landed
+    loop.run(0.3, Demand("hold"))
+    loop.sent.clear()
+    loop.run(2, Demand("fly", (1.0, 0.0, 0.0)))
+    assert loop.vehicle.mode in (LAND, 9)
+    assert not any(isinstance(message, dialect.SetPositionTargetLocalNed) for message in loop.sent)
+    assert sum("control" in text for text in loop.session.texts) == 1
+
+
+@AUTOPILOTS
+def test_a_landing_of_its_own_is_no_take_over(autopilot: int):
+    loop = Loop(autopilot)
+    loop.until("hovering", Demand("take_off"))
+    loop.run(2, Demand("hold"))
+    loop.run(0.1, Demand("land"))
+    loop.vehicle.mode = LAND if autopilot == PX4 else 9
+    loop.until("landed", Demand("land"))
+    assert not any("control" in text for text in loop.session.texts)
 
 
 def test_an_autopilot_that_fell_back_to_hold_is_led_back():

@@ -9,7 +9,7 @@ from zsim.contract.flight_messages import Ardrone, Mode, Velocity
 from zsim.math.frames import quaternion_from_heading
 from zsim.scenario.scenario import Silence
 from zsim_bridges.vehicle_links.aircraft_state import AircraftPose, AircraftState
-from zsim_bridges.vehicle_links.failsafe import TAKEOFF_S, Failsafe
+from zsim_bridges.vehicle_links.failsafe import RESET_S, TAKEOFF_S, Failsafe
 from zsim_bridges.vehicle_links.flight_limits import FlightLimits
 
 S = 1_000_000_000
@@ -25,11 +25,13 @@ class Flight:
         self.position, self.yaw = (0.0, 0.0, 1.0), 0.0
         self.state: Any = state
         self.hears_clock = True
+        self.received_ns: int | None = None  # None: now
 
     @property
     def vehicle(self) -> AircraftState:
         w, x, y, z = quaternion_from_heading(self.yaw).tolist()
-        return AircraftState(self.state, 90.0, AircraftPose(self.now_ns, self.position, q_WB=(w, x, y, z)), self.now_ns)
+        pose = AircraftPose(self.now_ns, self.position, q_WB=(w, x, y, z))
+        return AircraftState(self.state, 90.0, pose, self.received_ns or self.now_ns)
 
     def after(self, seconds: float) -> str:
         """Let time pass; return what is asked of the aircraft then."""
@@ -168,6 +170,54 @@ def test_a_takeoff_is_watched_as_a_flight():
     assert other.after(1.0) == "land"
 
 
+@pytest.mark.parametrize("airborne", [True, False])
+def test_an_aircraft_in_an_emergency_of_its_own_is_sent_nothing_more(airborne: bool):
+    """Else the repeated take-off would start it again as soon as the emergency is over."""
+    flight = Flight()
+    flight.mode("takeoff")
+    flight.state = "hovering" if airborne else "taking_off"
+    flight.after(0.1)
+    flight.state = "emergency"
+    assert flight.after(0.1) == "none"
+    flight.state = "landed"
+    assert flight.mode("takeoff")
+    assert flight.after(1) == "none"
+    assert not flight.failsafe.armed
+
+
+def test_an_emergency_of_its_own_is_left_by_reset_which_is_given_up():
+    flight = Flight(armed=False, state="emergency")
+    assert flight.mode("reset") is None
+    assert flight.after(RESET_S - 0.1) == "reset"
+    assert flight.after(0.2) == "none"
+
+
+def test_an_aircraft_that_lands_by_itself_is_landed_and_disarmed():
+    flight = Flight().takes_off()
+    flight.fly(1, 0, 0)
+    flight.state = "landing"
+    assert flight.after(0.1) == "land"
+    flight.state = "landed"
+    assert flight.after(2) == "none"
+    assert not flight.failsafe.armed
+
+
+def test_to_a_silent_aircraft_nothing_but_a_landing_or_a_stop_is_sent():
+    flight = Flight().takes_off()
+    flight.fly(1, 0, 0)
+    flight.received_ns = flight.now_ns
+    assert flight.after(0.4) == "fly"
+    assert flight.after(0.8) == "none"
+    flight.received_ns = None
+    flight.fly(1, 0, 0)
+    assert flight.after(0.1) == "fly"
+    flight.received_ns = flight.now_ns
+    flight.mode("land")
+    assert flight.after(2) == "land"
+    flight.mode("emergency")
+    assert flight.after(2) == "kill"
+
+
 def test_a_driver_that_begins_in_flight_holds():
     flight = Flight(state="flying")
     assert flight.after(0.1) == "hold"
@@ -197,6 +247,7 @@ def test_an_accepted_emergency_stops_the_motors_armed_or_not_and_disarms(armed: 
     assert flight.after(0.1) == "kill"
     flight.state = "emergency"
     assert flight.mode("reset") is None
+    assert flight.after(0.1) == "reset"
     flight.state = "landed"
     assert flight.after(0.1) == "none"
     assert flight.mode("takeoff")
