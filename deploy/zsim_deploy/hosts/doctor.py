@@ -15,6 +15,7 @@ from zsim_deploy.hosts.doctor_tables import hosts_table, paths_table
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.host_links import ProgramEndedError, RemoteProgram, open_program
 from zsim_deploy.hosts.host_plan import leftovers, port_in_use
+from zsim_deploy.hosts.host_report import HostReport, NetworkPath
 from zsim_deploy.hosts.ssh_connection import shell_line, shell_word
 from zsim_deploy.inventory import enrolment
 from zsim_deploy.inventory import inventory as inv
@@ -33,26 +34,6 @@ NO_PROGRAM = ("not found", "no such file")  # in the errors of shells, in lower 
 NO_PROGRAM_CODES = (126, 127)  # … and the codes with which they end; POSIX, 2.8.2
 NEEDED_TO_COMPUTE = "scipy"  # without it a host runs no world and no agent; a router, or a recorder, does without
 OFFSET_ASKS = 3  # the answer with the shortest round trip gives the clock's offset best
-
-
-class HostReport(NamedTuple):
-    """The facts of a host by its own probe, and what asking it showed."""
-
-    facts: dict[str, Any]
-    round_trip_s: float
-    clock_offset_s: float
-    """Its wall clock minus ours, good to half the round trip."""
-    remedy: str = "run `zsim push --hosts FILE`"
-    """How it gets another zsim."""
-
-
-class NetworkPath(NamedTuple):
-    """How a host reaches the port on which another listens."""
-
-    source: str
-    target: str
-    port: int
-    figures: dict[str, Any]
 
 
 async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:

@@ -1,12 +1,10 @@
 """What `zsim doctor` shows of the hosts and of the network between them."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from zsim.terminal.fitted_table import Column, FittedTable
-
-if TYPE_CHECKING:
-    from zsim_deploy.hosts.doctor import HostReport, NetworkPath
+from zsim_deploy.hosts.host_report import HostReport, NetworkPath
 
 HOST_COLUMNS = (
     Column("host", "name"),
@@ -28,12 +26,12 @@ PATH_COLUMNS = (
 )
 
 
-def hosts_table(reports: "Mapping[str, HostReport]") -> FittedTable:
+def hosts_table(reports: Mapping[str, HostReport]) -> FittedTable:
     """Return what each host has and how it answers."""
     return FittedTable(HOST_COLUMNS, [_host_cells(name, report) for name, report in reports.items()])
 
 
-def _host_cells(name: str, report: "HostReport") -> tuple[str, ...]:
+def _host_cells(name: str, report: HostReport) -> tuple[str, ...]:
     facts = report.facts
     return (
         name,
@@ -48,7 +46,7 @@ def _host_cells(name: str, report: "HostReport") -> tuple[str, ...]:
     )
 
 
-def paths_table(paths: "Sequence[NetworkPath]") -> FittedTable:
+def paths_table(paths: Sequence[NetworkPath]) -> FittedTable:
     """Return how hosts reach the ports that they will connect to."""
     rows = [(path.source, path.target, str(path.port), *_path_cells(path.figures)) for path in paths]
     return FittedTable(PATH_COLUMNS, rows)

@@ -16,10 +16,11 @@ from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.arguments import pace_options
 from zsim_deploy.hosts.control_socket import ControlSocket
-from zsim_deploy.hosts.doctor import HostReport, compare_reports, host_report
+from zsim_deploy.hosts.doctor import compare_reports, host_report
 from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
 from zsim_deploy.hosts.host_links import HostLinks, fetch
 from zsim_deploy.hosts.host_plan import RECORD, HostPlan, leftovers, port_faults
+from zsim_deploy.hosts.host_report import HostReport
 from zsim_deploy.hosts.launcher_requests import LauncherRequests
 from zsim_deploy.hosts.remote_process import ProcessLog, RemoteProcess
 from zsim_deploy.hosts.ssh_connection import shell_word

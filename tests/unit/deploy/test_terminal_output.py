@@ -13,7 +13,8 @@ from zsim.errors import printable
 from zsim.runtime.progress import cell
 from zsim_deploy.cli import hosts_commands
 from zsim_deploy.hosts import control_socket, doctor, doctor_tables, status_table
-from zsim_deploy.hosts.doctor import CheckResult, HostReport, NetworkPath
+from zsim_deploy.hosts.doctor import CheckResult
+from zsim_deploy.hosts.host_report import HostReport, NetworkPath
 from zsim_deploy.push.push import PushProgress
 
 ROOT = Path(__file__).parents[3]

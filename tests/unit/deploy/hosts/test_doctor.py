@@ -22,8 +22,9 @@ from refused import has_terms, refused
 from zsim import __version__
 from zsim.errors import HostsError
 from zsim_deploy.hosts import doctor, probe
-from zsim_deploy.hosts.doctor import CheckResult, HostReport, NetworkPath, check_hosts, compare_reports, path_faults
+from zsim_deploy.hosts.doctor import CheckResult, check_hosts, compare_reports, path_faults
 from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.host_report import HostReport, NetworkPath
 from zsim_deploy.inventory import certificates
 from zsim_deploy.inventory.certificates import CertificateRequest
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile

@@ -6,8 +6,8 @@ import pytest
 from refused import has_terms
 from rich.console import Console
 
-from zsim_deploy.hosts.doctor import HostReport, NetworkPath
 from zsim_deploy.hosts.doctor_tables import hosts_table, paths_table
+from zsim_deploy.hosts.host_report import HostReport, NetworkPath
 
 SAID = {"python": "3.11.2", "zsim": "1", "fingerprint": "abc", "cores": 2, "load": 0.1, "governors": ["[/x]"]}
 

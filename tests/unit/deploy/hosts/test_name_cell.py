@@ -7,8 +7,8 @@ from rich.console import Console
 
 from zsim.terminal.fitted_table import FittedTable
 from zsim.terminal.name_cell import shortened
-from zsim_deploy.hosts.doctor import HostReport, NetworkPath
 from zsim_deploy.hosts.doctor_tables import hosts_table, paths_table
+from zsim_deploy.hosts.host_report import HostReport, NetworkPath
 from zsim_deploy.hosts.status_table import table
 
 COLUMNS = 80  # of a terminal, by default
