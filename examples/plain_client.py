@@ -11,7 +11,7 @@ ENDPOINT, SECONDS = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447", 
 ME, DRONE = "plain.client", "zsim/drone/drone1"
 _ = "/" in ENDPOINT or sys.exit("usage: python examples/plain_client.py [ENDPOINT]     e.g. tcp/127.0.0.1:7447")
 config = f'{{mode: "client", connect: {{endpoints: ["{ENDPOINT}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
-seq, last, inbox, gates = {}, {}, queue.SimpleQueue(), 0
+seq, last, inbox, gates, t_ns = {}, {}, queue.SimpleQueue(), 0, 0
 
 with zenoh.open(zenoh.Config.from_json5(config)) as session:
 

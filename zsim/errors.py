@@ -28,6 +28,15 @@ def printable(text: str) -> str:
     return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
+REASON_MAX = 300  # characters of a reason
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the message of an exception in one line, with the exception's type where it is none of zsim's."""
+    text = " ".join(str(error).split())[:REASON_MAX]
+    return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
+
+
 class ZsimError(Exception):
     """Base of everything that a user can cause; the command line prints it without a traceback."""
 

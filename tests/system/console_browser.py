@@ -11,6 +11,14 @@ from federation import Federation, Role, free_port
 from wire import PATIENCE_S
 
 VIEWPORT = {"width": 860, "height": 420}  # pictures without a graphics card take long
+SCREENS = ({"width": 1600, "height": 1000}, {"width": 1280, "height": 720}, {"width": 390, "height": 844})
+FOLDERS = ("Trajectory", "Any fault", "Other variables")
+TABLES = ("Drones", "Events")  # panels that are folded on a phone
+IN_SIGHT = """() => ['land', 'emergency'].every(name => {
+  const button = document.querySelector('#zsim-head button.' + name), box = button.getBoundingClientRect();
+  const inside = box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight;
+  return inside && document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2) === button;
+})"""
 POLL_MS = 100  # between two looks at what a page shows
 PATIENCE_MS = 1000 * PATIENCE_S
 
@@ -32,7 +40,34 @@ class BrowserPage:
         self.page.get_by_role("button", name=name, exact=True).click()
 
     def select_tab(self, tab: str) -> None:
-        self.page.get_by_role("tab", name=tab, exact=True).click()
+        wanted = self.page.get_by_role("tab", name=tab, exact=True)
+        if tab in TABLES:
+            self._unfold(wanted)
+        elif (folded := self.page.get_by_label("Collapse panel Drones")).is_visible():
+            folded.click()
+        wanted.click()
+
+    def _unfold(self, tab: Any) -> None:
+        """Open the panel of tables, where it is folded."""
+        row = self.page.get_by_label("Expand panel Drones")
+        row.or_(tab).first.wait_for(state="attached")
+        if row.is_visible():
+            row.click()
+
+    def open_folders(self) -> None:
+        """Open the folders of the tab that is shown."""
+        for name in FOLDERS:
+            folder = self.page.get_by_text(name, exact=True).first
+            if folder.is_visible() and folder.locator(".tabler-icon-chevron-down").count():
+                folder.click()
+
+    def close_notice(self) -> None:
+        """Close viser's notice of software WebGL, of a browser without a graphics card."""
+        self.page.locator(".mantine-Notification-closeButton").click()
+
+    def wait_for_notice(self) -> None:
+        """Wait until viser's notice of software WebGL is there."""
+        self.page.locator(".mantine-Notification-closeButton").wait_for()
 
     def wait_for_text(self, text: str) -> None:
         """Wait until the page shows a text."""

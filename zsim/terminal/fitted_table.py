@@ -71,7 +71,11 @@ class FittedTable:
         return [" ".join(each.header.split()) for i, each in enumerate(self.columns) if i not in shown]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if self.title is not None:
+            yield Text(printable(self.title), style="table.title")
         yield self._table(self._shown(console, options.max_width))
+        if self._caption is not None:
+            yield Text(printable(self._caption), style="table.caption")
 
     def _shown(self, console: Console, width: int) -> list[int]:
         """Return the places of the columns that a width has room for."""
@@ -92,8 +96,6 @@ class FittedTable:
 
     def _table(self, shown: Sequence[int]) -> Table:
         made = self._empty()
-        made.title = None if self.title is None else Text(printable(self.title))
-        made.caption = None if self._caption is None else Text(printable(self._caption))
         for place in shown:
             column = self.columns[place]
             is_figure = column.kind == "figure"
@@ -112,8 +114,6 @@ class FittedTable:
             box=self._lines,
             pad_edge=self._lines is not None,
             show_header=any(column.header for column in self.columns),
-            title_justify="left",
-            caption_justify="left",
         )
 
     def _least(self, place: int) -> int:

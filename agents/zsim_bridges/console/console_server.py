@@ -3,11 +3,13 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import viser
 
 from zsim.contract.messages import Info
+from zsim.record.record_reader import RECORD
 from zsim.transport.session import Session
 from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.monitoring.page_head import no_run_head
@@ -34,6 +36,7 @@ class Console:
         rate_hz: pictures a second; None: as many as suit the number of drones.
         say: prints a line.
         world: where a run is looked for, in words.
+        folder: where the run that is shown is recorded, as far as that is known here.
 
     Raises:
         RunError: others could reach it, and there is no token.
@@ -47,7 +50,9 @@ class Console:
         rate_hz: float | None,
         say: Callable[[str], None],
         world: str = "",
+        folder: Path | None = None,
     ) -> None:
+        self._files = {} if folder is None else run_files(folder)
         self._name = name
         self._world = world
         self._rate_hz = rate_hz
@@ -111,10 +116,17 @@ class Console:
         return self._run_page.state() if self._run_page else {"run_id": None}
 
     def _head(self) -> dict[str, Any]:
-        return self._run_page.head() if self._run_page else no_run_head(self._world)
+        head = self._run_page.head() if self._run_page else no_run_head(self._world)
+        return {**head, "files": self._files}
 
     def _command(self, op: str) -> str:
         return self._run_page.command(op) if self._run_page else "there is no run yet"
+
+
+def run_files(folder: Path) -> dict[str, str]:
+    """Return the paths of what a run leaves behind, by what it is."""
+    whole = folder.absolute()
+    return {"report": str(whole / "report.html"), "record": str(whole / RECORD)}
 
 
 def _show_text(gui: viser.GuiApi, text: str) -> None:

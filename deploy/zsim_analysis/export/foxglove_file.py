@@ -1,6 +1,7 @@
 """Writes the Foxglove file of a record and its layout, in order of time and in bounded memory.
 
-Foxglove reads all of it. Rerun draws no scenes; it has the transforms, poses, points, fixes, log and numbers.
+Foxglove reads all of it. Rerun draws no scenes; it has the transforms, poses, points, fixes, log and numbers, and shows
+them by a blueprint (rerun_blueprint).
 """
 
 import re
@@ -10,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 from foxglove import layouts
@@ -33,14 +34,30 @@ ARM_M = 0.1785  # m, the AR.Drone's, where the scenario is not known
 ROTOR_RADIUS = 0.57  # of the arm, where the rotors are not known: 0.102 m at the AR.Drone's 0.1785 m
 
 
+class ConvertedRun(NamedTuple):
+    """What was written of a run.
+
+    Attributes:
+        topics: messages by topic.
+        variables: by cluster, the fields of its numbers.
+        rotors: of every drone.
+        refused: messages that could not be read.
+    """
+
+    topics: dict[str, int]
+    variables: dict[str, tuple[str, ...]]
+    rotors: dict[str, list[RotorDisc]]
+    refused: int
+
+
 def convert(
     reader: RecordReader,
     selection: MessageSelection,
     path: Path,
     layout_path: Path,
     progress: Callable[[int, int], None],
-) -> tuple[dict[str, int], int]:
-    """Write the MCAP file and its layout; return messages by topic, and how many could not be read.
+) -> ConvertedRun:
+    """Write the MCAP file and its layout; return what is in the file, and how many messages could not be read.
 
     Args:
         reader: of the record.
@@ -56,7 +73,8 @@ def convert(
     scenario = scenario_of(info)
     drones = [subject(key) for key in wanted if key.startswith("drone/")]
     decoded = DecodedMessages(selection.messages(reader, wanted), _decode, lambda done: progress(done, total))
-    file = FoxgloveFile(path, _rotors(info, scenario, dict.fromkeys(drones)), _spaces(scenario))
+    rotors = _rotors(info, scenario, dict.fromkeys(drones))
+    file = FoxgloveFile(path, rotors, _spaces(scenario))
     with deferred_signals() as check:
         try:
             for instant in chain(_cameras_before(reader, selection, wanted), instants(decoded)):
@@ -65,7 +83,7 @@ def convert(
         finally:
             file.close()
     layout_path.write_text(layout(file.counts, file.variables()) + "\n", encoding="utf-8")
-    return dict(sorted(file.counts.items())), decoded.refused
+    return ConvertedRun(dict(sorted(file.counts.items())), file.variables(), rotors, decoded.refused)
 
 
 def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: Iterable[str]) -> Iterator[Instant]:

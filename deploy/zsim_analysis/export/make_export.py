@@ -32,6 +32,8 @@ MATLAB = b"MATLAB 5.0 MAT-file Platform: "  # as SciPy begins a file; MATLAB its
 MCAP, MCAP_LIBRARY = b"\x89MCAP", b"foxglove-sdk"  # a file for Foxglove names its library; a record names zsim
 HEAD_MAX = 200  # bytes within which an MCAP file has named its library
 LAYOUT = "-layout.json"  # end of the name of the file beside one for Foxglove
+BLUEPRINT = ".rbl"  # likewise, for Rerun
+RERUN = b"RRF2"  # as Rerun's files begin
 RUN_FILES = ("run.mcap", "scenario.yaml", "summary.json", "report.html")  # what no export may replace
 
 Progress = Callable[[int, int], None]  # messages read so far, of how many
@@ -118,16 +120,20 @@ def _sink(form: Format, new: Path, survey: TableSurvey) -> Any:
 def _foxglove(
     reader: RecordReader, selection: MessageSelection, target: Path, force: bool, progress: Progress
 ) -> ExportResult:
+    from zsim_analysis.export import rerun_blueprint
     from zsim_analysis.export.foxglove_file import convert
 
-    layout = target.with_name(f"{target.stem}-layout.json")
-    for path in (target, layout):
+    beside = (target.with_name(f"{target.stem}{LAYOUT}"), target.with_suffix(BLUEPRINT))
+    targets = (target, *(beside if rerun_blueprint.is_available() else beside[:1]))
+    for path in targets:
         check_free(path, force, reader.path)
-    with placed(target, layout) as (new, new_layout):
-        topics, refused = convert(reader, selection, new, new_layout, progress)
-        if not topics:
+    with placed(*targets) as (new, new_layout, *new_blueprint):
+        run = convert(reader, selection, new, new_layout, progress)
+        if not run.topics:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
-    return ExportResult((target, layout), topics, [*record_notes(reader), *_refused(refused)])
+        for path in new_blueprint:
+            rerun_blueprint.write_blueprint(path, target.stem, run.topics, run.variables, run.rotors)
+    return ExportResult(targets, run.topics, [*record_notes(reader), *_refused(run.refused)])
 
 
 def _refused(count: int) -> list[str]:
@@ -196,6 +202,8 @@ def _is_export(file: Path) -> bool:
         head = opened.read(HEAD_MAX)
     if file.name.endswith(LAYOUT):
         return head.startswith(b"{")
+    if file.name.endswith(BLUEPRINT):
+        return head.startswith(RERUN)
     return file.name not in RUN_FILES and (head.startswith(MATLAB) or (head.startswith(MCAP) and MCAP_LIBRARY in head))
 
 

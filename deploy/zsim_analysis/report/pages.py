@@ -25,7 +25,7 @@ COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's con
 PAPER_DPI = 200  # of figures as wide as these
 PAPER_PT, SCREEN_PT = 8.0, 10.0  # of text, points
 LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of an entry of a legend besides its name, in its text's size
-FONTS: dict[str, Any] = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE takes no Type 3
+FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE takes no Type 3
 POINTS = 2000  # per line: more than a page has pixels
 # Okabe and Ito's colours, distinct with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"

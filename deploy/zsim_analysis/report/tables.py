@@ -4,12 +4,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from msgspec import Struct
+from rich.box import HEAVY_HEAD
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from zsim.errors import printable
-from zsim.runtime.progress import cell
+from zsim.terminal.fitted_table import Column, FittedTable
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import ParameterErrors
 from zsim_analysis.reading.verdict import NOT_AS_PLANNED, marks_of
@@ -17,6 +17,20 @@ from zsim_analysis.report.summary import ClusterErrors, RunSummary
 
 PAPER_COLUMN = "paper std"
 COLUMNS = ("parameter", PAPER_COLUMN, "est. std", "est. mean", "true std", "true RMS", "true mean")
+TERMINAL_COLUMNS = {
+    "parameter": Column("parameter", "name"),
+    PAPER_COLUMN: Column("paper\nstd", worth=4, right=True),
+    "est. std": Column("est.\nstd", worth=3, right=True),
+    "est. mean": Column("est.\nmean", worth=1, right=True),
+    "true std": Column("true\nstd", right=True),
+    "true RMS": Column("true\nRMS", right=True),
+    "true mean": Column("true\nmean", worth=2, right=True),
+    "parameters": Column("parameters", "name"),
+    "count": Column("count", worth=1, right=True),
+    "est. RMS": Column("est.\nRMS", worth=2, right=True),
+    "worst": Column("worst", worth=3, right=True),
+    "of": Column("of", "name"),
+}
 GROUP_COLUMNS = ("parameters", "count", "est. RMS", "true RMS", "worst", "of")
 SINGLY_MAX = 24  # parameters of a formation that need no table by groups: of 6 drones
 FRAME = {"x_c": "position", "y_c": "position", "z_c": "position"} | dict.fromkeys(("roll", "pitch", "yaw"), "attitude")
@@ -77,7 +91,7 @@ def terminal_text(summary: RunSummary) -> Group:
     return Group(*lines, *(table(summary, name) for name in summary.clusters))
 
 
-def table(summary: RunSummary, cluster: str) -> Table:
+def table(summary: RunSummary, cluster: str) -> FittedTable:
     """Return the errors of one cluster, with the paper's Table I beside Test 1, for the terminal."""
     start, end = summary.window_s
     judged = summary.clusters[cluster]
@@ -88,9 +102,5 @@ def table(summary: RunSummary, cluster: str) -> Table:
     caption = "est. = estimate − desired, true = truth − desired"
     if content.rest:
         caption += f"; all {len(content.rest.rows)} parameters: report.html, summary.json"
-    shown = Table(title=cell(f"{title}{beside}{mark}"), caption=caption, title_justify="left")
-    for place, column in enumerate(content.columns):
-        shown.add_column(column, justify="right" if place else "left", no_wrap=place == 0, min_width=5)
-    for row in content.rows:
-        shown.add_row(*map(cell, row))
-    return shown
+    columns = [TERMINAL_COLUMNS[column] for column in content.columns]
+    return FittedTable(columns, content.rows, f"{title}{beside}{mark}", caption, lines=HEAVY_HEAD)

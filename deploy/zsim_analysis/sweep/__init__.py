@@ -5,6 +5,6 @@
     make_sweep_report(DIR)                                 distributions with intervals, DIR/report.html
 
 `axes` and `design` define the runs; `sweep_run` flies one; `process_pool` and `dask_pool` fly many; `sweep_folder`
-keeps their rows; `points` computes what `sweep_figures` and `make_sweep_report` show.
+keeps their rows; `metrics` calls a function of the user's; `points` computes what `report` shows.
 Imports in_process, reading and report.
 """

@@ -16,6 +16,7 @@ from zsim.schema import yaml_file
 from zsim.schema.checker import show
 
 SEED = "seed"
+SHOWN_MAX = 24  # characters of a value in a table or figure
 SEEDS = 2**32  # drawn below it: ten digits that a person can type
 SYNTAX = "seed, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
 FieldPath = tuple[str | int, ...]  # steps to a field of a scenario from the top
@@ -107,6 +108,12 @@ def _draw(path: str, kind: str, arguments: str) -> Draw:
 def text_of(value: Any) -> str:
     """Return a value as `--set` takes it, in one line."""
     return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def shown(value: Any) -> str:
+    """Return a value in short, for tables and figures."""
+    text = f"{value:g}" if isinstance(value, float) else text_of(value)
+    return text if len(text) <= SHOWN_MAX else f"{text[: SHOWN_MAX - 1]}…"
 
 
 def field_path(document: dict[str, Any], path: str) -> FieldPath:

@@ -14,8 +14,8 @@ from distributed import as_completed as _as_completed
 from distributed.comm.core import connect
 
 from zsim import __version__
-from zsim.errors import RunError
-from zsim_analysis.sweep.sweep_run import Row, Task, failed_row, fly, reason_of
+from zsim.errors import RunError, reason_of
+from zsim_analysis.sweep.sweep_run import Row, Task, failed_row, fly
 
 AHEAD = 2  # tasks per thread of the cluster, so that none of them waits for us
 CONNECT_S = 5.0  # wall time after which a scheduler that does not answer is an error

@@ -22,6 +22,7 @@ from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import first_lines
 from zsim_agents.hosting import check_classes
 from zsim_analysis.sweep.axes import SEED, Axis, Draw, FieldPath, Grid, field_path, is_inside, parse, text_of
+from zsim_analysis.sweep.metrics import check_metrics
 
 PLAN = "plan.json"
 RUNS_MAX = 1_000_000
@@ -140,6 +141,7 @@ class SweepDesign:
         if faults:
             raise ScenarioError(faults)
         check_classes(scenario, self.plan.source)
+        check_metrics(scenario, self.plan.source)
         check_pace(scenario, "lockstep")
         return scenario
 

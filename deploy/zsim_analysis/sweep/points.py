@@ -11,10 +11,12 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.errors import ScenarioError
+from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.report.paper import paper_table
-from zsim_analysis.sweep.axes import Draw, text_of
+from zsim_analysis.sweep.axes import Draw, Seeds, shown
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.intervals import LEVEL, ConfidenceInterval, mean_interval, share_interval
+from zsim_analysis.sweep.metrics import metric_columns, metrics_function
 from zsim_analysis.sweep.sweep_run import FIXED, Row, engaged_column
 
 STATISTICS = ("est_std", "true_std", "true_rms", "true_mean")
@@ -30,6 +32,16 @@ class FormationParameter(Struct, frozen=True):
 
     name: str
     cluster: str | None = None
+
+    @property
+    def unit(self) -> str:
+        """Return the unit, m or rad."""
+        return unit(self.name)
+
+    @property
+    def titled(self) -> str:
+        """Return the name with its unit, and the cluster's where one is needed."""
+        return self.labelled(f"{self.name} ({self.unit})")
 
     def labelled(self, text: str) -> str:
         """Return a text about the variable, with the cluster's name where one is needed."""
@@ -83,6 +95,8 @@ class SweepSummary(Struct, frozen=True):
         windows_s: the judged windows, least start and greatest end of all runs; None where no run has one.
         paper_std: Table I by parameter, empty for any flight but Test 1.
         parameters: of the formations, by the beginning of their columns.
+        metrics: columns of the figures of the user's own.
+        unmeasured: by the reason, how many runs have none of those.
     """
 
     scenario: str
@@ -102,16 +116,13 @@ class SweepSummary(Struct, frozen=True):
     fingerprints: dict[str, int]
     version: str
     parameters: dict[str, FormationParameter]
+    metrics: tuple[str, ...]
+    unmeasured: dict[str, int]
     points: list[GridPoint]
 
     def json(self) -> bytes:
         """Return the text of summary.json; what is not known is null."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
-
-    @property
-    def grid(self) -> str:
-        """Return what the labels of the points are values of."""
-        return " · ".join(path.rpartition(".")[2] or path for path in self.points[0].values) or "point"
 
     @property
     def flown(self) -> list[GridPoint]:
@@ -134,6 +145,9 @@ class SweepResults:
         self.well = np.array([row["failure"] is None for row in rows], bool)
         self.errors = _error_columns(rows)
         self.clusters = _clusters(rows)
+        self.metrics = metric_columns(rows)
+        self.metrics_function = metrics_function(design.plan.document)
+        self.has_seeds = any(isinstance(axis, Seeds) for axis in design.axes)
         self.drawn = [axis.path for axis in design.axes if isinstance(axis, Draw)]
         self.paper_std = _paper_std(design)
 
@@ -179,7 +193,7 @@ class SweepResults:
     def label(self, point: int) -> str:
         """Return the values of a point in short; "all runs" where there is no grid."""
         values = self.design.at(point).values()
-        return " · ".join(_shown(value) for value in values) or "all runs"
+        return " · ".join(shown(value) for value in values) or "all runs"
 
     def summary(self) -> SweepSummary:
         """Return the content of summary.json."""
@@ -206,13 +220,17 @@ class SweepResults:
             fingerprints=dict(Counter(row["fingerprint"] for row in rows if row["fingerprint"])),
             version=plan.version,
             parameters=self.parameters(),
+            metrics=tuple(self.metrics),
+            unmeasured=dict(
+                Counter(row["metrics_failure"] for row in rows if row.get("metrics_failure")).most_common()
+            ),
             points=[self._point(point) for point in range(self.design.points)],
         )
 
     def _point(self, point: int) -> GridPoint:
         well, runs = self.ended_well(point)
         engaged, of = self.engaged(point)
-        columns = ("min_separation_m", *self.errors)
+        columns = ("min_separation_m", *self.errors, *self.metrics)
         spreads = {column: each for column in columns if (each := distribution(self.values(column, point)))}
         return GridPoint(
             label=self.label(point),
@@ -271,8 +289,3 @@ def _paper_std(design: SweepDesign) -> Mapping[str, float]:
     except ScenarioError:
         return {}
     return paper_table(scenario, scenario.clusters[0].name) if len(scenario.clusters) == 1 else {}
-
-
-def _shown(value: Any) -> str:
-    text = f"{value:g}" if isinstance(value, float) else text_of(value)
-    return text if len(text) <= 24 else f"{text[:23]}…"

@@ -19,6 +19,7 @@ from zsim_analysis.sweep.sweep_run import Row, Task
 
 PLAIN_S = 10.0  # wall time between two lines where no terminal is
 BAR = 20  # characters
+UNMEASURED_MAX = 5  # lines about runs without figures of the user's own
 
 
 class SweepScreen:
@@ -37,6 +38,7 @@ class SweepScreen:
         self._total = total
         self._before = self._done = done
         self._failed = 0
+        self._unmeasured = 0
         self._now_s = now_s
         self._start_s = now_s()
         self._throttle = Throttle(PLAIN_S)
@@ -64,6 +66,13 @@ class SweepScreen:
         self._failed += failed
         if not self.console.is_terminal and self._done < self._total and self._throttle.passes():
             self.say(self.line())
+
+    def unmeasured(self, run: int, reason: str) -> None:
+        """Show a line about a run that has no figures of the user's own, for the first such runs."""
+        self._unmeasured += 1
+        if self._unmeasured <= UNMEASURED_MAX:
+            more = "; further ones are in the table" if self._unmeasured == UNMEASURED_MAX else ""
+            self.say(f"run {run}: {reason}{more}")
 
     def line(self) -> str:
         """Return runs done, runs per hour since the start, and time to go at that rate."""
@@ -158,6 +167,8 @@ def _fly(folder: SweepFolder, pool: WorkerPool, missing: list[int], screen: Swee
         for row in rows:
             journal.append(row)
             screen.finished(row["failure"] is not None)
+            if row.get("metrics_failure"):
+                screen.unmeasured(row["run"], row["metrics_failure"])
 
 
 def _tasks(folder: SweepFolder, runs: list[int]) -> Iterator[Task]:

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Struct
 
 from zsim.contract.fingerprint import fingerprint
-from zsim.errors import RecordError, ZsimError
+from zsim.errors import RecordError, reason_of
 from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -23,10 +23,11 @@ from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading.flight import FlightReader, RecordedFlight
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.report.summary import RunSummary, summarise
+from zsim_analysis.sweep.metrics import NO_METRICS, metrics_of
 
 Row = dict[str, Any]
-"""Values by column; the columns are `FIXED`, the varied paths, when each cluster was engaged (`engaged_column`), and
-the errors by their paths in summary.json."""
+"""Values by column; the columns are `FIXED`, the varied paths, when each cluster was engaged (`engaged_column`),
+the errors by their paths in summary.json, and `metrics.NAME` of the user's own."""
 
 
 class Task(Struct, frozen=True):
@@ -59,6 +60,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
         engaged_throughout: whether every cluster was engaged at every instant of it, None without a cluster.
         as_planned: whether the flight did what its plan says.
         shortfall: the first thing that it did not do.
+        metrics_failure: why it has no figures of the user's own, None if it has, or none are asked for.
         window_from_s, window_to_s: the judged window.
         host: where it was flown.
         fingerprint: numeric; equal ones promise equal bits.
@@ -79,6 +81,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
     engaged_throughout: bool | None = None
     as_planned: bool | None = None
     shortfall: str | None = None
+    metrics_failure: str | None = None
     window_from_s: float | None = None
     window_to_s: float | None = None
     host: str = ""
@@ -106,9 +109,6 @@ def failed_row(task: Task, reason: str, **known: Any) -> Row:
     return make_row(result, task.varied, {})
 
 
-REASON_MAX = 300  # characters
-
-
 def fly(task: Task) -> Row:
     """Return the row of a run; an error of the run is in its row and does not end the sweep.
 
@@ -127,12 +127,6 @@ def fly(task: Task) -> Row:
         return failed_row(task, reason_of(error), **where)
     engaged = engaged_s(formations, summary.window_s)
     return _row(task, flight, summary, engaged, diverged, where)
-
-
-def reason_of(error: BaseException) -> str:
-    """Return the message of an exception in one line."""
-    text = " ".join(str(error).split())[:REASON_MAX]
-    return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
 
 
 def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[RecordedFlight, Exception | None]:
@@ -210,6 +204,7 @@ def _row(
     where: dict[str, str],
 ) -> Row:
     clusters = [cluster.name for cluster in task.scenario.clusters]
+    metrics = NO_METRICS if diverged else metrics_of(task.scenario, flight)
     result = RunResult(
         run=task.run,
         point=task.point,
@@ -226,14 +221,15 @@ def _row(
         engaged_throughout=not _outside_plan(summary, ("window", "early", "engagement")) if clusters else None,
         as_planned=summary.as_planned,
         shortfall=next((each.text for each in summary.shortfalls if each.fails), None),
+        metrics_failure=metrics.failure,
         window_from_s=summary.window_s[0],
         window_to_s=summary.window_s[1],
         **where,
     )
-    engaged_columns = {engaged_column(name): engaged.get(name) for name in clusters}
-    return make_row(
-        result, task.varied, engaged_columns if diverged else {**engaged_columns, **_errors(summary, engaged)}
-    )
+    columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
+    if not diverged:
+        columns.update(_errors(summary, engaged))
+    return make_row(result, task.varied, {**columns, **metrics.columns})
 
 
 def _outside_plan(summary: RunSummary, kinds: tuple[str, ...]) -> set[str]:

@@ -56,6 +56,9 @@ def console(
         str,
         typer.Option(help="Process name (default the certificate's, or console.1, .2, …)."),
     ] = "",
+    folder: Annotated[
+        Path | None, typer.Option(help="Folder of the run, named on the page when it is over.", show_default=False)
+    ] = None,
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
     require("console", CONSOLE_NEEDS)
@@ -72,7 +75,7 @@ def console(
     say = JsonProgress().say if reach.launched else log_printer(None)
     require_files(SERVER_FILES, "a console and its pages")
     world = f"federation {reach.federation!r} on {reach.endpoint}"
-    shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say, world)
+    shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say, world, folder)
     with shown.open():
         serve_runs(own_name, shown.serve, reach)
 

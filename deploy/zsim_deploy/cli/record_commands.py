@@ -27,6 +27,7 @@ SWEEP_NEEDS = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "
 DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
 WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy", Format.FOXGLOVE: "foxglove"}
 
+GATE = "a gate: an instant at which the processes meet"
 app = typer.Typer()
 Place = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)]
 
@@ -80,7 +81,7 @@ def _judge(record: Path) -> str:
 
 def _fault_of(complete: bool, state: str, shortfalls: "Sequence[Shortfall]") -> str:
     """Print whether the record is complete; return what it lacks, or what the flight did not do, empty if nothing."""
-    print(printable(f"record: {state}"))
+    print(printable(f"record: {state}{f' ({GATE})' if 'gates' in state else ''}"))
     lacking = "" if complete else f"the record is {state}"
     return lacking or next((each.text for each in shortfalls if each.fails), "")
 
@@ -138,8 +139,8 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
     from zsim_analysis.sweep.design import is_sweep
 
     if is_sweep(folder):
-        from zsim_analysis.sweep.make_sweep_report import make_sweep_report as make
-        from zsim_analysis.sweep.make_sweep_report import terminal_text
+        from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report as make
+        from zsim_analysis.sweep.report.terminal_tables import terminal_text
     else:
         from zsim_analysis.report.make_report import make_report as make
         from zsim_analysis.report.tables import terminal_text

@@ -89,7 +89,7 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
             ChildProcess(f"{role}.{thing}", [role, *reach, "--", thing], logs, launcher) for role, _, thing in split
         ]
     if options.console:
-        show = ["console", "--name", CONSOLE, "--port", str(page_port()), *reach]
+        show = ["console", "--name", CONSOLE, "--port", str(page_port()), "--folder", str(options.out), *reach]
         children.append(ChildProcess(CONSOLE, show, logs, launcher, supervisor.handle_line))
     for role, name, drones in options.camera_children():
         draw = [COMMANDS.get(role, role), "--name", name, *reach, "--", *drones]

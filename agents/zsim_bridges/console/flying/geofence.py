@@ -47,6 +47,7 @@ def geofence_of(scenario: Scenario) -> Geofence:
     """Return the fence of a scenario's drones: around all starts, and below the lowest ceiling."""
     starts = [drone.position_m for drone in scenario.drones]
     top_m = min(HEIGHT_MAX_M, *(drone.limits.altitude_m for drone in scenario.drones))
-    low = (round(min(p[axis] for p in starts)) - SIDEWAYS_M for axis in range(2))
-    high = (round(max(p[axis] for p in starts)) + SIDEWAYS_M for axis in range(2))
-    return Geofence((*low, min(HEIGHT_MIN_M, top_m / 2.0)), (*high, top_m))
+    xs, ys, _ = zip(*starts, strict=True)
+    low_m = (round(min(xs)) - SIDEWAYS_M, round(min(ys)) - SIDEWAYS_M, min(HEIGHT_MIN_M, top_m / 2.0))
+    high_m = (round(max(xs)) + SIDEWAYS_M, round(max(ys)) + SIDEWAYS_M, top_m)
+    return Geofence(low_m, high_m)

@@ -6,23 +6,25 @@ from typing import Any
 import numpy as np
 
 from zsim.contract.views import ViewCluster
+from zsim.drone_colours import drone_colours
 from zsim.math import frames
 from zsim.scenario.scenario import Obstacle, Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.flying.geofence import Geofence
-from zsim_bridges.console.scene.picture import CanvasTrails, DronePoses, ghosts
-from zsim_bridges.console.scene.scene_nodes import TRAIL_COLOURS
+from zsim_bridges.console.scene.picture import CanvasTrails, DronePoses, ghosts, short_names
+from zsim_bridges.console.scene.scene_nodes import LARGE_MAX
 
 DIGITS = 2  # of a metre: finer than a pixel
 HEADING_DIGITS = 3  # of a radian
 
 
 def surroundings(scenario: Scenario, fence: Geofence) -> dict[str, Any]:
-    """Return what does not change: names and colours of the drones, the fence, obstacles seen from above."""
-    colours = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in TRAIL_COLOURS.tolist()]
+    """Return what does not change: names, labels and colours of the drones, the fence, obstacles seen from above."""
+    names = [drone.name for drone in scenario.drones]
     return {
-        "names": [drone.name for drone in scenario.drones],
-        "colours": [colours[i % len(colours)] for i in range(len(scenario.drones))],
+        "names": names,
+        "labels": names if len(names) <= LARGE_MAX else short_names(names),
+        "colours": list(drone_colours(len(names))),
         "fence": {"low_m": fence.low_m, "high_m": fence.high_m},
         "obstacles": [_outline(each) for each in scenario.environment.obstacles],
     }

@@ -20,7 +20,7 @@ class _Action(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
     pass
 
 
-class LookFrom(_Action, tag="look"):
+class LookFrom(_Action, frozen=True, tag="look"):
     """Let the page's camera follow the formation, keep all of it in view, and look from somewhere."""
 
     page: Name
@@ -29,21 +29,21 @@ class LookFrom(_Action, tag="look"):
     direction: Literal["", "reset", "top", "side"] = ""
 
 
-class LookAtPlan(_Action, tag="plan"):
+class LookAtPlan(_Action, frozen=True, tag="plan"):
     """Send the view from above; `whole`: with what does not change."""
 
     page: Name
     whole: bool = False
 
 
-class ChooseDrone(_Action, tag="choose"):
+class ChooseDrone(_Action, frozen=True, tag="choose"):
     """Choose a drone on the page itself."""
 
     page: Name
     drone: Name
 
 
-class PlayRecord(_Action, tag="play"):
+class PlayRecord(_Action, frozen=True, tag="play"):
     """Let a replay go on from an instant, pause, resume, do a step, or change its pace; of operators only."""
 
     op: Literal["seek", "pause", "resume", "step", "rate"]
@@ -51,14 +51,14 @@ class PlayRecord(_Action, tag="play"):
     """Of seek simulated seconds, of step gates, of rate simulated per wall seconds."""
 
 
-class TakeDrone(_Action, tag="take"):
+class TakeDrone(_Action, frozen=True, tag="take"):
     """Take a drone, to fly it; `over` from whoever flies it; of operators only, as all below."""
 
     drone: Name
     over: bool = False
 
 
-class SteerDrone(_Action, tag="steer"):
+class SteerDrone(_Action, frozen=True, tag="steer"):
     """Fly the drone that was taken; not `held`: let it hover. To be repeated: who is silent does not fly."""
 
     held: bool = False
@@ -73,14 +73,14 @@ class SteerDrone(_Action, tag="steer"):
         return Stick(self.forward, self.left, self.up, self.turn, self.speed_m_s) if self.held else None
 
 
-class GoToPlace(_Action, tag="go"):
+class GoToPlace(_Action, frozen=True, tag="go"):
     """Send the drone that was taken to a place, at the height that it has."""
 
     x_m: Metres
     y_m: Metres
 
 
-class LeaveDrone(_Action, tag="leave"):
+class LeaveDrone(_Action, frozen=True, tag="leave"):
     """Give the drone back."""
 
 

@@ -13,6 +13,7 @@ from zsim_analysis.reading.recorded_flight import Array
 from zsim_analysis.report.comparison import ComparedRun, clusters, parameters
 from zsim_analysis.report.figures.comparison_drones import WIDTH_IN, columns, draw_drones, draw_plans
 from zsim_analysis.report.figures.formation_figures import curves, draw_error, parameter_groups, scale
+from zsim_analysis.report.figures.run_marks import LANE_IN, draw_instants, draw_lanes, name_marks, run_marks
 from zsim_analysis.report.figures.run_style import run_style
 from zsim_analysis.report.figures.time_marks import draw_marks, time_marks
 from zsim_analysis.report.pages import (
@@ -79,7 +80,7 @@ def _of_parameters(
             yield ReportFigure(
                 f"{file}_{cluster}.png",
                 f"{what} (the paper's Figure {number}){suffix}",
-                f"True and measured (from the estimates) {', '.join(shown)}; dotted: desired; upright: engagement.",
+                f"True and measured (from the estimates) {', '.join(shown)}; dotted: desired. Above: each run's marks.",
                 _draw_parameters(runs, cluster, shown),
             )
 
@@ -162,8 +163,10 @@ def _greatest(runs: Sequence[ComparedRun], cluster: str, name: str) -> float:
 
 def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
     """Return variables over time: true on the left, measured on the right, the runs over each other."""
-    figure = new_figure(WIDTH_IN, 1.2 + 2.1 * len(names))
-    grid = figure.subplots(len(names), 2, squeeze=False, sharex=True, sharey="row")
+    lanes_in, marks = LANE_IN * len(runs), run_marks(runs, cluster)
+    figure = new_figure(WIDTH_IN, 1.2 + 2.1 * len(names) + lanes_in)
+    heights = [lanes_in, *[2.0] * len(names)]
+    lanes, *grid = figure.subplots(len(heights), 2, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
     for name, (true_axes, measured_axes) in zip(names, grid, strict=True):
         dress(true_axes, label(name))
         dress(measured_axes)
@@ -174,13 +177,16 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
                 drawn += _draw_run(true_axes, measured_axes, formation, name, i, run.name)
         if drawn:
             scale(true_axes, *drawn)
-        _mark_engagements((true_axes, measured_axes), [run.formation(cluster) for run in runs])
-    grid[0, 0].plot([], [], label="desired, while engaged", **DESIRED)
-    grid[0, 0].set_title("true", fontsize=10)
-    grid[0, 1].set_title("measured (estimates)", fontsize=10)
+        for axes in (true_axes, measured_axes):
+            draw_instants(axes, marks)
+    for axes, title in zip(lanes, ("true", "measured (estimates)"), strict=True):
+        draw_lanes(axes, marks, named=axes is lanes[0])
+        axes.set_title(title, fontsize=10)
+    grid[0][0].plot([], [], label="desired, while engaged", **DESIRED)
+    name_marks(grid[0][0], marks)
     label_time(grid[-1])
-    figure.align_ylabels(grid[:, 0])
-    legend_above(figure, grid[0, 0])
+    figure.align_ylabels([row[0] for row in grid])
+    legend_above(figure, grid[0][0])
     return figure
 
 
@@ -198,14 +204,6 @@ def _draw_run(
         line(axes, formation.t_s, np.where(engaged, desired, np.nan), **DESIRED)
     since = formation.since_engaged
     return [true, measured[since], desired[since]]
-
-
-def _mark_engagements(axes: Sequence[Axes], formations: Sequence[Formation | None]) -> None:
-    """Draw when each run's formation was engaged, in the run's colour."""
-    for index, formation in enumerate(formations):
-        if formation is not None and formation.engaged_s is not None:
-            for each in axes:
-                each.axvline(formation.engaged_s, color=run_style(index).color, lw=0.9, ls="-.", zorder=1.5)
 
 
 def _draw_absence(axes: Axes) -> None:

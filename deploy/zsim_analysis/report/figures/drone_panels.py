@@ -1,6 +1,6 @@
 """Altitude, state of the firmware and battery of every drone, on one time axis."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,7 +30,7 @@ from zsim_analysis.report.pages import (
     text_pt,
 )
 
-LANES_IN = 8.0  # of states: half of it on the page; more drones share it
+LANES_IN = 5.0  # of states: half of it on the page; more drones share it
 LANES_NAMED = 12  # of them, at most
 DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
 STATES = {
@@ -80,7 +80,7 @@ def drone_panel_heights(count: int) -> tuple[float, float, float]:
     return 3.0, 0.5 + min(0.28 * count, LANES_IN), 2.0
 
 
-def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: dict[str, str], named: int) -> None:
+def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: Mapping[str, str], named: int) -> None:
     """Draw drones into the axes of DRONE_PANELS.
 
     Args:
@@ -97,7 +97,7 @@ def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: 
         draw_states(state, track, lane)
     step = -(-len(tracks) // LANES_NAMED)
     state.set_yticks(range(0, len(tracks), step), [track.name for track in tracks[::step]])
-    state.invert_yaxis()
+    state.set_ylim(len(tracks) - 0.5, -0.5)
     state.grid(False)
     label_time([battery])
 

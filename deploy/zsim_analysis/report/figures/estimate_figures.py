@@ -31,6 +31,7 @@ EACH_MAX = 4  # drones with a column of their own on a page
 QUANTITIES = ("x (m)", "y (m)", "z (m)", "yaw (rad)")
 INSIDE = 0.9545  # share of a normal error within SIGMAS standard deviations
 SMALL_PT = PAPER_PT - 1.5
+CONSISTENT = "95 % of χ²"  # the range of NEES that nineteen of twenty have whose covariance is true
 FLOOR = 0.1  # of NEES on its axis, which is logarithmic
 
 
@@ -99,7 +100,7 @@ def _draw_nees(axes: Axes, t_s: Array, nees: Array, degrees: int, colour: str, o
     """Draw NEES, or its mean over `of` drones, with the range of nineteen of twenty consistent ones."""
     dress(axes)
     low, high = (float(chdtri(of * degrees, share)) / of for share in (0.975, 0.025))
-    axes.axhspan(low, high, color=ORANGE, alpha=0.25, lw=0, zorder=0.6, label="95 % of χ²")
+    axes.axhspan(low, high, color=ORANGE, alpha=0.25, lw=0, zorder=0.6, label=CONSISTENT)
     line(axes, t_s, np.maximum(nees, FLOOR), color=colour, lw=0.6, zorder=3)
     axes.set_yscale("log")
     axes.tick_params(which="both", labelsize=PAPER_PT - 1)
@@ -126,12 +127,17 @@ def _draw_many(
     t_s, distance, nees = _together(errors)
     dress(grid[0, 0], "position error (m)")
     draw_spread(grid[0, 0], t_s, distance, BLUE)
+    judged = t_s >= (marks.engaged_s or 0.0)  # before it, the start's noise would set the scale
+    grid[0, 0].set_ylim(0.0, 1.1 * float(np.max(distance[judged], initial=0.0)) or None)
     _draw_nees(grid[1, 0], t_s, nees.mean(axis=1), DEGREES, BLUE, of=len(errors))
+    grid[1, 0].set_yscale("linear")
     grid[1, 0].set_ylabel(f"NEES, mean of {len(errors)}", fontsize=PAPER_PT)
     draw_marks(grid[:, 0], marks)
     label_time(grid[1:, 0])
     _draw_each(grid[:, 1], errors, colours, window_s)
     figure.align_ylabels()
+    grid[0, 0].fill_between([], [], color=ORANGE, alpha=0.25, lw=0, label=CONSISTENT)
+    grid[0, 0].plot([], [], "_", color=BLACK, ms=5, label="σ as stated")
     legend_above(figure, grid[0, 0], columns=6)
     return figure
 
@@ -156,9 +162,8 @@ def _draw_each(
     rms, stated, inside = np.array([_figures(each, _rows(each, window_s)) for each in errors.values()]).T
     dress(panels[0], "RMS (m)")
     panels[0].scatter(numbers, rms, c=tints, s=14, zorder=3)
-    panels[0].plot(numbers, stated, "_", color=BLACK, ms=5, zorder=2, label="σ as stated")
+    panels[0].plot(numbers, stated, "_", color=BLACK, ms=5, zorder=2)
     panels[0].set_ylim(bottom=0)
-    panels[0].legend(fontsize=SMALL_PT, frameon=False, loc="best")
     panels[0].set_title("each drone, within the window", fontsize=PAPER_PT)
     dress(panels[1], f"x, y, z in {SIGMAS:g}σ (%)")
     panels[1].scatter(numbers, 100 * inside, c=tints, s=14, zorder=3)

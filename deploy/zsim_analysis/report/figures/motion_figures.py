@@ -73,6 +73,7 @@ def _draw_many(responses: Mapping[str, VelocityResponse], marks: TimeMarks) -> F
     for axes, quantity, table in zip(grid, panels, values, strict=True):
         dress(axes, quantity)
         draw_spread(axes, t_s, table, BLUE)
+    grid[0].set_title("flown − commanded", fontsize=PAPER_PT)
     draw_marks(grid, marks)
     label_time(grid[-1:])
     figure.align_ylabels()

@@ -77,7 +77,7 @@ def _draw_desired(axes: Axes, formation: Formation) -> None:
         desired = np.where(engaged[:, None], formation.desired, np.nan)
         x, y = (desired[:, formation.column(name)] for name in ("x_c", "y_c"))
         step = max(1, len(x) // 4000)
-        axes.plot(x[::step], y[::step], color=BLACK, lw=0.9, zorder=3, label=f"desired centroid of {formation.name}")
+        axes.plot(x[::step], y[::step], color=BLACK, lw=0.9, zorder=3, label=f"{formation.name}, desired")
 
 
 def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:

@@ -53,7 +53,8 @@ def _plain(
         yield ReportFigure(
             "plan_view.png",
             "Plan view",
-            "True paths from above, with the formation drawn at some instants of simulated time.",
+            "True paths from above, squares where they begin and dots where they end; black: desired centroid; grey: "
+            "the formation at some instants of simulated time.",
             draw_plan(flight, formations),
         )
     yield from _distances(flight, marks)

@@ -26,11 +26,12 @@ from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.record import RecordReader, RecordWriter
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
-from zsim_analysis.export import Format
+from zsim_analysis.export import Format, rerun_blueprint
 from zsim_analysis.export.foxglove_messages import NumericMessageType
-from zsim_analysis.export.foxglove_scene import Instant, RotorDisc
+from zsim_analysis.export.foxglove_scene import Instant, RotorDisc, colours_of
 from zsim_analysis.export.foxglove_topics import FoxgloveFile
 from zsim_analysis.export.make_export import export
+from zsim_analysis.export.rerun_blueprint import TIMELINE, drone_mesh, panels
 from zsim_analysis.export.selection import MessageSelection
 
 DRONES = ("drone1", "a-b.c", "end")
@@ -255,7 +256,7 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
     chosen = MessageSelection(("drone/end/truth", "world/**"), from_s=2.0, to_s=3.0)
     done = export(run, Format.FOXGLOVE, tmp_path / "some.mcap", chosen)
     topics = shown(tmp_path / "some.mcap")
-    assert done.paths == (tmp_path / "some.mcap", tmp_path / "some-layout.json")
+    assert done.paths[:2] == (tmp_path / "some.mcap", tmp_path / "some-layout.json")
     assert {topic.split("/")[2] for topic in topics if topic.startswith("/drone/")} == {"end"}
     assert [t_ns for t_ns, _ in topics["/drone/end/pose"]] == list(range(2 * 10**9, 3 * 10**9 + 1, 20_000_000))
     assert done.tables == {topic: len(found) for topic, found in topics.items()}
@@ -408,3 +409,55 @@ def test_rerun_plays_pictures_with_their_camera_in_the_drone_s_tree(filmed: Path
     assert rows["/drone/drone1/front_camera/image", "EncodedImage:blob"] == FILMED
     assert rows["/drone/drone1/front_camera/calibration", "Pinhole:image_from_camera"] == 1
     assert rows["/tf", "Transform3D:translation"] == FILMED + 1
+
+
+def test_the_blueprint_names_what_rerun_reads_of_the_file(run: Path, converted: Path) -> None:
+    topics = shown(run / "foxglove.mcap")
+    variables = {"main": tuple(topics["/cluster/main/variables"][0][1].DESCRIPTOR.fields_by_name)}
+    curves = [curve for _, curves in panels(topics, variables, colours_of(DRONES)) for curve in curves]
+    assert {curve.entity for curve in curves} == {"/cluster/main/variables", *(f"/drone/{d}/numbers" for d in DRONES)}
+    for curve in curves:
+        described = topics[curve.entity][0][1].DESCRIPTOR
+        assert curve.field in described.fields_by_name
+        assert curve.component == f"{described.full_name}:message"
+    assert {f"desired_{name}" for name in ("x_c", "beta")} <= {curve.field for curve in curves}
+
+
+def test_the_blueprint_has_meshes_plots_log_and_time(run: Path, converted: Path) -> None:
+    blueprint = run / "foxglove.rbl"
+    assert has_terms(rerun(run / "home", "rrd", "verify", str(blueprint)), "verified", "without error")
+    printed = rerun(run / "home", "rrd", "print", "-vvv", str(blueprint)).replace("\\", "")
+    for kind in ("3D", "TimeSeries", "TextLog"):
+        assert f"[{kind}]" in printed
+    for name in DRONES:
+        assert re.search(rf"overrides\S*/drone/{re.escape(name)}/pose", printed), name
+    assert "Mesh3D:vertex_positions" in printed
+    assert TIMELINE in printed
+
+
+def test_rerun_has_the_run_s_own_zero_as_a_duration(run: Path, converted: Path) -> None:
+    path = run / "own_zero.rrd"
+    rerun(run / "home", "mcap", "convert", str(run / "foxglove.mcap"), "--timeline-type", "duration", "-o", str(path))
+    printed = rerun(run / "home", "rrd", "print", "-vvv", str(path), "--entity", "/drone/end/pose")
+    assert TIMELINE in printed
+    assert "1970-01-01" not in printed
+    seconds = {float(each) for each in re.findall(r"PT(\d+(?:\.\d+)?)S", printed)}
+    assert {0.02, 0.5, 5.98} <= seconds
+
+
+def test_a_drone_s_mesh_reaches_to_the_rims_of_its_rotors() -> None:
+    rotors = [RotorDisc(0.2, 0.1, 0.1), RotorDisc(-0.2, -0.1, 0.05)]
+    mesh = drone_mesh(rotors, "#0072b2")
+    assert mesh.vertices_m[:, 0].max() == pytest.approx(0.3)
+    assert mesh.vertices_m[:, 0].min() == pytest.approx(-0.25)
+    assert len(mesh.colours) == len(mesh.vertices_m)
+    assert set(np.unique(mesh.triangles)) == set(range(len(mesh.vertices_m)))
+    corners = mesh.vertices_m[mesh.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    assert (area > 0).all()
+
+
+def test_without_rerun_s_library_there_is_no_blueprint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded_run.write(tmp_path / "run.mcap")
+    monkeypatch.setattr(rerun_blueprint, "is_available", lambda: False)
+    assert [path.name for path in export(tmp_path, Format.FOXGLOVE).paths] == ["foxglove.mcap", "foxglove-layout.json"]

@@ -14,6 +14,8 @@ from synthetic_record import Flown
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate, Status, Truth, Velocity
 from zsim.record import RecordWriter
+from zsim.schema.message import Vector3
+from zsim_analysis.reading import drone_errors
 from zsim_analysis.reading.distances import distances, separations
 from zsim_analysis.reading.drone_errors import YAW, estimate_errors, nees, velocity_responses
 from zsim_analysis.reading.flight import FlightReader, read_flight
@@ -44,12 +46,14 @@ def traffic(flown: Flown) -> Iterator[tuple[str, Any, int]]:
 def estimate_of(truth: Truth) -> Estimate:
     w, _, _, z = truth.orientation_wxyz
     yaw = 2 * math.atan2(z, w) + YAW_RAD
-    position, velocity = (
-        tuple(a + b for a, b in zip(*pair, strict=True))
-        for pair in ((truth.position_m, OFFSET_M), (truth.velocity_m_s, VELOCITY_M_S))
-    )
-    pose = (position, velocity, truth.orientation_wxyz, math.remainder(yaw, 2 * math.pi))
+    position, velocity = moved(truth.position_m, OFFSET_M), moved(truth.velocity_m_s, VELOCITY_M_S)
+    heading = math.remainder(yaw, 2 * math.pi)
+    pose = (position, velocity, truth.orientation_wxyz, heading)
     return Estimate(truth.t_ns, truth.seq, *pose, COVARIANCE, SIGMA_RAD, (0.0, 0.0, 0.0), {})
+
+
+def moved(vector: Vector3, by: Vector3) -> Vector3:
+    return vector[0] + by[0], vector[1] + by[1], vector[2] + by[2]
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +74,17 @@ def test_errors_of_estimates_and_what_is_stated_of_them(flight: RecordedFlight) 
         assert each.sigma[0] == pytest.approx([SIGMA_M] * 3 + [SIGMA_RAD], rel=1e-6)
         assert each.nees == pytest.approx(NEES, rel=1e-3)
         assert each.share_inside(np.ones(151, bool)).tolist() == [1.0, 0.0, 1.0, 0.0]
+
+
+def test_of_very_many_estimates_the_same_instants_of_all_drones_count(
+    flight: RecordedFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = estimate_errors(flight)
+    monkeypatch.setattr(drone_errors, "ESTIMATES_MAX", 200)  # of 3 x 151
+    some = estimate_errors(flight)
+    for name, each in some.items():
+        assert each.t_s == pytest.approx(whole[name].t_s[::3])
+        assert each.error == pytest.approx(whole[name].error[::3])
 
 
 def test_nees_of_a_covariance_that_is_none_is_not_known() -> None:

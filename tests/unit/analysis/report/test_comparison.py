@@ -12,10 +12,12 @@ import matplotlib.image
 import numpy as np
 import pytest
 import synthetic_record
+from matplotlib.colors import to_hex
 from refused import has_terms, refused
 from synthetic_record import Flown
 from typer.testing import CliRunner
 
+from zsim.contract.run_messages import Event
 from zsim.errors import RecordError, ReportError
 from zsim_analysis.report.comparison import (
     ABSENT,
@@ -28,6 +30,7 @@ from zsim_analysis.report.comparison import (
     scenario_rows,
 )
 from zsim_analysis.report.figures.comparison_figures import comparison_figures
+from zsim_analysis.report.figures.run_marks import POINTS
 from zsim_analysis.report.figures.run_style import STYLES, run_style
 from zsim_analysis.report.make_report import STATISTICS, compare, comparison_path, fact_rows, judge, statistics_rows
 from zsim_deploy.cli.cli import app
@@ -206,12 +209,48 @@ def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
         assert any(axes.has_data() for axes in figure.axes), name
     labels = [axes.get_xlabel() for axes in drawn["rms_main.png"].axes]
     assert [text.rpartition("(")[2] for text in labels] == ["m)", "rad)"]
-    x_true, x_measured = drawn["figure_6_position_main.png"].axes[:2]
+    lanes, _, x_true, x_measured = drawn["figure_6_position_main.png"].axes[:4]
+    assert [text.get_text() for text in lanes.get_yticklabels()] == ["calm", "rough", "alone", "calm again"]
     largest = [float(np.nanmax(np.abs(np.asarray(line.get_ydata()) - 5.0))) for line in x_true.lines[::2][:3]]
     assert [line.get_label() for line in x_true.lines[::2][:3]] == ["calm", "rough", "calm again"]
     assert largest == pytest.approx([ERRORS[0], 3 * ERRORS[0], ERRORS[0]], rel=1e-3)
     assert len(x_measured.lines) == 9  # measured, desired, and the engagement of three runs
     assert [axes.get_title() for axes in drawn["plan_view.png"].axes] == [run.name for run in four]
+
+
+def test_runs_over_each_other_have_each_its_marks_in_its_colour(tmp_path: Path) -> None:
+    """The first run has a fault, the second a collision; both take off."""
+    fault = (event(6.0, 0, "fault"), event(8.0, 1, "fault_end"))
+    flights = {
+        "first": Flown(duration_s=12.0, overrides=(WINDOW,), climb_s=4.0, events=fault),
+        "second": Flown(duration_s=12.0, overrides=(WINDOW,), climb_s=6.0, events=(event(9.0, 0, "collision"),)),
+    }
+    both = judged([record(tmp_path / name, flight) for name, flight in flights.items()])
+    figure = next(each.drawing for each in comparison_figures(both) if each.name == "figure_6_position_main.png")
+    lanes, _, curves = figure.axes[:3]
+    assert [text.get_text() for text in lanes.get_yticklabels()] == ["first", "second"]
+    colours = [run_style(index).color for index in range(2)]
+    assert [text.get_color() for text in lanes.get_yticklabels()] == colours
+    pointed = [line for line in lanes.lines if line.get_marker() in POINTS.values()]
+    marks = {(line.get_marker(), line.get_color()): np.asarray(line.get_xydata())[0].tolist() for line in pointed}
+    assert marks[POINTS["take-off"], colours[0]] == pytest.approx([0.4, 0])
+    assert marks[POINTS["take-off"], colours[1]] == pytest.approx(
+        [0.6, 1], abs=0.03
+    )  # a gate later, where 0.6 s is none
+    assert marks[POINTS["collision"], colours[1]] == [9.0, 1]
+    assert (POINTS["collision"], colours[0]) not in marks
+    bars = [bar for bar in lanes.collections if to_hex(np.asarray(bar.get_facecolor())[0]) == colours[0]]
+    times = [np.asarray(path.vertices)[:, 0] for bar in bars for path in bar.get_paths()]
+    assert (6.0, 8.0) in [(each.min(), each.max()) for each in times]
+    drawn = [(line.get_color(), np.asarray(line.get_xdata())) for line in curves.lines]
+    upright = {(colour, x[0]) for colour, x in drawn if len(set(x)) == 1}
+    assert (colours[1], 9.0) in upright
+    named = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+    assert {"take-off", "collision", "fault", "engagement"} <= named
+
+
+def event(t_s: float, seq: int, kind: str) -> Event:
+    return Event(round(t_s * 1e9), seq, kind, "world", "drone1", kind, {"id": 1})
 
 
 def test_the_page_is_one_file_that_asks_nothing_of_the_network(runs: list[Path], tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 """Figures for a paper: of few drones one by one, of many as their spread; each fits the page of a conference paper."""
 
 import re
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import synthetic_record
@@ -22,8 +24,9 @@ from zsim_analysis.report.figures.formation_figures import ROWS_MAX, draw_errors
 from zsim_analysis.report.figures.motion_figures import draw_distances, draw_velocities
 from zsim_analysis.report.figures.spread import INSTANTS, draw_spread
 from zsim_analysis.report.figures.time_marks import TimeMarks
+from zsim_analysis.report.make_report import page
 from zsim_analysis.report.pages import COLUMN_IN, PAGE_IN, PAPER_PT, ReportFigure, new_figure
-from zsim_analysis.report.summary import ClusterErrors
+from zsim_analysis.report.summary import ClusterErrors, summarise
 from zsim_analysis.report.tables import error_table
 
 PAGE_HEIGHT_IN = 9.25  # of the text of an IEEE page
@@ -66,7 +69,7 @@ def large(count: int) -> Formation:
     """Return a formation of so many drones whose variables err by their number in millimetres."""
     own = [f"{what}_{i}" for i in range(1, count) for what in ("w", "h", "v", "phi")]
     named = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", *own)[: 4 * count]
-    error = np.tile(1e-3 * np.arange(len(named)), (len(T_S), 1))
+    error = np.tile(1e-3 * np.arange(len(named)), (len(T_S), 1)).astype(np.float64)
     desired = np.outer(T_S, np.arange(len(named), 0, -1.0))
     pair = (desired, desired + error, desired + error, error, error)
     return Formation("main", tuple(names(count)), named, T_S, *pair, ["engaged"] * len(T_S))
@@ -78,7 +81,7 @@ def fits(figure: Figure) -> None:
     assert width in (COLUMN_IN, PAGE_IN)
     assert height <= PAGE_HEIGHT_IN
     figure.draw_without_rendering()
-    sizes = {text.get_fontsize() for text in figure.findobj(Text) if isinstance(text, Text) and text.get_text()}
+    sizes = {float(text.get_fontsize()) for text in figure.findobj(Text) if isinstance(text, Text) and text.get_text()}
     assert READABLE_PT <= min(sizes) <= max(sizes) <= PAPER_PT
     box = figure.bbox
     for legend in figure.legends:
@@ -179,3 +182,20 @@ def test_vector_files_have_true_fonts_and_the_same_bytes_each_time() -> None:
     size = re.search(rb'<svg [^>]*width="([\d.]+)pt"', files["svg"])
     assert size is not None
     assert float(size[1]) == pytest.approx(72 * COLUMN_IN)
+
+
+def test_a_page_of_a_large_formation_has_all_its_parameters_behind_the_figures() -> None:
+    each = ParameterErrors(0.1, 0.1, 0.0, 0.2, 0.2, 0.0)
+    reader = FlightReader()
+    for key, message, wall_ns in synthetic_record.traffic(
+        Flown(duration_s=2.0, end={"reason": "over", "command_age_ms": None})
+    ):
+        reader.add_message(key, message, wall_ns)
+    flight = reader.flight()
+    summary = summarise(flight, formations_of(flight), Path())
+    cluster = ClusterErrors(tuple(names(10)), dict.fromkeys(large(10).names, each))
+    text = page(msgspec.structs.replace(summary, clusters={"main": cluster}), [])
+    groups, figures, every = (text.index(mark) for mark in (">headings (rad)<", "<h2>Figures</h2>", ">phi_3 (rad)<"))
+    assert groups < figures < every
+    assert 'href="#all-main"' in text
+    assert 'id="all-main"' in text

@@ -18,17 +18,17 @@ import pytest
 import synthetic_record
 from refused import has_terms, refused
 from rich.console import Console
-from rich.table import Table
 from synthetic_record import GATE_NS, SCENARIOS, Flown
 
 from zsim.contract import keys, messages, run_messages
 from zsim.errors import RecordError, ReportError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
+from zsim.terminal.fitted_table import FittedTable
 from zsim_analysis.reading.formation import window
 from zsim_analysis.report.make_report import judge, make_report, page
 from zsim_analysis.report.pages import thinned
-from zsim_analysis.report.tables import PAPER_COLUMN, table, terminal_text
+from zsim_analysis.report.tables import PAPER_COLUMN, TERMINAL_COLUMNS, table, terminal_text
 
 NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
 AMPLITUDE = np.array([0.12, 0.13, 0.03, 0.02, 0.01, 0.07, 0.05, 0.06, 0.04, 0.28, 0.3, 0.08])
@@ -274,7 +274,7 @@ def test_a_run_without_a_cluster(tmp_path):
     assert any("no cluster" in note for note in summary.notes)
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"plan_view.png", "distances.png", "drones.png"}
     assert '<table class="numbers">' not in (tmp_path / "report.html").read_text()
-    assert not any(isinstance(each, Table) for each in terminal_text(summary).renderables)
+    assert not any(isinstance(each, FittedTable) for each in terminal_text(summary).renderables)
 
 
 def test_a_cluster_that_said_nothing(tmp_path):
@@ -379,13 +379,14 @@ def test_the_terminal_table_stands_beside_the_paper(run):
     row = next(line for line in text.splitlines() if line.strip("│ ").startswith("p (m)"))
     assert "0.032" in row
     assert f"{AMPLITUDE[9] / math.sqrt(2):.4f}" in row
-    assert any("beta (rad)" in line for line in text.splitlines())  # 80 columns do not break a name
+    assert any("beta (rad)" in line for line in text.splitlines())  # 80 columns do not break a name …
+    assert table(summary, "main").left_out(80) == []  # … nor leave a figure out
 
 
 def test_the_paper_stands_beside_its_test_1_alone(tmp_path):
     summary = report_of(tmp_path, flown(scenario="trajectory", overrides=("report.window_s=[2, 9.98]",)))
     assert summary.clusters["main"].paper_std == {}
-    assert PAPER_COLUMN not in [column.header for column in table(summary, "main").columns]
+    assert TERMINAL_COLUMNS[PAPER_COLUMN] not in table(summary, "main").columns
     assert PAPER_COLUMN not in page(summary, [])
 
 

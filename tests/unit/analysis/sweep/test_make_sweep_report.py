@@ -1,12 +1,16 @@
 """The report of a sweep: summary, figures and page."""
 
 import io
+import re
 from pathlib import Path
+from typing import Any
 
 import matplotlib.image
 import msgspec
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from refused import has_terms, without_tags
 from rich.console import Console
 from sweep_rows import made, plan, well
@@ -14,10 +18,11 @@ from sweep_rows import made, plan, well
 from zsim.errors import ReportError
 from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
-from zsim_analysis.sweep.make_sweep_report import make_sweep_report, terminal_text
-from zsim_analysis.sweep.make_sweep_report import table as shown_table
 from zsim_analysis.sweep.points import SweepResults
-from zsim_analysis.sweep.sweep_figures import figures, slices
+from zsim_analysis.sweep.report.field_names import field_name
+from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report
+from zsim_analysis.sweep.report.sweep_figures import BEYOND_AXIS, figures, slices
+from zsim_analysis.sweep.report.terminal_tables import terminal_text
 from zsim_analysis.sweep.sweep_folder import locked, read_table
 from zsim_analysis.sweep.sweep_run import Row
 
@@ -28,7 +33,7 @@ def report_of(tmp_path: Path, of: SweepPlan, rows: list[Row]) -> str:
             book.append(each)
     summary = make_sweep_report(tmp_path)
     console = Console(file=io.StringIO(), width=100)
-    console.print(shown_table(summary))
+    console.print(terminal_text(summary))
     return (tmp_path / "report.html").read_text()
 
 
@@ -179,3 +184,104 @@ def test_slices_of_a_drawn_value_hold_as_many_runs_each() -> None:
     for k, (middle, samples) in enumerate(found):
         assert middle == pytest.approx(k + 0.5, abs=0.25)
         assert samples.mean() == pytest.approx(10 * middle)
+
+
+def drawn(of: SweepPlan, name: str, **known: Any) -> Figure:
+    rows = [{**well(of, run), **known} for run in range(of.runs)]
+    return next(each.drawing for each in figures(SweepResults(SweepDesign(of), rows)) if each.name == name)
+
+
+def named(figure: Figure) -> set[str]:
+    """Return the texts of a figure's legend."""
+    return {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+
+
+def beyond(axes: Axes) -> list[tuple[str, float]]:
+    """Return kind and y of the marks of intervals that leave an axis."""
+    marks = [line for line in axes.lines if line.get_marker() in ("^", "v") and not line.get_clip_on()]
+    return [(str(line.get_marker()), float(np.asarray(line.get_ydata())[0])) for line in marks]
+
+
+def test_numbers_stand_at_their_value_under_their_full_name() -> None:
+    figure = drawn(plan("seed", "sensors.gps.position_m.noise=0,1,4", runs=6), "true_rms.png")
+    axes = figure.axes[0]
+    assert axes.get_xlabel() == "GPS position noise (m)"
+    assert has_terms(axes.get_ylabel().replace("\n", " "), "RMS", "$x_c$", "truth", "m")
+    assert axes.get_xticks().tolist() == [0.0, 1.0, 4.0]
+    low, high = axes.get_xlim()
+    assert low < 0 < 4 < high < 5
+    assert any(has_terms(text, "mean", "95 %", "2 seeds") for text in named(figure))
+
+
+def test_values_over_decades_have_a_logarithmic_axis() -> None:
+    axes = drawn(plan("seed", "sensors.gps.position_m.noise=0.01,0.1,1,10", runs=8), "true_rms.png").axes[0]
+    assert axes.get_xscale() == "log"
+    assert axes.get_xticks().tolist() == [0.01, 0.1, 1, 10]
+    assert drawn(plan("seed", "duration_s=1,2,3", runs=6), "true_rms.png").axes[0].get_xscale() == "linear"
+
+
+def test_combinations_of_other_fields_have_a_colour_each_and_words_stand_side_by_side() -> None:
+    both = drawn(plan("seed", "wind.gust_m_s=0,1,2", "estimation.flow=true,false", runs=12), "true_rms.png")
+    assert {"estimation flow true", "estimation flow false"} <= named(both)
+    words = drawn(plan("seed", "sensors.preset=paper,ardrone2", runs=4), "true_rms.png").axes[0]
+    assert [text.get_text() for text in words.get_xticklabels()] == ["paper", "ardrone2"]
+    assert words.get_xlabel() == "sensors preset"
+
+
+def test_an_interval_that_leaves_its_axis_is_marked_there_and_named() -> None:
+    """Two runs give an interval some ten times as wide as their spread."""
+    figure = drawn(plan("seed", "duration_s=1,2", runs=4), "true_rms.png")
+    axes = figure.axes[0]
+    low, high = axes.get_ylim()
+    ends = {"v": low, "^": high}
+    assert beyond(axes)
+    assert all(y == pytest.approx(ends[mark]) for mark, y in beyond(axes))
+    assert BEYOND_AXIS in named(figure)
+    many = drawn(plan("seed", "duration_s=1,2", runs=80), "true_rms.png")
+    assert not any(beyond(axes) for axes in many.axes)
+    assert BEYOND_AXIS not in named(many)
+
+
+@pytest.mark.parametrize(
+    "vary",
+    [
+        ("wind.gust_m_s=0,1,2",),
+        ("sensors.gps.position_m.noise=0.1,1", "sensors.imu.accel_m_s2.bias_walk=0,1"),
+        ("wind.gust_m_s=0,1", "duration_s=1,2", "estimation.flow=true,false", "sensors.preset=paper,ardrone2"),
+    ],
+)
+def test_the_tables_of_a_terminal_of_80_columns_keep_every_name_and_number(vary: tuple[str, ...]) -> None:
+    of = plan("seed", *vary, runs=32)
+    rows = [{**well(of, run), "metrics.time_to_engagement_s": 1.0 + run} for run in range(of.runs)]
+    console = Console(file=io.StringIO(), width=80)
+    console.print(terminal_text(SweepResults(SweepDesign(of), rows).summary()))
+    assert isinstance(console.file, io.StringIO)
+    text = console.file.getvalue()
+    assert "…" not in text
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
+    words = {word for path in SweepDesign(of).varied for word in str(field_name(path)).split()}
+    assert words | {"x_c", "y_c", "beta", "collision", "separation", "engagement"} <= set(text.split())
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_no_table_of_the_page_has_more_columns_than_fit_it(tmp_path: Path) -> None:
+    of = plan("seed", "wind.gust_m_s=0,1", "sensors.gps.position_m.noise=1,4", runs=8)
+    more = {f"errors.phi_{i}.true_rms": 0.1 for i in range(1, 13)}
+    page = report_of(tmp_path, of, [{**well(of, run), **more, "metrics.overshoot_m": 0.5} for run in range(8)])
+    heads = [re.findall(r"<th>(.*?)</th>", row) for row in page.split("<tr>") if "<th>" in row]
+    tables = [head for head in heads if head[:2] == ["wind gust (m/s)", "GPS position noise (m)"]]
+    assert ["overshoot (m)"] in [head[2:] for head in tables]
+    assert {"x_c (m)", "phi_12 (rad)"} <= {column for head in tables for column in head}
+    assert max(map(len, tables)) <= 9
+
+
+def test_figures_of_the_user_s_own_are_drawn_and_summed_up() -> None:
+    of = plan("seed", "wind.gust_m_s=0,1", runs=6, report={"metrics": "my_figures:overshoot"})
+    figure = drawn(of, "metrics.png", **{"metrics.overshoot_m": 0.5})
+    assert figure.axes[0].get_ylabel() == "overshoot (m)"
+    rows = [{**well(of, run), "metrics.overshoot_m": float(run)} for run in range(5)]
+    rows.append({**well(of, 5), "metrics_failure": "report.metrics my_figures:overshoot: KeyError: 'main'"})
+    summary = SweepResults(SweepDesign(of), rows).summary()
+    assert summary.points[0].spreads["metrics.overshoot_m"].mean.value == 2.0
+    assert summary.points[1].spreads["metrics.overshoot_m"].runs == 2
+    assert summary.unmeasured == {"report.metrics my_figures:overshoot: KeyError: 'main'": 1}

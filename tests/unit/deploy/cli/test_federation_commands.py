@@ -117,6 +117,18 @@ def test_every_kind_is_listed(capsys: pytest.CaptureFixture[str]):
     assert [line.split()[0] for line in lines] == list(KINDS)
 
 
+@pytest.mark.parametrize("columns", [80, 120])
+def test_the_list_of_kinds_fits_a_terminal(
+    columns: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    federation_commands.kinds()
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= columns
+    named = {f"{parameter.name}:" for kind in KINDS.values() for parameter in kind.parameters}
+    assert named <= set(text.split())  # none is broken
+
+
 def test_with_a_scenario_those_of_its_users_sensors_are_listed(mine: Path, capsys: pytest.CaptureFixture[str]):
     federation_commands.kinds(mine)
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]

@@ -8,11 +8,13 @@ import pytest
 import synthetic_record
 import typer
 from refused import has_terms, without_tags
+from typer.testing import CliRunner
 
 from zsim.contract import keys, run_messages
 from zsim.errors import RecordError
 from zsim.record import RecordWriter
 from zsim_deploy.cli import record_commands
+from zsim_deploy.cli.cli import app
 from zsim_deploy.launch.supervisor import Outcome
 
 INTERRUPTED = Outcome("interrupted by Ctrl-C", interrupted=True)
@@ -121,7 +123,8 @@ def test_summary_page_terminal_and_exit_code_agree(tmp_path: Path, capsys: pytes
     assert has_terms(shown.summary["state"], *terms)
     assert (shown.summary["complete"], shown.code) == ((True, 0) if case == "whole" else (False, 1))
     assert shown.summary["state"] in shown.page
-    assert f"record: {shown.summary['state']}" in shown.out.splitlines()
+    (line,) = [line for line in shown.out.splitlines() if line.startswith("record: ")]
+    assert line.partition(" (")[0] == f"record: {shown.summary['state']}"
     if case != "whole":
         assert shown.err.splitlines()[-1].endswith(shown.summary["state"])
     if case == "gap":
@@ -171,3 +174,35 @@ def test_a_rerun_and_a_sweep_that_fail_end_with_why(
         record_commands._conclude(tmp_path, ["too heavy", "too heavy"], 2, report=False)
     assert ended.value.exit_code == 1
     assert has_terms(capsys.readouterr().err.splitlines()[-1], "2", "too heavy")
+
+
+# Formats of figures
+
+
+@pytest.fixture
+def formats(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
+    """Return the formats in which reports are asked for; none is made."""
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(record_commands, "_report", lambda _, wanted=(): asked.append(tuple(wanted)))
+    return asked
+
+
+def report(*arguments: str) -> int:
+    return CliRunner().invoke(app, ["report", *arguments]).exit_code
+
+
+def test_figures_are_asked_for_in_other_formats(recorded: Path, formats: list[tuple[str, ...]]) -> None:
+    assert report(str(recorded)) == report(str(recorded), "--format", "svg") == 0
+    assert report(str(recorded), "--format", "pdf,svg") == 0
+    assert formats == [(), ("svg",), ("pdf", "svg")]
+
+
+@pytest.mark.parametrize("wrong", ["png", "pdf svg", "pdf,", ","])
+def test_formats_that_are_none_are_refused(wrong: str, recorded: Path, formats: list[tuple[str, ...]]) -> None:
+    assert report(str(recorded), "--format", wrong) == 2
+    assert formats == []
+
+
+def test_comparisons_have_no_files_of_their_figures(recorded: Path, formats: list[tuple[str, ...]]) -> None:
+    assert report(str(recorded), str(recorded), "--format", "pdf") == 2
+    assert formats == []

@@ -27,6 +27,8 @@ class Good:
 class Half:
     def read(self): return 1.0
 
+def measure(): return 2.0
+
 number = 3
 """
 
@@ -65,6 +67,27 @@ def test_what_cannot_be_loaded_is_one_line(beside: Path, name: str, wrong: str) 
     assert has_terms(line, "a.yaml", "meter")
     assert wrong in line
     assert "\n" not in line
+
+
+def test_a_function_is_loaded(beside: Path) -> None:
+    assert plugin.load_function("plugin_meter:measure", "a.yaml: metrics")() == 2.0
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("plugin_nowhere:measure", "ModuleNotFoundError"),
+        ("plugin_meter:bad", "measure"),
+        ("plugin_meter:number", "measure"),
+        ("plugin_meter", "package.module:function"),
+    ],
+)
+def test_what_is_no_function_is_one_line(beside: Path, name: str, wrong: str) -> None:
+    with pytest.raises(DocumentError) as raised:
+        plugin.load_function(name, "a.yaml: metrics")
+    (line,) = raised.value.faults
+    assert has_terms(line, "a.yaml", "metrics")
+    assert wrong in line
 
 
 def test_a_module_is_loaded(beside: Path) -> None:

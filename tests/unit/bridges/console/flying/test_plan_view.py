@@ -32,7 +32,7 @@ def drone(name: str, x: float = 0.0) -> DroneView:
 def test_what_stands_around_the_drones():
     scenario = scenario_file.from_text(FIELD)
     around = plan_view.surroundings(scenario, geofence_of(scenario))
-    assert around["names"] == ["drone1", "drone2"]
+    assert around["names"] == around["labels"] == ["drone1", "drone2"]
     assert len(set(around["colours"])) == 2
     assert around["fence"] == {"low_m": (-50.0, -50.0, 1.0), "high_m": (53.0, 50.0, 30.0)}
     wall, mast = around["obstacles"]

@@ -5,55 +5,77 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
 
-from zsim.errors import ReportError, printable
-from zsim.runtime.progress import cell
-from zsim_agents.formation.spaces.cluster_space import unit
+from zsim.errors import ReportError
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
+from zsim_analysis.sweep.axes import shown
 from zsim_analysis.sweep.intervals import ConfidenceInterval
-from zsim_analysis.sweep.points import (
-    Distribution,
-    FormationParameter,
-    GridPoint,
-    SweepResults,
-    SweepSummary,
-)
-from zsim_analysis.sweep.sweep_figures import figures
+from zsim_analysis.sweep.points import Distribution, FormationParameter, GridPoint, SweepResults, SweepSummary
+from zsim_analysis.sweep.report.field_names import FieldName, field_name
+from zsim_analysis.sweep.report.sweep_figures import figures
 from zsim_analysis.sweep.sweep_folder import load
 
 POINTS_MAX = 200  # in a table of the page; sweep.parquet has all
 DETAILED_MAX = 24  # points with a table of their own
 OVERVIEW = ("runs", "ended well", "as planned", "engaged", "no collision", "separation (m)", "least (m)")
+OWN = "figures of your own"
+BLOCK_COLUMNS = 6  # of a table that fits the page, those of the grid's fields among them
+Block = tuple[list[str], list[list[str]]]
 PAPER_COLUMN = "paper std"
 DETAILS = ("parameter", PAPER_COLUMN, "est. std", "true std", "true RMS", "true mean", "true RMS, 5 to 95 %")
 
 
 def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
     """Return report.html."""
-    shown = summary.flown[:POINTS_MAX]
-    known = {column for point in shown for column in point.spreads}
+    points = summary.flown[:POINTS_MAX]
+    known = {column for point in points for column in point.spreads}
     names = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in known}
-    return template("sweep.html.j2", "zsim_analysis.sweep").render(
+    axes = axes_of(summary)
+    return template("sweep.html.j2", "zsim_analysis.sweep.report").render(
         summary=summary,
         facts=facts(summary),
         notes=notes(summary),
-        overview=[summary.grid, *OVERVIEW],
-        points=[(point.label, *overview(point)) for point in shown],
-        parameters=[_titled(each) for each in names.values()],
-        errors=[(point.label, *(_mean(point, f"{p}.true_rms") for p in names)) for point in shown],
-        left_out=len(summary.flown) - len(shown),
+        overview=[*map(str, axes), *OVERVIEW],
+        points=[(*values_of(point), *overview(point)) for point in points],
+        parameters=list(names),
+        errors=_blocks(points, axes, {f"{prefix}.true_rms": each.titled for prefix, each in names.items()}),
+        metrics=_blocks(points, axes, {column: str(field_name(column)) for column in summary.metrics}),
+        left_out=len(summary.flown) - len(points),
         window=window_text(summary),
         paper_column=PAPER_COLUMN,
         details=[column for column in DETAILS if column != PAPER_COLUMN or summary.paper_std],
-        tables=[(point, details(point, names, summary.paper_std)) for point in shown[:DETAILED_MAX]],
+        tables=[(_heading(point), details(point, names, summary.paper_std)) for point in points[:DETAILED_MAX]],
         paper_note=PAPER_NOTE if summary.paper_std else "",
         figures=sources(pictures),
     )
+
+
+def axes_of(summary: SweepSummary) -> list[FieldName]:
+    """Return the full names of the fields of the grid; of none, that of a column which holds all runs."""
+    return [field_name(path) for path in summary.points[0].values] or [FieldName("point")]
+
+
+def values_of(point: GridPoint) -> list[str]:
+    """Return the values of a point, as many as `axes_of` has names."""
+    return [shown(value) for value in point.values.values()] or [point.label]
+
+
+def _heading(point: GridPoint) -> str:
+    return ", ".join(field_name(path).at(value) for path, value in point.values.items()) or point.label
+
+
+def _blocks(points: Sequence[GridPoint], axes: Sequence[FieldName], titles: dict[str, str]) -> list[Block]:
+    """Return the means of some columns at each point as tables that fit the page: their heads, and their rows."""
+    columns, across = list(titles), max(2, BLOCK_COLUMNS - len(axes))
+    parts = [columns[start : start + across] for start in range(0, len(columns), across)]
+    return [
+        (
+            [*map(str, axes), *(titles[column] for column in part)],
+            [[*values_of(point), *(_mean(point, column) for column in part)] for point in points],
+        )
+        for part in parts
+    ]
 
 
 def facts(summary: SweepSummary) -> list[tuple[str, str]]:
@@ -100,6 +122,7 @@ def notes(summary: SweepSummary) -> list[str]:
             f"In {summary.not_engaged} runs that ended well a cluster was never engaged within the judged window; "
             "its errors are left out."
         )
+    lines += [f"{count} of {summary.finished} runs have no {OWN}: {why}" for why, count in summary.unmeasured.items()]
     if len(summary.fingerprints) > 1:
         lines.append("The hosts compute with different numeric fingerprints; the same bits are not promised.")
     return lines
@@ -123,12 +146,8 @@ def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: d
         rms = point.spreads.get(f"{prefix}.true_rms")
         span = "–" if rms is None else f"{rms.p5:.4f} to {rms.p95:.4f}"
         means = [_mean(point, f"{prefix}.{each}") for each in ("est_std", "true_std", "true_rms", "true_mean")]
-        rows.append([_titled(parameter), *paper, *means, span])
+        rows.append([parameter.titled, *paper, *means, span])
     return rows
-
-
-def _titled(parameter: FormationParameter) -> str:
-    return parameter.labelled(f"{parameter.name} ({unit(parameter.name)})")
 
 
 def _mean(point: GridPoint, column: str) -> str:
@@ -148,10 +167,6 @@ def _share(share: ConfidenceInterval | None) -> str:
     if share is None:
         return "–"
     return f"{100 * share.value:.3g} % [{100 * share.low:.3g}, {100 * share.high:.3g}]"
-
-
-SHOWN_MAX = 40  # points on a terminal
-ERRORS_MAX = 9  # parameters on a terminal of 80 columns
 
 
 def make_sweep_report(directory: Path, progress: Callable[[str], None] = lambda _: None) -> SweepSummary:
@@ -175,66 +190,3 @@ def make_sweep_report(directory: Path, progress: Callable[[str], None] = lambda 
     summary = results.summary()
     write_report(directory, summary.json(), figures(results), partial(page, summary), progress)
     return summary
-
-
-def terminal_text(summary: SweepSummary) -> Group:
-    """Return what the runs did not do, the table of all points, and that of the errors, for the terminal."""
-    marks = [Text(printable(mark), style="bold red") for mark in marks_of(summary)]
-    names = errors_of_terminal(summary)
-    return Group(*marks, table(summary), *([errors_table(summary, names)] if names else []))
-
-
-def table(summary: SweepSummary) -> Table:
-    """Return the table of all points, for the terminal."""
-    caption = f"± and [ ]: {100 * summary.level:g} % confidence intervals"
-    return _terminal_table(
-        summary, f"{summary.scenario}: {summary.finished} of {summary.runs} runs", caption, OVERVIEW, overview
-    )
-
-
-def errors_of_terminal(summary: SweepSummary) -> dict[str, FormationParameter]:
-    """Return the parameters whose errors stand on a terminal: the paper's, else the first ones that are no heading."""
-    known = {column for point in summary.flown for column in point.spreads}
-    flown = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in known}
-    first = dict.fromkeys(each.cluster for each in flown.values())
-    own = {prefix: each for prefix, each in flown.items() if each.cluster == next(iter(first), None)}
-    return dict([(prefix, each) for prefix, each in own.items() if not each.name.startswith("phi_")][:ERRORS_MAX])
-
-
-def errors_table(summary: SweepSummary, names: dict[str, FormationParameter]) -> Table:
-    """Return the means of the RMS errors at each point, for the terminal."""
-    cluster = next(iter(names.values())).cluster
-    title = (
-        f"RMS of truth − desired{f' of {cluster}' if cluster else ''} from {window_text(summary)}, means over the runs"
-    )
-    return _terminal_table(
-        summary,
-        title,
-        "in m; angles in rad",
-        [each.name for each in names.values()],
-        lambda point: [_short_mean(point, f"{prefix}.true_rms") for prefix in names],
-    )
-
-
-def _short_mean(point: GridPoint, column: str) -> str:
-    samples = point.spreads.get(column)
-    return "–" if samples is None else f"{samples.mean.value:.3f}"
-
-
-def _terminal_table(
-    summary: SweepSummary,
-    title: str,
-    caption: str,
-    columns: Sequence[str],
-    cells: Callable[[GridPoint], Sequence[str]],
-) -> Table:
-    """Return a table with a row per point, no more of them than a terminal shows; no name is broken."""
-    shown = Table(title=cell(title), caption=cell(caption), title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    shown.add_column(cell(summary.grid), no_wrap=True)
-    for column in columns:
-        shown.add_column(column, justify="right")
-    for point in summary.flown[:SHOWN_MAX]:
-        shown.add_row(cell(point.label), *cells(point))
-    if len(summary.flown) > SHOWN_MAX:
-        shown.add_row(f"… and {len(summary.flown) - SHOWN_MAX} more")
-    return shown

@@ -1,0 +1,233 @@
+"""The figures of a sweep: the runs of each point of the grid, with the mean's confidence interval upon them."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from zsim_analysis.report.pages import (
+    BLUE,
+    GREY,
+    VERMILION,
+    ReportFigure,
+    dress,
+    label,
+    legend_above,
+    new_figure,
+)
+from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
+from zsim_analysis.sweep.points import FormationParameter, SweepResults
+from zsim_analysis.sweep.report.distributions import PAPER, Panel, Samples, draw_distribution, known
+from zsim_analysis.sweep.report.field_names import field_name
+from zsim_analysis.sweep.report.grid_axis import POINTS_MAX, GridAxis, Place
+from zsim_analysis.sweep.report.intervals_drawn import DrawnInterval, mark_beyond, scale_to_samples
+
+PANELS_MAX = 24  # quantities in one figure; 6 drones
+COLUMNS = 3  # of panels
+NARROW_MAX = 8  # points side by side in a panel of a third of the page
+SLICES = 6  # of a drawn value's range, each with a mean of its own
+LEGEND_COLUMNS = 4
+ONE_RUN, BEYOND_AXIS, TABLE_I = "one run", "the interval goes beyond the axis", "the paper's Table I"
+
+
+def figures(results: SweepResults) -> Iterator[ReportFigure]:
+    """Yield the figures that the runs have data for."""
+    parameters = dict(list(results.parameters().items())[:PANELS_MAX])
+    if parameters:
+        yield ReportFigure(
+            "true_rms.png",
+            "How well the formation was flown",
+            f"RMS of truth − desired within the window{_window(results)}." + _legend(results),
+            _panels(results, rms_panels(parameters)),
+        )
+        yield ReportFigure(
+            "est_std.png",
+            f"Standard deviations as the controller sees them{', beside the paper' * bool(results.paper_std)}",
+            f"Standard deviation of estimate − desired within the window{_window(results)}." + _legend(results),
+            _panels(results, std_panels(parameters, results.paper_std)),
+        )
+    if results.metrics:
+        yield ReportFigure(
+            "metrics.png",
+            "Figures of the user's own",
+            f"What {results.metrics_function} returned of each run." + _legend(results),
+            _panels(results, metric_panels(results)),
+        )
+    yield ReportFigure(
+        "safety.png",
+        "How the runs ended, and how near the drones came to each other",
+        "Left: share of runs that ended well, and of those without a collision, with exact intervals. "
+        "Right: least true distance of two drones in the air." + _legend(results),
+        _safety(results),
+    )
+    panels = [*rms_panels(parameters), *metric_panels(results)]
+    for i, path in enumerate(results.drawn):
+        if panels:
+            yield ReportFigure(
+                f"drawn_{i + 1}.png",
+                f"Against {field_name(path)}",
+                f"Each quantity over the value that was drawn; means of {SLICES} slices with as many runs each.",
+                _scatter(results, path, panels),
+            )
+
+
+def rms_panels(parameters: Mapping[str, FormationParameter]) -> list[Panel]:
+    """Return a panel for the true RMS error of each parameter."""
+    return [
+        Panel(f"{prefix}.true_rms", each.labelled(f"RMS error of {_symbol(each)}\nin truth ({each.unit})"))
+        for prefix, each in parameters.items()
+    ]
+
+
+def std_panels(parameters: Mapping[str, FormationParameter], printed: Mapping[str, float]) -> list[Panel]:
+    """Return a panel for the estimated standard deviation of each parameter."""
+    return [
+        Panel(
+            f"{prefix}.est_std",
+            each.labelled(f"std of the error of {_symbol(each)}\nas estimated ({each.unit})"),
+            printed.get(each.name),
+        )
+        for prefix, each in parameters.items()
+    ]
+
+
+def metric_panels(results: SweepResults) -> list[Panel]:
+    """Return a panel for each figure of the user's own."""
+    return [Panel(column, str(field_name(column))) for column in results.metrics[:PANELS_MAX]]
+
+
+def _symbol(parameter: FormationParameter) -> str:
+    return label(parameter.name).rpartition(" (")[0]
+
+
+def _window(results: SweepResults) -> str:
+    windows_s = results.windows_s()
+    return " ({:g} to {:g} s)".format(*windows_s) if windows_s else ""
+
+
+def _legend(results: SweepResults) -> str:
+    left_out = results.design.points - POINTS_MAX
+    if left_out > 0 and not GridAxis(results.design).field:
+        return f" The first {POINTS_MAX} points are shown, the tables have all."
+    return ""
+
+
+def mean_label(results: SweepResults) -> str:
+    """Return what a mean is of, and of how many runs, called seeds where they alone differ."""
+    counts = {results.ended_well(point)[0] for point in range(results.design.points)} - {0}
+    many = " to ".join(f"{count}" for count in sorted({min(counts), max(counts)})) if counts else "no"
+    what = "runs" if results.drawn or not results.has_seeds else "seeds"
+    return f"mean and {100 * LEVEL:g} % interval of {many} {what[:-1] if counts == {1} else what}"
+
+
+def _panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
+    """Return the figure of some quantities."""
+    axis = GridAxis(results.design) if results.design.points > 1 else None
+    across = COLUMNS if not axis or axis.field or results.design.points <= NARROW_MAX else COLUMNS - 1
+    across = min(across, len(panels))
+    rows = -(-len(panels) // across)
+    figure = new_figure(
+        4 * across if across < COLUMNS - 1 else 12, 1.0 + rows * (2.7 if axis and axis.is_turned else 2.5)
+    )
+    grid = figure.subplots(rows, across, squeeze=False).ravel()
+    beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(grid, panels, strict=False)]
+    for axes in grid[len(panels) :]:
+        axes.set_visible(False)
+    paper = any(panel.printed is not None for panel in panels)
+    _name(figure, grid[0], results, axis, any(beyond), paper)
+    return figure
+
+
+def _name(
+    figure: Figure, axes: Axes, results: SweepResults, axis: GridAxis | None, beyond: bool, paper: bool = False
+) -> None:
+    """Put the legend above a figure: what a dot, a mean, a box, a mark and a colour are."""
+    mean = VERMILION if not axis or len(axis.series) == 1 else GREY
+    if axis:
+        axes.plot([], [], ".", color=BLUE if len(axis.series) == 1 else GREY, ms=7, alpha=0.6, label=ONE_RUN)
+        if not axis.field:
+            axes.plot([], [], "s", color="#0072b226", mec=BLUE, ms=8, label="quartiles and median")
+        axes.errorbar([], [], yerr=[], fmt="o", ms=4, lw=1.4, capsize=3, color=mean, label=mean_label(results))
+    else:
+        axes.plot([], [], "s", color="#d55e0066", ms=8, label=mean_label(results))
+    if beyond:
+        axes.plot([], [], "^", color=mean, ms=7, mec="white", mew=0.6, label=BEYOND_AXIS)
+    if paper:
+        axes.plot([], [], color=PAPER, ls="--", lw=1.2, label=TABLE_I)
+    if axis and len(axis.series) > 1:
+        for place in {place.series: place for place in axis.places.values()}.values():
+            axes.plot([], [], color=axis.colour(place), lw=3, label=axis.series[place.series])
+    legend_above(figure, axes, LEGEND_COLUMNS)
+
+
+def _safety(results: SweepResults) -> Figure:
+    axis = GridAxis(results.design) if results.design.points > 1 else None
+    figure = new_figure(12, 4.4)
+    shares, separation = figure.subplots(1, 2)
+    _shares(shares, results, axis)
+    beyond = draw_distribution(separation, results, Panel("min_separation_m", "least separation (m)"), axis)
+    _name(figure, shares, results, axis, beyond)
+    return figure
+
+
+def _shares(axes: Axes, results: SweepResults, axis: GridAxis | None) -> None:
+    """Draw the shares of the runs of each point that ended well, and of those that met no other drone."""
+    dress(axes, "share of runs")
+    places = axis.places if axis else {0: Place(0.0, (-0.12, 0.12))}
+    of_kind: tuple[tuple[str, str, int, Callable[[int], tuple[int, int]]], ...] = (
+        ("ended well", "o", 0, results.ended_well),
+        ("of these, without collision", "s", 1, results.without_collision),
+    )
+    for name, mark, side, counted in of_kind:
+        for point, place in places.items():
+            count, of = counted(point)
+            if of:
+                share = share_interval(count, of)
+                ends = [[share.value - share.low], [share.high - share.value]]
+                tint = axis.colour(place) if axis and len(axis.series) > 1 else ("#009e73", "#000000")[side]
+                face = "white" if side else tint
+                x = place.x + (0.2, -0.2)[side == 0] * (place.room[1] - place.room[0])
+                axes.errorbar([x], [share.value], yerr=ends, fmt=mark, ms=5, lw=1.4, capsize=4, color=tint, mfc=face)
+        axes.plot([], [], mark, color=("#009e73", "#000000")[side], mfc="white" if side else None, ms=5, label=name)
+    axes.set_ylim(-0.03, 1.03)
+    if axis:
+        axis.dress(axes)
+    else:
+        axes.set_xticks([])
+        axes.set_xlim(-0.8, 0.8)
+
+
+def _scatter(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figure:
+    rows = -(-len(panels) // COLUMNS)
+    figure = new_figure(12, 1.0 + 2.6 * rows)
+    grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
+    x = results.values(path)
+    beyond = False
+    for axes, panel in zip(grid, panels, strict=False):
+        dress(axes, panel.label)
+        axes.set_xlabel(str(field_name(path)), fontsize=9)
+        y = results.values(panel.column)
+        axes.plot(x, y, ".", color=BLUE, ms=4, alpha=0.45, mew=0, zorder=2)
+        intervals = [DrawnInterval(middle, mean_interval(samples)) for middle, samples in slices(x, y)]
+        for each in intervals:
+            each.draw(axes)
+        scale_to_samples(axes, known(y))
+        beyond |= mark_beyond(axes, intervals)
+    for axes in grid[len(panels) :]:
+        axes.set_visible(False)
+    grid[0].plot([], [], ".", color=BLUE, ms=7, alpha=0.6, label=ONE_RUN)
+    slice_label = f"mean and {100 * LEVEL:g} % interval of a slice"
+    grid[0].errorbar([], [], yerr=[], fmt="o", ms=4, lw=1.4, capsize=3, color=VERMILION, label=slice_label)
+    if beyond:
+        grid[0].plot([], [], "^", color=VERMILION, ms=7, mec="white", mew=0.6, label=BEYOND_AXIS)
+    legend_above(figure, grid[0], LEGEND_COLUMNS)
+    return figure
+
+
+def slices(x: Samples, y: Samples, count: int = SLICES) -> Sequence[tuple[float, Samples]]:
+    """Return the mean x and the y of `count` groups of runs by rising x, as equal in number as can be."""
+    both = np.isfinite(x) & np.isfinite(y)
+    order = np.argsort(x[both], kind="stable")
+    groups = [part for part in np.array_split(order, count) if len(part) >= 2]
+    return [(float(x[both][part].mean()), y[both][part]) for part in groups]

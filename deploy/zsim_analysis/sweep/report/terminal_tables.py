@@ -1,0 +1,180 @@
+"""The tables of a sweep on a terminal: as many columns in each as fit it, every name whole."""
+
+from collections.abc import Callable, Iterator, Sequence
+from textwrap import wrap
+
+from msgspec import Struct
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from zsim.errors import printable
+from zsim.runtime.progress import cell
+from zsim_analysis.sweep.intervals import ConfidenceInterval
+from zsim_analysis.sweep.points import FormationParameter, GridPoint, SweepSummary
+from zsim_analysis.sweep.report.field_names import field_name
+from zsim_analysis.sweep.report.make_sweep_report import axes_of, marks_of, values_of, window_text
+
+POINTS_MAX = 40  # on a terminal
+BETWEEN = 3  # characters between two columns of a table
+EDGE = 1  # of them that no table has after its last column, and its edges beside
+ERRORS_MAX = 9  # parameters, as many as the paper's Table I has
+HEAD = 8  # characters of a head, at least, that stand in one line
+AXES_MAX = 3  # fields of the grid with a column each; more of them share one
+
+
+class TerminalColumn(Struct, frozen=True):
+    """A column with its head, which is broken between its words alone, and a cell for each point."""
+
+    head: str
+    cells: tuple[str, ...]
+
+    @property
+    def lines(self) -> list[str]:
+        """Return the head in lines."""
+        return wrap(self.head, max(map(len, (*self.cells, "x" * HEAD))), break_long_words=False, break_on_hyphens=False)
+
+    @property
+    def width(self) -> int:
+        """Return how many characters it needs."""
+        return max(map(len, (*self.lines, *self.cells)))
+
+
+class TerminalText(Struct, frozen=True):
+    """What the runs did not do, how they ended at each point, their errors, and the figures of the user's own."""
+
+    summary: SweepSummary
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield from (Text(printable(mark), style="bold red") for mark in marks_of(self.summary))
+        for part in (overview(self.summary), errors(self.summary), own_figures(self.summary)):
+            if part.columns:
+                yield from part.lines(self.summary, options.max_width)
+
+
+def terminal_text(summary: SweepSummary) -> TerminalText:
+    """Return what a terminal shows of a sweep, in tables that fit it."""
+    return TerminalText(summary)
+
+
+class PointTable(Struct, frozen=True):
+    """Columns beside the fields of the grid, in as many tables as it takes; without columns it is none."""
+
+    title: str
+    caption: str
+    columns: tuple[TerminalColumn, ...]
+
+    def lines(self, summary: SweepSummary, width: int) -> Iterator[Text | Table]:
+        """Yield title, tables and caption, no table wider than `width` characters if its first columns are not."""
+        axes = _axis_columns(summary)
+        yield cell(self.title)
+        for part in _parted(self.columns, width + EDGE - sum(column.width + BETWEEN for column in axes)):
+            yield _table([*axes, *part], len(axes))
+        left_out = len(summary.flown) - POINTS_MAX
+        yield cell(f"{f'{left_out} more points are in the report. ' if left_out > 0 else ''}{self.caption}".strip())
+
+
+def overview(summary: SweepSummary) -> PointTable:
+    """Return how the runs ended at each point."""
+    title = f"{summary.scenario}: {summary.finished} of {summary.runs} runs"
+    columns = (
+        _column(summary, "runs", lambda point: str(point.runs)),
+        _column(summary, "ended well", lambda point: _percent(point.ended_well)),
+        _column(summary, "as planned", lambda point: _percent(point.as_planned)),
+        _column(summary, "engaged", lambda point: "–" if point.engaged is None else str(point.engaged)),
+        _column(summary, "no collision", lambda point: _percent(point.without_collision)),
+        _column(summary, "separation (m)", lambda point: _mean(point, "min_separation_m", 2)),
+        _column(summary, "least (m)", _least),
+    )
+    caption = f"separation: mean of the runs; {100 * summary.level:g} % intervals are in the report\n"
+    return PointTable(title, caption, columns)
+
+
+def errors(summary: SweepSummary) -> PointTable:
+    """Return the means of the RMS errors at each point."""
+    names = errors_of_terminal(summary)
+    cluster = next((each.cluster for each in names.values()), None)
+    of = f" of {cluster}" if cluster else ""
+    columns = [
+        _column(summary, each.name, lambda point, prefix=prefix: _mean(point, f"{prefix}.true_rms"))
+        for prefix, each in names.items()
+    ]
+    title = f"RMS of truth − desired{of} from {window_text(summary)}, means over the runs"
+    return PointTable(title, "in m; angles in rad\n", tuple(columns))
+
+
+def own_figures(summary: SweepSummary) -> PointTable:
+    """Return the means of the figures of the user's own at each point."""
+    columns = [
+        _column(summary, str(field_name(name)), lambda point, name=name: _significant(point, name))
+        for name in summary.metrics
+    ]
+    return PointTable("Figures of your own, means over the runs", "", tuple(columns))
+
+
+def errors_of_terminal(summary: SweepSummary) -> dict[str, FormationParameter]:
+    """Return the parameters whose errors stand on a terminal: the paper's, else the first ones that are no heading."""
+    known = {column for point in summary.flown for column in point.spreads}
+    flown = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in known}
+    first = next((each.cluster for each in flown.values()), None)
+    own = {prefix: each for prefix, each in flown.items() if each.cluster == first}
+    return dict([(prefix, each) for prefix, each in own.items() if not each.name.startswith("phi_")][:ERRORS_MAX])
+
+
+def _column(summary: SweepSummary, head: str, text: Callable[[GridPoint], str]) -> TerminalColumn:
+    return TerminalColumn(head, tuple(text(point) for point in summary.flown[:POINTS_MAX]))
+
+
+def _percent(share: ConfidenceInterval | None) -> str:
+    return "–" if share is None else f"{100 * share.value:.3g} %"
+
+
+def _mean(point: GridPoint, column: str, digits: int = 3) -> str:
+    samples = point.spreads.get(column)
+    return "–" if samples is None else f"{samples.mean.value:.{digits}f}"
+
+
+def _significant(point: GridPoint, column: str) -> str:
+    samples = point.spreads.get(column)
+    return "–" if samples is None else f"{samples.mean.value:.4g}"
+
+
+def _least(point: GridPoint) -> str:
+    separation = point.spreads.get("min_separation_m")
+    return "–" if separation is None else f"{separation.least:.2f}"
+
+
+def _axis_columns(summary: SweepSummary) -> list[TerminalColumn]:
+    """Return a column for each field of the grid, or one for all of them where they are many."""
+    names = [str(name) for name in axes_of(summary)]
+    rows = [values_of(point) for point in summary.flown[:POINTS_MAX]]
+    if len(names) <= AXES_MAX:
+        return [
+            TerminalColumn(name, cells)
+            for name, cells in zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True)
+        ]
+    return [TerminalColumn(" · ".join(names), tuple(" · ".join(row) for row in rows))]
+
+
+def _parted(columns: Sequence[TerminalColumn], room: int) -> list[list[TerminalColumn]]:
+    """Return columns in parts that fit a room in characters, at least one in each."""
+    parts: list[list[TerminalColumn]] = [[]]
+    left = room
+    for column in columns:
+        if parts[-1] and column.width + BETWEEN > left:
+            parts.append([])
+            left = room
+        parts[-1].append(column)
+        left -= column.width + BETWEEN
+    return parts
+
+
+def _table(columns: Sequence[TerminalColumn], axes: int) -> Table:
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1))
+    for place, column in enumerate(columns):
+        head = cell("\n".join(column.lines))
+        table.add_column(head, justify="left" if place < axes else "right", vertical="bottom", no_wrap=True)
+    for row in zip(*(column.cells for column in columns), strict=True):
+        table.add_row(*map(cell, row))
+    return table

@@ -1,0 +1,35 @@
+"""Figures of a user's own for a sweep: when the formation's shape had settled, and how far it overshot.
+
+    PYTHONPATH=examples zsim sweep scenarios/step.yaml --vary wind.gust_m_s=0,1 --set report.metrics=settling:settling
+
+See docs/sweep.md.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim_analysis.reading.flight import RecordedFlight
+from zsim_analysis.reading.formation import formations_of
+
+BAND_M = 0.5  # m: a side is settled from when on it stays so near to its desired length; chosen
+
+
+def settling(flight: RecordedFlight) -> dict[str, float | None]:
+    """Return when the side p had settled [s after the engagement], and by how much it was too long at most [m].
+
+    None where the formation never engaged, or never settled.
+    """
+    formation = formations_of(flight)[0]
+    if formation.engaged_s is None:
+        return {"settled_s": None, "overshoot_m": None}
+    since = formation.since_engaged
+    error_m = formation.true_error[since, formation.column("p")]
+    return settled(formation.t_s[since], error_m, formation.engaged_s)
+
+
+def settled(t_s: NDArray[np.float64], error_m: NDArray[np.float64], engaged_s: float) -> dict[str, float | None]:
+    """Return the figures of an error (K,) at times (K,)."""
+    outside = np.flatnonzero(np.abs(error_m) > BAND_M)
+    first = outside[-1] + 1 if len(outside) else 0
+    settled_s = float(t_s[first]) - engaged_s if first < len(t_s) else None
+    return {"settled_s": settled_s, "overshoot_m": float(np.nanmax(error_m))}

@@ -1,0 +1,168 @@
+"""A console as it is, on a run that only the test performs: pages of it cost a browser, and no federation."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from federation import free_port
+from wire import PATIENCE_S
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import DroneInfo
+from zsim.contract.run_messages import Clock, ControlAnswer, Event
+from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
+from zsim.scenario import scenario_file
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_bridges.console.console_server import Console
+from zsim_bridges.console.server.http_proxy import ListenAddress
+
+STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
+PICTURES_HZ = 100.0  # while the past is performed; each has one point of the plots
+PAST_STEP_S = 0.5  # simulated, from one picture of the past to the next
+PRESENT_S = (
+    0.5  # wall, and simulated, between two pictures of the present: a browser without a graphics card draws slowly
+)
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+ROTORS = (300.0, 300.0, 300.0, 300.0)  # rad/s
+COVARIANCE_M2 = (0.04, 0.0, 0.0, 0.04, 0.0, 0.09)
+GPS = {"gps": (700, 3), "baro": (3000, 0), "mag": (3000, 0), "imu": (30000, 0), "sonar": (0, 120)}  # used, refused
+SWAY_M, SWAY_S = 0.4, 25.0  # of the drones about their places, so that curves are none
+
+
+class StagedLink:
+    """A session on which only the test publishes."""
+
+    host = "lab"
+
+    def __init__(self) -> None:
+        self.subscribers: list[tuple[str, Callable[[Any], None]]] = []
+        self.asked: list[tuple[str, dict[str, Any]]] = []
+        self.clock: Clock | None = None
+        self.timeline: dict[str, Any] = {}
+
+    def declare_subscriber(self, expression: str, callback: Callable[[Any], None]) -> None:
+        self.subscribers.append((expression, callback))
+
+    def publish(self, key: str, message: Any) -> None:
+        """Let the console receive a message."""
+        sample = SimpleNamespace(key=key, payload=messages.encode(message))
+        for expression, callback in self.subscribers[:]:
+            if keys.matches(expression, key):
+                callback(sample)
+
+    def put(self, key: str, message: Any) -> None:
+        """Take a command; nobody flies by it."""
+
+    def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
+        if expression != keys.CLOCK or self.clock is None:
+            return []
+        return [SimpleNamespace(key=keys.CLOCK, payload=messages.encode(self.clock))]
+
+    def request(self, key: str, op: str, source: str, args: dict[str, Any], timeout_s: float) -> ControlAnswer:
+        self.asked.append((op, args))
+        return ControlAnswer(True, "", result=self.timeline if op == "timeline" else None)
+
+
+class StagedRun:
+    """Three drones in the formation of scenarios/step.yaml, engaged.
+
+    Args:
+        past_s: simulated time that has gone by when a page is opened.
+        timeline: of a replay; empty for a flight.
+
+    Attributes:
+        link: of the console.
+        t_s: simulated time of the newest picture.
+        clock_state: what the run's clock says.
+        stands: whether time stands.
+    """
+
+    def __init__(self, past_s: float = 156.0, timeline: dict[str, Any] | None = None) -> None:
+        self._scenario = scenario_file.load(STEP)
+        self._cluster = self._scenario.clusters[0]
+        self._space = scenario_space(self._scenario, self._cluster)
+        self._past_s = past_s
+        self.link = StagedLink()
+        self.link.timeline = timeline or {}
+        self.t_s, self.clock_state, self.stands = 0.0, "running", False
+        self._performed_s = 0.0  # wall
+        self.percent = 73.0  # of each battery
+        drones = tuple(DroneInfo(drone.name, "ardrone2") for drone in self._scenario.drones)
+        self.info: Any = SimpleNamespace(
+            run_id="staged", rate=1.0, mode="lockstep", drones=drones, scenario=STEP.read_text(),
+            replay_of="r0" if timeline else "",
+        )  # fmt: skip
+        self.observer: Any = SimpleNamespace(
+            name="console.1", now_ns=0, end_reason="", health=SimpleNamespace(received=0, refused=0),
+            update_clock=lambda payload: messages.decode(keys.CLOCK, payload), tick=self._tick,
+        )  # fmt: skip
+
+    def _tick(self) -> None:
+        """Perform the next picture."""
+        past, wall_s = self.t_s < self._past_s, time.monotonic()
+        if past or (not self.stands and wall_s - self._performed_s >= PRESENT_S):
+            self.t_s, self._performed_s = self.t_s + (PAST_STEP_S if past else PRESENT_S), wall_s
+            self.publish_views()
+        t_ns = round(self.t_s * 1e9)
+        self.link.clock = Clock(t_ns, 0, "staged", t_ns // 20_000_000, self.clock_state, 1.0)  # type: ignore[arg-type]
+
+    def publish_views(self) -> None:
+        """Publish where all drones are at `t_s`, where they are believed to be, and where they are to be."""
+        t_ns, names = round(self.t_s * 1e9), self._cluster.drones
+        desired = np.array([float(self._cluster.plan.target[name]) for name in self._space.names])
+        p_W, yaw = self._space.inverse(desired)
+        phase = math.tau * self.t_s / SWAY_S
+        sway = SWAY_M * np.array([(math.sin(phase + k), math.cos(phase + 2 * k), 0.0) for k in range(len(names))])
+        true_W, believed_W = p_W + sway, p_W + 0.8 * sway
+        views = tuple(
+            DroneView(name, tuple(p), LEVEL, ROTORS, "flying", self.percent)
+            for name, p in zip(names, true_W.tolist(), strict=True)
+        )
+        self.link.publish(keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((1.0, 0.5, 0.0),)))
+        for name, p, psi in zip(names, believed_W.tolist(), yaw.tolist(), strict=True):
+            estimate = EstimateView(name, tuple(p), COVARIANCE_M2, psi, 0.05, GPS)
+            self.link.publish(keys.estimates_view(f"estimator.{name}"), ViewEstimates(t_ns, 0, (estimate,)))
+        value = self._space.forward(believed_W, yaw)
+        cluster = ViewCluster(t_ns, 0, "engaged", self._space.names, tuple(value.tolist()), tuple(desired.tolist()), "")
+        self.link.publish(keys.cluster_view(self._cluster.name), cluster)
+
+    def happen(self, kind: str, subject: str, text: str) -> None:
+        """Publish an event of the world."""
+        self.link.publish(keys.EVENT, Event(round(self.t_s * 1e9), 0, kind, "world", subject, text))
+
+    def end(self) -> None:
+        """End the run, as the world does."""
+        self.happen("end", "world", "the duration is over")
+        self.observer.end_reason = "the duration is over"
+
+    def wait_for_past(self) -> None:
+        """Wait until the past has been performed."""
+        until_s = time.monotonic() + PATIENCE_S
+        while self.t_s < self._past_s:
+            assert time.monotonic() < until_s, f"the past has come to {self.t_s} s only"
+            time.sleep(0.05)
+
+
+@contextmanager
+def staged_console(run: StagedRun) -> Iterator[str]:
+    """Serve pages of a run; yield the operator's address."""
+    port = free_port()
+    console = Console(ListenAddress("127.0.0.1", port), "console.1", None, PICTURES_HZ, lambda _: None)
+    over = threading.Event()
+    link: Any = run.link
+    args = link, run.info, run.observer, over.is_set, lambda _: None
+    thread = threading.Thread(target=console.serve, args=args, name="staged console")
+    with console.open():
+        thread.start()
+        try:
+            run.wait_for_past()
+            yield f"http://127.0.0.1:{port}/"
+        finally:
+            over.set()
+            thread.join(PATIENCE_S)

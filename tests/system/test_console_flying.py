@@ -1,0 +1,105 @@
+"""One drone flown from a page: by hand with a dead-man key, and to a place on the map; a viewer moves nothing."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from chromium import needs_browser
+from console_browser import BrowserPage, console
+from federation import Federation
+from test_console import TRIAD
+
+FLOWN = 1  # drone2
+STICK_S = 3.0  # simulated; for which the key is held
+SETTLE_S = 3.0  # simulated; in which a drone comes to rest
+BAR = "document.querySelector('#zsim-flight .bar').dataset.state"
+SEES = "() => { const view = document.getElementById('zsim-map').dataset.view; return view && JSON.parse(view); }"
+
+
+def place(state: dict[str, Any]) -> list[float]:
+    return state["drones"][FLOWN]["position_m"]
+
+
+def after(page: BrowserPage, seconds: float) -> list[float]:
+    """Return where the drone is after some simulated time."""
+    return place(page.until(f"s.t_s > {page.state()['t_s'] + seconds}"))
+
+
+def click_map(page: BrowserPage, x_m: float, y_m: float) -> None:
+    """Click a place [m; W] on the map."""
+    view = page.page.evaluate(SEES)
+    box = page.page.locator("#zsim-map canvas").bounding_box()
+    assert box is not None
+    dx, dy = (x_m - view["x"]) * view["scale"], (view["y"] - y_m) * view["scale"]
+    page.page.mouse.click(box["x"] + box["width"] / 2 + dx, box["y"] + box["height"] / 2 + dy)
+
+
+@needs_browser
+@pytest.mark.slow
+def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened: Callable[..., BrowserPage]) -> None:
+    federation.run(TRIAD, "--rate", "2")
+    _, links = console(federation)
+    operator, viewer = opened(links["steer"]), opened(links["look"])
+    bar = operator.page.locator("#zsim-flight")
+    operator.page.get_by_role("button", name="Take off", exact=True).and_(operator.page.locator(":enabled")).click()
+    operator.until("s.clusters[0].reason == 'ready to engage'")
+
+    # a viewer has the map, and nothing to fly with
+    viewer.page.locator("#zsim-flight .map").click()
+    viewer.page.wait_for_function(SEES)
+    assert viewer.page.locator("#zsim-flight .fly").is_hidden()
+    click_map(viewer, 6.0, 6.0)
+    viewer.page.locator("#zsim-map .there").wait_for()
+    assert viewer.page.locator("#zsim-map .go").is_hidden()
+    viewer.page.close()
+
+    # a click on a drone chooses it
+    bar.locator(".map").click()
+    operator.page.wait_for_function(SEES)
+    click_map(operator, *place(operator.state())[:2])
+    bar.locator(".fly").click()
+    bar.locator(".take").get_by_text("drone2").wait_for()
+
+    # its controller flies it: refused, unless it is taken over
+    bar.locator(".take").click()
+    bar.locator(".over").wait_for()
+    bar.locator(".over").click()
+    bar.locator(".leave").wait_for()
+
+    # without the dead-man key nothing moves; with it forward is where the nose points, here north
+    operator.page.keyboard.down("KeyW")
+    start = after(operator, STICK_S)
+    assert operator.page.evaluate(BAR) == "flying"
+    operator.page.keyboard.down("Shift")
+    operator.page.wait_for_function(f"() => {BAR} === 'held'")
+    there = after(operator, STICK_S)
+    assert there[1] - start[1] > 0.5
+    assert abs(there[0] - start[0]) < 0.5 * (there[1] - start[1])
+
+    # a page that loses the focus lets it hover, and so does a key that is let go
+    operator.page.evaluate("dispatchEvent(new Event('blur'))")
+    operator.page.wait_for_function(f"() => {BAR} === 'flying'")
+    rest = after(operator, SETTLE_S)
+    assert abs(after(operator, STICK_S)[1] - rest[1]) < 0.5
+    operator.page.keyboard.up("Shift")
+    operator.page.keyboard.up("KeyW")
+
+    # to a place, at its height; outside of the fence there is nothing to go on with
+    goal = (round(rest[0] - 1.0, 1), round(rest[1] + 1.0, 1))
+    click_map(operator, *goal)
+    operator.page.locator("#zsim-map .go").click()
+    near = f"Math.hypot(s.drones[{FLOWN}].position_m[0] - {goal[0]}, s.drones[{FLOWN}].position_m[1] - {goal[1]}) < 0.7"
+    arrived = operator.until(near)
+    assert abs(place(arrived)[2] - rest[2]) < 0.7
+    operator.page.locator("#zsim-map canvas").hover()
+    operator.page.mouse.wheel(0, 10_000)
+    operator.page.wait_for_function(f"() => ({SEES})().scale < 1")
+    click_map(operator, 0.0, 120.0)
+    operator.page.locator("#zsim-map .there").wait_for()
+    assert operator.page.locator("#zsim-map .go").is_hidden()
+
+    # given back
+    bar.locator(".leave").click()
+    bar.locator(".take").wait_for()
+    assert operator.outside() == set()
+    assert operator.faults == []

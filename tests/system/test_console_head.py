@@ -1,0 +1,134 @@
+"""The head of the console's page, in a real browser, on answers that the test gives."""
+
+import importlib.resources
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from chromium import needs_browser
+from console_browser import IN_SIGHT, PATIENCE_MS, POLL_MS, SCREENS
+from page_overflow import overflow
+
+from zsim_bridges.console.console_server import run_files
+
+pytestmark = needs_browser
+
+ADDRESS = "http://console.test/"  # of no machine: all requests are answered here
+AUDIO_JS = """
+window.tones = 0;
+window.AudioContext = class {
+  state = "running"; currentTime = 0; destination = null;
+  resume() {}
+  createOscillator() { return { frequency: {}, connect() {}, start() { window.tones += 1; }, stop() {} }; }
+};"""
+"""In place of the browser's: counts the tones that a page has begun."""
+LOOKS = 3  # of the page at the console, after which what it shows is no longer that of before
+RED = {"severity": "red", "subject": "drone1", "name": "battery", "text": "8 %", "for_s": 0.0, "acknowledged": False}
+
+
+class Head:
+    """A page with the head alone.
+
+    Attributes:
+        page: playwright's.
+        state: what the console answers.
+        looks: how often it was asked.
+    """
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        self.looks = 0
+        self.commands: list[dict[str, Any]] = []
+        refusals = {"land": "", "emergency": ""}
+        self.state: dict[str, Any] = {
+            "level": "running", "title": "running 7.0 s", "detail": "step", "t_s": 7.0, "age_s": 0.0,
+            "refusals": refusals, "alarms": [],
+        }  # fmt: skip
+        html = importlib.resources.files("zsim_bridges.console.frame").joinpath("head_bar.html").read_text("utf-8")
+        page.set_default_timeout(PATIENCE_MS)
+        page.add_init_script(AUDIO_JS)
+        page.route(f"{ADDRESS}**", lambda route: route.fulfill(body=html, content_type="text/html"))
+        page.route(f"{ADDRESS}head", self._answer)
+        page.route(f"{ADDRESS}command", self._command)
+        page.goto(ADDRESS)
+
+    def _answer(self, route: Any) -> None:
+        self.looks += 1
+        route.fulfill(body=json.dumps(self.state), content_type="application/json")
+
+    def _command(self, route: Any) -> None:
+        self.commands.append(route.request.post_data_json)
+        route.fulfill(body="{}", content_type="application/json")
+
+    def show(self, **state: Any) -> None:
+        """Let the page show another state."""
+        self.state = {**self.state, **state}
+        until = self.looks + LOOKS
+        while self.looks < until:
+            self.page.wait_for_timeout(POLL_MS)
+
+    def tones(self) -> int:
+        """Return how many tones the page has begun."""
+        return self.page.evaluate("window.tones")
+
+
+@pytest.fixture
+def head(browser: Any) -> Iterator[Head]:
+    context = browser.new_context(viewport={"width": 1280, "height": 200})
+    yield Head(context.new_page())
+    context.close()
+
+
+def test_a_red_alarm_sounds_once(head: Head) -> None:
+    head.show()
+    assert head.tones() == 0
+    head.show(alarms=[{**RED, "severity": "amber"}])
+    assert head.tones() == 0
+    head.show(alarms=[RED])
+    assert head.tones() == 1
+    head.show(alarms=[RED, {**RED, "subject": "drone2"}])
+    assert head.tones() == 2
+    head.show(alarms=[])
+    head.show(alarms=[RED])
+    assert head.tones() == 3
+
+
+def test_no_alarm_sounds_that_was_acknowledged_or_while_the_sound_is_off(head: Head) -> None:
+    head.show(alarms=[{**RED, "acknowledged": True}])
+    assert head.tones() == 0
+    sound = head.page.locator(".sound")
+    sound.click()
+    assert sound.get_attribute("aria-pressed") == "false"
+    head.show(alarms=[RED])
+    assert head.tones() == 0
+    sound.click()
+    head.show(alarms=[{**RED, "subject": "drone3"}])
+    assert head.tones() == 1
+
+
+def test_an_alarm_is_acknowledged_by_its_button(head: Head) -> None:
+    head.show(alarms=[RED])
+    head.page.locator(".acknowledge").click()
+    assert head.commands == [{"op": "acknowledge"}]
+
+
+@pytest.mark.parametrize("size", SCREENS, ids=lambda size: str(size["width"]))
+def test_when_a_run_is_over_its_report_and_record_are_named(head: Head, size: dict[str, int]) -> None:
+    head.page.set_viewport_size(size)
+    files = run_files(Path("/home/somebody/lab/flights/with/a/long/name/runs/step-20261125-065514"))
+    head.show(files=files)
+    shown = head.page.locator(".files")
+    assert shown.text_content() == ""
+    head.show(level="ended", title="run over at 330.0 s", detail="step · the duration is over")
+    for path in files.values():
+        assert path in str(shown.text_content())
+    assert overflow(head.page) == []
+    assert head.page.evaluate(IN_SIGHT)
+    head.page.unroute(f"{ADDRESS}head")  # the console of a run ends with it
+    head.page.route(f"{ADDRESS}head", lambda route: route.abort())
+    head.page.locator("[data-level=gone]").wait_for()
+    for path in files.values():
+        assert path in str(shown.text_content())
+    assert overflow(head.page) == []

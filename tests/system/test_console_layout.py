@@ -1,0 +1,163 @@
+"""Every panel of the console at the sizes of a desk's screen, of a laptop's and of a phone's."""
+
+from collections.abc import Callable, Iterator
+
+import pytest
+from chromium import needs_browser
+from console_browser import IN_SIGHT, PATIENCE_MS, SCREENS, BrowserPage
+from page_overflow import overflow
+from staged_console import StagedRun, staged_console
+
+pytestmark = needs_browser
+
+LOOKS = 20  # at a page that is laid out anew, within the tests' patience
+TIMELINE = {"from_s": 0.0, "to_s": 400.0, "marks": [{"t_s": 20.0, "kind": "mode", "text": "take off"}]}
+FORMS, TABLES = ("Fly", "Plots", "Faults", "Run"), ("Drones", "Events")
+LONG = "link_loss of drone1/estimator.drone1 begins with a probability of 0.3, as was asked for by console.1"
+COVERED_JS = """() => {
+  const canvas = document.querySelector("canvas[data-engine]").getBoundingClientRect();
+  const at = (x, y) => document.elementFromPoint(canvas.left + x * canvas.width, canvas.top + y * canvas.height);
+  const free = [.2, .4, .6, .8].flatMap(x => [.3, .5, .7].map(y => at(x, y)?.closest("canvas") !== null));
+  return { width: canvas.width, height: canvas.height, free: free.filter(Boolean).length / free.length };
+}"""
+"""The scene: its size, and how much of its middle nothing lies over."""
+CURVES_JS = """() => [...document.querySelectorAll(".uplot canvas")].map(canvas => {
+  const points = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  const colours = [[25, 113, 194], [232, 89, 12]];
+  const near = (i, colour) => points[i + 3] > 128 && colour.every((value, k) => Math.abs(points[i + k] - value) < 24);
+  return colours.map(colour => {
+    let count = 0;
+    for (let i = 0; i < points.length; i += 4) count += near(i, colour);
+    return count;
+  });
+})"""
+"""Of each plot, how many of its pixels have the colours of the estimated and the true curve."""
+LIT = ["#zsim-head", ".mantine-Tabs-tab", "label", "table td"]
+LIGHTNESS_JS = """selectors => selectors.flatMap(selector => {
+  const lightness = colour => { const [r, g, b] = colour.match(/[\\d.]+/g).map(Number); return (r + g + b) / 765; };
+  const element = [...document.querySelectorAll(selector)].find(each => each.checkVisibility());
+  if (!element) return [];
+  let behind = element;
+  const clear = each => / 0\\)/.test(getComputedStyle(each).backgroundColor);
+  while (clear(behind) && behind.parentElement) behind = behind.parentElement;
+  return [[lightness(getComputedStyle(behind).backgroundColor), lightness(getComputedStyle(element).color)]];
+})"""
+"""How light parts of the page are, from 0 to 1: what is behind a text, and the text."""
+CURVE_PX = 100  # at least, of a curve across a plot; its sign in the legend is no pixel of the canvas
+DRAWN_JS = (
+    f"() => {{ const found = ({CURVES_JS})(); return found.length === 3 && found.every(c => c[1] > {CURVE_PX}); }}"
+)
+WIDTHS_JS = "() => [...document.querySelectorAll('.uplot-container')].map(each => each.offsetWidth)"
+
+
+@pytest.fixture(scope="module")
+def flight() -> Iterator[str]:
+    run = StagedRun()
+    with staged_console(run) as address:
+        run.happen("fault", "drone1", LONG)
+        yield address
+
+
+@pytest.fixture(scope="module")
+def replay() -> Iterator[str]:
+    with staged_console(StagedRun(timeline=TIMELINE)) as address:
+        yield address
+
+
+def settled(page: BrowserPage) -> list[str]:
+    """Return what is cut off once the page has had time to lay itself out."""
+    faults = overflow(page.page)
+    for _ in range(LOOKS):
+        if faults:
+            page.page.wait_for_timeout(PATIENCE_MS / LOOKS)
+            faults = overflow(page.page)
+    return faults
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("of", ["flight", "replay"])
+def test_nothing_is_cut_off_on_any_panel_at_any_size(
+    of: str, request: pytest.FixtureRequest, opened: Callable[..., BrowserPage]
+) -> None:
+    page = opened(request.getfixturevalue(of), SCREENS[0])
+    page.wait_for_text("running")
+    found = {}
+    for size in SCREENS:
+        page.page.set_viewport_size(size)
+        for tab in (*FORMS, *TABLES):
+            page.select_tab(tab)
+            page.open_folders()
+            if faults := settled(page):
+                found[f"{tab} at {size['width']} px"] = faults
+        assert page.page.evaluate(IN_SIGHT)
+    assert found == {}
+    assert page.faults == []
+
+
+@pytest.mark.slow
+def test_a_phone_shows_the_scene_above_one_panel(flight: str, opened: Callable[..., BrowserPage]) -> None:
+    page = opened(flight, SCREENS[-1])
+    page.wait_for_text("running")
+    page.wait_for_notice()
+    assert settled(page) == []
+    page.page.wait_for_function(f"({COVERED_JS})().height < innerHeight * 0.6")
+    scene = page.page.evaluate(COVERED_JS)
+    assert scene["width"] == SCREENS[-1]["width"]
+    assert scene["height"] > SCREENS[-1]["height"] / 3
+    sheet = page.page.locator(".zsim-sheet").bounding_box()
+    assert sheet["width"] == SCREENS[-1]["width"]
+    page.close_notice()
+    assert page.page.evaluate(COVERED_JS)["free"] == 1.0
+    page.select_tab("Drones")
+    assert page.page.get_by_role("tab", name="Fly", exact=True).is_hidden()  # one panel at a time
+
+
+@pytest.mark.slow
+def test_plots_have_curves_as_soon_as_they_are_opened_and_after_the_end(opened: Callable[..., BrowserPage]) -> None:
+    run = StagedRun()
+    with staged_console(run) as address:
+        page = opened(address, SCREENS[1])
+        page.wait_for_text("running")
+        page.select_tab("Plots")
+        page.page.wait_for_function(DRAWN_JS)
+        widths, shown_s = page.page.evaluate(WIDTHS_JS), run.t_s
+        page.until(f"s.t_s > {shown_s + 2.0}")
+        assert page.page.evaluate(WIDTHS_JS) == widths
+        run.end()
+        page.wait_for_text("run over")
+        later = opened(address, SCREENS[1])
+        later.wait_for_text("run over")
+        later.select_tab("Plots")
+        later.page.wait_for_function(DRAWN_JS)
+        later.page.get_by_label("variables").click()
+        later.page.get_by_role("option", name="drone1: x, y, z").click()
+        later.page.get_by_text("x of drone1 [m]").wait_for()
+        later.page.wait_for_function(DRAWN_JS)
+
+
+@pytest.mark.slow
+def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: Callable[..., BrowserPage]) -> None:
+    page, other = opened(replay, SCREENS[1]), opened(replay, SCREENS[2])
+    page.wait_for_text("running")
+    other.wait_for_text("running")
+    page.select_tab("Run")
+    page.page.get_by_label("Dark theme").check()
+    dark = f"parts => ({LIGHTNESS_JS})(parts).every(([behind, text]) => behind < 0.3 && text > 0.4)"
+    page.page.wait_for_function(dark, arg=LIT)
+    assert len(page.page.evaluate(LIGHTNESS_JS, LIT)) == len(LIT)
+    assert all(behind > 0.7 and text < 0.6 for behind, text in other.page.evaluate(LIGHTNESS_JS, LIT))
+
+
+@pytest.mark.slow
+def test_a_record_at_its_end_offers_nothing_that_would_be_refused(opened: Callable[..., BrowserPage]) -> None:
+    run = StagedRun(past_s=TIMELINE["to_s"], timeline=TIMELINE)
+    with staged_console(run) as address:
+        run.stands, run.clock_state = True, "paused"
+        page = opened(address, SCREENS[1])
+        bar = page.page.locator("#zsim-record")
+        for control in (bar.get_by_text("Play"), bar.get_by_text("Step")):
+            control.and_(page.page.locator(":disabled")).wait_for()
+            assert "end" in str(control.get_attribute("title"))
+        assert bar.locator("input").is_enabled()
+        page.select_tab("Run")
+        page.page.get_by_role("button", name="Step", exact=True).and_(page.page.locator(":disabled")).first.wait_for()

@@ -1,0 +1,49 @@
+"""What a run leaves on a terminal, which is a pseudo-terminal here."""
+
+import fcntl
+import os
+import pty
+import struct
+import subprocess
+import termios
+from pathlib import Path
+
+import pytest
+from federation import ONE
+from forked_commands import ROOT, ZSIM
+from wire import PATIENCE_S
+
+CLEARED = "\x1b[2K"  # a line that is erased; what comes after the last one stays
+
+
+def shown(command: list[str], columns: int) -> str:
+    """Run a command on a terminal of so many columns; return all that it writes there."""
+    leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
+    environment["TERM"] = "xterm"
+    with subprocess.Popen(command, cwd=ROOT, stdout=follower, stderr=follower, env=environment) as process:
+        os.close(follower)
+        pieces = []
+        try:
+            while piece := os.read(leader, 65_536):
+                pieces.append(piece)
+        except OSError:
+            pass  # so Linux tells that nobody has the terminal open any more
+        process.wait(PATIENCE_S)
+    os.close(leader)
+    return b"".join(pieces).decode()
+
+
+@pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("columns", [80, 120])
+def test_a_run_in_one_process_leaves_its_outcome_and_its_folder(tmp_path: Path, columns: int) -> None:
+    scenario, out = tmp_path / "one.yaml", tmp_path / "run"
+    scenario.write_text(ONE)
+    options = ("--in-process", "--no-report", "--duration", "1", "--out", str(out))
+    text = shown([*ZSIM, "run", str(scenario), *options], columns)
+    assert CLEARED in text  # the live line
+    left = text.rpartition(CLEARED)[2]
+    assert "ended: " in left
+    assert str(out / "run.mcap") in left
+    assert f"into {out}" in text
