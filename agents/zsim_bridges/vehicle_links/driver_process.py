@@ -194,7 +194,7 @@ class DriverProcess:
             channel, refused = self._session.channels[0], self._session.figures(self._clock.now_ns()).refused
             silence = self._sockets[0].fault.lower() or "nothing comes"
             what = f"{refused} messages came that are not its own" if refused else silence
-            advice = "check its address, its system id and key, and that it is switched on"
+            advice = "check its address, that it is switched on, and over MAVLink its system id and key"
             self._say(f"{self._observer.name}: no aircraft at {channel.host}:{channel.port} ({what}); {advice}")
 
     def _send(self) -> None:

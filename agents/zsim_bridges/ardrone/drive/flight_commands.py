@@ -15,6 +15,8 @@ from zsim_bridges.vehicle_links.failsafe import Demand
 
 PERIOD_NS = 30_000_000  # Developer Guide 6.3: at most 30 ms between commands
 CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller commands once
+PULSE_NS = 90_000_000  # chosen: three datagrams have the emergency bit, of which two may be lost
+PULSES_NS = 400_000_000  # chosen: longer than a pulse takes to show in navdata, since another one would take it back
 HOVER = 0  # flag of a PCMD: hold the place
 
 
@@ -29,7 +31,7 @@ class FlightCommands:
         self._control = control
         self._sent_ns = -PERIOD_NS
         self._last: Demand | None = None
-        self._toggles = False
+        self._rose_ns = -PULSES_NS  # when the emergency bit did last
 
     def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
         """Yield the commands that are due, without their numbers; none where nothing is demanded.
@@ -45,22 +47,23 @@ class FlightCommands:
             case "none":
                 return
             case "kill":
-                yield self._toggle(wanted=True, emergency=emergency)
+                yield self._toggle(now_ns, due=not emergency)
             case "land":
                 yield at_commands.ref(0, takes_off=False)
                 yield Pcmd(0, HOVER, 0.0, 0.0, 0.0, 0.0)
             case "reset":
-                yield self._toggle(wanted=False, emergency=emergency)
+                yield self._toggle(now_ns, due=emergency)
             case _ if emergency:
                 return
             case _:
                 yield at_commands.ref(0, takes_off=True)
                 yield self._pcmd(now_ns, demand, pose)
 
-    def _toggle(self, wanted: bool, emergency: bool) -> Command:
+    def _toggle(self, now_ns: int, due: bool) -> Command:
         """Return the next REF of a pulse of the emergency bit, which the aircraft takes at its rise."""
-        self._toggles = emergency != wanted and not self._toggles
-        return at_commands.ref(0, takes_off=False, emergency=self._toggles)
+        if due and now_ns - self._rose_ns >= PULSES_NS:
+            self._rose_ns = now_ns
+        return at_commands.ref(0, takes_off=False, emergency=now_ns - self._rose_ns < PULSE_NS)
 
     def _pcmd(self, now_ns: int, demand: Demand, pose: AircraftPose | None) -> Command:
         if demand.action != "fly" or pose is None:

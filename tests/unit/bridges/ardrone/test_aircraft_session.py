@@ -127,6 +127,16 @@ def test_kill_stops_the_motors_and_a_reset_leaves_the_emergency():
     loop.until("hovering", Demand("take_off"))
 
 
+def test_a_kill_is_not_taken_back_by_its_repetition_where_the_link_is_slow():
+    loop = Loop(delay_s=0.2)
+    loop.run(8)
+    loop.until("hovering", Demand("take_off"))
+    loop.until("emergency", Demand("kill"), 1)
+    for _ in range(20):
+        loop.run(0.1, Demand("kill"))
+        assert loop.session.state.state == "emergency"
+
+
 def test_readings_have_our_units_and_axes():
     loop = Loop(yaw=0.0)
     loop.run(6)
