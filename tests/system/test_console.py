@@ -179,6 +179,7 @@ def states(shown: dict[str, Any]) -> list[str]:
 
 @needs_browser
 @pytest.mark.slow
+@pytest.mark.soak
 def test_an_operator_sees_three_drones_and_flies_them(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:
@@ -308,6 +309,7 @@ def test_what_one_operator_moves_the_other_sees_move(
     )
 
 
+@pytest.mark.soak
 def test_an_emergency_stops_a_drone_that_another_operator_flies(
     federation: Federation, connected: Callable[[str], PageConnection]
 ) -> None:

@@ -200,6 +200,7 @@ def repeated(client: Client, key: str, payload: bytes) -> AbstractContextManager
 
 @needs_browser
 @pytest.mark.slow
+@pytest.mark.soak
 def test_pictures_and_drones_are_shown_on_a_page_that_is_loaded_again(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:

@@ -36,6 +36,7 @@ def click_map(page: BrowserPage, x_m: float, y_m: float) -> None:
 
 @needs_browser
 @pytest.mark.slow
+@pytest.mark.soak
 def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened: Callable[..., BrowserPage]) -> None:
     federation.run(TRIAD, "--rate", "2")
     _, links = console(federation)

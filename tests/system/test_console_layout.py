@@ -75,7 +75,8 @@ def settled(page: BrowserPage) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("of", ["flight", pytest.param("replay", marks=pytest.mark.soak)])
+@pytest.mark.parametrize("of", ["flight", "replay"])
+@pytest.mark.soak
 def test_nothing_is_cut_off_on_any_panel_at_any_size(
     of: str, request: pytest.FixtureRequest, opened: Callable[..., BrowserPage]
 ) -> None:
