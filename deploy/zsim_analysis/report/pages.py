@@ -171,15 +171,13 @@ def thinned(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
     if len(x) <= points:
         return x, y
     size = -(-len(x) // (points // 2))
-    starts = range(0, len(x), size)
-    kept = np.unique([index for start in starts for index in _extremes(y[start : start + size], start)])
+    starts = np.arange(0, len(x), size)
+    bins = np.full((len(starts), size), np.nan)
+    bins.flat[: len(x)] = y
+    unknown = np.isnan(bins)  # as good as any other one of its bin, if there is none that is known
+    least, greatest = (np.where(unknown, worst, bins) for worst in (np.inf, -np.inf))
+    kept = np.unique((starts + least.argmin(axis=1), starts + greatest.argmax(axis=1)))
     return x[kept], y[kept]
-
-
-def _extremes(y: Array, start: int) -> Sequence[int]:
-    if not np.isfinite(y).any():
-        return (start,)
-    return (start + int(np.nanargmin(y)), start + int(np.nanargmax(y)))
 
 
 def write_report(
