@@ -32,8 +32,8 @@ def faults(done: subprocess.CompletedProcess[str]) -> list[str]:
 def rows(text: str) -> dict[tuple[str, ...], list[str]]:
     """Return what the table of paths says, by from, to and port."""
     below = text.partition("bandwidth")[2].splitlines()[1:]
-    words = [line.split() for line in below if line.startswith(" ")]
-    return {tuple(row[:3]): row[3:] for row in words}
+    words = [line.split() for line in below]
+    return {tuple(row[:3]): row[3:] for row in words if len(row) > 3 and row[2].isdigit()}
 
 
 def test_a_host_with_a_router_only_is_measured_and_a_greeting_is_passed_over(lab: Lab) -> None:
