@@ -36,7 +36,7 @@ CURVES_JS = """() => [...document.querySelectorAll(".uplot canvas")].map(canvas 
   });
 })"""
 """Of each plot, how many of its pixels have the colours of the estimated and the true curve."""
-LIT = ["#zsim-head", ".mantine-Tabs-tab", "label"]
+LIT = ["#zsim-head", ".mantine-Tabs-tab"]
 LIGHTNESS_JS = """selectors => selectors.flatMap(selector => {
   const lightness = colour => { const [r, g, b] = colour.match(/[\\d.]+/g).map(Number); return (r + g + b) / 765; };
   const element = [...document.querySelectorAll(selector)].find(each => each.checkVisibility());

@@ -25,6 +25,7 @@ BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # of a pl
 NONE = "none"
 STEPS_PER_WINDOW = 6  # by which the time axis moves on; chosen: plots are made anew every 30 s at most
 LEAST_POINTS = 2  # of a curve
+VALUES_LEAST = 0.01  # of a unit: curves that differ less are shown as much apart
 WINDOWS_S = (SPAN_S, 60.0, 20.0)  # simulated
 FLIGHT = {"x": "m", "y": "m", "z": "m", "yaw": "deg", "roll": "deg", "pitch": "deg"}  # of each drone, with units
 ESTIMATED = 4  # of them, the first ones: views of estimates have no roll and pitch
@@ -83,25 +84,42 @@ def flight_history(names: Sequence[str]) -> FlightHistory:
 
 
 class AxisRange(NamedTuple):
-    """What of the time axis is shown [s], simulated.
-
-    Viser keeps an automatic range by its share of the former data, read before the first range has been committed: a
-    page that draws slowly then shows a stretch without data for ever. So the range is set; it moves on by whole steps,
-    since a plot with another range is made anew.
-    """
+    """What of an axis is shown, in whole steps, since a plot with another range is made anew."""
 
     low: float
     high: float
 
     @classmethod
-    def of(cls, t_s: Array, span_s: float) -> "AxisRange":
-        """Return the range of points of those times (M,), M > 0, in a window of `span_s`."""
+    def of_times(cls, t_s: Array, span_s: float) -> "AxisRange":
+        """Return the range of points of those times (M,) [s], M > 0, in a window of `span_s`.
+
+        Viser keeps an automatic range by its share of the former data, read before the first range has been committed:
+        a page that draws slowly then shows a stretch without data for ever.
+        """
         step_s = span_s / STEPS_PER_WINDOW
         return cls(math.floor(t_s[0] / step_s) * step_s, (math.floor(t_s[-1] / step_s) + 1) * step_s)
 
-    def scales(self) -> dict[str, uplot.Scale]:
-        """Return it as uPlot takes it."""
-        return {"x": uplot.Scale(time=False, range=(self.low, self.high))}
+    @classmethod
+    def of_values(cls, values: Sequence[Array]) -> "AxisRange | None":
+        """Return the range of curves of which one is not known at all: uPlot finds none then. None where it does.
+
+        Args:
+            values: (M,) each, of one unit; NaN for what is not known.
+        """
+        known = np.concatenate(values)
+        known = known[np.isfinite(known)]
+        if not len(known) or not any(np.isnan(each).all() for each in values):
+            return None
+        least, greatest = float(known.min()), float(known.max())
+        step = 10.0 ** math.floor(math.log10(max(greatest - least, VALUES_LEAST)))
+        return cls((math.floor(least / step) - 0.5) * step, (math.ceil(greatest / step) + 0.5) * step)
+
+
+def _scales(curves: Sequence[Array], span_s: float) -> dict[str, uplot.Scale]:
+    """Return the axes of curves as uPlot takes them."""
+    scales = {"x": uplot.Scale(time=False, range=AxisRange.of_times(curves[0], span_s))}
+    values = AxisRange.of_values(curves[1:])
+    return scales if values is None else {**scales, "y": uplot.Scale(range=values)}
 
 
 class VariablePlots:
@@ -136,7 +154,7 @@ class VariablePlots:
         gui.add_markdown(f"<sub>{_legend()} over time [s]; below a plot, the values at the cursor</sub>")
         self._plots = [_plot(gui, each) for each in of_all[:PLOTS_SHOWN]]
         self._shown: tuple[PlottedVariable, ...] = tuple(of_all[:PLOTS_SHOWN])
-        self._ranges: dict[int, AxisRange] = {}  # by plot
+        self._scales: dict[int, dict[str, uplot.Scale]] = {}  # by plot
         self._lock = threading.Lock()
         for control in (self._choice, self._window, self._errors):
             control.on_update(lambda _: self._redraw())
@@ -161,18 +179,18 @@ class VariablePlots:
         less = each.reference if self._errors.value else None
         curves = each.history.curves(each.column, each.angular, span_s, less)
         if len(curves[0]) < LEAST_POINTS:
+            plot.data = BLANK
             return
-        range_s = AxisRange.of(curves[0], span_s)
-        if range_s != self._ranges.get(index):
-            self._ranges[index] = range_s
-            plot.scales = range_s.scales()
+        scales = _scales(curves, span_s)
+        if scales != self._scales.get(index):
+            self._scales[index] = plot.scales = scales
         plot.data = curves
 
     def _retitle(self) -> None:
         for index, plot in enumerate(self._plots):
             plot.visible = index < len(self._shown)
             if plot.visible:
-                plot.title, plot.data = self._shown[index].label, BLANK
+                plot.title = self._shown[index].label
 
 
 def _triples(of: str, variables: list[PlottedVariable]) -> dict[str, tuple[PlottedVariable, ...]]:
@@ -194,6 +212,6 @@ def _plot(gui: viser.GuiApi, variable: PlottedVariable) -> Any:
         height=HEIGHT_PX,
         padding=PADDING_PX,
         axes=(uplot.Axis(), uplot.Axis(size=AXIS_PX)),
-        scales=AxisRange(0.0, 1.0).scales(),
+        scales={"x": uplot.Scale(time=False, range=(0.0, 1.0))},
         legend=uplot.Legend(show=True, live=True),
     )

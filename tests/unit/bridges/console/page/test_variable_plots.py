@@ -128,10 +128,20 @@ def test_the_time_axis_holds_all_points_and_moves_on_by_whole_steps():
     span_s = WINDOWS_S[0]
     ends = np.arange(1.0, 900.0, 0.5)
     times = [np.array([max(0.0, end - span_s), end]) for end in ends]
-    found = [AxisRange.of(t, span_s) for t in times]
+    found = [AxisRange.of_times(t, span_s) for t in times]
     assert all(each.low <= t[0] and t[-1] <= each.high for each, t in zip(found, times, strict=True))
     assert max(each.high - each.low for each in found) <= span_s * (1.0 + 2.0 / STEPS_PER_WINDOW)
     assert len(set(found)) == math.ceil(ends[-1] / (span_s / STEPS_PER_WINDOW))
+
+
+def test_values_have_a_range_of_their_own_where_a_curve_is_not_known_at_all():
+    unknown, known = np.full(3, np.nan), np.array([np.nan, -1.0, 4.0])
+    assert AxisRange.of_values((unknown, unknown)) is None
+    assert AxisRange.of_values((known, known)) is None
+    found = AxisRange.of_values((unknown, known, known + 0.5))
+    assert found is not None
+    assert found.low < -1.0
+    assert found.high > 4.5
 
 
 def test_a_plot_is_made_anew_only_where_its_time_axis_moves_on():
