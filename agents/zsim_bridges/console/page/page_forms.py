@@ -74,25 +74,29 @@ class PageForms:
 
     def move_rings(self, drones: DronePoses) -> None:
         """Put the ring of each page about the drone that it has chosen."""
-        for form in list(self._forms.values()):
-            form.ring.move(drones, form.drone.chosen)
+        self._update(lambda form: form.ring.move(drones, form.drone.chosen))
 
     def show_figures(self, figures_of: Callable[[str], str]) -> None:
         """Show on each page the figures of the drone that it has chosen; `figures_of` a drone are HTML."""
         forms = list(self._forms.values())
         contents = {drone: figures_of(drone) for drone in {form.drone.chosen for form in forms}}
-        for form in forms:
-            form.figures.content = contents.get(form.drone.chosen, "")
+        self._update(lambda form: setattr(form.figures, "content", contents.get(form.drone.chosen, "")))
 
     def show_events(self, rows: Sequence[EventRow]) -> None:
         """Show on each page the events that it has chosen."""
-        for form in list(self._forms.values()):
-            form.events.show(rows)
+        self._update(lambda form: form.events.show(rows))
 
     def refresh(self, run: RunCondition) -> None:
         """Offer what would not be refused."""
-        for form in list(self._forms.values()):
-            form.drone.refresh(run)
+        self._update(lambda form: form.drone.refresh(run))
+
+    def _update(self, change: Callable[[_PageForm], None]) -> None:
+        """Change the forms of all pages but of those that are closed just then, whose handles viser has removed."""
+        for client_id, form in list(self._forms.items()):
+            try:
+                change(form)
+            except RuntimeError:
+                self._forms.pop(client_id, None)
 
     def _add(self, page: viser.ClientHandle) -> None:
         if self._closed:

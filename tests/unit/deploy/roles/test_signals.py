@@ -117,8 +117,10 @@ def test_a_command_behind_a_head_has_the_exit_code_of_shells(tmp_path: Path) -> 
     """As Click has it, that would be 1, without a word."""
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "zsim_deploy.cli", "fault", "kinds"]
-    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, timeout=60.0, check=False)
+    command = [sys.executable, "-m", "zsim_deploy.cli", "validate", "scenarios/step.yaml"]
+    done = subprocess.run(
+        command, stdout=write, stderr=subprocess.PIPE, timeout=60.0, check=False, cwd=Path(__file__).parents[4]
+    )
     os.close(write)
     assert (done.returncode, done.stderr) == (141, b"")
 
