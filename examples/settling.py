@@ -8,8 +8,8 @@ See docs/sweep.md.
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim_analysis.reading.flight import RecordedFlight
 from zsim_analysis.reading.formation import formations_of
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 
 BAND_M = 0.5  # m: a side is settled from when on it stays so near to its desired length; chosen
 

@@ -4,6 +4,7 @@ Few drones have the colours of Okabe and Ito (2008); more have those of viridis 
 first drone of the scenario to the last, without its yellow, which white paper swallows.
 """
 
+from collections.abc import Collection
 from functools import lru_cache
 from itertools import pairwise
 
@@ -17,6 +18,11 @@ def drone_colours(count: int) -> tuple[str, ...]:
     if count <= len(FEW):
         return FEW[:count]
     return tuple(_between(i / (count - 1)) for i in range(count))
+
+
+def colours_of(drones: Collection[str]) -> dict[str, str]:
+    """Return the colour of each drone by its name; they are in the order of the scenario."""
+    return dict(zip(drones, drone_colours(len(drones)), strict=True))
 
 
 def _between(share: float) -> str:

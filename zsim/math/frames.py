@@ -4,6 +4,8 @@ World W is ENU (x east, y north, z up) at an origin given in WGS 84; body B is F
 w first, and turn body components into world components. All functions take arrays with any leading shape.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -139,6 +141,12 @@ def heading(q: ArrayLike) -> Array:
     """Return the heading [rad]: the angle of the body's x axis from east, counter-clockwise seen from above."""
     w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def turned_about_up(v: tuple[float, float, float], angle_rad: float) -> tuple[float, float, float]:
+    """Return a vector turned about z, counter-clockwise seen from above; by a heading: heading frame to W."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
 
 
 def quaternion_from_heading(heading_rad: ArrayLike) -> Array:

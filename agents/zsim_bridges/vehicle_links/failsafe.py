@@ -13,11 +13,10 @@ The rules, for the clock of the run:
   setpoint, or the repetition of an old take-off, for a new one.
 """
 
-from math import cos, sin
 from typing import Literal, NamedTuple
 
 from zsim.contract import flight_messages
-from zsim.math.frames import heading
+from zsim.math.frames import heading, turned_about_up
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Silence
 from zsim_bridges.vehicle_links.aircraft_state import AIRBORNE, STANDING, STILL, AircraftState
@@ -232,7 +231,7 @@ class Failsafe:
             return Demand("hold")
         velocity = setpoint.velocity_m_s
         if setpoint.frame == "heading":
-            velocity = turned(velocity, float(heading(pose.q_WB)))
+            velocity = turned_about_up(velocity, float(heading(pose.q_WB)))
         velocity = self._limits.limited(velocity, pose.position_m)
         return Demand("fly", velocity, self._limits.yaw_rate(setpoint.yaw_rate_rad_s))
 
@@ -246,9 +245,3 @@ class Failsafe:
 def _is_lost(vehicle: AircraftState, now_ns: int) -> bool:
     """Tell whether nothing has come from an aircraft for too long, or ever."""
     return vehicle.received_ns is None or now_ns - vehicle.received_ns > LINK_LOST_S * 1e9
-
-
-def turned(velocity: Vector, yaw_rad: float) -> Vector:
-    """Return a velocity of the heading frame in W."""
-    x, y, z = velocity
-    return x * cos(yaw_rad) - y * sin(yaw_rad), x * sin(yaw_rad) + y * cos(yaw_rad), z

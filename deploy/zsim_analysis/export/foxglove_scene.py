@@ -5,7 +5,7 @@ Foxglove shows, at any time, the last message of a topic alone; so each message 
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, NamedTuple
@@ -33,7 +33,7 @@ from zsim.contract.camera_messages import CameraImage, CameraInfo
 from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth
 from zsim.contract.messages import Gps, Info
 from zsim.contract.run_messages import Event
-from zsim.drone_colours import drone_colours
+from zsim.drone_colours import colours_of
 from zsim.math.frames import principal_axes
 from zsim.record import Recorded
 from zsim_analysis.export.message_columns import Values
@@ -138,11 +138,6 @@ def colour(text: str, opacity: float = 1.0) -> Color:
     """Return the colour of `#rrggbb`."""
     red, green, blue = rgb(text)
     return Color(r=red, g=green, b=blue, a=opacity)
-
-
-def colours_of(drones: Collection[str]) -> dict[str, str]:
-    """Return the colour of each drone, which are in the order of the scenario."""
-    return dict(zip(drones, drone_colours(len(drones)), strict=True))
 
 
 def frame(drone: str) -> str:

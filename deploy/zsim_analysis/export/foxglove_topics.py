@@ -23,11 +23,12 @@ from foxglove.messages import PoseInFrame
 
 from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Status
+from zsim.drone_colours import colours_of
 from zsim.math.frames import heading
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_analysis.export import foxglove_messages, foxglove_scene
 from zsim_analysis.export.foxglove_messages import NumericMessageType
-from zsim_analysis.export.foxglove_scene import GREY, MAGENTA, Instant, RotorDisc, colours_of, pose, timestamp
+from zsim_analysis.export.foxglove_scene import GREY, MAGENTA, Instant, RotorDisc, pose, timestamp
 
 TF, LOG, DRONES, GROUND, TRAILS = "/tf", "/log", "/scene/drones", "/scene/ground", "/scene/trails"
 FORMATIONS, ESTIMATES = "/scene/formations", "/scene/estimates"

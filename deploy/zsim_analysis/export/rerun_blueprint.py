@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zsim.drone_colours import colours_of
 from zsim_analysis.export.foxglove_file import CURVES, DRONE_PLOTS, DRONES_MAX, PICTURES, PICTURES_MAX, PLOTS_MAX, TAB
 from zsim_analysis.export.foxglove_messages import PACKAGE, tidy
-from zsim_analysis.export.foxglove_scene import DARK, MAGENTA, WORLD, RotorDisc, colours_of, rgb
+from zsim_analysis.export.foxglove_scene import DARK, MAGENTA, WORLD, RotorDisc, rgb
 from zsim_analysis.export.foxglove_topics import DESIRED, LOG, POINTS
 
 TIMELINE = "message_log_time"  # Rerun's name of the MCAP file's log time: simulated time

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zsim.math.frames import wrap_angle
 from zsim_analysis.reading.recorded_flight import Array, DroneEstimates, RecordedFlight, Track, VelocityCommands
 
 SIGMAS = 2.0  # half width of the band that is drawn, in standard deviations
@@ -69,7 +70,7 @@ def _errors(track: Track, estimates: DroneEstimates, step: int) -> EstimateError
     there = there * step
     position = estimates.p_W[here] - track.p_W[there]
     velocity = estimates.v_W[here] - track.truth[there, 3:6]
-    yaw = _short_way(estimates.yaw[here] - track.yaw[there])
+    yaw = wrap_angle(estimates.yaw[here] - track.yaw[there])
     covariance = estimates.covariance[here]
     variances = np.diagonal(covariance, axis1=1, axis2=2)[:, :3]
     sigma = np.column_stack([np.sqrt(np.maximum(variances, 0.0)), estimates.yaw_sigma[here]])
@@ -99,8 +100,3 @@ def _in_heading(v_W: Array, yaw: Array) -> Array:
     """Return velocities (K, 3) forward, left and up, of those in W."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.column_stack([c * v_W[:, 0] + s * v_W[:, 1], c * v_W[:, 1] - s * v_W[:, 0], v_W[:, 2]])
-
-
-def _short_way(angle: Array) -> Array:
-    """Return angles [rad] in [-π, π)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -19,7 +19,7 @@ from zsim.errors import DocumentError, ReportError, ScenarioError, reason_of
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.schema.checker import show
-from zsim_analysis.reading.flight import RecordedFlight
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 
 PREFIX = "metrics."  # of the columns
 FIELD = "report.metrics"

@@ -20,8 +20,9 @@ from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_analysis.in_process import InProcessFlight
-from zsim_analysis.reading.flight import FlightReader, RecordedFlight
+from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import Formation, formations_of
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.metrics import NO_METRICS, metrics_of
 

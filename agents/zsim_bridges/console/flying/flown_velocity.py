@@ -3,6 +3,8 @@
 import math
 from typing import NamedTuple
 
+from zsim.math.frames import turned_about_up
+from zsim.math.rotation import Vector
 from zsim.vehicles.vehicle import Limits
 from zsim_bridges.console.flying.geofence import Geofence
 
@@ -10,7 +12,6 @@ CLIMB_SHARE = 0.5  # of the speed over the ground, up and down; chosen: on a pag
 YAW_RATE_RAD_S = math.radians(45.0)  # chosen: once around in 8 s
 SPEED_M_S = 1.5  # towards a place; chosen: as the formations of the paper
 GAIN_1_S = 0.6  # of the way to a place; as formations, `Gains.proportional_1_s`
-Vector = tuple[float, float, float]
 
 
 class Stick(NamedTuple):
@@ -51,7 +52,7 @@ def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofenc
     climb = stick.up * min(CLIMB_SHARE * speed, limits.vertical_speed_m_s)
     wanted = (stick.forward / deflection * speed, stick.left / deflection * speed, climb)
     yaw_rate = stick.turn * min(YAW_RATE_RAD_S, math.radians(limits.yaw_rate_deg_s))
-    return FlownVelocity(_fenced(turned(wanted, pose.yaw_rad), pose, fence), yaw_rate)
+    return FlownVelocity(_fenced(turned_about_up(wanted, pose.yaw_rad), pose, fence), yaw_rate)
 
 
 def velocity_to(place_W: Vector, pose: DronePose, limits: Limits, fence: Geofence) -> FlownVelocity:
@@ -66,10 +67,4 @@ def velocity_to(place_W: Vector, pose: DronePose, limits: Limits, fence: Geofenc
 def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
     """Return a velocity of W in the heading frame, without what leads out of the fence."""
     x, y, z = fence.within(velocity_W, pose.p_W)
-    return turned((x, y, z), -pose.yaw_rad)
-
-
-def turned(velocity: Vector, yaw_rad: float) -> Vector:
-    """Return a velocity turned about up."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    return (c * velocity[0] - s * velocity[1], s * velocity[0] + c * velocity[1], velocity[2])
+    return turned_about_up((x, y, z), -pose.yaw_rad)

@@ -6,6 +6,7 @@ Source: https://mavlink.io/en/messages/common.html#SET_POSITION_TARGET_LOCAL_NED
 import math
 from typing import NamedTuple
 
+from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.autopilot.enums import AttitudeMask, MavFrame, TypeMask
@@ -88,7 +89,7 @@ def _target(
         return SetpointRefusal("a setpoint is beyond all bounds")
     along = along_heading and position == NOWHERE
     if along_heading and not along and velocity is not None:
-        velocity = _turned(velocity, state.yaw_rad)
+        velocity = turned_about_up(velocity, state.yaw_rad)
     yaw, yaw_rate = _yaw(mask, message.yaw, message.yaw_rate, message.coordinate_frame, state)
     return Target(position, velocity or (0.0, 0.0, 0.0), yaw, yaw_rate, along)
 
@@ -106,11 +107,6 @@ def _velocity(mask: TypeMask, given: Vector, along_heading: bool) -> Vector | No
         return None
     x, y, z = (0.0 if mask & bit or not math.isfinite(v) else v for v, bit in zip(given, bits, strict=True))
     return ned_axes.frd((x, y, z)) if along_heading else ned_axes.ned((x, y, z))
-
-
-def _turned(v_H: Vector, yaw_rad: float) -> Vector:
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    return c * v_H[0] - s * v_H[1], s * v_H[0] + c * v_H[1], v_H[2]
 
 
 def _is_sane(position: Axes, velocity: Vector) -> bool:

@@ -6,7 +6,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from zsim.drone_colours import drone_colours
+from zsim.drone_colours import colours_of
 from zsim_analysis.report.comparison import ComparedRun
 from zsim_analysis.report.figures.drone_panels import draw_drone_panels, drone_panel_heights, name_states
 from zsim_analysis.report.figures.plan_view import NAMED_MAX, draw_obstacles, draw_path
@@ -58,8 +58,7 @@ def _even_out(grid: Any) -> None:
 
 def _drone_colours(runs: Sequence[ComparedRun]) -> dict[str, str]:
     """Return a colour for each drone of all runs: one of a name has one colour."""
-    names = list(dict.fromkeys(track.name for run in runs for track in run.flight.tracks))
-    return dict(zip(names, drone_colours(len(names)), strict=True))
+    return colours_of(list(dict.fromkeys(track.name for run in runs for track in run.flight.tracks)))
 
 
 def _name_drones(figure: Figure, axes: Axes, colours: Mapping[str, str]) -> None:

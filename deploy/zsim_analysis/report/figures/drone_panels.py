@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from zsim.drone_colours import drone_colours
+from zsim.drone_colours import colours_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight, Track
 from zsim_analysis.report.figures.plan_view import NAMED_MAX
 from zsim_analysis.report.figures.time_marks import TimeMarks, draw_marks
@@ -60,11 +60,6 @@ def draw_drones(flight: RecordedFlight, marks: TimeMarks) -> Figure:
     if count > NAMED_MAX:
         name_ends(panels[0], list(colours.items()))
     return figure
-
-
-def colours_of(drones: Sequence[str]) -> dict[str, str]:
-    """Return the colour of each drone, which are in the order of the scenario."""
-    return dict(zip(drones, drone_colours(len(drones)), strict=True))
 
 
 def name_ends(axes: Axes, colours: Sequence[tuple[str, str]]) -> None:

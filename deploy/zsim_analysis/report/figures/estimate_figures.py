@@ -77,7 +77,7 @@ def _draw_drone(column: Sequence[Axes], errors: EstimateErrors, colour: str, row
             label=None if i else "estimate − truth",
         )
         _note(axes, f"{100 * inside[i]:.0f} % in {SIGMAS:g}σ")
-    _draw_nees(column[-1], errors.t_s, errors.nees, DEGREES, colour)
+    _draw_nees(column[-1], errors.t_s, errors.nees, colour)
     known = errors.nees[rows][np.isfinite(errors.nees[rows])]
     _note(column[-1], f"mean {known.mean():.3g}, of {DEGREES}" if len(known) else "P is singular")
 
@@ -96,10 +96,10 @@ def _note(axes: Axes, text: str) -> None:
     )
 
 
-def _draw_nees(axes: Axes, t_s: Array, nees: Array, degrees: int, colour: str, of: int = 1) -> None:
+def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, of: int = 1) -> None:
     """Draw NEES, or its mean over `of` drones, with the range of nineteen of twenty consistent ones."""
     dress(axes)
-    low, high = (float(chdtri(of * degrees, share)) / of for share in (0.975, 0.025))
+    low, high = (float(chdtri(of * DEGREES, share)) / of for share in (0.975, 0.025))
     axes.axhspan(low, high, color=ORANGE, alpha=0.25, lw=0, zorder=0.6, label=CONSISTENT)
     line(axes, t_s, np.maximum(nees, FLOOR), color=colour, lw=0.6, zorder=3)
     axes.set_yscale("log")
@@ -129,7 +129,7 @@ def _draw_many(
     draw_spread(grid[0, 0], t_s, distance, BLUE)
     judged = t_s >= (marks.engaged_s or 0.0)  # before it, the start's noise would set the scale
     grid[0, 0].set_ylim(0.0, 1.1 * float(np.max(distance[judged], initial=0.0)) or None)
-    _draw_nees(grid[1, 0], t_s, nees.mean(axis=1), DEGREES, BLUE, of=len(errors))
+    _draw_nees(grid[1, 0], t_s, nees.mean(axis=1), BLUE, of=len(errors))
     grid[1, 0].set_yscale("linear")
     grid[1, 0].set_ylabel(f"NEES, mean of {len(errors)}", fontsize=PAPER_PT)
     draw_marks(grid[:, 0], marks)

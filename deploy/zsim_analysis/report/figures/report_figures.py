@@ -3,12 +3,13 @@
 from collections.abc import Iterator, Sequence
 from textwrap import shorten
 
+from zsim.drone_colours import colours_of
 from zsim_analysis.reading.distances import distances, separations
 from zsim_analysis.reading.drone_errors import estimate_errors, velocity_responses
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.goal import goal_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.report.figures.drone_panels import colours_of, draw_drones
+from zsim_analysis.report.figures.drone_panels import draw_drones
 from zsim_analysis.report.figures.estimate_figures import draw_estimates
 from zsim_analysis.report.figures.formation_figures import ROWS_MAX, draw_errors, draw_parameters, parameter_groups
 from zsim_analysis.report.figures.motion_figures import PAIRS_MAX, draw_distances, draw_velocities

@@ -22,13 +22,14 @@ from synthetic_pictures import AHEAD, FRONT_P_BK, NO_JPEG, image, info, jpeg
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState, Truth
+from zsim.drone_colours import colours_of
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.record import RecordReader, RecordWriter
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export import Format, rerun_blueprint
 from zsim_analysis.export.foxglove_messages import NumericMessageType
-from zsim_analysis.export.foxglove_scene import Instant, RotorDisc, colours_of
+from zsim_analysis.export.foxglove_scene import Instant, RotorDisc
 from zsim_analysis.export.foxglove_topics import FoxgloveFile
 from zsim_analysis.export.make_export import export
 from zsim_analysis.export.rerun_blueprint import TIMELINE, drone_mesh, panels

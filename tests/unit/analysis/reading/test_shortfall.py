@@ -15,7 +15,8 @@ from zsim.contract.flight_messages import ClusterState
 from zsim.contract.run_messages import Clock, Event
 from zsim.record import RecordWriter
 from zsim_agents.formation.flight_plan import WAITS, waiting_step
-from zsim_analysis.reading.flight import FlightReader, RecordedFlight
+from zsim_analysis.reading.flight import FlightReader
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.shortfall import Shortfall, shortfalls
 from zsim_analysis.reading.verdict import NOT_AS_PLANNED, marks_of, verdict
 from zsim_analysis.report.figures.report_figures import figures

@@ -12,8 +12,9 @@ from synthetic_record import Flown
 
 from zsim.contract.flight_messages import ClusterState
 from zsim.contract.run_messages import Event
-from zsim_analysis.reading.flight import FlightReader, RecordedFlight
+from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import Formation, formations_of
+from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.figures.drone_panels import draw_drones
 from zsim_analysis.report.figures.formation_figures import curves, draw_errors, draw_parameters
 from zsim_analysis.report.figures.plan_view import draw_plan

@@ -7,9 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refused import has_terms
 
+from zsim.math.frames import turned_about_up
 from zsim.scenario import scenario_file
 from zsim.vehicles.vehicle import Limits
-from zsim_bridges.console.flying.flown_velocity import DronePose, Stick, stick_velocity, turned, velocity_to
+from zsim_bridges.console.flying.flown_velocity import DronePose, Stick, stick_velocity, velocity_to
 from zsim_bridges.console.flying.geofence import Geofence, geofence_of
 
 FENCE = Geofence((-50.0, -50.0, 1.0), (50.0, 50.0, 30.0))
@@ -65,7 +66,7 @@ def test_the_fence_holds_whatever_the_heading():
 
 def test_to_a_place_a_drone_flies_straight_and_slows_down_there():
     far = velocity_to((30.0, 40.0, 5.0), MIDDLE, LIMITS, FENCE)
-    assert turned(far.velocity_m_s, MIDDLE.yaw_rad) == pytest.approx((0.9, 1.2, 0.0))
+    assert turned_about_up(far.velocity_m_s, MIDDLE.yaw_rad) == pytest.approx((0.9, 1.2, 0.0))
     near = velocity_to((0.5, 0.0, 5.5), MIDDLE, LIMITS, FENCE)
-    assert turned(near.velocity_m_s, MIDDLE.yaw_rad) == pytest.approx((0.3, 0.0, 0.3))
+    assert turned_about_up(near.velocity_m_s, MIDDLE.yaw_rad) == pytest.approx((0.3, 0.0, 0.3))
     assert far.yaw_rate_rad_s == near.yaw_rate_rad_s == 0.0
