@@ -27,6 +27,7 @@ PICTURES_HZ = 100.0  # while the past is performed; each has one point of the pl
 PAST_STEP_S = 0.5  # simulated, from one picture of the past to the next
 PRESENT_S = 0.5  # wall, and simulated, between two pictures: a browser without a graphics card draws slowly
 GATE_NS = 20_000_000
+LOOK_S = 0.5  # wall, between two looks whether the console lives
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ROTORS = (300.0, 300.0, 300.0, 300.0)  # rad/s
 COVARIANCE_M2 = (0.04, 0.0, 0.0, 0.04, 0.0, 0.09)
@@ -91,6 +92,7 @@ class StagedRun:
         self.link.timeline = timeline or {}
         self.t_s, self.clock_state, self.stands = 0.0, "running", False
         self._performed_s = 0.0  # wall
+        self._present = threading.Event()  # once the past has been performed
         self.percent = 73.0  # of each battery
         drones = tuple(DroneInfo(drone.name, "ardrone2") for drone in self._scenario.drones)
         self.info: Any = SimpleNamespace(
@@ -108,6 +110,8 @@ class StagedRun:
         if past or (not self.stands and wall_s - self._performed_s >= PRESENT_S):
             self.t_s, self._performed_s = self.t_s + (PAST_STEP_S if past else PRESENT_S), wall_s
             self.publish_views()
+        if self.t_s >= self._past_s:
+            self._present.set()
         t_ns = round(self.t_s * 1e9)
         self.link.clock = Clock(t_ns, 0, "staged", t_ns // GATE_NS, self.clock_state, 1.0)  # type: ignore[arg-type]
 
@@ -143,10 +147,9 @@ class StagedRun:
     def wait_for_past(self, console: threading.Thread) -> None:
         """Wait until the past has been performed for a console."""
         until_s = time.monotonic() + PATIENCE_S
-        while self.t_s < self._past_s:
+        while not self._present.wait(LOOK_S):
             assert console.is_alive()
             assert time.monotonic() < until_s, f"the past has come to {self.t_s} s only"
-            time.sleep(0.05)
 
 
 @contextmanager
