@@ -140,7 +140,7 @@ function clusterRow({ name }) {
   row.insertCell().textContent = name;
   row.insertCell().className = "phase";
   const ask = (request) => (cluster) => zsim.ask(`cluster/${cluster}/control`, request);
-  const asked = { "Take off": "takeoff", Engage: "engage", Hold: "hold", Land: "land" };
+  const asked = { "Take off": "takeoff", Engage: "engage", Hold: "hold", Rejoin: "rejoin", Land: "land" };
   row.insertCell().append(...Object.entries(asked).map(([text, request]) => button(text, name, ask(request))));
   return row;
 }

@@ -35,7 +35,7 @@ POLL_S = 0.1  # how often a stop is checked
 STATUS_S = 1.0  # how long a drone's state is waited for
 ATTEMPT_S = 1.0  # of connecting to ROS's router
 TRIGGER = "std_srvs/srv/Trigger"
-CLUSTER_SERVICES = ("takeoff", "engage", "hold", "land")
+CLUSTER_SERVICES = ("takeoff", "engage", "hold", "rejoin", "land")
 Say = Callable[[str], None]
 
 

@@ -215,6 +215,7 @@ classdef Client < handle
         function clusterTakeoff(c, name), c.ask_cluster(name, 'takeoff', {}); end
         function clusterEngage(c, name), c.ask_cluster(name, 'engage', {}); end
         function clusterHold(c, name), c.ask_cluster(name, 'hold', {}); end
+        function clusterRejoin(c, name), c.ask_cluster(name, 'rejoin', {}); end
         function clusterLand(c, name), c.ask_cluster(name, 'land', {}); end
 
         % The lockstep

@@ -196,7 +196,10 @@ def _head(page: Path) -> bytes:
 
 
 def compare(
-    directories: Sequence[Path], out: Path, progress: Callable[[str], None] = lambda _: None
+    directories: Sequence[Path],
+    out: Path,
+    progress: Callable[[str], None] = lambda _: None,
+    formats: Sequence[str] = (),
 ) -> list[ComparedRun]:
     """Read the records of several runs and write the page that compares them.
 
@@ -204,6 +207,7 @@ def compare(
         directories: of the runs, at least two.
         out: of the page; an earlier one is replaced when the new one is whole.
         progress: called with a text at each step.
+        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written into a folder beside the page.
 
     Raises:
         RecordError: one of them has no record, or no drone moves on it.
@@ -214,7 +218,7 @@ def compare(
     for name, directory in zip(run_names(directories), directories, strict=True):
         judged = judge(directory / RECORD, lambda text, name=name: progress(f"{name}: {text}"))
         runs.append(ComparedRun(name, directory, *judged))
-    write_page(out, comparison_figures(runs), partial(comparison_page, runs), progress)
+    write_page(out, comparison_figures(runs), partial(comparison_page, runs), progress, formats)
     return runs
 
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import fill
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
@@ -19,11 +19,11 @@ from msgspec import Struct
 from zsim.errors import ReportError
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.recorded_flight import Array
+from zsim_analysis.report import FORMATS
 
-DPI = 120  # of figures that are for the screen alone
 COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's conference papers
-PAPER_DPI = 200  # of figures as wide as these
-PAPER_PT, SCREEN_PT = 8.0, 10.0  # of text, points
+DPI = 200  # of PNG files
+PAPER_PT = 8.0  # of text, points: that of a paper's captions
 LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of an entry of a legend besides its name, in its text's size
 FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE takes no Type 3
 POINTS = 2000  # per line: more than a page has pixels
@@ -90,17 +90,7 @@ Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 
 def new_figure(width_in: float, height_in: float) -> Figure:
     """Return an empty figure that lays itself out; nothing of matplotlib's global state is used."""
-    dpi = PAPER_DPI if width_in <= PAGE_IN else DPI
-    return Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained")
-
-
-def text_pt(figure: Figure) -> float:
-    """Return the size of a figure's text [points]: that of a paper's captions in one that fits its page."""
-    return PAPER_PT if figure.get_size_inches()[0] <= PAGE_IN else SCREEN_PT
-
-
-def _text_pt(axes: Axes) -> float:
-    return text_pt(cast(Figure, axes.get_figure(root=True)))
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
 def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
@@ -115,8 +105,8 @@ def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
 def mark_figure(figure: Figure, text: str) -> None:
     """Write above a figure that its flight is not what it may be taken for; nothing without a text."""
     if text:
-        width = int(18 * figure.get_size_inches()[0] * SCREEN_PT / text_pt(figure))  # characters of a line
-        figure.suptitle(fill(text, width), color=VERMILION, fontsize=text_pt(figure), fontweight="bold")
+        width = int(22.5 * figure.get_size_inches()[0])  # characters of a line
+        figure.suptitle(fill(text, width), color=VERMILION, fontsize=PAPER_PT, fontweight="bold")
 
 
 def dress(axes: Axes, label: str = "") -> None:
@@ -124,16 +114,16 @@ def dress(axes: Axes, label: str = "") -> None:
     axes.grid(True, color="#d8dee4", lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(which="both", labelsize=_text_pt(axes) - 1)
+    axes.tick_params(which="both", labelsize=PAPER_PT - 1)
     axes.margins(x=0.01)
     if label:
-        axes.set_ylabel(label, fontsize=_text_pt(axes))
+        axes.set_ylabel(label, fontsize=PAPER_PT)
 
 
 def label_time(axes: Iterable[Axes]) -> None:
     """Label the time axis of axes."""
     for each in axes:
-        each.set_xlabel("simulated time (s)", fontsize=_text_pt(each))
+        each.set_xlabel("simulated time (s)", fontsize=PAPER_PT)
 
 
 def label(name: str) -> str:
@@ -152,7 +142,7 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
     """Put the legend of some axes above all axes of the figure, where it covers no data."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        longest = (ENTRY_EMS + LETTER_EMS * max(map(len, labels))) * text_pt(figure) / 72  # inches
+        longest = (ENTRY_EMS + LETTER_EMS * max(map(len, labels))) * PAPER_PT / 72  # inches
         columns = min(columns, max(1, int(figure.get_size_inches()[0] / longest)))
         figure.legend(
             handles,
@@ -160,7 +150,7 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
             loc="outside upper center",
             ncols=min(columns, len(handles)),
             frameon=False,
-            fontsize=text_pt(figure),
+            fontsize=PAPER_PT,
             columnspacing=1.2,
             handlelength=1.6,
         )
@@ -190,6 +180,8 @@ def write_report(
 ) -> None:
     """Write DIR/summary.json, DIR/figures/*.png and DIR/report.html, all or none of them.
 
+    Files of these figures in other formats, which an earlier report left, are of another drawing and go.
+
     Args:
         directory: of the run or the sweep.
         summary: content of summary.json.
@@ -202,13 +194,14 @@ def write_report(
         ReportError: the directory cannot be written.
     """
     with _put_in_place(directory, directory) as new:
-        (new / "figures").mkdir()
         pictures = render(_kept(figures, new / "figures", formats), progress)
         progress("writing the page")
         for figure, png in pictures:
             (new / "figures" / figure.name).write_bytes(png)
         (new / "summary.json").write_bytes(summary)
         (new / "report.html").write_text(page(pictures), encoding="utf-8")
+    for figure, _ in pictures:
+        _remove_others(directory / "figures" / figure.name, formats)
 
 
 def write_page(
@@ -216,20 +209,31 @@ def write_page(
     figures: Iterable[ReportFigure],
     page: Callable[[Sequence[Picture]], str],
     progress: Callable[[str], None],
+    formats: Sequence[str] = (),
 ) -> None:
-    """Write one page; an earlier one is replaced when the new one is whole. Arguments and errors as `write_report`."""
+    """Write one page; an earlier one is replaced when the new one is whole. Arguments and errors as `write_report`.
+
+    Figures in other formats come into a folder beside the page, by the page's name without its ending.
+    """
     with _put_in_place(out.parent, out) as new:
-        pictures = render(figures, progress)
+        pictures = render(_kept(figures, new / out.stem, formats), progress)
         progress("writing the page")
         (new / out.name).write_text(page(pictures), encoding="utf-8")
 
 
 def _kept(figures: Iterable[ReportFigure], folder: Path, formats: Sequence[str]) -> Iterator[ReportFigure]:
     """Yield figures when their files in other formats are written."""
+    folder.mkdir()
     for figure in figures:
         yield figure
         for form in formats:
             (folder / figure.name).with_suffix(f".{form}").write_bytes(figure.vector(form))
+
+
+def _remove_others(png: Path, formats: Sequence[str]) -> None:
+    """Remove the files of a figure in formats other than these."""
+    for form in set(FORMATS) - set(formats):
+        png.with_suffix(f".{form}").unlink(missing_ok=True)
 
 
 @contextmanager

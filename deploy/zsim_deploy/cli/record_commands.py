@@ -96,7 +96,7 @@ def report(
     ] = None,
     formats: Annotated[
         str | None,
-        typer.Option("--format", help="pdf, svg or pdf,svg: a run's figures are written so too.", show_default=False),
+        typer.Option("--format", help="pdf, svg or pdf,svg: figures are written so too.", show_default=False),
     ] = None,
 ) -> None:
     """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
@@ -104,10 +104,8 @@ def report(
     from zsim_analysis.sweep.design import is_sweep
 
     wanted = _formats(formats)
-    if wanted and (len(directories) > 1 or is_sweep(directories[0])):
-        raise typer.BadParameter("--format is for the figures of one run; leave it out")
     if len(directories) > 1:
-        _compare(directories, out)
+        _compare(directories, out, wanted)
         return
     directory = directories[0]
     if out is not None:
@@ -130,7 +128,7 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
 
     Args:
         folder: of the run or the sweep.
-        formats: of figures, beside PNG; a sweep's have none.
+        formats: of figures, beside PNG.
     """
     require("report", REPORT_NEEDS)
     from rich.console import Console
@@ -145,15 +143,14 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
         from zsim_analysis.report.make_report import make_report as make
         from zsim_analysis.report.tables import terminal_text
     with Console(stderr=True).status("reading …") as status:
-        options = {"formats": formats} if formats else {}
-        summary: Any = make(folder, lambda text: status.update(cell(text)), **options)
+        summary: Any = make(folder, lambda text: status.update(cell(text)), formats)
     PipedConsole().print(terminal_text(summary))
     fault = "" if is_sweep(folder) else _fault_of(summary.record.complete, summary.record.state, summary.shortfalls)
     print(printable(f"report: {folder / 'report.html'}"))
     return fault
 
 
-def _compare(directories: list[Path], out: Path | None) -> None:
+def _compare(directories: list[Path], out: Path | None, formats: Sequence[str]) -> None:
     from rich.console import Console
 
     from zsim.record.record_reader import record_in
@@ -167,7 +164,7 @@ def _compare(directories: list[Path], out: Path | None) -> None:
         record_in(directory)
     page = out or comparison_path(directories)
     with Console(stderr=True).status("reading the records …") as status:
-        compare(directories, page, lambda text: status.update(cell(text)))
+        compare(directories, page, lambda text: status.update(cell(text)), formats)
     print(printable(f"report: {page}"))
 
 

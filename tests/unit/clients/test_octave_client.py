@@ -114,7 +114,7 @@ def test_requests_as_the_gateway_wants_them() -> None:
 def test_requests_of_the_world_and_of_a_cluster() -> None:
     code = """
     c.pause(); c.advance(3); c.resume(); c.rate(2); c.stop('done');
-    c.clusterTarget('main', struct('z_c', 10), 20); c.clusterHold('main');
+    c.clusterTarget('main', struct('z_c', 10), 20); c.clusterHold('main'); c.clusterRejoin('main');
     c.acquire('drone1', 10); r = c.ask('world/control', 'step', struct('gates', 1)); disp(r.at);
     """
 
@@ -132,6 +132,7 @@ def test_requests_of_the_world_and_of_a_cluster() -> None:
         ("world/control", "stop", {"reason": "done"}),
         ("cluster/main/control", "target", {"values": {"z_c": 10}, "over_s": 20}),
         ("cluster/main/control", "hold", {}),
+        ("cluster/main/control", "rejoin", {}),
         ("world/control", "acquire", {"drone": "drone1", "priority": 10}),
         ("world/control", "step", {"gates": 1}),
     ]

@@ -11,10 +11,9 @@ from zsim_analysis.report.comparison import ComparedRun
 from zsim_analysis.report.figures.drone_panels import draw_drone_panels, drone_panel_heights, name_states
 from zsim_analysis.report.figures.plan_view import NAMED_MAX, draw_obstacles, draw_path
 from zsim_analysis.report.figures.time_marks import draw_marks, time_marks
-from zsim_analysis.report.pages import dress, legend_above, new_figure
+from zsim_analysis.report.pages import PAGE_IN, PAPER_PT, dress, legend_above, new_figure
 
 COLUMNS = 3  # runs beside each other in a row of a figure, at most
-WIDTH_IN = 12.0  # of the figures on the page
 
 
 def columns(runs: Sequence[ComparedRun]) -> int:
@@ -27,22 +26,22 @@ def draw_plans(runs: Sequence[ComparedRun]) -> Figure:
     """Return the true paths from above, a plan per run, all on one scale."""
     across, colours = columns(runs), _drone_colours(runs)
     rows = -(-len(runs) // across)
-    figure = new_figure(WIDTH_IN, 0.8 + rows * WIDTH_IN / across)
+    figure = new_figure(PAGE_IN, 0.8 + rows * PAGE_IN / across)
     grid = figure.subplots(rows, across, squeeze=False, sharex=True, sharey=True)
     for axes in grid.flat[len(runs) :]:
         axes.set_axis_off()
     for run, axes in zip(runs, grid.flat, strict=False):
         dress(axes)
-        axes.set_title(run.name, fontsize=10)
+        axes.set_title(run.name, fontsize=PAPER_PT)
         axes.set_aspect("equal", adjustable="box")
         draw_obstacles(axes, run.flight.scenario)
         for track in run.flight.tracks:
             draw_path(axes, track, colours[track.name], named=False)
     for axes in grid.flat[len(runs) - across : len(runs)]:
-        axes.set_xlabel("east x (m)", fontsize=10)
+        axes.set_xlabel("east x (m)", fontsize=PAPER_PT)
         axes.tick_params(labelbottom=True)
     for axes in grid[:, 0]:
-        axes.set_ylabel("north y (m)", fontsize=10)
+        axes.set_ylabel("north y (m)", fontsize=PAPER_PT)
     _even_out(grid)
     _name_drones(figure, grid[0, 0], colours)
     return figure
@@ -74,7 +73,7 @@ def draw_drones(runs: Sequence[ComparedRun]) -> Figure:
     heights = drone_panel_heights(max(len(run.flight.tracks) for run in runs))
     across, colours = columns(runs), _drone_colours(runs)
     rows = -(-len(runs) // across)
-    figure = new_figure(WIDTH_IN, (1.2 + sum(heights)) * rows)
+    figure = new_figure(PAGE_IN, (1.2 + sum(heights)) * rows)
     grid = figure.subplots(3 * rows, across, squeeze=False, sharex=True, height_ratios=heights * rows)
     for axes in grid.flat:
         axes.set_axis_off()
@@ -92,7 +91,7 @@ def _draw_run_drones(run: ComparedRun, panels: Any, colours: Mapping[str, str], 
     for axes, quantity in zip(panels, ("true altitude (m)", "", "battery (%)"), strict=True):
         axes.set_axis_on()
         dress(axes, quantity if first else "")
-    panels[0].set_title(run.name, fontsize=10)
+    panels[0].set_title(run.name, fontsize=PAPER_PT)
     draw_drone_panels(panels, run.flight.tracks, colours, named=0)
     panels[-1].tick_params(labelbottom=True)
     draw_marks(panels, time_marks(run.flight, run.formations[0] if run.formations else None))

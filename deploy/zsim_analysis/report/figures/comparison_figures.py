@@ -11,13 +11,15 @@ from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import Array
 from zsim_analysis.report.comparison import ComparedRun, clusters, parameters
-from zsim_analysis.report.figures.comparison_drones import WIDTH_IN, columns, draw_drones, draw_plans
+from zsim_analysis.report.figures.comparison_drones import columns, draw_drones, draw_plans
 from zsim_analysis.report.figures.formation_figures import curves, draw_error, parameter_groups, scale
 from zsim_analysis.report.figures.run_marks import LANE_IN, draw_instants, draw_lanes, name_marks, run_marks
 from zsim_analysis.report.figures.run_style import run_style
 from zsim_analysis.report.figures.time_marks import draw_marks, time_marks
 from zsim_analysis.report.pages import (
     BLACK,
+    PAGE_IN,
+    PAPER_PT,
     ReportFigure,
     dress,
     label,
@@ -89,12 +91,12 @@ def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -
     """Return the RMS errors, a panel for each unit: metres and radians have no axis in common."""
     shown = list(names)[:ROWS_MAX]
     groups = {each: [name for name in shown if unit(name) == each] for each in dict.fromkeys(map(unit, shown))}
-    figure = new_figure(WIDTH_IN, 1.0 + len(groups) * 0.4 + 0.16 * (len(runs) + 1) * len(shown))
+    figure = new_figure(PAGE_IN, 1.0 + len(groups) * 0.4 + 0.16 * (len(runs) + 1) * len(shown))
     heights = [len(group) for group in groups.values()]
     panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (measure, group) in zip(panels, groups.items(), strict=True):
         _draw_rms_panel(axes, runs, cluster, group)
-        axes.set_xlabel(f"RMS error ({measure})", fontsize=10)
+        axes.set_xlabel(f"RMS error ({measure})", fontsize=PAPER_PT)
     for i, run in enumerate(runs):
         look = run_style(i)
         panels[0].plot([], [], look.marker, color=look.color, ms=7, label=run.name)
@@ -126,11 +128,11 @@ def _draw_errors(
 ) -> Figure:
     """Return the errors of a few runs side by side; the scale of a row is that of all runs."""
     shown = list(names)[:ROWS_MAX]
-    figure = new_figure(WIDTH_IN, 1.2 + 1.15 * len(shown))
+    figure = new_figure(PAGE_IN, 1.2 + 1.15 * len(shown))
     grid = figure.subplots(len(shown), len(some), squeeze=False, sharex=True, sharey="row")
     for run, column in zip(some, grid.T, strict=True):
         formation = run.formation(cluster)
-        column[0].set_title(run.name, fontsize=10)
+        column[0].set_title(run.name, fontsize=PAPER_PT)
         label_time(column[-1:])
         for name, axes in zip(shown, column, strict=True):
             if formation is None or name not in formation.names:
@@ -140,7 +142,7 @@ def _draw_errors(
             axes.axvspan(*run.summary.window_s, color="#eef2f6", zorder=0)
             draw_marks([axes], time_marks(run.flight, formation))
     for name, axes in zip(shown, grid[:, 0], strict=True):
-        axes.set_ylabel(label(name), fontsize=10)
+        axes.set_ylabel(label(name), fontsize=PAPER_PT)
         if limit := _greatest(runs, cluster, name):
             axes.set_ylim(-1.15 * limit, 1.15 * limit)
     figure.align_ylabels(grid[:, 0])
@@ -164,7 +166,7 @@ def _greatest(runs: Sequence[ComparedRun], cluster: str, name: str) -> float:
 def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
     """Return variables over time: true on the left, measured on the right, the runs over each other."""
     lanes_in, marks = LANE_IN * len(runs), run_marks(runs, cluster)
-    figure = new_figure(WIDTH_IN, 1.2 + 2.1 * len(names) + lanes_in)
+    figure = new_figure(PAGE_IN, 1.2 + 2.1 * len(names) + lanes_in)
     heights = [lanes_in, *[2.0] * len(names)]
     lanes, *grid = figure.subplots(len(heights), 2, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
     for name, (true_axes, measured_axes) in zip(names, grid, strict=True):
@@ -181,7 +183,7 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
             draw_instants(axes, marks)
     for axes, title in zip(lanes, ("true", "measured (estimates)"), strict=True):
         draw_lanes(axes, marks, named=axes is lanes[0])
-        axes.set_title(title, fontsize=10)
+        axes.set_title(title, fontsize=PAPER_PT)
     grid[0][0].plot([], [], label="desired, while engaged", **DESIRED)
     name_marks(grid[0][0], marks)
     label_time(grid[-1])
@@ -209,5 +211,12 @@ def _draw_run(
 def _draw_absence(axes: Axes) -> None:
     dress(axes)
     axes.text(
-        0.5, 0.5, "not in this run", transform=axes.transAxes, ha="center", va="center", fontsize=9, color="#57606a"
+        0.5,
+        0.5,
+        "not in this run",
+        transform=axes.transAxes,
+        ha="center",
+        va="center",
+        fontsize=PAPER_PT - 1,
+        color="#57606a",
     )

@@ -27,7 +27,6 @@ from zsim_analysis.report.pages import (
     legend_above,
     line,
     new_figure,
-    text_pt,
 )
 
 LANES_IN = 5.0  # of states: half of it on the page; more drones share it
@@ -115,5 +114,5 @@ def name_states(figure: Figure, tracks: Sequence[Track]) -> None:
     handles = [Patch(color=STATES[name], label=name.replace("_", " ")) for name in occur]
     if handles:
         columns = 3 if figure.get_size_inches()[0] <= COLUMN_IN else 6
-        look = {"frameon": False, "fontsize": text_pt(figure), "columnspacing": 1.2, "handlelength": 1.2}
+        look = {"frameon": False, "fontsize": PAPER_PT, "columnspacing": 1.2, "handlelength": 1.2}
         figure.legend(handles=handles, loc="outside lower center", ncols=min(columns, len(handles)), **look)

@@ -9,7 +9,7 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.comparison import ComparedRun
 from zsim_analysis.report.figures.run_style import RunStyle, run_style
 from zsim_analysis.report.figures.time_marks import FAULT, TAKE_OVER, TimeMarks, time_marks
-from zsim_analysis.report.pages import DARK
+from zsim_analysis.report.pages import DARK, PAPER_PT
 
 LANE_IN = 0.24  # height of a lane
 HATCHES = {"assembly": "////", "held": "xxxx", "landing": "....", FAULT: "", TAKE_OVER: "\\\\\\\\"}
@@ -57,7 +57,7 @@ def draw_lanes(lanes: Axes, marks: Sequence[RunMarks], named: bool) -> None:
     lanes.set_yticks(range(len(marks)), short)
     for place, text in enumerate(lanes.get_yticklabels()):
         text.set_color(run_style(place).color)
-    lanes.tick_params(axis="y", length=0, labelsize=9, labelleft=named)
+    lanes.tick_params(axis="y", length=0, labelsize=PAPER_PT - 1, labelleft=named)
     lanes.tick_params(axis="x", length=0, labelbottom=False)
     lanes.spines[:].set_visible(False)
 

@@ -8,7 +8,7 @@ from matplotlib.ticker import MaxNLocator
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from zsim_analysis.report.pages import BLUE, GREY, VERMILION, dress, padded_range
+from zsim_analysis.report.pages import BLUE, GREY, PAPER_PT, VERMILION, dress, padded_range
 from zsim_analysis.sweep.intervals import mean_interval
 from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.grid_axis import GridAxis, Place
@@ -40,7 +40,7 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: Gri
     """Draw one quantity: a histogram where there is one point, else points; return if an interval leaves the axis."""
     if axis is None:
         dress(axes)
-        axes.set_xlabel(panel.label.replace("\n", " "), fontsize=9)
+        axes.set_xlabel(panel.label.replace("\n", " "), fontsize=PAPER_PT)
         return _histogram(axes, known(results.values(panel.column)), panel.printed)
     dress(axes, panel.label)
     drawn = []
@@ -62,7 +62,7 @@ def known(samples: Samples) -> Samples:
 
 
 def _histogram(axes: Axes, samples: Samples, printed: float | None) -> bool:
-    axes.set_ylabel("runs", fontsize=10)
+    axes.set_ylabel("runs", fontsize=PAPER_PT)
     if not len(samples):
         axes.text(0.5, 0.5, "no data", transform=axes.transAxes, ha="center", color=GREY)
         return False

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 from msgspec import Struct
 
-from zsim_analysis.report.pages import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY
+from zsim_analysis.report.pages import BLACK, BLUE, GREEN, ORANGE, PAPER_PT, PURPLE, SKY
 from zsim_analysis.sweep.axes import Grid, shown
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.report.field_names import field_name
@@ -83,8 +83,8 @@ class GridAxis:
             )
             axes.grid(False, axis="x")
             axes.set_xlim(-0.6, len(self.places) - 0.2)
-            axes.tick_params(axis="x", labelsize=8 if turned else 9)
-        axes.set_xlabel(self.label, fontsize=9)
+            axes.tick_params(axis="x", labelsize=PAPER_PT - 1.5 if turned else PAPER_PT - 1)
+        axes.set_xlabel(self.label, fontsize=PAPER_PT)
 
     def _dress_numbers(self, axes: Axes) -> None:
         values = sorted({float(at[self.field]) for at in self._at}) if self.field else []

@@ -169,7 +169,9 @@ def _share(share: ConfidenceInterval | None) -> str:
     return f"{100 * share.value:.3g} % [{100 * share.low:.3g}, {100 * share.high:.3g}]"
 
 
-def make_sweep_report(directory: Path, progress: Callable[[str], None] = lambda _: None) -> SweepSummary:
+def make_sweep_report(
+    directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
+) -> SweepSummary:
     """Read the finished runs, write DIR/summary.json, DIR/figures/*.png and DIR/report.html.
 
     The sweep may be at work meanwhile.
@@ -177,6 +179,7 @@ def make_sweep_report(directory: Path, progress: Callable[[str], None] = lambda 
     Args:
         directory: of the sweep.
         progress: called with a text at each step.
+        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written too.
 
     Raises:
         RunError: it holds no sweep.
@@ -188,5 +191,5 @@ def make_sweep_report(directory: Path, progress: Callable[[str], None] = lambda 
         raise ReportError(f"{directory}: no run of this sweep is finished yet; there is nothing to report")
     results = SweepResults(sweep.design, rows)
     summary = results.summary()
-    write_report(directory, summary.json(), figures(results), partial(page, summary), progress)
+    write_report(directory, summary.json(), figures(results), partial(page, summary), progress, formats)
     return summary

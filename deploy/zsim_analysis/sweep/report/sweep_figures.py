@@ -8,7 +8,10 @@ from matplotlib.figure import Figure
 
 from zsim_analysis.report.pages import (
     BLUE,
+    COLUMN_IN,
     GREY,
+    PAGE_IN,
+    PAPER_PT,
     VERMILION,
     ReportFigure,
     dress,
@@ -127,9 +130,7 @@ def _panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
     across = COLUMNS if not axis or axis.field or results.design.points <= NARROW_MAX else COLUMNS - 1
     across = min(across, len(panels))
     rows = -(-len(panels) // across)
-    figure = new_figure(
-        4 * across if across < COLUMNS - 1 else 12, 1.0 + rows * (2.7 if axis and axis.is_turned else 2.5)
-    )
+    figure = new_figure(PAGE_IN if across > 1 else COLUMN_IN, 0.8 + rows * (2.0 if axis and axis.is_turned else 1.8))
     grid = figure.subplots(rows, across, squeeze=False).ravel()
     beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(grid, panels, strict=False)]
     for axes in grid[len(panels) :]:
@@ -163,7 +164,7 @@ def _name(
 
 def _safety(results: SweepResults) -> Figure:
     axis = GridAxis(results.design) if results.design.points > 1 else None
-    figure = new_figure(12, 4.4)
+    figure = new_figure(PAGE_IN, 3.0)
     shares, separation = figure.subplots(1, 2)
     _shares(shares, results, axis)
     beyond = draw_distribution(separation, results, Panel("min_separation_m", "least separation (m)"), axis)
@@ -200,13 +201,13 @@ def _shares(axes: Axes, results: SweepResults, axis: GridAxis | None) -> None:
 
 def _scatter(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figure:
     rows = -(-len(panels) // COLUMNS)
-    figure = new_figure(12, 1.0 + 2.6 * rows)
+    figure = new_figure(PAGE_IN, 0.8 + 1.8 * rows)
     grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
     x = results.values(path)
     beyond = False
     for axes, panel in zip(grid, panels, strict=False):
         dress(axes, panel.label)
-        axes.set_xlabel(str(field_name(path)), fontsize=9)
+        axes.set_xlabel(str(field_name(path)), fontsize=PAPER_PT)
         y = results.values(panel.column)
         axes.plot(x, y, ".", color=BLUE, ms=4, alpha=0.45, mew=0, zorder=2)
         intervals = [DrawnInterval(middle, mean_interval(samples)) for middle, samples in slices(x, y)]

@@ -262,13 +262,19 @@ def test_the_page_is_one_file_that_asks_nothing_of_the_network(runs: list[Path],
     assert len(pictures) == 7
     for each in pictures:
         picture = matplotlib.image.imread(io.BytesIO(base64.b64decode(each)))[:, :, :3]
-        assert picture.shape[1] >= 1000
+        assert picture.shape[1] == 1432  # 7.16 in, a page of a paper
         assert 0.003 < (picture < 0.9).any(axis=2).mean() < 0.6
     assert not re.search(r"https?:|@import|url\(|<script", text)
     assert has_terms(text, "<title>calm", "rough", "alone", "comparison</title>")
     assert has_terms("\n".join(steps), "calm", "reading")
     for run in compared:
         assert run.summary.truth_sha256 in text
+
+
+def test_figures_in_other_formats_come_into_a_folder_beside_the_page(runs: list[Path], tmp_path: Path) -> None:
+    compare(runs[:2], tmp_path / "page.html", formats=["svg"])
+    written = sorted(path.suffix for path in (tmp_path / "page").iterdir())
+    assert written == [".svg"] * 7
 
 
 @pytest.mark.usefixtures("unrendered")

@@ -70,6 +70,19 @@ def test_the_report_of_a_sweep(tmp_path: Path, vary: tuple[str, ...], figures: s
     assert first["ended_well"]["value"] == 1.0
 
 
+def test_figures_in_other_formats_stand_beside_the_pictures_until_a_report_without_them(tmp_path: Path) -> None:
+    of = plan("seed", runs=4)
+    report_of(tmp_path, of, [well(of, run) for run in range(of.runs)])
+    own = tmp_path / "figures" / "of_the_user.pdf"
+    own.write_bytes(b"")
+    make_sweep_report(tmp_path, formats=["pdf", "svg"])
+    stems = {path.stem for path in (tmp_path / "figures").glob("*.png")}
+    assert {path.stem for path in (tmp_path / "figures").glob("*.svg")} == stems
+    assert (tmp_path / "figures" / "safety.pdf").read_bytes().startswith(b"%PDF")
+    make_sweep_report(tmp_path)
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {f"{stem}.png" for stem in stems} | {own.name}
+
+
 @pytest.mark.usefixtures("unrendered")
 def test_a_report_of_failures_and_of_what_is_not_finished(tmp_path: Path) -> None:
     of = plan("seed", "duration_s=1,2", runs=40)

@@ -201,8 +201,3 @@ def test_figures_are_asked_for_in_other_formats(recorded: Path, formats: list[tu
 def test_formats_that_are_none_are_refused(wrong: str, recorded: Path, formats: list[tuple[str, ...]]) -> None:
     assert report(str(recorded), "--format", wrong) == 2
     assert formats == []
-
-
-def test_comparisons_have_no_files_of_their_figures(recorded: Path, formats: list[tuple[str, ...]]) -> None:
-    assert report(str(recorded), str(recorded), "--format", "pdf") == 2
-    assert formats == []
