@@ -132,9 +132,9 @@ def test_two_participants_find_and_receive_every_topic_and_request(federation: F
     after = peer(port_of(federation.endpoint))
     assert after.until("topics", lambda found: found == topics) == topics
     services = after.request("services")
-    assert services == {f"/cluster/main/{op}": [TRIGGER["kind"]] for op in ("takeoff", "engage", "hold", "rejoin", "land")} | {
-        f"/drone{n}/{service}": [TRIGGER["kind"]] for n in (1, 2) for service in ("release", "ardrone/togglecam")
-    }
+    assert services == {
+        f"/cluster/main/{op}": [TRIGGER["kind"]] for op in ("takeoff", "engage", "hold", "rejoin", "land")
+    } | {f"/drone{n}/{service}": [TRIGGER["kind"]] for n in (1, 2) for service in ("release", "ardrone/togglecam")}
     after.request("subscribe", topic="/cluster/main/state", kind=kinds["/cluster/main/state"])
     engaged = after.receive("/cluster/main/state", lambda m: m["phase"] == "engaged")
     assert engaged["names"][:3] == ["x_c", "y_c", "z_c"]

@@ -43,8 +43,7 @@ def serve(
     process = CameraProcess(link, info, presence, scenario, drones)
     process.begin()
     if presence.gates:
-        presence.announce()
-        process.catch_up()
+        process.join()
     while not (presence.end_reason or stopped()):
         process.turn()
     if presence.end_reason == RUN_ENDED:
@@ -116,6 +115,16 @@ class CameraProcess:
             self._link.declare_queryable(eye.info_key, self._on_query)
         self._link.declare_subscriber(keys.truth("*"), self._on_truth)
         self._publish_infos()
+
+    def join(self) -> None:
+        """Let the world wait for this process.
+
+        What is asked for may overtake what was published earlier: nothing is asked of a run that has yet to begin.
+        """
+        has_begun = bool(self._link.get(keys.truth("*"), timeout_s=ASK_S))
+        self._presence.announce()
+        if has_begun:
+            self.catch_up()
 
     def turn(self) -> None:
         """Wait for something, and publish the pictures that are due."""

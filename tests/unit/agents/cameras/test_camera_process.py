@@ -6,7 +6,7 @@ import pytest
 from fake_link import FakeLink
 from synthetic_pictures import jpeg
 
-from zsim.contract import keys
+from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Truth
 from zsim.scenario import scenario_file
 from zsim_agents.cameras.camera_process import CameraProcess
@@ -28,6 +28,10 @@ GATE_NS = 20_000_000
 ZEROS = (0.0, 0.0, 0.0)
 
 
+def truth(gate: int) -> Truth:
+    return Truth(gate * GATE_NS, gate, ZEROS, ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (0.0,) * 4)
+
+
 class Drawing:
     """A camera process of all drones, whose world goes on by some gates while a picture is drawn."""
 
@@ -41,16 +45,16 @@ class Drawing:
         monkeypatch.setattr(Renderer, "jpeg", drawn)
         link: Any = self.link
         info = World(SCENARIO, run_id="r").info()
-        self.process = CameraProcess(link, info, ObserverProcess(link, info, "camera.main"), SCENARIO, DRONES)
+        self.process = CameraProcess(
+            link, info, ObserverProcess(link, info, "camera.main", slack_ns=GATE_NS), SCENARIO, DRONES
+        )
         self.process.begin()
 
     def fly(self, gates: int) -> None:
         """Let the truth of some gates arrive."""
         for _ in range(gates):
-            at = self._gate * GATE_NS, self._gate
             for drone in DRONES:
-                state = Truth(*at, ZEROS, ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (0.0,) * 4)
-                self.link.deliver(keys.truth(drone), state)
+                self.link.deliver(keys.truth(drone), truth(self._gate))
             self._gate += 1
 
     def pictures(self, camera: str) -> list[int]:
@@ -70,3 +74,22 @@ def test_a_camera_process_that_is_too_slow_leaves_out_pictures_of_all(
         counts = drawing.pictures(camera)
         assert min(counts) > 5
         assert max(counts) <= 2 * min(counts), counts
+
+
+def test_a_camera_that_gates_draws_the_first_picture_whatever_is_answered_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An answer to what is asked for may overtake what was published before it."""
+    drawing = Drawing(monkeypatch, gates_per_picture=0)
+    link = drawing.link
+
+    def start(key: str, _: bytes) -> None:
+        if key == keys.process("camera.main", "join"):
+            for drone in DRONES:
+                link.last[keys.truth(drone)] = messages.encode(truth(1))
+
+    link.on_publish = start
+    drawing.process.join()
+    drawing.fly(6)
+    drawing.process.turn()
+    assert link.published_on(keys.camera("d1", "front"))[0].t_sample_ns == 0
