@@ -70,8 +70,8 @@ def test_a_flight_is_followed_to_the_sensors_limits():
     "sections",
     [
         {"estimation": {"madgwick_beta": 0.1}},
-        {"estimation": {"madgwick_beta": 0.0}},
-        {"estimation": {"flow": False}},
+        pytest.param({"estimation": {"madgwick_beta": 0.0}}, marks=pytest.mark.soak),
+        pytest.param({"estimation": {"flow": False}}, marks=pytest.mark.soak),
         pytest.param({"estimation": {"magnetometer": False}}, marks=pytest.mark.soak),
     ],
     ids=["beta .1", "gyro alone", "no flow", "no magnetometer"],

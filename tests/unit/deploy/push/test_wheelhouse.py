@@ -216,6 +216,7 @@ def test_wheels_that_are_kept_need_no_index(checkout: Path, tmp_path: Path, monk
     assert not [line for line in lines if has_terms(line, "index")]
 
 
+@pytest.mark.soak
 def test_what_builds_the_project_is_kept(
     checkout: Path, index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -283,7 +283,9 @@ print(output.phase, before, compiled())
 """
 
 
-@pytest.mark.parametrize("kind", [*map(str, SIZES), "template", "nested"])
+@pytest.mark.parametrize(
+    "kind", ["3", "nested", *(pytest.param(each, marks=pytest.mark.soak) for each in ("2", "5", "template"))]
+)
 def test_after_the_rehearsal_nothing_is_compiled_in_flight(kind):
     run = [sys.executable, "-c", FLIGHT, kind]
     phase, before, after = subprocess.run(run, capture_output=True, text=True, check=True).stdout.split()
