@@ -111,7 +111,7 @@ def _sink(form: Format, new: Path, survey: TableSurvey) -> Any:
         from zsim_analysis.export.matlab import MatFile
 
         return MatFile(new, survey)
-    from zsim_analysis.export.tables import TableFolder
+    from zsim_analysis.export.table_folder import TableFolder
 
     new.mkdir()
     return TableFolder(new, form.value, survey.fields)

@@ -16,7 +16,7 @@ from scipy.io import savemat
 from zsim.errors import ReportError
 from zsim_analysis.export.message_columns import FieldColumns, KeyedColumns, NamedColumns, VectorColumns, table_name
 from zsim_analysis.export.selection import RowBatch, TableSurvey
-from zsim_analysis.export.tables import WrittenTable
+from zsim_analysis.export.table_folder import WrittenTable
 
 VARIABLE_MAX = 2**31 - 1  # bytes of a variable that MATLAB loads from a Level 5 file
 NAME_MAX = 63  # characters of a MATLAB name

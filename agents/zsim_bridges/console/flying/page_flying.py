@@ -8,7 +8,7 @@ from zsim.contract.messages import Info
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient
-from zsim_bridges.console.flying import plan_view
+from zsim_bridges.console.flying import map_view
 from zsim_bridges.console.flying.flight_conditions import DroneSight, RunSight
 from zsim_bridges.console.flying.flown_velocity import DronePose
 from zsim_bridges.console.flying.geofence import geofence_of
@@ -59,7 +59,7 @@ class PageFlying:
         self._pages = pages
         self._spaces = spaces
         fence = geofence_of(scenario)
-        self._surroundings = plan_view.surroundings(scenario, fence)
+        self._surroundings = map_view.surroundings(scenario, fence)
         names = self._surroundings["names"]
         self._members = {each.name: [names.index(drone) for drone in each.drones] for each in scenario.clusters}
         limits = {drone.name: drone.limits for drone in scenario.drones}
@@ -85,12 +85,12 @@ class PageFlying:
         shown = {
             "t_s": drones.t_ns / 1e9,
             "chosen": self._pages.chosen(client_id),
-            "drones": plan_view.positions(drones, states),
-            "formations": plan_view.formations(self._spaces, self._members, dict(self._views.clusters)),
+            "drones": map_view.positions(drones, states),
+            "formations": map_view.formations(self._spaces, self._members, dict(self._views.clusters)),
         }
         if not whole:
             return shown
-        return {**shown, **self._surroundings, "trails": plan_view.trail_lines(self._scene.trails, drones)}
+        return {**shown, **self._surroundings, "trails": map_view.trail_lines(self._scene.trails, drones)}
 
     def _sight(self, drone: str) -> DroneSight:
         view = self._views.drones

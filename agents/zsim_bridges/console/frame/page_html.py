@@ -12,8 +12,8 @@ PARTS = (  # of the page beside viser's; of the last three, each uses those befo
     "camera_windows.html",
     "scene_tools.html",
     "flight_bar.html",
-    "plan_drawing.html",
-    "plan_view.html",
+    "map_drawing.html",
+    "map_view.html",
 )
 VIEW_STYLE = (
     "<style>.mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"
