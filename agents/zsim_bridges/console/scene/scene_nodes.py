@@ -67,7 +67,7 @@ class SceneNodes:
         self._count = len(drones)
         names = tuple(drone.name for drone in drones)
         self._trail_node: Any = None
-        self._trail_colours = np.array([rgb(each) for each in drone_colours(max(1, len(drones)))], np.uint8)
+        self._trail_colours = linear(np.array([rgb(each) for each in drone_colours(max(1, len(drones)))]))
         self._trails_shown = True
         server.scene.reset()
         server.scene.set_up_direction("+z")
@@ -274,6 +274,15 @@ class _FormationNodes:
             label.visible = i < len(texts)
             if label.visible:
                 label.text, label.position = texts[i]
+
+
+def linear(colours: Array) -> NDArray[np.uint8]:
+    """Return sRGB colours, 0 to 255, in linear light, in which viser takes those of a line's points.
+
+    IEC 61966-2-1, 5.3.
+    """
+    share = colours / 255
+    return np.round(255 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)).astype(np.uint8)
 
 
 def _padded(count: int, p_W: Array, q: Array) -> tuple[Array, Array, Array]:
