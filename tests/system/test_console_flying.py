@@ -5,12 +5,13 @@ from typing import Any
 
 import pytest
 from chromium import needs_browser
-from console_browser import BrowserPage, console
+from console_browser import SCREENS, BrowserPage, console
 from federation import Federation
 from test_console import TRIAD
 
 FLOWN = 1  # drone2
 STICK_S = 3.0  # simulated; for which the key is held
+BESIDE_M = 1.5  # of a drone: no click on it, and on the map
 SETTLE_S = 3.0  # simulated; in which a drone comes to rest
 BAR = "document.querySelector('#zsim-flight .bar').dataset.state"
 SEES = "() => { const view = document.getElementById('zsim-map').dataset.view; return view && JSON.parse(view); }"
@@ -31,6 +32,8 @@ def click_map(page: BrowserPage, x_m: float, y_m: float) -> None:
     box = page.page.locator("#zsim-map canvas").bounding_box()
     assert box is not None
     dx, dy = (x_m - view["x"]) * view["scale"], (view["y"] - y_m) * view["scale"]
+    assert abs(dx) < box["width"] / 2, "beside the map"
+    assert abs(dy) < box["height"] / 2, "beside the map"
     page.page.mouse.click(box["x"] + box["width"] / 2 + dx, box["y"] + box["height"] / 2 + dy)
 
 
@@ -40,7 +43,7 @@ def click_map(page: BrowserPage, x_m: float, y_m: float) -> None:
 def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened: Callable[..., BrowserPage]) -> None:
     federation.run(TRIAD, "--rate", "2")
     _, links = console(federation)
-    operator, viewer = opened(links["steer"]), opened(links["look"])
+    operator, viewer = opened(links["steer"], SCREENS[1]), opened(links["look"], SCREENS[1])
     bar = operator.page.locator("#zsim-flight")
     operator.page.get_by_role("button", name="Take off", exact=True).and_(operator.page.locator(":enabled")).click()
     operator.until("s.clusters[0].reason == 'ready to engage'")
@@ -49,7 +52,8 @@ def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened:
     viewer.page.locator("#zsim-flight .map").click()
     viewer.page.wait_for_function(SEES)
     assert viewer.page.locator("#zsim-flight .fly").is_hidden()
-    click_map(viewer, 6.0, 6.0)
+    x_m, y_m, _ = place(viewer.state())
+    click_map(viewer, x_m + BESIDE_M, y_m + BESIDE_M)
     viewer.page.locator("#zsim-map .there").wait_for()
     assert viewer.page.locator("#zsim-map .go").is_hidden()
     viewer.page.close()
