@@ -153,10 +153,10 @@ class StagedRun:
 
 
 @contextmanager
-def staged_console(run: StagedRun) -> Iterator[str]:
-    """Serve pages of a run; yield the operator's address."""
+def staged_console(run: StagedRun, folder: Path | None = None) -> Iterator[str]:
+    """Serve pages of a run, recorded in a folder if there is one; yield the operator's address."""
     port = free_port()
-    console = Console(ListenAddress("127.0.0.1", port), "console.1", None, PICTURES_HZ, lambda _: None)
+    console = Console(ListenAddress("127.0.0.1", port), "console.1", None, PICTURES_HZ, lambda _: None, folder=folder)
     over = threading.Event()
     link: Any = run.link
     args = link, run.info, run.observer, over.is_set, lambda _: None

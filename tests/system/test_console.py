@@ -11,6 +11,7 @@ import urllib.request
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 from urllib.parse import urlsplit
@@ -22,6 +23,7 @@ from chromium import needs_browser
 from console_browser import IN_SIGHT, PATIENCE_MS, POLL_MS, SCREENS, VIEWPORT, BrowserPage, console
 from federation import Federation, Role, free_port
 from refused import has_terms
+from staged_console import StagedRun, staged_console
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from wire import PATIENCE_S
@@ -343,6 +345,21 @@ def test_a_run_with_a_console_prints_its_link_and_ends_as_a_whole(federation: Fe
     run.signal(signal.SIGINT)
     run.ends(with_code=130)
     federation.nobody_left()
+
+
+def test_what_a_run_left_behind_is_served_once_it_is_there(tmp_path: Path) -> None:
+    with staged_console(StagedRun(past_s=0.5), tmp_path) as address:
+        assert status(f"{address}report") == status(f"{address}view/record") == 404
+        for name in ("report.html", "run.mcap"):
+            (tmp_path / name).write_text(name)
+        with (
+            urllib.request.urlopen(f"{address}view/report") as report,
+            urllib.request.urlopen(f"{address}record") as record,
+        ):
+            assert (report.read(), report.headers.get_content_type()) == (b"report.html", "text/html")
+            assert (record.read(), record.headers.get_filename()) == (b"run.mcap", "run.mcap")
+        with urllib.request.urlopen(f"{address}head") as head:
+            assert all(each["is_there"] for each in json.load(head)["files"].values())
 
 
 @pytest.mark.soak

@@ -11,7 +11,7 @@ from chromium import needs_browser
 from console_browser import IN_SIGHT, PATIENCE_MS, POLL_MS, SCREENS
 from page_overflow import overflow
 
-from zsim_bridges.console.console_server import run_files
+from zsim_bridges.console.console_server import run_files, shown_files
 
 pytestmark = needs_browser
 
@@ -114,21 +114,27 @@ def test_an_alarm_is_acknowledged_by_its_button(head: Head) -> None:
     assert head.commands == [{"op": "acknowledge"}]
 
 
-@pytest.mark.parametrize("size", SCREENS, ids=lambda size: str(size["width"]))
-def test_when_a_run_is_over_its_report_and_record_are_named(head: Head, size: dict[str, int]) -> None:
-    head.page.set_viewport_size(size)
-    files = run_files(Path("/home/somebody/lab/flights/with/a/long/name/runs/step-20261125-065514"))
+def test_when_a_run_is_over_its_report_and_record_are_named(head: Head) -> None:
+    files = shown_files(run_files(Path("/home/somebody/lab/flights/with/a/long/name/runs/step-20261125-065514")))
     head.show(files=files)
     shown = head.page.locator(".files")
     assert shown.text_content() == ""
     head.show(level="ended", title="run over at 330.0 s", detail="step · the duration is over")
-    for path in files.values():
-        assert path in str(shown.text_content())
-    assert overflow(head.page) == []
-    assert head.page.evaluate(IN_SIGHT)
+    for size in SCREENS:
+        head.page.set_viewport_size(size)
+        assert are_in_sight(files, head)
+        assert head.page.evaluate(IN_SIGHT)
+    head.show(files={name: {**each, "is_there": True} for name, each in files.items()})
+    assert [link.get_attribute("href") for link in shown.locator("a").all()] == ["/report", "/record"]
     head.page.unroute(f"{ADDRESS}head")  # the console of a run ends with it
     head.page.route(f"{ADDRESS}head", lambda route: route.abort())
     head.page.locator("[data-level=gone]").wait_for()
-    for path in files.values():
-        assert path in str(shown.text_content())
-    assert overflow(head.page) == []
+    for size in SCREENS:
+        head.page.set_viewport_size(size)
+        assert are_in_sight(files, head)
+    assert shown.locator("a").count() == 0
+
+
+def are_in_sight(files: dict[str, Any], head: Head) -> bool:
+    shown = str(head.page.locator(".files").text_content())
+    return all(each["path"] in shown for each in files.values()) and overflow(head.page) == []

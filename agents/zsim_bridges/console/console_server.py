@@ -1,6 +1,6 @@
 """The console: shows one run after the other on a viser server that only its own HTTP proxy can reach."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -66,7 +66,7 @@ class Console:
         permits = partial(is_permitted, controls=controls)
         sockets = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
         actions = ActionSockets(self._frustums.client_id, self._camera_follow, self._record, self._flying)
-        answers = permits, sockets.respond, actions.respond, self._head, self._command
+        answers = permits, sockets.respond, actions.respond, self._head, self._command, self._files
         backend = ViserBackend(self._viser.port, self._viser.secret, self._state, *answers)
         self._proxy = HttpProxy(address, token, backend)
 
@@ -117,16 +117,21 @@ class Console:
 
     def _head(self) -> dict[str, Any]:
         head = self._run_page.head() if self._run_page else no_run_head(self._world)
-        return {**head, "files": self._files}
+        return {**head, "files": shown_files(self._files)}
 
     def _command(self, op: str) -> str:
         return self._run_page.command(op) if self._run_page else "there is no run yet"
 
 
-def run_files(folder: Path) -> dict[str, str]:
+def run_files(folder: Path) -> dict[str, Path]:
     """Return the paths of what a run leaves behind, by what it is."""
     whole = folder.absolute()
-    return {"report": str(whole / "report.html"), "record": str(whole / RECORD)}
+    return {"report": whole / "report.html", "record": whole / RECORD}
+
+
+def shown_files(files: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
+    """Return what the head of the page shows of files, as plain data."""
+    return {name: {"path": str(path), "is_there": path.is_file()} for name, path in files.items()}
 
 
 def _show_text(gui: viser.GuiApi, text: str) -> None:

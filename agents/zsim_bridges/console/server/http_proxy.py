@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 from urllib.parse import quote
 
@@ -60,6 +61,7 @@ class ViserBackend(NamedTuple):
         serve_actions: answers one for a socket of what is done in the scene, by the page's role, until it closes.
         head: returns what the head of the page shows, as plain data.
         command: does what a button of the head asks for; returns why it is refused, empty where it is not.
+        files: what the run leaves behind, by its name on the page, as far as that is known; it may not be there yet.
     """
 
     port: int
@@ -70,6 +72,7 @@ class ViserBackend(NamedTuple):
     serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]
     head: Callable[[], dict[str, Any]]
     command: Callable[[str], str]
+    files: dict[str, Path]
 
 
 class HeadCommand(Struct, frozen=True, forbid_unknown_fields=True):
@@ -123,6 +126,9 @@ class HttpProxy:
         for path, handler in shared.items():
             app.add_routes([web.get(path, handler), web.get(f"{VIEW_PATH}{path}", handler)])
         app.add_routes([web.post("/command", self._command)])
+        for name, path in self._backend.files.items():
+            shown = partial(self._file, path)
+            app.add_routes([web.get(f"/{name}", shown), web.get(f"{VIEW_PATH}/{name}", shown)])
         try:
             site = await start_site(app, *self._address, shutdown_s=CLOSE_S)
         except OSError as error:
@@ -170,6 +176,15 @@ class HttpProxy:
         if self._tokens.role_of(_page_request(request)) is None:
             return _missing_token()
         return _json_response(shown())
+
+    async def _file(self, path: Path, request: web.Request) -> web.StreamResponse:
+        """Serve what a run left behind: a page to be read, or a file to be kept."""
+        if self._tokens.role_of(_page_request(request)) is None:
+            return _missing_token()
+        if not path.is_file():
+            return web.Response(status=404, text=f"{path} is not there yet\n", headers=HEADERS)
+        kept = {} if path.suffix == ".html" else {"Content-Disposition": f'attachment; filename="{path.name}"'}
+        return web.FileResponse(path, headers={**HEADERS, **kept})
 
     async def _command(self, request: web.Request) -> web.Response:
         """Do what an operator's button asks for; viewers have no such path."""
