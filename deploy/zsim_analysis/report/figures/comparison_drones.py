@@ -73,7 +73,7 @@ def draw_drones(runs: Sequence[ComparedRun]) -> Figure:
     heights = drone_panel_heights(max(len(run.flight.tracks) for run in runs))
     across, colours = columns(runs), _drone_colours(runs)
     rows = -(-len(runs) // across)
-    figure = new_figure(PAGE_IN, (1.2 + sum(heights)) * rows)
+    figure = new_figure(PAGE_IN, (1.0 + 0.6 * sum(heights)) * rows)
     grid = figure.subplots(3 * rows, across, squeeze=False, sharex=True, height_ratios=heights * rows)
     for axes in grid.flat:
         axes.set_axis_off()

@@ -128,7 +128,7 @@ def _draw_errors(
 ) -> Figure:
     """Return the errors of a few runs side by side; the scale of a row is that of all runs."""
     shown = list(names)[:ROWS_MAX]
-    figure = new_figure(PAGE_IN, 1.2 + 1.15 * len(shown))
+    figure = new_figure(PAGE_IN, 0.9 + 0.7 * len(shown))
     grid = figure.subplots(len(shown), len(some), squeeze=False, sharex=True, sharey="row")
     for run, column in zip(some, grid.T, strict=True):
         formation = run.formation(cluster)
@@ -166,8 +166,8 @@ def _greatest(runs: Sequence[ComparedRun], cluster: str, name: str) -> float:
 def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -> Figure:
     """Return variables over time: true on the left, measured on the right, the runs over each other."""
     lanes_in, marks = LANE_IN * len(runs), run_marks(runs, cluster)
-    figure = new_figure(PAGE_IN, 1.2 + 2.1 * len(names) + lanes_in)
-    heights = [lanes_in, *[2.0] * len(names)]
+    figure = new_figure(PAGE_IN, 0.9 + 1.4 * len(names) + lanes_in)
+    heights = [lanes_in, *[1.35] * len(names)]
     lanes, *grid = figure.subplots(len(heights), 2, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
     for name, (true_axes, measured_axes) in zip(names, grid, strict=True):
         dress(true_axes, label(name))
