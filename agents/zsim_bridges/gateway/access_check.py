@@ -10,8 +10,8 @@ from aiohttp import web
 
 from zsim.errors import DecodeError, NoWorldError, SessionError, ZsimError
 from zsim_bridges.gateway.client_messages import ForbiddenError, MethodError, TooManyError, UnknownError
-from zsim_bridges.loopback import is_loopback, is_loopback_authority
-from zsim_bridges.web_server import tokens_match
+from zsim_bridges.web.loopback import is_loopback, is_loopback_authority
+from zsim_bridges.web.web_server import tokens_match
 
 HTTP_RATE_HZ = 5_000.0  # requests per wall second of one address: 500 clients that ask ten times a second
 HTTP_BURST = 10_000.0

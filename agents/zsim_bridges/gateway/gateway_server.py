@@ -25,8 +25,15 @@ from zsim_bridges.gateway.publications import SharedSubscriptions
 from zsim_bridges.gateway.run_access import RunAccess
 from zsim_bridges.gateway.stream_client import Client
 from zsim_bridges.observer_process import ANOTHER_RUN, ObserverProcess
-from zsim_bridges.picture_streams import PictureFeeds
-from zsim_bridges.web_server import ServedSite, cancel_other_tasks, check_token, open_on_thread, start_site, url_host
+from zsim_bridges.web.picture_streams import PictureFeeds
+from zsim_bridges.web.web_server import (
+    ServedSite,
+    cancel_other_tasks,
+    check_token,
+    open_on_thread,
+    start_site,
+    url_host,
+)
 
 CLIENTS_MAX = 500  # streams at once
 UNAUTHENTICATED_MAX = 100  # connections at once that have not shown the token yet

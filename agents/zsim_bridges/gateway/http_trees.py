@@ -43,7 +43,7 @@ from zsim_bridges.gateway.client_messages import (
 from zsim_bridges.gateway.client_streams import event_bytes, stream_events
 from zsim_bridges.gateway.publications import SharedSubscriptions
 from zsim_bridges.gateway.run_access import RunAccess
-from zsim_bridges.picture_streams import PictureFeeds, as_file, stream_pictures
+from zsim_bridges.web.picture_streams import PictureFeeds, as_file, stream_pictures
 
 EVENT_STREAM = "text/event-stream"
 RAW, TOKEN = "_raw", "token"

@@ -97,7 +97,7 @@ def gateway(
     from zsim.transport.connection import find_world
     from zsim.transport.open_files import SERVER_FILES, allow_files, require_files
     from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
-    from zsim_bridges.http_connections import CONNECTIONS_MAX
+    from zsim_bridges.web.http_connections import CONNECTIONS_MAX
     from zsim_deploy.roles.priority import lower_priority
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import log_printer, serve_runs

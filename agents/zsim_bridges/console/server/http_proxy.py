@@ -18,7 +18,7 @@ from msgspec import Struct
 from zsim.errors import RunError
 from zsim_bridges.console.frame import page_html
 from zsim_bridges.console.server.page_tokens import OPERATOR, VIEW_PATH, VIEWER, PageRequest, PageTokens
-from zsim_bridges.web_server import ServedSite, open_on_thread, start_site, url_host
+from zsim_bridges.web.web_server import ServedSite, open_on_thread, start_site, url_host
 
 MESSAGE_MAX = 100_000  # bytes of one message of a page
 BACKEND_HOST = "127.0.0.1"  # where viser listens

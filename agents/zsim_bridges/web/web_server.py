@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, TypeVar
 from aiohttp import web
 
 from zsim.errors import RunError
-from zsim_bridges.http_connections import HttpConnections
-from zsim_bridges.loopback import is_loopback
+from zsim_bridges.web.http_connections import HttpConnections
+from zsim_bridges.web.loopback import is_loopback
 
 BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own
 Resource = TypeVar("Resource")

@@ -8,8 +8,8 @@ from synthetic_pictures import NO_JPEG, image, jpeg
 
 from zsim.contract import keys, messages
 from zsim.transport.session import RawSample
-from zsim_bridges import picture_streams
-from zsim_bridges.picture_streams import BOUNDARY, PictureFeed, PictureFeeds, part
+from zsim_bridges.web import picture_streams
+from zsim_bridges.web.picture_streams import BOUNDARY, PictureFeed, PictureFeeds, part
 
 FRONT = keys.camera("d1", "front")
 MS = 1_000_000
