@@ -1,6 +1,8 @@
 """The TCP connections of this process, by the address of their far end: what each holds back, and closing one.
 
-Zenoh shows neither. Only Linux does; elsewhere there are none.
+Zenoh shows neither, and has its sockets linger for 10 s when it closes them itself, as that of a process that is stopped
+in realtime: in these the thread that closes, which passes on what others publish, does nothing else. So none lingers
+that was seen once. Only Linux shows connections; elsewhere there are none.
 """
 
 import os
@@ -17,7 +19,7 @@ if sys.platform == "linux":
 
 OWN_FILES = "/proc/self/fd"
 TCP_INFO = struct.Struct("68xI48xQ")  # tcpi_rtt [µs] and tcpi_bytes_acked in struct tcp_info, linux/tcp.h
-NO_LINGER = struct.pack("ii", 1, 0)  # struct linger, socket(7)
+RESET, IN_BACKGROUND = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)  # struct linger, socket(7)
 QUEUED = struct.Struct("i")  # of SIOCOUTQ, linux/sockios.h: bytes that the far end has not acknowledged
 
 
@@ -53,12 +55,9 @@ class LinkSockets:
         return Progress(-1, 0.0)
 
     def close(self, address: str) -> None:
-        """Close a connection and forget what it holds back; for Zenoh it is lost then.
-
-        Zenoh has its sockets linger for 10 s, in which the thread that closes them does nothing else.
-        """
+        """Close a connection and forget what it holds back; for Zenoh it is lost then."""
         with suppress(OSError), self._open(address) as connection:
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, NO_LINGER)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             connection.shutdown(socket.SHUT_RDWR)
 
     def _open(self, address: str) -> socket.socket:
@@ -82,14 +81,17 @@ class LinkSockets:
                 status = os.fstat(int(name))
                 if stat.S_ISSOCK(status.st_mode):
                     found[int(name), status.st_ino] = ""
-        self._far = {key: self._far[key] if key in self._far else _address(key[0]) for key in found}
+        self._far = {key: self._far[key] if key in self._far else _first_seen(key[0]) for key in found}
         return {file: address for (file, _), address in self._far.items() if address}
 
 
-def _address(file: int) -> str:
+def _first_seen(file: int) -> str:
+    """Return the far end of a file, empty where it is no connection; who closes it from now on does not linger."""
     try:
         with socket.socket(fileno=os.dup(file)) as duplicate:
-            return _far_end(duplicate)
+            if address := _far_end(duplicate):
+                duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, IN_BACKGROUND)
+            return address
     except OSError:
         return ""
 
