@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SCENARIO ?= scenarios/step.yaml
 PARTS ?=
-WORKERS ?= 4
+WORKERS ?= 6
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
 
 .PHONY: run test setup lint soak bench clean help

@@ -118,29 +118,36 @@ def test_a_phone_shows_the_scene_above_one_panel(flight: str, opened: Callable[.
 
 
 @pytest.mark.slow
-def test_plots_have_curves_as_soon_as_they_are_opened_and_after_the_end(opened: Callable[..., BrowserPage]) -> None:
-    run = StagedRun()
-    with staged_console(run) as address:
-        page = opened(address, SCREENS[1])
-        page.wait_for_text("running")
-        page.select_tab("Plots")
-        page.page.wait_for_function(DRAWN_JS)
-        widths, shown_s = page.page.evaluate(WIDTHS_JS), run.t_s
-        page.until(f"s.t_s > {shown_s + 2.0}")
-        assert page.page.evaluate(WIDTHS_JS) == widths
-        run.end()
-        page.wait_for_text("run over")
-        later = opened(address, SCREENS[1])
-        later.wait_for_text("run over")
-        later.select_tab("Plots")
-        later.page.wait_for_function(DRAWN_JS)
-        later.page.get_by_label("variables").click()
-        later.page.get_by_role("option", name="drone1: x, y, z").click()
-        later.page.get_by_text("x of drone1 [m]").wait_for()
-        later.page.wait_for_function(DRAWN_JS)
+def test_plots_have_curves_as_soon_as_they_are_opened_and_hold_their_width(
+    flight: str, opened: Callable[..., BrowserPage]
+) -> None:
+    page = opened(flight, SCREENS[1])
+    page.wait_for_text("running")
+    page.select_tab("Plots")
+    page.page.wait_for_function(DRAWN_JS)
+    widths, shown_s = page.page.evaluate(WIDTHS_JS), page.state()["t_s"]
+    page.until(f"s.t_s > {shown_s + 2.0}")
+    assert page.page.evaluate(WIDTHS_JS) == widths
 
 
 @pytest.mark.slow
+@pytest.mark.soak
+def test_plots_of_a_run_that_is_over_have_curves_of_any_variable(opened: Callable[..., BrowserPage]) -> None:
+    run = StagedRun()
+    with staged_console(run) as address:
+        run.end()
+        page = opened(address, SCREENS[1])
+        page.wait_for_text("run over")
+        page.select_tab("Plots")
+        page.page.wait_for_function(DRAWN_JS)
+        page.page.get_by_label("variables").click()
+        page.page.get_by_role("option", name="drone1: x, y, z").click()
+        page.page.get_by_text("x of drone1 [m]").wait_for()
+        page.page.wait_for_function(DRAWN_JS)
+
+
+@pytest.mark.slow
+@pytest.mark.soak
 def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: Callable[..., BrowserPage]) -> None:
     page, other = opened(replay, SCREENS[1]), opened(replay, SCREENS[1])
     for each in (page, other):
@@ -156,6 +163,7 @@ def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: 
 
 
 @pytest.mark.slow
+@pytest.mark.soak
 def test_a_record_at_its_end_offers_nothing_that_would_be_refused(opened: Callable[..., BrowserPage]) -> None:
     run = StagedRun(past_s=TIMELINE["to_s"], timeline=TIMELINE)
     with staged_console(run) as address:

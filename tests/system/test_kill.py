@@ -136,6 +136,7 @@ def test_who_does_not_come_back_in_its_time_ends_the_run(federation: Federation)
     assert (federation.out / "journal").exists()
 
 
+@pytest.mark.soak
 def test_or_the_run_goes_on_without_it(federation: Federation) -> None:
     options = (
         "processes.on_death={controller: wait}",
@@ -452,6 +453,7 @@ def test_interrupt_while_time_stands(federation: Federation) -> None:
     check_end(federation, whole=False)
 
 
+@pytest.mark.soak
 def test_two_interrupts(federation: Federation) -> None:
     flight = Flight(federation)
     federation.kill("world", signal.SIGSTOP)

@@ -29,6 +29,7 @@ DURATION_S = 10.0
 KEYS = ("drone/drone1/sensor/my_uwb", "drone/drone2/sensor/pitot", "drone/drone3/estimate", "cluster/main/state")
 
 
+@pytest.mark.soak
 def test_they_fly_as_in_one_process(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Modules of sensors and vehicles need be only where the scenario is read and where the world is."""
     monkeypatch.syspath_prepend(str(EXAMPLES))

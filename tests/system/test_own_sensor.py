@@ -44,6 +44,7 @@ def same_samples(first: Record, second: Record) -> bool:
     return all(first.all(key) and first.all(key) == second.all(key) for key in KEYS)
 
 
+@pytest.mark.soak
 def test_processes_give_the_samples_of_one_process(federation: Federation) -> None:
     """With modules beside the scenario; exported and flown again where only Python's path has them, or none."""
     for name in ("uwb_range.py", "airspeed.py"):

@@ -54,6 +54,7 @@ def test_a_sweep_compares_vehicles(federation: Federation) -> None:
     assert len({row["truth_sha256"] for row in rows}) == 3
 
 
+@pytest.mark.soak
 def test_crazyflies_fly_test_1_at_the_size_of_a_room(federation: Federation) -> None:
     """In the window of its report the triangle stands where it is to, as well as its positioning of 10 cm allows."""
     path = str(ROOT / "scenarios/crazyflie.yaml")

