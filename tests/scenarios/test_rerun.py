@@ -223,6 +223,7 @@ def damaged(record: Path, into: Path, part: float, cut: int = 0) -> Path:
     return into
 
 
+@pytest.mark.soak
 def test_a_damaged_record(federation: Federation) -> None:
     """A bit is turned in the last chunk of a record, in the last of one that is cut too, in one in the middle.
 

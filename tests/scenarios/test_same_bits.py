@@ -41,6 +41,7 @@ def test_as_processes(federation: Federation, pair_sha256: str) -> None:
     assert record.end()["last_ns"] == 12_000_000_000
 
 
+@pytest.mark.soak
 def test_with_all_agents_in_one_process(federation: Federation, pair_sha256: str) -> None:
     """Estimators and controller share a process; the estimators one kernel.
 

@@ -216,7 +216,7 @@ def test_a_port_in_use(federation: Federation) -> None:
     assert events.now() == []
 
 
-@pytest.mark.parametrize("name", ["estimator.drone1", "recorder"])
+@pytest.mark.parametrize("name", ["estimator.drone1", pytest.param("recorder", marks=pytest.mark.soak)])
 def test_of_two_processes_of_one_name_the_older_ends(federation: Federation, world: Client, name: str) -> None:
     events = world.subscribe("world/event")
     arguments = [("estimator", "drone1")] * 2

@@ -28,6 +28,7 @@ def test_no_picture_is_left_out(tmp_path_factory: pytest.TempPathFactory, compil
 
 
 @pytest.mark.slow
+@pytest.mark.soak
 def test_a_camera_that_is_killed_holds_time_until_it_is_back(
     tmp_path_factory: pytest.TempPathFactory, compiled: None
 ) -> None:

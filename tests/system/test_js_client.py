@@ -211,6 +211,7 @@ def test_the_page_lives_through_the_end_of_its_gateway_and_of_its_run(
 
 
 @needs_browser
+@pytest.mark.soak
 def test_the_page_is_refused_a_command_in_words(federation: Federation, opened: Callable[..., Watched]) -> None:
     """A landed drone cannot be held: the page says what the world said, and stays."""
     federation.world(ONE, "--rate", "2", "--duration", "600")
@@ -222,6 +223,7 @@ def test_the_page_is_refused_a_command_in_words(federation: Federation, opened: 
 
 
 @needs_browser
+@pytest.mark.soak
 def test_the_page_shows_a_token_where_one_is_asked_for(federation: Federation, opened: Callable[..., Watched]) -> None:
     federation.world(ONE, "--rate", "2", "--duration", "600")
     gateway = GatewayProcess(federation, "--token", "secret")

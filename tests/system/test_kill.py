@@ -90,7 +90,7 @@ def check_end(federation: Federation, whole: bool) -> Record:
     [
         ("estimator.drone1", ()),
         pytest.param("controller.main", (), marks=pytest.mark.soak),
-        ("controller.main", ("--hosted",)),
+        pytest.param("controller.main", ("--hosted",), marks=pytest.mark.soak),
     ],
 )
 def test_restart(
@@ -127,6 +127,7 @@ def test_wait(federation: Federation, name: str) -> None:
     assert [event["subject"] for event in check_end(federation, whole=True).events("restart")] == [name]
 
 
+@pytest.mark.soak
 def test_who_does_not_come_back_in_its_time_ends_the_run(federation: Federation) -> None:
     flight = Flight(federation, "--set", "processes.on_death={estimator: wait}", "--set", "processes.return_s=1.5")
     federation.kill("estimator.drone1")
@@ -221,6 +222,7 @@ def test_a_recorder_that_is_killed_again_and_again_leaves_no_gap(
 
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.soak), signal.SIGKILL])
+@pytest.mark.soak
 def test_a_recorder_that_ends_just_before_the_run(federation: Federation, number: signal.Signals) -> None:
     """The last gates are written by the one in its place, or the run has failed, and says why."""
     run = federation.run(PAIR, "--rate", "4", "--duration", "8")
@@ -358,6 +360,7 @@ def test_in_realtime_the_formation_flies_on_as_without_the_deaths(
             assert np.linalg.norm(apart, axis=1).max() < APART_M
 
 
+@pytest.mark.soak
 def test_a_world_that_is_not_to_be_restarted(federation: Federation) -> None:
     flight = Flight(federation, "--set", "processes.on_death={world: end}")
     federation.kill("world")
@@ -401,7 +404,7 @@ def test_launcher(federation: Federation) -> None:
     assert record.end()["reason"] == end.message["data"]["reason"]
 
 
-@pytest.mark.parametrize("number", REASONS)
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.soak)])
 def test_interrupt(federation: Federation, number: signal.Signals) -> None:
     flight = Flight(federation)
     flight.run.signal(number)
@@ -411,7 +414,9 @@ def test_interrupt(federation: Federation, number: signal.Signals) -> None:
     assert REASONS[number] in record.end()["reason"]
 
 
-@pytest.mark.parametrize("options", [("--in-process",), ()], ids=["one process", "processes"])
+@pytest.mark.parametrize(
+    "options", [("--in-process",), pytest.param((), marks=pytest.mark.soak)], ids=["one process", "processes"]
+)
 def test_a_terminal_that_is_closed(federation: Federation, options: tuple[str, ...]) -> None:
     where = options or ("--listen", federation.endpoint)
     command = ["run", federation.write(PAIR), "--out", str(federation.out), "--duration", "100000", *where]

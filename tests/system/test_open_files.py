@@ -50,7 +50,7 @@ def test_too_few_files_are_a_line_with_the_number_needed(tmp_path: Path, name: s
     assert not (tmp_path / "out" / "logs").exists()
 
 
-@pytest.mark.parametrize("name", ["run", "a hosted run"])
+@pytest.mark.parametrize("name", ["run", pytest.param("a hosted run", marks=pytest.mark.soak)])
 def test_the_number_that_is_said_is_enough(tmp_path: Path, name: str) -> None:
     refused = zsim(tmp_path, 16, *COMMANDS[name])
     needed = re.search(r"must be (\d+)", refused.stderr)

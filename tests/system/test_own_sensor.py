@@ -106,6 +106,7 @@ def test_a_record_is_flown_again(federation: Federation) -> None:
 
 
 @pytest.mark.usefixtures("examples")
+@pytest.mark.soak
 def test_a_sweep_varies_it_and_no_truth_changes(federation: Federation) -> None:
     path, out = federation.write(PAIR, "pair.yaml"), federation.folder / "sweep"
     plan = ("--vary", "sensors.my_uwb.range_m.noise=0.1,0.5", "--workers", "1", "--no-report")

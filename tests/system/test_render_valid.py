@@ -238,7 +238,7 @@ def started(process: "subprocess.Popen[str]") -> Iterator["subprocess.Popen[str]
 
 
 @SECURITY
-@pytest.mark.parametrize("name", ["estimator.drone1", "estimator.drone2", "controller.main", "recorder"])
+@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main", "recorder"])
 def test_a_unit_s_command_is_one_that_the_role_takes(tmp_path: Path, name: str, insecure: bool) -> None:
     """Nobody listens there, and the role says so, which it does when it is content with its options."""
     unit = laid_out(tmp_path, PAIR, insecure)[name]

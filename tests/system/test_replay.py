@@ -289,6 +289,7 @@ def test_all_roles_beside_a_replay(federation: Federation, flown: Path) -> None:
         assert output == [*map(without_source, recorded(flown, key)[key][:301])]
 
 
+@pytest.mark.soak
 def test_a_record_that_was_cut(federation: Federation, flown: Path) -> None:
     """The writer of the record died.
 

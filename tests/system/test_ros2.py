@@ -340,6 +340,7 @@ def check_attachments(session: zenoh.Session, node: Peer) -> None:
     assert {(size, gid) for _, _, size, gid in attachments} == {(16, rmw_zenoh.gid_of(token))}
 
 
+@pytest.mark.soak
 def test_either_side_may_restart(federation: Federation, ros: ROS) -> None:
     """ROS's own router comes late, dies and comes back; so do the bridge and the world: ROS nodes receive again."""
     peer, router = ros

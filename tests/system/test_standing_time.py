@@ -48,7 +48,8 @@ class Watched:
         self.run.ends(with_code=0)
 
 
-@pytest.mark.parametrize("has_token", [False, pytest.param(True, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("has_token", [False, True])
 def test_a_join_in_another_s_name_takes_no_place(federation: Federation, has_token: bool) -> None:
     watched = Watched(federation)
     if has_token:  # of the name alone, as a program has that knows no more than the contract
@@ -122,6 +123,7 @@ def test_a_stopped_estimator_is_named_and_not_the_controller_that_waits_for_it(f
     watched.flies_on()
 
 
+@pytest.mark.soak
 def test_a_stopped_recorder_is_named_in_realtime(federation: Federation) -> None:
     watched = Watched(federation, "--realtime")
     watched.stop("recorder")
@@ -173,7 +175,7 @@ def reader(endpoint: str, stopped: bool) -> Iterator[int]:
         program.communicate()
 
 
-@pytest.mark.parametrize("pace", [("--rate", "10"), ("--realtime",)])
+@pytest.mark.parametrize("pace", [pytest.param(("--rate", "10"), marks=pytest.mark.soak), ("--realtime",)])
 def test_who_subscribes_to_everything_and_takes_nothing_costs_nobody_anything(
     federation: Federation, pace: tuple[str, ...]
 ) -> None:

@@ -105,6 +105,7 @@ def test_a_killed_worker_is_replaced_and_its_run_flown_again(federation: Federat
     assert without_wall(out) == without_wall(undisturbed)
 
 
+@pytest.mark.soak
 def test_ctrl_c_then_kill_then_the_same_command(federation: Federation, undisturbed: Path) -> None:
     """Whatever is finished is kept and not flown again; nobody outlives the sweep."""
     out = federation.folder / "sweep"

@@ -35,8 +35,8 @@ from zsim_analysis.export.make_export import export
 from zsim_analysis.export.selection import MessageSelection
 from zsim_analysis.report.make_report import judge
 
-CUTS = 100
-FLIPS = 60
+CUTS = 50
+FLIPS = 30
 
 Content = tuple[bytes, int, int]  # payload, simulated and wall time [ns] of a message
 Made = tuple[int, list[str]]  # rows of what was made from a record, and what was said of it
