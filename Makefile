@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SCENARIO ?= scenarios/step.yaml
 PARTS ?=
-WORKERS ?= 6
+WORKERS ?= 4
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
 
 .PHONY: run test setup lint soak bench clean help
