@@ -172,8 +172,6 @@ class RosGraph:
 
 
 def numbers(line: str) -> list[float]:
-    """Return the numbers of a line of `rostopic echo -p`, its time in seconds first; none of its head."""
-    if line.startswith("%"):
-        return []
+    """Return the numbers of a line of `rostopic echo -p`, its time in seconds first; none of its head or a warning."""
     first, *others = line.split(",")
-    return [int(first) * 1e-9, *map(float, others)]
+    return [int(first) * 1e-9, *map(float, others)] if first.isdigit() else []
