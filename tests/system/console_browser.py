@@ -21,10 +21,15 @@ IN_SIGHT = """() => ['land', 'emergency'].every(name => {
 })"""
 FRAME_MS = 250  # at least, between two frames of the scene: drawn without a graphics card, each takes a core
 RARE_FRAMES_JS = f"""{{
-  const draw = requestAnimationFrame.bind(window);
-  window.requestAnimationFrame = callback => setTimeout(() => draw(callback), {FRAME_MS});
-  window.cancelAnimationFrame = clearTimeout.bind(window);
+  const draw = requestAnimationFrame.bind(window), cancel = cancelAnimationFrame.bind(window), seen = new WeakSet();
+  window.requestAnimationFrame = callback => {{
+    if (seen.has(callback)) return -setTimeout(() => draw(callback), {FRAME_MS});
+    seen.add(callback);
+    return draw(callback);
+  }};
+  window.cancelAnimationFrame = id => id < 0 ? clearTimeout(-id) : cancel(id);
 }}"""
+"""What asks for frame after frame, as the scene does, has them rarely; a single one, as of a folder that opens, at once."""
 POLL_MS = 100  # between two looks at what a page shows
 PATIENCE_MS = 1000 * PATIENCE_S
 
