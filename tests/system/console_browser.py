@@ -21,13 +21,13 @@ IN_SIGHT = """() => ['land', 'emergency'].every(name => {
 })"""
 FRAME_MS = 250  # at least, between two frames of the scene: drawn without a graphics card, each takes a core
 RARE_FRAMES_JS = f"""{{
-  const draw = requestAnimationFrame.bind(window), cancel = cancelAnimationFrame.bind(window), seen = new WeakSet();
+  const draw = requestAnimationFrame.bind(window), seen = new WeakSet();
   window.requestAnimationFrame = callback => {{
-    if (seen.has(callback)) return -setTimeout(() => draw(callback), {FRAME_MS});
+    const wait_ms = seen.has(callback) ? {FRAME_MS} : 0;
     seen.add(callback);
-    return draw(callback);
+    return setTimeout(() => draw(callback), wait_ms);
   }};
-  window.cancelAnimationFrame = id => id < 0 ? clearTimeout(-id) : cancel(id);
+  window.cancelAnimationFrame = clearTimeout.bind(window);
 }}"""
 """What asks for frame after frame, as the scene does, has them rarely; a single one, as of a folder that opens, at once."""
 POLL_MS = 100  # between two looks at what a page shows
