@@ -19,17 +19,6 @@ IN_SIGHT = """() => ['land', 'emergency'].every(name => {
   const inside = box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight;
   return inside && document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2) === button;
 })"""
-FRAME_MS = 250  # at least, between two frames of the scene: drawn without a graphics card, each takes a core
-RARE_FRAMES_JS = f"""{{
-  const draw = requestAnimationFrame.bind(window), seen = new WeakSet();
-  window.requestAnimationFrame = callback => {{
-    const wait_ms = seen.has(callback) ? {FRAME_MS} : 0;
-    seen.add(callback);
-    return setTimeout(() => draw(callback), wait_ms);
-  }};
-  window.cancelAnimationFrame = clearTimeout.bind(window);
-}}"""
-"""What asks for frame after frame, as the scene does, has them rarely; a single one, as of a folder that opens, at once."""
 POLL_MS = 100  # between two looks at what a page shows
 PATIENCE_MS = 1000 * PATIENCE_S
 
@@ -113,7 +102,6 @@ def opened(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
 
         def open_it(address: str, viewport: dict[str, int] = VIEWPORT) -> BrowserPage:
             context = browser.new_context(viewport=viewport)
-            context.add_init_script(RARE_FRAMES_JS)
             stack.callback(context.close)
             return BrowserPage(context.new_page(), address)
 
