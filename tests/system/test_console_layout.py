@@ -10,7 +10,7 @@ from staged_console import StagedRun, staged_console
 
 pytestmark = [
     needs_browser,
-    pytest.mark.filterwarnings("ignore:Queued a SceneNode"),  # of viser, where a page is closed just then
+    pytest.mark.filterwarnings("ignore:Queued a "),  # of viser, where a page is closed just then
 ]
 
 LOOKS = 20  # at a page that is laid out anew, within the tests' patience
