@@ -194,6 +194,7 @@ def write_report(
         ReportError: the directory cannot be written.
     """
     with _put_in_place(directory, directory) as new:
+        (new / "figures").mkdir()
         pictures = render(_kept(figures, new / "figures", formats), progress)
         progress("writing the page")
         for figure, png in pictures:
@@ -213,17 +214,20 @@ def write_page(
 ) -> None:
     """Write one page; an earlier one is replaced when the new one is whole. Arguments and errors as `write_report`.
 
-    Figures in other formats come into a folder beside the page, by the page's name without its ending.
+    Figures in other formats come into a folder beside the page, NAME-figures.
     """
+    folder = f"{out.stem}-figures"
     with _put_in_place(out.parent, out) as new:
-        pictures = render(_kept(figures, new / out.stem, formats), progress)
+        (new / folder).mkdir()
+        pictures = render(_kept(figures, new / folder, formats), progress)
         progress("writing the page")
         (new / out.name).write_text(page(pictures), encoding="utf-8")
+    for figure, _ in pictures:
+        _remove_others(out.parent / folder / figure.name, formats)
 
 
 def _kept(figures: Iterable[ReportFigure], folder: Path, formats: Sequence[str]) -> Iterator[ReportFigure]:
     """Yield figures when their files in other formats are written."""
-    folder.mkdir()
     for figure in figures:
         yield figure
         for form in formats:
@@ -233,7 +237,8 @@ def _kept(figures: Iterable[ReportFigure], folder: Path, formats: Sequence[str])
 def _remove_others(png: Path, formats: Sequence[str]) -> None:
     """Remove the files of a figure in formats other than these."""
     for form in set(FORMATS) - set(formats):
-        png.with_suffix(f".{form}").unlink(missing_ok=True)
+        if (earlier := png.with_suffix(f".{form}")).is_file():
+            earlier.unlink()
 
 
 @contextmanager

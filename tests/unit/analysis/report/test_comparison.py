@@ -5,6 +5,7 @@ import errno
 import io
 import os
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -273,16 +274,21 @@ def test_the_page_is_one_file_that_asks_nothing_of_the_network(runs: list[Path],
 
 @pytest.mark.usefixtures("unrendered")
 def test_figures_in_other_formats_come_into_a_folder_beside_the_page(runs: list[Path], tmp_path: Path) -> None:
-    compare(runs[:2], tmp_path / "page.html", formats=["svg"])
-    written = sorted(path.suffix for path in (tmp_path / "page").iterdir())
+    page = tmp_path / "page"  # a name without an ending will do
+    compare(runs[:2], page, formats=["svg"])
+    written = sorted(path.suffix for path in (tmp_path / "page-figures").iterdir())
     assert written == [".svg"] * 7
+    compare(runs[:2], page)
+    assert list((tmp_path / "page-figures").iterdir()) == []
+    assert page.is_file()
 
 
 @pytest.mark.usefixtures("unrendered")
 def test_the_command(runs: list[Path], tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["report", *map(str, runs[:2])])
+    done = CliRunner().invoke(app, ["report", *map(str, runs[:2]), "--format", "pdf"])
     page = runs[0].parent / "compare-calm-rough.html"
     assert done.exit_code == 0, done.output
+    shutil.rmtree(page.with_name("compare-calm-rough-figures"))
     assert done.stdout == f"report: {page}\n"
     page.unlink()
     alone = CliRunner().invoke(app, ["report", str(runs[0]), "--out", str(tmp_path / "x.html")])
