@@ -347,6 +347,27 @@ def test_a_run_with_a_console_prints_its_link_and_ends_as_a_whole(federation: Fe
     federation.nobody_left()
 
 
+@needs_browser
+def test_the_pages_of_a_run_s_console_keep_its_report_and_record(federation: Federation, opened) -> None:
+    where = "--out", str(federation.out), "--listen", federation.endpoint
+    run = federation.start("run", federation.write(TRIAD), "--console", *where)
+    page = opened(run.line("steer at").text.rpartition(" ")[2]).page
+    page.locator("[data-level=running]").wait_for()
+    assert federation.client().request("world/control", "stop")["ok"]
+    run.ends(with_code=0)
+    federation.nobody_left()
+    page.get_by_text("the console has ended with its run").wait_for()
+    assert page.locator("#zsim-head .title").text_content().startswith("run over")
+    links = page.locator("#zsim-head .files a")
+    with page.context.expect_page() as report:
+        links.nth(0).click()
+    report.value.wait_for_load_state()
+    assert report.value.get_by_role("heading").first.text_content() == "triad"
+    with page.expect_download() as record:
+        links.nth(1).click()
+    assert record.value.path().read_bytes() == (federation.out / "run.mcap").read_bytes()
+
+
 def test_what_a_run_left_behind_is_served_once_it_is_there(tmp_path: Path) -> None:
     with staged_console(StagedRun(past_s=0.5), tmp_path) as address:
         assert status(f"{address}report") == status(f"{address}view/record") == 404
@@ -359,7 +380,7 @@ def test_what_a_run_left_behind_is_served_once_it_is_there(tmp_path: Path) -> No
             assert (report.read(), report.headers.get_content_type()) == (b"report.html", "text/html")
             assert (record.read(), record.headers.get_filename()) == (b"run.mcap", "run.mcap")
         with urllib.request.urlopen(f"{address}head") as head:
-            assert all(each["is_there"] for each in json.load(head)["files"].values())
+            assert all(each["size_bytes"] for each in json.load(head)["files"].values())
 
 
 @pytest.mark.soak

@@ -1,7 +1,9 @@
 """The head of the console's page, in a real browser, on answers that the test gives."""
 
+import functools
 import importlib.resources
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,12 @@ from chromium import needs_browser
 from console_browser import IN_SIGHT, PATIENCE_MS, POLL_MS, SCREENS
 from page_overflow import overflow
 
-from zsim_bridges.console.console_server import run_files, shown_files
+from zsim_bridges.console.server.run_files import RunFiles
 
 pytestmark = needs_browser
 
 ADDRESS = "http://console.test/"  # of no machine: all requests are answered here
+LOOKED_AT = re.compile(f"{ADDRESS}head(\\?.*)?$")
 AUDIO_JS = """
 window.tones = 0;
 window.AudioContext = class {
@@ -35,11 +38,13 @@ class Head:
         page: playwright's.
         state: what the console answers.
         looks: how often it was asked.
+        copied: whether the page had, when it last asked, all that it keeps of a console that leaves.
     """
 
     def __init__(self, page: Any) -> None:
         self.page = page
         self.looks = 0
+        self.copied = False
         self.commands: list[dict[str, Any]] = []
         refusals = {"land": "", "emergency": ""}
         self.state: dict[str, Any] = {
@@ -50,12 +55,13 @@ class Head:
         page.set_default_timeout(PATIENCE_MS)
         page.add_init_script(AUDIO_JS)
         page.route(f"{ADDRESS}**", lambda route: route.fulfill(body=html, content_type="text/html"))
-        page.route(f"{ADDRESS}head", self._answer)
+        page.route(LOOKED_AT, self._answer)
         page.route(f"{ADDRESS}command", self._command)
         page.goto(ADDRESS)
 
     def _answer(self, route: Any) -> None:
         self.looks += 1
+        self.copied = "copied" in route.request.url
         route.fulfill(body=json.dumps(self.state), content_type="application/json")
 
     def _command(self, route: Any) -> None:
@@ -114,25 +120,91 @@ def test_an_alarm_is_acknowledged_by_its_button(head: Head) -> None:
     assert head.commands == [{"op": "acknowledge"}]
 
 
+def ended(folder: Path, **state: Any) -> dict[str, Any]:
+    """Return the head of a run that is over, with what its folder holds."""
+    over = {"level": "ended", "title": "run over at 330.0 s", "detail": "step · the duration is over"}
+    return {**over, **RunFiles(folder).shown(page="", has_copies=False), **state}
+
+
+def gone(head: Head) -> None:
+    """Let the console end."""
+    head.page.unroute(LOOKED_AT)
+    head.page.route(LOOKED_AT, lambda route: route.abort())
+
+
 def test_when_a_run_is_over_its_report_and_record_are_named(head: Head) -> None:
-    files = shown_files(run_files(Path("/home/somebody/lab/flights/with/a/long/name/runs/step-20261125-065514")))
+    state = ended(Path("/home/somebody/lab/flights/with/a/long/name/runs/step-20261125-065514"))
+    files = state["files"]
     head.show(files=files)
     shown = head.page.locator(".files")
     assert shown.text_content() == ""
-    head.show(level="ended", title="run over at 330.0 s", detail="step · the duration is over")
+    head.show(**state)
     for size in SCREENS:
         head.page.set_viewport_size(size)
         assert are_in_sight(files, head)
         assert head.page.evaluate(IN_SIGHT)
-    head.show(files={name: {**each, "is_there": True} for name, each in files.items()})
+    head.show(files={name: {**each, "size_bytes": 7} for name, each in files.items()})
     assert [link.get_attribute("href") for link in shown.locator("a").all()] == ["/report", "/record"]
-    head.page.unroute(f"{ADDRESS}head")  # the console of a run ends with it
-    head.page.route(f"{ADDRESS}head", lambda route: route.abort())
+    gone(head)
     head.page.locator("[data-level=gone]").wait_for()
     for size in SCREENS:
         head.page.set_viewport_size(size)
         assert are_in_sight(files, head)
     assert shown.locator("a").count() == 0
+
+
+def test_a_page_keeps_report_and_record_of_a_console_that_leaves(head: Head, tmp_path: Path) -> None:
+    content = {"report": "<title>the report</title>", "record": "MCAP"}
+    (tmp_path / "report.html").write_text(content["report"])
+    (tmp_path / "run.mcap").write_text(content["record"])
+    for name, text in content.items():
+        head.page.route(f"{ADDRESS}{name}", functools.partial(serve, text))
+    head.show(**ended(tmp_path, leaves=True))
+    assert head.copied
+    gone(head)
+    head.page.get_by_text("the console has ended with its run").wait_for()
+    links = head.page.locator(".files a")
+    with head.page.context.expect_page() as report:
+        links.nth(0).click()
+    report.value.wait_for_load_state()
+    assert report.value.title() == "the report"
+    with head.page.expect_download() as record:
+        links.nth(1).click()
+    assert (record.value.suggested_filename, record.value.path().read_text()) == ("run.mcap", content["record"])
+
+
+def test_a_page_copies_no_record_as_large_as_a_disk(head: Head, tmp_path: Path) -> None:
+    state = ended(tmp_path, leaves=True)
+    head.show(**{**state, "files": {"record": {"path": "/runs/large/run.mcap", "size_bytes": 10**12}}})
+    assert head.copied
+    gone(head)
+    head.page.get_by_text("the console has ended with its run").wait_for()
+    assert head.page.locator(".files").text_content() == "record: /runs/large/run.mcap"
+    assert head.page.locator(".files a").count() == 0
+
+
+def test_what_a_run_has_not_left_is_not_named(head: Head, tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_text("MCAP")
+    head.page.route(f"{ADDRESS}record", functools.partial(serve, "MCAP"))
+    head.show(**ended(tmp_path))
+    assert "report.html" in str(head.page.locator(".files").text_content())
+    head.show(leaves=True)
+    assert head.page.locator(".files").text_content() == f"record: {tmp_path / 'run.mcap'}"
+
+
+def test_the_next_run_on_a_console_s_port_has_none_of_these_copies(head: Head, tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("")
+    head.page.route(f"{ADDRESS}report", functools.partial(serve, ""))
+    head.show(**ended(tmp_path, leaves=True))
+    assert str(head.page.locator(".files a").get_attribute("href")).startswith("blob:")
+    head.show(level="running", leaves=False)
+    assert not head.copied
+    head.show(level="ended")
+    assert head.page.locator(".files a").get_attribute("href") == "/report"
+
+
+def serve(text: str, route: Any) -> None:
+    route.fulfill(body=text, content_type="text/html")
 
 
 def are_in_sight(files: dict[str, Any], head: Head) -> bool:

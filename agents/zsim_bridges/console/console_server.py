@@ -1,6 +1,7 @@
 """The console: shows one run after the other on a viser server that only its own HTTP proxy can reach."""
 
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,6 @@ from typing import Any
 import viser
 
 from zsim.contract.messages import Info
-from zsim.record.record_reader import RECORD
 from zsim.transport.session import Session
 from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.monitoring.page_head import no_run_head
@@ -23,7 +23,11 @@ from zsim_bridges.console.server.http_proxy import HttpProxy, ListenAddress, Vis
 from zsim_bridges.console.server.page_messages import PageControls, is_permitted
 from zsim_bridges.console.server.page_tokens import OPERATOR, VIEWER
 from zsim_bridges.console.server.private_viser import PrivateViser
+from zsim_bridges.console.server.run_files import RunFiles
 from zsim_bridges.observer_process import ObserverProcess
+
+REASON_S = 0.1  # wall; between two looks for a reason to end
+OFFER_S = 20.0  # wall; how long pages may take to copy what a run left behind
 
 
 class Console:
@@ -52,7 +56,7 @@ class Console:
         world: str = "",
         folder: Path | None = None,
     ) -> None:
-        self._files = {} if folder is None else run_files(folder)
+        self._files = RunFiles(folder)
         self._name = name
         self._world = world
         self._rate_hz = rate_hz
@@ -103,6 +107,14 @@ class Console:
         finally:
             page.close()
 
+    def remain(self, end_reason: Callable[[], str | None]) -> None:
+        """Serve the pages of a run that is over until there is a reason to end, and they have copies of its files."""
+        while not (reason := end_reason()):
+            time.sleep(REASON_S)
+        if self._run_page:
+            self._run_page.end(reason)
+        self._files.offer(OFFER_S)
+
     def _record(self) -> RecordPlayer | None:
         return self._run_page.record if self._run_page else None
 
@@ -116,22 +128,10 @@ class Console:
         return self._run_page.state() if self._run_page else {"run_id": None}
 
     def _head(self) -> dict[str, Any]:
-        head = self._run_page.head() if self._run_page else no_run_head(self._world)
-        return {**head, "files": shown_files(self._files)}
+        return self._run_page.head() if self._run_page else no_run_head(self._world)
 
     def _command(self, op: str) -> str:
         return self._run_page.command(op) if self._run_page else "there is no run yet"
-
-
-def run_files(folder: Path) -> dict[str, Path]:
-    """Return the paths of what a run leaves behind, by what it is."""
-    whole = folder.absolute()
-    return {"report": whole / "report.html", "record": whole / RECORD}
-
-
-def shown_files(files: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
-    """Return what the head of the page shows of files, as plain data."""
-    return {name: {"path": str(path), "is_there": path.is_file()} for name, path in files.items()}
 
 
 def _show_text(gui: viser.GuiApi, text: str) -> None:

@@ -142,6 +142,11 @@ class RunPage:
                 pause.wait(next_s - time.monotonic())
         self._draw_end()
 
+    def end(self, reason: str) -> None:
+        """Show that the run is over; to be called after `run`, which shows that by itself where it learns of it."""
+        self._monitor.end(reason)
+        self._monitor.update(time.monotonic())
+
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
         state = console_state(self._info.run_id, self.views, self._time_monitor, dict(self._scene.shapes))

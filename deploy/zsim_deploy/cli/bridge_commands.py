@@ -77,7 +77,7 @@ def console(
     world = f"federation {reach.federation!r} on {reach.endpoint}"
     shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say, world, folder)
     with shown.open():
-        serve_runs(own_name, shown.serve, reach)
+        serve_runs(own_name, shown.serve, reach, remain=shown.remain)
 
 
 @app.command(rich_help_panel=TRANSLATE)

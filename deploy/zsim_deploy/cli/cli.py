@@ -90,6 +90,7 @@ def run(
     from zsim.runtime.progress import Screen
     from zsim_agents.hosting import check_plans
     from zsim_deploy.launch.camera_children import with_cameras
+    from zsim_deploy.launch.console_process import ending_after
     from zsim_deploy.launch.run import (
         RunOptions,
         check_endpoint,
@@ -129,7 +130,8 @@ def run(
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
         except KeyboardInterrupt as error:
             outcome = Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
-    record_commands.conclude(outcome, options.out, report)
+    with ending_after(outcome, lambda line: print(printable(line), file=sys.stderr)):
+        record_commands.conclude(outcome, options.out, report)
 
 
 def _refuse_with_others(

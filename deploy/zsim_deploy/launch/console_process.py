@@ -1,14 +1,17 @@
-"""The console as a process of its own, beside a replay that runs in this one."""
+"""The console as a process of its own: beside a replay that runs in this one, and after a run."""
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from zsim_deploy.launch.run import page_port
+from zsim_deploy.launch.free_ports import page_port
+from zsim_deploy.launch.supervisor import INTERRUPT_S, Outcome
 
 END_S = 10.0  # wall; how long it may take to end
+COPIED_S = 22.0  # wall; how long after a run, as its pages may copy for 20 s
+SLOW_S = 2.0  # wall; after which it is shown what is waited for
 
 
 @contextmanager
@@ -47,3 +50,29 @@ def _federation_of(record: Path) -> str:
 
     with open_run(record) as (_, _, scenario):
         return scenario.federation
+
+
+@contextmanager
+def ending_after(outcome: Outcome, say: Callable[[str], None]) -> Iterator[None]:
+    """End what remains of a run after what is done meanwhile; a console may let its pages copy what is there then.
+
+    Args:
+        outcome: of the run.
+        say: takes a line on what takes long.
+    """
+    patience_s = INTERRUPT_S if outcome.interrupted else COPIED_S
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):  # Ctrl-C
+        patience_s = INTERRUPT_S
+        raise
+    finally:
+        try:
+            for child in outcome.remaining:
+                child.request_stop(outcome.reason)
+                if not child.wait(min(SLOW_S, patience_s)):
+                    say(f"{child.name}: its pages copy the report and the record")
+                    child.wait(patience_s - SLOW_S)
+        finally:
+            for child in outcome.remaining:
+                child.close()

@@ -2,7 +2,6 @@
 
 import contextlib
 import re
-import socket
 import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,18 +16,18 @@ from zsim.scenario.scenario import Scenario
 from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
-from zsim_deploy.arguments import CONSOLE_PORT, load_scenario, pace_options
+from zsim_deploy.arguments import load_scenario, pace_options
 from zsim_deploy.inventory.processes import COMMANDS
 from zsim_deploy.launch import interrupted_run
 from zsim_deploy.launch.camera_children import CameraChild, camera_children
 from zsim_deploy.launch.child_process import ChildProcess
 from zsim_deploy.launch.end_signals import EndSignals
+from zsim_deploy.launch.free_ports import DEFAULT_PORT, free_port, is_free, page_port
 from zsim_deploy.launch.interrupted_run import JOURNAL, Launch
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
-DEFAULT_PORT = 7447  # Zenoh's own
 RECORDER = "recorder"
 CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
@@ -126,36 +125,6 @@ def check_open_files(options: RunOptions) -> None:
     require_files(launcher_files(count, len(expected)), f"{count} processes")
 
 
-def _is_free(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return False
-    return True
-
-
-def page_port() -> int:
-    """Return the console's port, or another free one where that is taken."""
-    return CONSOLE_PORT if _is_free(CONSOLE_PORT) else _any_port()
-
-
-def _any_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def free_port(screen: Screen) -> int:
-    """Return Zenoh's port, or another free one, shown on the screen, where that is taken."""
-    if _is_free(DEFAULT_PORT):
-        return DEFAULT_PORT
-    port = _any_port()
-    screen.say(f"port {DEFAULT_PORT} is in use; this run is on tcp/127.0.0.1:{port} (--connect for other commands)")
-    return port
-
-
 def options_of(folder: Path) -> tuple[RunOptions, bool]:
     """Return how an interrupted run goes on, and whether in one process: then it is flown once more, as all of it.
 
@@ -218,7 +187,7 @@ def _interrupt(number: int, _: object) -> None:
 def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher, signals: EndSignals) -> Outcome:
     for line in driver_lines(options.scenario, endpoint):
         screen.say(line)
-    supervisor = Supervisor(options.scenario.processes, screen)
+    supervisor = Supervisor(options.scenario.processes, screen, remaining=CONSOLE)
     supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
 
     def end_with_output() -> None:
@@ -236,13 +205,15 @@ def _run_on_free_port(
     endpoint = f"tcp/127.0.0.1:{port}"
     outcome = _run_on(options, endpoint, screen, launcher, signals)
     if tries > 1 and _lost_port(outcome, endpoint, port):
+        for child in outcome.remaining:
+            child.close()
         return _run_on_free_port(options, screen, launcher, signals, tries - 1)
     return outcome
 
 
 def _lost_port(outcome: Outcome, endpoint: str, port: int) -> bool:
     """Return whether another process took the port between our check of it and the start of our world."""
-    return outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not _is_free(port)
+    return outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not is_free(port)
 
 
 def _write_scenario(options: RunOptions, in_process: bool) -> None:

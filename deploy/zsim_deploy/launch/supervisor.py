@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from queue import SimpleQueue
 from typing import Any, Protocol
 
@@ -49,11 +49,17 @@ class RunProcess(Protocol):
 
 @dataclass
 class Outcome:
-    """How a run ended."""
+    """How a run ended.
+
+    Attributes:
+        reason: why.
+        remaining: processes that go on after it, to be stopped and closed.
+    """
 
     reason: str
     failed: bool = False
     interrupted: bool = False
+    remaining: Sequence[RunProcess] = field(default=(), repr=False)
 
 
 class Supervisor:
@@ -62,13 +68,15 @@ class Supervisor:
     Args:
         processes: what the scenario says of their deaths.
         show: takes progress.
+        remaining: name of a process that goes on after the run.
 
     Attributes:
         members: to be given before `run`; the world among them.
     """
 
-    def __init__(self, processes: Processes, show: ProgressSink) -> None:
+    def __init__(self, processes: Processes, show: ProgressSink, remaining: str = "") -> None:
         self.members: list[RunProcess] = []
+        self._remaining = remaining
         self._deaths = DeathPolicy(processes)
         self._show = show
         self._reason = ""
@@ -91,16 +99,19 @@ class Supervisor:
         """
         if self._interrupted:
             return Outcome(self._interrupted, interrupted=True)
+        remaining: list[RunProcess] = []
         with self._interrupts():
             try:
                 for child in self.members:
                     child.start()
                 self._watch(look)
-                self._finish()
+                self._finish([child for child in self.members if child.name != self._remaining])
+                remaining = [child for child in self.members if child.name == self._remaining]
             finally:
                 self._cancel_requests()
-                _close([*self.members, *(child for child, _ in self._leaving.values()), *self._gone])
-        return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
+                replaced = [*(child for child, _ in self._leaving.values()), *self._gone]
+                _close([child for child in (*self.members, *replaced) if child not in remaining])
+        return Outcome(self._reason or "ended", self._failed, self._interrupted is not None, remaining)
 
     def _interrupts(self) -> AbstractContextManager[None]:
         """Take Ctrl-C and SIGTERM as a request to end the run in order; a second Ctrl-C does not wait."""
@@ -296,15 +307,15 @@ class Supervisor:
             self._reason = ""
         self._fail(reason)
 
-    def _finish(self) -> None:
+    def _finish(self, members: Sequence[RunProcess]) -> None:
         """Let everybody leave; the recorder leaves last, by itself."""
-        for child in self.members:
+        for child in members:
             if self._failed or self._interrupted or child.role != "recorder":
                 child.request_stop(self._reason)
-        for child in self.members:
+        for child in members:
             while not child.wait(min(POLL_S, self._left_s())) and self._left_s() > 0:
                 continue
-        recorder = next(child for child in self.members if child.role == "recorder")
+        recorder = next(child for child in members if child.role == "recorder")
         if recorder.code not in (0, None) and recorder.name not in self._dead:
             self._fail_after_end(f"the recorder ended: {recorder.outcome()}")
 

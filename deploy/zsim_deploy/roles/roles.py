@@ -46,6 +46,8 @@ Serve = Callable[[Session, Info, ObserverProcess, Stopped, Say], None]
 """Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
 StandsFor = Callable[[Info], tuple[str, ...]]  # names of processes whose work a process does in a run
 SlackNs = Callable[[Info], int]  # by how much the world of a run may be ahead of a process; 0 for any
+Remain = Callable[[Callable[[], str | None]], None]
+"""Does with (reason) what is left to do after a run; `reason` returns why to stop, None to go on."""
 
 
 def agent(build: Callable[[messages.Info, Scenario], Agent], reach: WorldAccess, name: str = "") -> None:
@@ -190,7 +192,12 @@ def _no_slack(_: Info) -> int:
 
 
 def serve_runs(
-    name: str, serve: Serve, reach: WorldAccess, stands_for: StandsFor = _nobody, slack_ns: SlackNs = _no_slack
+    name: str,
+    serve: Serve,
+    reach: WorldAccess,
+    stands_for: StandsFor = _nobody,
+    slack_ns: SlackNs = _no_slack,
+    remain: Remain | None = None,
 ) -> None:
     """Serve one run after the other of the world on an endpoint, until it is stopped; launched, only one.
 
@@ -200,6 +207,7 @@ def serve_runs(
         reach: of the world.
         stands_for: whose work it does in a run, beside its own.
         slack_ns: by how much the world of a run may be ahead of it; 0 for any.
+        remain: what it does after the run of its launcher, until that asks it to stop.
 
     Raises:
         NoWorldError: there was no first world within `wait_s`.
@@ -226,6 +234,8 @@ def serve_runs(
                 else:
                     time.sleep(PAUSE_S)
             if launched:
+                if remain is not None and not stop.orphaned():
+                    remain(stop.reason)
                 stop.exit_if_terminated()
                 return
             wait_s = None

@@ -18,15 +18,18 @@ from msgspec import Struct
 from zsim.errors import RunError
 from zsim_bridges.console.frame import page_html
 from zsim_bridges.console.server.page_tokens import OPERATOR, VIEW_PATH, VIEWER, PageRequest, PageTokens
+from zsim_bridges.console.server.run_files import RunFiles
 from zsim_bridges.web.web_server import ServedSite, open_on_thread, start_site, url_host
 
 MESSAGE_MAX = 100_000  # bytes of one message of a page
 BACKEND_HOST = "127.0.0.1"  # where viser listens
+PAGE = "page"  # in a page's query: its name
+COPIED = "copied"  # in a page's query: it has what it keeps of a console that leaves
 SECRET_HEADER = "X-Zsim-Console"  # which viser's server asks for
 ALL_ADDRESSES = ("0.0.0.0", "::")
 PAGES_MAX = 50  # open at once, of operators and of viewers: viewers keep no operator out
 HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed
-CLOSE_S = 1.0
+CLOSE_S = 0.3  # twice: for what is under way, and for pages to close their sockets
 POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
 HEADERS = {
     "Content-Security-Policy": POLICY,  # the page is one file, and nothing it shows comes from elsewhere
@@ -61,7 +64,7 @@ class ViserBackend(NamedTuple):
         serve_actions: answers one for a socket of what is done in the scene, by the page's role, until it closes.
         head: returns what the head of the page shows, as plain data.
         command: does what a button of the head asks for; returns why it is refused, empty where it is not.
-        files: what the run leaves behind, by its name on the page, as far as that is known; it may not be there yet.
+        files: what the run leaves behind.
     """
 
     port: int
@@ -72,7 +75,7 @@ class ViserBackend(NamedTuple):
     serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]
     head: Callable[[], dict[str, Any]]
     command: Callable[[str], str]
-    files: dict[str, Path]
+    files: RunFiles
 
 
 class HeadCommand(Struct, frozen=True, forbid_unknown_fields=True):
@@ -126,7 +129,7 @@ class HttpProxy:
         for path, handler in shared.items():
             app.add_routes([web.get(path, handler), web.get(f"{VIEW_PATH}{path}", handler)])
         app.add_routes([web.post("/command", self._command)])
-        for name, path in self._backend.files.items():
+        for name, path in self._backend.files.paths.items():
             shown = partial(self._file, path)
             app.add_routes([web.get(f"/{name}", shown), web.get(f"{VIEW_PATH}/{name}", shown)])
         try:
@@ -170,7 +173,8 @@ class HttpProxy:
         return self._answer(request, self._backend.state)
 
     async def _head(self, request: web.Request) -> web.Response:
-        return self._answer(request, self._backend.head)
+        look = request.query.get(PAGE, ""), COPIED in request.query
+        return self._answer(request, lambda: {**self._backend.head(), **self._backend.files.shown(*look)})
 
     def _answer(self, request: web.Request, shown: Callable[[], dict[str, Any]]) -> web.Response:
         if self._tokens.role_of(_page_request(request)) is None:

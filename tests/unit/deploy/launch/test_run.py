@@ -9,7 +9,7 @@ from synthetic_record import SCENARIOS
 
 from zsim.errors import RunError, SessionError
 from zsim.scenario import scenario_file
-from zsim_deploy.launch import run
+from zsim_deploy.launch import free_ports, run
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.run import RunOptions
 from zsim_deploy.launch.supervisor import Outcome
@@ -35,7 +35,7 @@ class FakeSupervisor:
     outcomes: ClassVar[list[str]] = []
     ports: ClassVar[list[int]] = []
 
-    def __init__(self, *_: Any) -> None:
+    def __init__(self, *_: Any, **__: Any) -> None:
         self.members: list[Any] = []
 
     def handle_line(self, text: str) -> None: ...
@@ -62,7 +62,8 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> type[FakeSupervisor]:
     FakeSupervisor.outcomes, FakeSupervisor.ports = [], []
     monkeypatch.setattr(run, "RoleLauncher", NoRoleLauncher)
     monkeypatch.setattr(run, "Supervisor", FakeSupervisor)
-    monkeypatch.setattr(run, "_is_free", lambda port: port == run.DEFAULT_PORT and not FakeSupervisor.ports)
+    for module in (run, free_ports):
+        monkeypatch.setattr(module, "is_free", lambda port: port == run.DEFAULT_PORT and not FakeSupervisor.ports)
     return FakeSupervisor
 
 
