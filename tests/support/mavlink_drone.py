@@ -6,10 +6,10 @@ from zsim.contract import flight_messages
 from zsim.contract.messages import Origin
 from zsim.scenario import scenario_file
 from zsim_bridges.mavlink.autopilot.personality import PERSONALITIES
-from zsim_bridges.mavlink.vehicle.mavlink_vehicle import Options, Vehicle
+from zsim_bridges.mavlink.vehicle.mavlink_vehicle import MavlinkVehicle, Options
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Received
-from zsim_bridges.mavlink.wire.wire_message import Message
+from zsim_bridges.mavlink.wire.wire_message import WireMessage
 from zsim_bridges.vehicle_links.command_sender import CommandSender
 
 GATE_NS = 20_000_000
@@ -22,7 +22,7 @@ drones:
   - {name: drone1, position_m: [0, 0, 0]}
 """
 OWN = "mavlink.main"
-M = TypeVar("M", bound=Message)
+M = TypeVar("M", bound=WireMessage)
 
 
 class FlownDrone:
@@ -32,8 +32,8 @@ class FlownDrone:
         self.commands: list[Any] = []
         sender = CommandSender("drone1", OWN, lambda _, command: self.commands.append(command))
         (drone,) = scenario_file.from_text(SCENARIO).drones
-        self.vehicle = Vehicle(drone, ORIGIN, sender, Options(1, PERSONALITIES[autopilot], "normal", OWN))
-        self.sent: list[Message] = []
+        self.vehicle = MavlinkVehicle(drone, ORIGIN, sender, Options(1, PERSONALITIES[autopilot], "normal", OWN))
+        self.sent: list[WireMessage] = []
         self.state = "landed"
         self.position = [0.0, 0.0, 0.0]
         self.battery_percent = 90.0
@@ -62,7 +62,7 @@ class FlownDrone:
             self.step()
         raise AssertionError(f"not within {gates} gates; {self.state} at {self.position}, {self.vehicle.flight.mode}")
 
-    def receive(self, message: Message, system: int = 255) -> None:
+    def receive(self, message: WireMessage, system: int = 255) -> None:
         """Let a client send a message."""
         self.vehicle.on_message(Received(message, system, 190, 0, False), self.t_ns)
         self.sent += self.vehicle.take()

@@ -24,7 +24,7 @@ from zsim.transport.session import RawSample, Session
 from zsim.transport.tls import Identity
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
-from zsim_bridges.ros2.camera_topics import DRIVER, DroneCameras
+from zsim_bridges.ros2.drone_cameras import DRIVER, DroneCameras
 from zsim_bridges.ros2.rmw_zenoh import Ros2Node, RosContext, ros_names
 from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.source_keys import SAMPLES_MAX, BridgedTopic, CallbackQueue, SourceSubscriptions

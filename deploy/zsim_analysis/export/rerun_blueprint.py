@@ -36,7 +36,7 @@ class Curve(NamedTuple):
     colour: str
 
 
-class Mesh(NamedTuple):
+class DroneMesh(NamedTuple):
     """Triangles in the body frame: vertices (n, 3) [m; B], corners (m, 3) by vertex, colours (n, 4) 0 to 255."""
 
     vertices_m: np.ndarray
@@ -173,7 +173,7 @@ def _entity(topic: str) -> str:
     return rr.new_entity_path(topic.strip("/").split("/"))
 
 
-def drone_mesh(rotors: Sequence[RotorDisc], colour: str) -> Mesh:
+def drone_mesh(rotors: Sequence[RotorDisc], colour: str) -> DroneMesh:
     """Return a drone as triangles: a dark hull with its nose, and a disc for each rotor in the drone's colour."""
     arm_m = max(float(np.hypot(disc.x_m, disc.y_m)) for disc in rotors)
     parts = [
@@ -183,26 +183,26 @@ def drone_mesh(rotors: Sequence[RotorDisc], colour: str) -> Mesh:
     ]
     starts = np.cumsum([0, *(len(part.vertices_m) for part in parts[:-1])])
     triangles = [part.triangles + start for part, start in zip(parts, starts, strict=True)]
-    return Mesh(
+    return DroneMesh(
         np.concatenate([part.vertices_m for part in parts]),
         np.concatenate(triangles),
         np.concatenate([part.colours for part in parts]),
     )
 
 
-def _box(middle_m: Sequence[float], size_m: Sequence[float], colour: str) -> Mesh:
+def _box(middle_m: Sequence[float], size_m: Sequence[float], colour: str) -> DroneMesh:
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     faces = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     triangles = np.array([triangle for a, b, c, d in faces for triangle in ((a, b, c), (a, c, d))])
-    return Mesh(corners * size_m + middle_m, triangles, _tint(colour, len(corners)))
+    return DroneMesh(corners * size_m + middle_m, triangles, _tint(colour, len(corners)))
 
 
-def _disc(middle_m: Sequence[float], radius_m: float, colour: str) -> Mesh:
+def _disc(middle_m: Sequence[float], radius_m: float, colour: str) -> DroneMesh:
     angles = np.arange(ROTOR_CORNERS) * 2 * np.pi / ROTOR_CORNERS
     rim = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(ROTOR_CORNERS)]) * radius_m
     rim_numbers = np.arange(1, ROTOR_CORNERS + 1)
     triangles = np.column_stack([np.zeros(ROTOR_CORNERS, int), rim_numbers, np.roll(rim_numbers, -1)])
-    return Mesh(np.vstack([np.zeros(3), rim]) + middle_m, triangles, _tint(colour, ROTOR_CORNERS + 1))
+    return DroneMesh(np.vstack([np.zeros(3), rim]) + middle_m, triangles, _tint(colour, ROTOR_CORNERS + 1))
 
 
 def _tint(colour: str, count: int) -> np.ndarray:

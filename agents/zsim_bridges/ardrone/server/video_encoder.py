@@ -16,7 +16,7 @@ IDR, SPS, PPS = 5, 7, 8  # types of NAL units (ITU-T H.264, table 7-1)
 PRESET = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline", "x264-params": "annexb=1"}
 
 
-class PictureError(ValueError):
+class VideoError(ValueError):
     """A picture cannot be read."""
 
 
@@ -56,7 +56,7 @@ class VideoEncoder:
             begins: whether decoding is to be able to begin here.
 
         Raises:
-            PictureError: it is no JPEG that can be read.
+            VideoError: it is no JPEG that can be read.
         """
         picture = _picture(jpeg).reformat(WIDTH_PX, HEIGHT_PX, "yuv420p")
         picture.pts, picture.time_base = self._count, self._codec.time_base
@@ -71,9 +71,9 @@ def _picture(jpeg: bytes) -> Any:
     try:
         pictures = reader.decode(av.Packet(jpeg))
     except (FFmpegError, ValueError) as error:
-        raise PictureError(f"it is no JPEG that can be read ({error})") from error
+        raise VideoError(f"it is no JPEG that can be read ({error})") from error
     if not pictures:
-        raise PictureError("it is no JPEG that can be read")
+        raise VideoError("it is no JPEG that can be read")
     return pictures[0]
 
 

@@ -24,7 +24,7 @@ class SpeedLimits(NamedTuple):
     down_m_s: float
 
 
-class Mode(Enum):
+class FlightMode(Enum):
     """What a vehicle is to do, in words of its own."""
 
     MANUAL = "MANUAL"
@@ -39,8 +39,8 @@ class Mode(Enum):
     OFFBOARD = "OFFBOARD"
 
 
-BY_STICKS = (Mode.MANUAL, Mode.ALTITUDE, Mode.POSITION)
-HOLDING = (*BY_STICKS, Mode.HOLD, Mode.BRAKE)
+BY_STICKS = (FlightMode.MANUAL, FlightMode.ALTITUDE, FlightMode.POSITION)
+HOLDING = (*BY_STICKS, FlightMode.HOLD, FlightMode.BRAKE)
 
 
 def px4_mode(main: int, sub: int = 0) -> int:
@@ -49,26 +49,26 @@ def px4_mode(main: int, sub: int = 0) -> int:
 
 
 PX4_MODES = {
-    Mode.MANUAL: px4_mode(1),
-    Mode.ALTITUDE: px4_mode(2),
-    Mode.POSITION: px4_mode(3),
-    Mode.TAKEOFF: px4_mode(4, 2),
-    Mode.HOLD: px4_mode(4, 3),
-    Mode.MISSION: px4_mode(4, 4),
-    Mode.RETURN: px4_mode(4, 5),
-    Mode.LAND: px4_mode(4, 6),
-    Mode.OFFBOARD: px4_mode(6),
+    FlightMode.MANUAL: px4_mode(1),
+    FlightMode.ALTITUDE: px4_mode(2),
+    FlightMode.POSITION: px4_mode(3),
+    FlightMode.TAKEOFF: px4_mode(4, 2),
+    FlightMode.HOLD: px4_mode(4, 3),
+    FlightMode.MISSION: px4_mode(4, 4),
+    FlightMode.RETURN: px4_mode(4, 5),
+    FlightMode.LAND: px4_mode(4, 6),
+    FlightMode.OFFBOARD: px4_mode(6),
 }
 COPTER_MODES = {
-    Mode.MANUAL: 0,  # STABILIZE
-    Mode.ALTITUDE: 2,  # ALT_HOLD
-    Mode.MISSION: 3,  # AUTO
-    Mode.OFFBOARD: 4,  # GUIDED
-    Mode.HOLD: 5,  # LOITER
-    Mode.RETURN: 6,  # RTL
-    Mode.LAND: 9,
-    Mode.POSITION: 16,  # POSHOLD
-    Mode.BRAKE: 17,
+    FlightMode.MANUAL: 0,  # STABILIZE
+    FlightMode.ALTITUDE: 2,  # ALT_HOLD
+    FlightMode.MISSION: 3,  # AUTO
+    FlightMode.OFFBOARD: 4,  # GUIDED
+    FlightMode.HOLD: 5,  # LOITER
+    FlightMode.RETURN: 6,  # RTL
+    FlightMode.LAND: 9,
+    FlightMode.POSITION: 16,  # POSHOLD
+    FlightMode.BRAKE: 17,
 }
 Meaning = Literal[
     "speed_m_s",
@@ -156,25 +156,25 @@ class Personality(NamedTuple):
 
     name: Literal["px4", "ardupilot"]
     autopilot: Autopilot
-    modes: Mapping[Mode, int]
-    first_mode: Mode
+    modes: Mapping[FlightMode, int]
+    first_mode: FlightMode
     names: Names
     fence_actions: Mapping[int, FenceAction]
     needs_stream: bool
     version: tuple[int, int, int, int]
 
-    def mode_of(self, custom_mode: int) -> Mode | None:
+    def mode_of(self, custom_mode: int) -> FlightMode | None:
         """Return the mode of a number; None for one that is not offered."""
         return next((mode for mode, number in self.modes.items() if number == custom_mode), None)
 
 
 PERSONALITIES = {
-    "px4": Personality("px4", Autopilot.PX4, PX4_MODES, Mode.HOLD, PX4_NAMES, PX4_FENCE, True, (1, 15, 4, 255)),
+    "px4": Personality("px4", Autopilot.PX4, PX4_MODES, FlightMode.HOLD, PX4_NAMES, PX4_FENCE, True, (1, 15, 4, 255)),
     "ardupilot": Personality(
         "ardupilot",
         Autopilot.ARDUPILOTMEGA,
         COPTER_MODES,
-        Mode.MANUAL,
+        FlightMode.MANUAL,
         COPTER_NAMES,
         COPTER_FENCE,
         False,

@@ -6,7 +6,7 @@ A landed drone of zsim has no state of its own for armed: armed is that it will 
 from collections.abc import Callable
 
 from zsim_bridges.mavlink.autopilot.enums import Severity
-from zsim_bridges.mavlink.autopilot.personality import HOLDING, Mode, Personality, Settings
+from zsim_bridges.mavlink.autopilot.personality import HOLDING, FlightMode, Personality, Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.command_output import CommandOutput
 from zsim_bridges.mavlink.flight.flight_control import ARRIVED_M, FlightControl
@@ -15,7 +15,7 @@ from zsim_bridges.mavlink.flight.position_guidance import AttitudeTarget, Target
 from zsim_bridges.mavlink.flight.return_course import ReturnCourse
 from zsim_bridges.mavlink.flight.setpoint_stream import SetpointStream
 
-OVER_ON_GROUND = (Mode.TAKEOFF, Mode.LAND, Mode.RETURN, Mode.MISSION)
+OVER_ON_GROUND = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RETURN, FlightMode.MISSION)
 Report = Callable[[Severity, str], None]
 
 
@@ -89,7 +89,7 @@ class Flight:
             self._is_armed, self._armed_ns = True, self._state.t_ns
             self._state.home_m = self._state.position_m
             self._report(Severity.INFO, "Armed")
-            if self.mode is Mode.MISSION and self._personality.needs_stream and self.mission.items:
+            if self.mode is FlightMode.MISSION and self._personality.needs_stream and self.mission.items:
                 self._begin_mission_on_ground()
         return reason
 
@@ -121,22 +121,26 @@ class Flight:
     def take_off(self, altitude_m: float) -> str | None:
         """Take off to an altitude over home."""
         reason = self.refusal() or self._not_ready()
-        if reason is None and Mode.TAKEOFF not in self._personality.modes and self.mode is not Mode.OFFBOARD:
+        if (
+            reason is None
+            and FlightMode.TAKEOFF not in self._personality.modes
+            and self.mode is not FlightMode.OFFBOARD
+        ):
             reason = "a take-off needs GUIDED"
         if reason:
             return reason
-        if Mode.TAKEOFF in self._personality.modes:
-            self.mode = Mode.TAKEOFF
+        if FlightMode.TAKEOFF in self._personality.modes:
+            self.mode = FlightMode.TAKEOFF
         self._is_armed = True
         self._control.climb(self._state.home_z_m + altitude_m)
         return None
 
-    def set_mode(self, mode: Mode) -> str | None:
+    def set_mode(self, mode: FlightMode) -> str | None:
         """Change the mode."""
         reason = self.refusal()
         if reason and (self._state.is_airborne or self.foreign_commander):
             return reason
-        if self._state.state == "landing" and mode is not Mode.LAND:
+        if self._state.state == "landing" and mode is not FlightMode.LAND:
             return "landing; it ends on the ground"
         return self._enter(mode)
 
@@ -144,7 +148,7 @@ class Flight:
         """Fly to a position and hold it."""
         reason = self.refusal() or (None if self._state.is_steerable else f"{self._state.state}, not flying")
         if reason is None:
-            self.mode = Mode.HOLD if Mode.TAKEOFF in self._personality.modes else Mode.OFFBOARD
+            self.mode = FlightMode.HOLD if FlightMode.TAKEOFF in self._personality.modes else FlightMode.OFFBOARD
             self._is_armed = True
             self._control.stop_climb()
             self._control.hold(target)
@@ -153,7 +157,7 @@ class Flight:
     def set_point(self, target: Target | AttitudeTarget) -> str | None:
         """Take a setpoint of a stream; it is flown in OFFBOARD (GUIDED), and at once."""
         self._stream.note()
-        if self.mode is not Mode.OFFBOARD:
+        if self.mode is not FlightMode.OFFBOARD:
             return None if self._personality.needs_stream else "not in GUIDED"
         reason = self.refusal()
         if reason is None and not self._control.is_climbing:
@@ -172,7 +176,7 @@ class Flight:
         reason = self.refusal() or self._not_ready()
         if reason is None and first is not None and not self.mission.set_current(first):
             reason = f"no item {first}"
-        return reason or self.set_mode(Mode.MISSION)
+        return reason or self.set_mode(FlightMode.MISSION)
 
     # What time brings
 
@@ -202,7 +206,7 @@ class Flight:
             self._disarm_idle()
         if state == "landing" and self.mode not in OVER_ON_GROUND:
             self._control.let_go()
-            self.mode = Mode.LAND
+            self.mode = FlightMode.LAND
         self._was_airborne = airborne
 
     def _disarm_idle(self) -> None:
@@ -215,19 +219,19 @@ class Flight:
         if self._control.is_climbing:
             if self._control.go_on_climbing():
                 self._on_climbed()
-        elif self.mode is Mode.MISSION:
+        elif self.mode is FlightMode.MISSION:
             self._fly_mission()
-        elif self.mode is Mode.RETURN:
+        elif self.mode is FlightMode.RETURN:
             self._return.step()
-        elif self.mode is Mode.LAND:
+        elif self.mode is FlightMode.LAND:
             self._control.ask("land")
-        elif self.mode is Mode.OFFBOARD or self._control.is_moving:
+        elif self.mode is FlightMode.OFFBOARD or self._control.is_moving:
             self._watch_stream()
 
     def _on_climbed(self) -> None:
-        if self.mode is Mode.TAKEOFF:
-            self.mode = Mode.HOLD
-        elif self.mode is Mode.MISSION:
+        if self.mode is FlightMode.TAKEOFF:
+            self.mode = FlightMode.HOLD
+        elif self.mode is FlightMode.MISSION:
             self.mission.on_climbed()
 
     def _fly_mission(self) -> None:
@@ -237,20 +241,20 @@ class Flight:
         elif step.climb_to_m is not None:
             self._control.climb(step.climb_to_m)
         elif step.returns:
-            self._enter(Mode.RETURN)
+            self._enter(FlightMode.RETURN)
         elif step.target is not None and step.target != self.target:
             self._control.hold(step.target)
         if step.is_over:
             self._report(Severity.INFO, "Mission finished")
-            self._enter(Mode.HOLD)
+            self._enter(FlightMode.HOLD)
 
     def _watch_stream(self) -> None:
         """Hold where setpoints have ceased to come; a position is held anyway by ArduPilot."""
         if not self._stream.is_silent or self.target is None:
             return
-        if self.mode is Mode.OFFBOARD and self._personality.needs_stream:
+        if self.mode is FlightMode.OFFBOARD and self._personality.needs_stream:
             self._report(Severity.WARNING, "Offboard lost: no setpoints; holding")
-            self._enter(Mode.HOLD)
+            self._enter(FlightMode.HOLD)
         elif self._control.is_moving:
             self._control.hold_here()
 
@@ -258,26 +262,26 @@ class Flight:
         """Return why it cannot take off now."""
         return "landing" if self._state.state == "landing" else None if self.is_armed else "not armed"
 
-    def _enter(self, mode: Mode) -> str | None:
-        if mode is Mode.OFFBOARD and self._personality.needs_stream and self._stream.is_silent:
+    def _enter(self, mode: FlightMode) -> str | None:
+        if mode is FlightMode.OFFBOARD and self._personality.needs_stream and self._stream.is_silent:
             return "OFFBOARD needs a stream of setpoints first"
-        if mode is Mode.MISSION and not self.mission.items:
+        if mode is FlightMode.MISSION and not self.mission.items:
             return "no mission"
-        if mode is Mode.TAKEOFF:
+        if mode is FlightMode.TAKEOFF:
             return self.take_off(self._settings["takeoff_altitude_m"])
         self.mode = mode
         self._return.rewind()
         if self._state.is_airborne:
             self._is_armed = True
             self._begin_in_air(mode)
-        elif mode is Mode.MISSION and self._is_armed:
+        elif mode is FlightMode.MISSION and self._is_armed:
             self._begin_mission_on_ground()
         return None
 
-    def _begin_in_air(self, mode: Mode) -> None:
-        if mode is Mode.LAND:
+    def _begin_in_air(self, mode: FlightMode) -> None:
+        if mode is FlightMode.LAND:
             self._control.ask("land")
-        elif mode in HOLDING or (mode is Mode.OFFBOARD and not self._personality.needs_stream):
+        elif mode in HOLDING or (mode is FlightMode.OFFBOARD and not self._personality.needs_stream):
             self._control.hold_here()
         else:
             self._control.stop_climb()
@@ -295,6 +299,6 @@ class Flight:
         """Be disarmed."""
         self._control.let_go()
         self._is_armed = False
-        if self.mode in OVER_ON_GROUND or (self.mode is Mode.OFFBOARD and self._personality.needs_stream):
+        if self.mode in OVER_ON_GROUND or (self.mode is FlightMode.OFFBOARD and self._personality.needs_stream):
             self.mode = self._personality.first_mode
         self._report(Severity.INFO, text)

@@ -19,7 +19,7 @@ from zsim_bridges.mavlink.autopilot.personality import PERSONALITIES
 from zsim_bridges.mavlink.serve.peers import Address
 from zsim_bridges.mavlink.serve.vehicle_ports import VehiclePort, VehiclePorts
 from zsim_bridges.mavlink.telemetry.telemetry import Level
-from zsim_bridges.mavlink.vehicle.mavlink_vehicle import Options, Vehicle
+from zsim_bridges.mavlink.vehicle.mavlink_vehicle import MavlinkVehicle, Options
 from zsim_bridges.mavlink.wire.frame import Link, Received, Version
 from zsim_bridges.mavlink.wire.signing import Signing
 from zsim_bridges.observer_process import ObserverProcess
@@ -90,7 +90,7 @@ def serve(
 class Served(NamedTuple):
     """A vehicle and its ports."""
 
-    vehicle: Vehicle
+    vehicle: MavlinkVehicle
     ports: VehiclePorts
 
 
@@ -115,7 +115,7 @@ class MavlinkServer:
         options, system_id = self._options, index + 1
         sender = CommandSender(drone.name, self._observer.name, self._link.put)
         shown = Options(system_id, PERSONALITIES[options.autopilot], options.level, self._observer.name)
-        vehicle = Vehicle(drone, self._info.origin, sender, shown)
+        vehicle = MavlinkVehicle(drone, self._info.origin, sender, shown)
 
         def on_received(received: Received) -> None:
             vehicle.on_message(received, time.monotonic_ns())

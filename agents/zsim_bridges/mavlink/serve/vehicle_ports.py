@@ -12,7 +12,7 @@ from zsim.errors import RunError
 from zsim_bridges.mavlink.serve.peers import Address, Peers
 from zsim_bridges.mavlink.wire.frame import Link, Parser, Received
 from zsim_bridges.mavlink.wire.signing import Signing
-from zsim_bridges.mavlink.wire.wire_message import Message
+from zsim_bridges.mavlink.wire.wire_message import WireMessage
 
 DATAGRAM_MAX = 1400  # bytes; fits into a frame of Ethernet
 READ_MAX = 65_536  # bytes
@@ -93,7 +93,7 @@ class VehiclePorts:
         for port in self._ports:
             port.close(loop)
 
-    def send(self, messages: Sequence[Message]) -> None:
+    def send(self, messages: Sequence[WireMessage]) -> None:
         """Send messages to all peers, many in a datagram."""
         frames = [frame for message in messages if (frame := self._packed(message))]
         if not frames:
@@ -102,7 +102,7 @@ class VehiclePorts:
         for port in self._ports:
             port.send(datagrams)
 
-    def _packed(self, message: Message) -> bytes:
+    def _packed(self, message: WireMessage) -> bytes:
         """Return a frame; empty, and counted, where a value does not fit into its field."""
         try:
             return self._link.pack(message)

@@ -8,7 +8,7 @@ from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.autopilot.enums import GpsFix
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource, int16
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.wire_message import Message
+from zsim_bridges.mavlink.wire.wire_message import WireMessage
 
 UNKNOWN_16, UNKNOWN_8 = 65535, 255
 GAUSS_PER_UT, MILLIGAUSS_PER_UT = 0.01, 10.0
@@ -16,7 +16,7 @@ INERTIAL = 0x3F  # HIGHRES_IMU_UPDATED_FLAGS: accelerometer and gyroscope; 0x1C0
 MG_PER_M_S2 = 1000.0 / G_M_S2
 
 
-def gps_raw_int(s: TelemetrySource) -> Message:
+def gps_raw_int(s: TelemetrySource) -> WireMessage:
     gps = s.state.samples.get("gps")
     if gps is None or s.state.has_failed("gps"):
         fix = GpsFix.NO_GPS if gps is None else GpsFix.NO_FIX
@@ -41,7 +41,7 @@ def gps_raw_int(s: TelemetrySource) -> Message:
     )
 
 
-def battery_status(s: TelemetrySource) -> Message:
+def battery_status(s: TelemetrySource) -> WireMessage:
     used = round(s.capacity_mah * (1.0 - s.battery_percent / 100.0))
     return dialect.BatteryStatus(
         current_consumed=max(0, used),
@@ -55,7 +55,7 @@ def battery_status(s: TelemetrySource) -> Message:
     )
 
 
-def scaled_imu(s: TelemetrySource) -> Message | None:
+def scaled_imu(s: TelemetrySource) -> WireMessage | None:
     imu, mag = s.state.samples.get("imu"), s.state.samples.get("mag")
     if imu is None or s.state.has_failed("imu"):
         return None
@@ -65,7 +65,7 @@ def scaled_imu(s: TelemetrySource) -> Message | None:
     return dialect.ScaledImu(s.boot_ms, *accel, *gyro, *field)
 
 
-def raw_imu(s: TelemetrySource) -> Message | None:
+def raw_imu(s: TelemetrySource) -> WireMessage | None:
     scaled = scaled_imu(s)
     if not isinstance(scaled, dialect.ScaledImu):
         return None
@@ -73,7 +73,7 @@ def raw_imu(s: TelemetrySource) -> Message | None:
     return dialect.RawImu(s.boot_us, m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro, m.xmag, m.ymag, m.zmag)
 
 
-def inertial(imu: Any) -> Message:
+def inertial(imu: Any) -> WireMessage:
     """Return HIGHRES_IMU of a sample of the inertial unit alone."""
     t_us = imu.t_sample_ns // 1000
     return dialect.HighresImu(
@@ -81,7 +81,7 @@ def inertial(imu: Any) -> Message:
     )
 
 
-def highres_imu(s: TelemetrySource) -> Message | None:
+def highres_imu(s: TelemetrySource) -> WireMessage | None:
     imu = s.state.samples.get("imu")
     if imu is None or s.state.has_failed("imu"):
         return None
@@ -97,14 +97,14 @@ def highres_imu(s: TelemetrySource) -> Message | None:
     )
 
 
-def scaled_pressure(s: TelemetrySource) -> Message | None:
+def scaled_pressure(s: TelemetrySource) -> WireMessage | None:
     baro = s.state.samples.get("baro")
     if baro is None or s.state.has_failed("baro"):
         return None
     return dialect.ScaledPressure(s.boot_ms, baro.pressure_pa / 100.0)
 
 
-def distance_sensor(s: TelemetrySource) -> Message | None:
+def distance_sensor(s: TelemetrySource) -> WireMessage | None:
     sonar = s.state.samples.get("sonar")
     if sonar is None or s.state.has_failed("sonar"):
         return None
@@ -119,7 +119,7 @@ def distance_sensor(s: TelemetrySource) -> Message | None:
     )
 
 
-def optical_flow(s: TelemetrySource) -> Message | None:
+def optical_flow(s: TelemetrySource) -> WireMessage | None:
     flow = s.state.samples.get("flow")
     if flow is None or s.state.has_failed("flow"):
         return None
@@ -128,5 +128,5 @@ def optical_flow(s: TelemetrySource) -> Message | None:
     return dialect.OpticalFlow(s.boot_us, 0, 0, 0, forward, -left, quality, s.state.altitude_m)
 
 
-def vibration(s: TelemetrySource) -> Message:
+def vibration(s: TelemetrySource) -> WireMessage:
     return dialect.Vibration(s.boot_us)

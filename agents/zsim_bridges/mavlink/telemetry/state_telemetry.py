@@ -14,11 +14,11 @@ from zsim_bridges.mavlink.autopilot.enums import (
     SystemStatus,
     TypeMask,
 )
-from zsim_bridges.mavlink.autopilot.personality import BY_STICKS, Mode
+from zsim_bridges.mavlink.autopilot.personality import BY_STICKS, FlightMode
 from zsim_bridges.mavlink.flight.position_guidance import Target
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource, int16
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.wire_message import Message
+from zsim_bridges.mavlink.wire.wire_message import WireMessage
 
 MAVLINK_VERSION = 3  # of HEARTBEAT
 NAN = math.nan
@@ -39,7 +39,7 @@ def heartbeat(s: TelemetrySource) -> dialect.Heartbeat:
     base |= BaseMode.MANUAL_INPUT if mode in BY_STICKS else BaseMode.GUIDED | BaseMode.AUTO
     if flight.is_armed:
         base |= BaseMode.ARMED
-    custom = modes[Mode.MISSION] if flight.foreign_commander else modes[mode]
+    custom = modes[FlightMode.MISSION] if flight.foreign_commander else modes[mode]
     return dialect.Heartbeat(TYPE_QUADROTOR, s.personality.autopilot, base, custom, _system_status(s), MAVLINK_VERSION)
 
 
@@ -51,7 +51,7 @@ def _system_status(s: TelemetrySource) -> SystemStatus:
     return SystemStatus.ACTIVE if s.flight.is_armed else SystemStatus.STANDBY
 
 
-def sys_status(s: TelemetrySource) -> Message:
+def sys_status(s: TelemetrySource) -> WireMessage:
     present = int(SensorBit(0x3FFFFFFF) & _ALL_HEALTH)
     return dialect.SysStatus(
         onboard_control_sensors_present=present,
@@ -66,25 +66,25 @@ def sys_status(s: TelemetrySource) -> Message:
 _ALL_HEALTH = SensorBit(sum(part.value for part in SensorBit if part is not SensorBit.GEOFENCE))
 
 
-def system_time(s: TelemetrySource) -> Message:
+def system_time(s: TelemetrySource) -> WireMessage:
     return dialect.SystemTime(time_unix_usec=0, time_boot_ms=s.boot_ms)
 
 
-def attitude(s: TelemetrySource) -> Message:
+def attitude(s: TelemetrySource) -> WireMessage:
     return dialect.Attitude(s.boot_ms, *s.rpy_ned_rad, *ned_axes.frd(s.state.rate_rad_s))
 
 
-def attitude_quaternion(s: TelemetrySource) -> Message:
+def attitude_quaternion(s: TelemetrySource) -> WireMessage:
     return dialect.AttitudeQuaternion(
         s.boot_ms, *ned_axes.attitude_ned(s.state.q_WB), *ned_axes.frd(s.state.rate_rad_s)
     )
 
 
-def local_position_ned(s: TelemetrySource) -> Message:
+def local_position_ned(s: TelemetrySource) -> WireMessage:
     return dialect.LocalPositionNed(s.boot_ms, *s.position_ned_m, *s.velocity_ned_m_s)
 
 
-def odometry(s: TelemetrySource) -> Message:
+def odometry(s: TelemetrySource) -> WireMessage:
     vx, vy, vz = _body_velocity(s)
     level, up = (sigma * sigma for sigma in s.state.sigma_m)
     pose = (level, *(0.0,) * 5, level, *(0.0,) * 4, up, *(0.0,) * 3, NAN, 0.0, 0.0, NAN, 0.0, NAN)
@@ -114,7 +114,7 @@ def _body_velocity(s: TelemetrySource) -> tuple[float, float, float]:
     return ned_axes.frd((v[0], v[1], v[2]))
 
 
-def global_position_int(s: TelemetrySource) -> Message:
+def global_position_int(s: TelemetrySource) -> WireMessage:
     latitude, longitude, height = s.place
     north, east, down = (int16(100 * v) for v in s.velocity_ned_m_s)
     return dialect.GlobalPositionInt(
@@ -130,19 +130,19 @@ def global_position_int(s: TelemetrySource) -> Message:
     )
 
 
-def vfr_hud(s: TelemetrySource) -> Message:
+def vfr_hud(s: TelemetrySource) -> WireMessage:
     vx, vy, vz = s.state.velocity_m_s
     speed = math.hypot(vx, vy)
     heading = round(math.degrees(s.rpy_ned_rad[2])) % 360
     return dialect.VfrHud(speed, speed, heading, 50 if s.state.is_airborne else 0, s.place[2], vz)
 
 
-def altitude(s: TelemetrySource) -> Message:
+def altitude(s: TelemetrySource) -> WireMessage:
     z, height = s.state.position_m[2], s.place[2]
     return dialect.Altitude(s.boot_us, z, height, z, s.state.altitude_m, NAN, NAN)
 
 
-def extended_sys_state(s: TelemetrySource) -> Message:
+def extended_sys_state(s: TelemetrySource) -> WireMessage:
     return dialect.ExtendedSysState(0, LANDED_STATES[s.state.state])
 
 
@@ -154,18 +154,18 @@ def estimator_flags(s: TelemetrySource) -> int:
     return flags
 
 
-def estimator_status(s: TelemetrySource) -> Message:
+def estimator_status(s: TelemetrySource) -> WireMessage:
     level, up = s.state.sigma_m
     return dialect.EstimatorStatus(
         time_usec=s.boot_us, flags=estimator_flags(s), pos_horiz_accuracy=level, pos_vert_accuracy=up
     )
 
 
-def ekf_status_report(s: TelemetrySource) -> Message:
+def ekf_status_report(s: TelemetrySource) -> WireMessage:
     return dialect.EkfStatusReport(estimator_flags(s))
 
 
-def home_position(s: TelemetrySource) -> Message | None:
+def home_position(s: TelemetrySource) -> WireMessage | None:
     if s.state.home_m is None:
         return None
     latitude, longitude, height = s.home_place
@@ -179,12 +179,12 @@ def home_position(s: TelemetrySource) -> Message | None:
     )
 
 
-def gps_global_origin(s: TelemetrySource) -> Message:
+def gps_global_origin(s: TelemetrySource) -> WireMessage:
     latitude, longitude, height = s.state.origin
     return dialect.GpsGlobalOrigin(round(1e7 * latitude), round(1e7 * longitude), round(1000 * height), s.boot_us)
 
 
-def position_target_local_ned(s: TelemetrySource) -> Message | None:
+def position_target_local_ned(s: TelemetrySource) -> WireMessage | None:
     target = s.flight.target
     if not isinstance(target, Target):
         return None
@@ -201,11 +201,11 @@ def position_target_local_ned(s: TelemetrySource) -> Message | None:
     )
 
 
-def mission_current(s: TelemetrySource) -> Message:
+def mission_current(s: TelemetrySource) -> WireMessage:
     mission = s.flight.mission
     return dialect.MissionCurrent(mission.current, mission.first + len(mission.items))
 
 
-def fence_status(s: TelemetrySource) -> Message:
+def fence_status(s: TelemetrySource) -> WireMessage:
     breached = s.breach != 0
     return dialect.FenceStatus(int(breached), min(s.breaches, 0xFFFF), s.breach, s.breach_ns // 1_000_000)

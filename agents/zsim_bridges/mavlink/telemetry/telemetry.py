@@ -6,7 +6,7 @@ from typing import Any, Literal
 from zsim_bridges.mavlink.telemetry import sensor_telemetry, state_telemetry
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.wire_message import LAYOUTS, Message
+from zsim_bridges.mavlink.wire.wire_message import LAYOUTS, WireMessage
 
 Level = Literal["normal", "full"]
 SECOND_NS = 1_000_000_000
@@ -14,8 +14,8 @@ RATE_MAX_HZ = 50.0  # Hz; one of each with a gate of 20 ms
 IMU_RATE_MAX_HZ = 200.0  # Hz; each sample of the inertial unit
 GATE_NS = round(SECOND_NS / RATE_MAX_HZ)
 
-Builder = Callable[[TelemetrySource], Message | None]
-BUILDERS: dict[type[Message], Builder] = {
+Builder = Callable[[TelemetrySource], WireMessage | None]
+BUILDERS: dict[type[WireMessage], Builder] = {
     dialect.Heartbeat: state_telemetry.heartbeat,
     dialect.SysStatus: state_telemetry.sys_status,
     dialect.SystemTime: state_telemetry.system_time,
@@ -44,14 +44,14 @@ BUILDERS: dict[type[Message], Builder] = {
     dialect.FenceStatus: state_telemetry.fence_status,
     dialect.Vibration: sensor_telemetry.vibration,
 }
-SAMPLED: dict[type[Message], str] = {
+SAMPLED: dict[type[WireMessage], str] = {
     dialect.HighresImu: "imu",
     dialect.GpsRawInt: "gps",
     dialect.OpticalFlow: "flow",
     dialect.DistanceSensor: "sonar",
 }
 """Messages that are of a sample of a sensor, and are sent when there is one."""
-Rates = dict[type[Message], tuple[float, float]]
+Rates = dict[type[WireMessage], tuple[float, float]]
 """Rates at the levels normal and full [Hz of simulated time]."""
 
 BOTH: Rates = {
@@ -87,7 +87,7 @@ ARDUPILOT: Rates = {
     dialect.FenceStatus: (1.0, 2.0),
     dialect.ScaledPressure: (2.0, 10.0),
 }
-STREAMS: dict[int, tuple[type[Message], ...]] = {  # MAV_DATA_STREAM, as ArduCopter fills them
+STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM, as ArduCopter fills them
     1: (dialect.RawImu, dialect.ScaledPressure, dialect.ScaledImu),
     2: (dialect.SysStatus, dialect.MissionCurrent, dialect.GpsRawInt, dialect.FenceStatus),
     6: (dialect.GlobalPositionInt, dialect.LocalPositionNed),
@@ -112,12 +112,12 @@ class Telemetry:
         column = 1 if level == "full" else 0
         self._source = source
         self._defaults = {kind: pair[column] for kind, pair in rates.items()}
-        self._interval_ns: dict[type[Message], int] = {}
-        self._due_ns: dict[type[Message], int] = {}
+        self._interval_ns: dict[type[WireMessage], int] = {}
+        self._due_ns: dict[type[WireMessage], int] = {}
         for kind in self._defaults:
             self._put(kind, self._defaults[kind])
 
-    def _put(self, kind: type[Message], rate_hz: float) -> None:
+    def _put(self, kind: type[WireMessage], rate_hz: float) -> None:
         if rate_hz <= 0:
             self._interval_ns.pop(kind, None)
             return
@@ -125,11 +125,11 @@ class Telemetry:
         self._interval_ns[kind] = round(SECOND_NS / min(rate_hz, most_hz))
         self._due_ns[kind] = 0
 
-    def due(self, t_ns: int) -> list[Message]:
+    def due(self, t_ns: int) -> list[WireMessage]:
         """Return the messages that are due at a gate."""
         self._source.advance()
         arrived = self._source.state.take_arrived()
-        messages: list[Message] = []
+        messages: list[WireMessage] = []
         for kind, interval_ns in self._interval_ns.items():
             due_ns = self._due_ns[kind]
             if t_ns >= due_ns + _waits_ns(kind, interval_ns, arrived):
@@ -137,7 +137,9 @@ class Telemetry:
                 messages += self._made(kind, interval_ns, arrived)
         return messages
 
-    def _made(self, kind: type[Message], interval_ns: int, arrived: Mapping[str, Sequence[Any]]) -> list[Message]:
+    def _made(
+        self, kind: type[WireMessage], interval_ns: int, arrived: Mapping[str, Sequence[Any]]
+    ) -> list[WireMessage]:
         """Return what is sent of a message at a gate: more than one of an inertial unit that samples more often."""
         message = BUILDERS[kind](self._source)
         if message is None:
@@ -146,7 +148,7 @@ class Telemetry:
             return [message]
         return [*map(sensor_telemetry.inertial, arrived.get("imu", ())[:-1]), message]
 
-    def build(self, message_id: int) -> Message | None:
+    def build(self, message_id: int) -> WireMessage | None:
         """Return a message now; None for one that this vehicle has not."""
         kind = BY_ID.get(message_id)
         self._source.advance()
@@ -180,7 +182,7 @@ class Telemetry:
                         self._put(kind, rate_hz)
 
 
-def _waits_ns(kind: type[Message], interval_ns: int, arrived: Mapping[str, Sequence[Any]]) -> int:
+def _waits_ns(kind: type[WireMessage], interval_ns: int, arrived: Mapping[str, Sequence[Any]]) -> int:
     """Return how long after it is due a message waits: one of a sample comes with it, or two intervals later."""
     sensor = SAMPLED.get(kind)
     if sensor is None:

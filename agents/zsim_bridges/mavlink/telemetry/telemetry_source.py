@@ -8,7 +8,7 @@ from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_bridges.mavlink.autopilot.ned_axes import ned
 from zsim_bridges.mavlink.autopilot.personality import Personality
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.geofence import BREACH_NONE
+from zsim_bridges.mavlink.flight.vehicle_fence import BREACH_NONE
 from zsim_bridges.mavlink.flight.vehicle_flight import Flight
 
 

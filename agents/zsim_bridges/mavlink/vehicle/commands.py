@@ -11,7 +11,7 @@ from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.autopilot.enums import FORCE, Cmd, Result
 from zsim_bridges.mavlink.autopilot.parameters import Parameters
-from zsim_bridges.mavlink.autopilot.personality import Mode, Personality, Settings
+from zsim_bridges.mavlink.autopilot.personality import FlightMode, Personality, Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.mission import ABSOLUTE, FRAMES, LOCAL, MissionItem, place_of
 from zsim_bridges.mavlink.flight.position_guidance import Target, is_place
@@ -19,7 +19,7 @@ from zsim_bridges.mavlink.flight.vehicle_flight import Flight
 from zsim_bridges.mavlink.telemetry.telemetry import Telemetry
 from zsim_bridges.mavlink.vehicle.mission_protocol import DEGREES, LOCAL_M
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.wire_message import Message
+from zsim_bridges.mavlink.wire.wire_message import WireMessage
 
 AUTOPILOT_VERSION, PROTOCOL_VERSION = 148, 300  # ids of messages that are sent on request alone
 NAN = math.nan
@@ -79,8 +79,8 @@ class Commands:
         state: VehicleState,
         flight: Flight,
         telemetry: Telemetry,
-        send: Callable[[Message], None],
-        version: Callable[[], Message],
+        send: Callable[[WireMessage], None],
+        version: Callable[[], WireMessage],
     ) -> None:
         self._personality = personality
         self._settings = settings
@@ -93,9 +93,9 @@ class Commands:
         self._handlers: dict[int, Callable[[Request], Answer]] = {
             Cmd.COMPONENT_ARM_DISARM: self._arm,
             Cmd.NAV_TAKEOFF: self._take_off,
-            Cmd.NAV_LAND: lambda _: answered(flight.set_mode(Mode.LAND)),
-            Cmd.NAV_RETURN_TO_LAUNCH: lambda _: answered(flight.set_mode(Mode.RETURN)),
-            Cmd.NAV_LOITER_UNLIM: lambda _: answered(flight.set_mode(Mode.HOLD)),
+            Cmd.NAV_LAND: lambda _: answered(flight.set_mode(FlightMode.LAND)),
+            Cmd.NAV_RETURN_TO_LAUNCH: lambda _: answered(flight.set_mode(FlightMode.RETURN)),
+            Cmd.NAV_LOITER_UNLIM: lambda _: answered(flight.set_mode(FlightMode.HOLD)),
             Cmd.DO_SET_MODE: self._set_mode,
             Cmd.DO_REPOSITION: self._reposition,
             Cmd.DO_PAUSE_CONTINUE: self._pause,
@@ -175,7 +175,7 @@ class Commands:
 
     def _pause(self, request: Request) -> Answer:
         if request.params[0] == 0.0:
-            return answered(self._flight.set_mode(Mode.HOLD))
+            return answered(self._flight.set_mode(FlightMode.HOLD))
         return answered(self._flight.start_mission())
 
     def _change_speed(self, request: Request) -> Answer:

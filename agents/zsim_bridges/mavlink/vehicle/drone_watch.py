@@ -2,13 +2,13 @@
 
 from zsim.contract.run_messages import Event
 from zsim_bridges.mavlink.autopilot.enums import Severity
-from zsim_bridges.mavlink.autopilot.personality import FenceAction, Mode, Settings
-from zsim_bridges.mavlink.flight.geofence import BREACH_NONE, Geofence
+from zsim_bridges.mavlink.autopilot.personality import FenceAction, FlightMode, Settings
+from zsim_bridges.mavlink.flight.vehicle_fence import BREACH_NONE, VehicleFence
 from zsim_bridges.mavlink.flight.vehicle_flight import Report
 from zsim_bridges.mavlink.telemetry.telemetry_source import TelemetrySource
 
 FAULTS = {"fault": "", "fault_end": " is over", "fault_clear": " cleared"}
-MODE_OF = {FenceAction.HOLD: Mode.HOLD, FenceAction.RETURN: Mode.RETURN, FenceAction.LAND: Mode.LAND}
+MODE_OF = {FenceAction.HOLD: FlightMode.HOLD, FenceAction.RETURN: FlightMode.RETURN, FenceAction.LAND: FlightMode.LAND}
 
 
 class DroneWatch:
@@ -27,7 +27,7 @@ class DroneWatch:
         source: str,
         seen: TelemetrySource,
         settings: Settings,
-        fence: Geofence,
+        fence: VehicleFence,
         report: Report,
     ) -> None:
         self._drone = drone

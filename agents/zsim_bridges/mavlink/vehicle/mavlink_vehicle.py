@@ -11,9 +11,9 @@ from zsim_bridges.mavlink.autopilot.enums import COMPONENT_AUTOPILOT, FENCE, MIS
 from zsim_bridges.mavlink.autopilot.personality import Personality, Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.command_output import CommandOutput
-from zsim_bridges.mavlink.flight.geofence import Geofence
 from zsim_bridges.mavlink.flight.mission import MissionItem, place_of
 from zsim_bridges.mavlink.flight.position_guidance import Target
+from zsim_bridges.mavlink.flight.vehicle_fence import VehicleFence
 from zsim_bridges.mavlink.flight.vehicle_flight import Flight
 from zsim_bridges.mavlink.telemetry import state_telemetry
 from zsim_bridges.mavlink.telemetry.telemetry import Level, Telemetry
@@ -24,7 +24,7 @@ from zsim_bridges.mavlink.vehicle.drone_watch import DroneWatch
 from zsim_bridges.mavlink.vehicle.mission_protocol import MissionProtocol, home_item, item_fault, item_of
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Received
-from zsim_bridges.mavlink.wire.wire_message import Message
+from zsim_bridges.mavlink.wire.wire_message import WireMessage
 from zsim_bridges.vehicle_links.command_sender import CommandSender
 
 TEXT_MAX = 50  # characters of a STATUSTEXT
@@ -44,7 +44,7 @@ class Options(NamedTuple):
     source: str
 
 
-class Vehicle:
+class MavlinkVehicle:
     """One drone as a MAVLink vehicle.
 
     Args:
@@ -62,11 +62,11 @@ class Vehicle:
         self._drone = drone
         self._options = options
         person = options.personality
-        self.outbox: list[Message] = []
+        self.outbox: list[WireMessage] = []
         self.state = VehicleState(drone, origin)
         self._parameters = personalities.parameters(person, drone, options.system_id)
         self._settings = Settings(person, self._parameters)
-        self._fence = Geofence()
+        self._fence = VehicleFence()
         output = CommandOutput(sender)
         self.flight = Flight(options.source, person, self._settings, self.state, output, self.report)
         self._source = TelemetrySource(drone, self.state, self.flight, person)
@@ -97,7 +97,7 @@ class Vehicle:
             self._version,
         )
 
-    def outbox_append(self, message: Message) -> None:
+    def outbox_append(self, message: WireMessage) -> None:
         """Send a message to all clients."""
         self.outbox.append(message)
 
@@ -105,7 +105,7 @@ class Vehicle:
         """Send a text for the operator."""
         self.outbox.append(dialect.Statustext(severity, text[:TEXT_MAX]))
 
-    def take(self) -> list[Message]:
+    def take(self) -> list[WireMessage]:
         """Return what is to be sent, and forget it."""
         taken, self.outbox = self.outbox, []
         return taken
@@ -158,7 +158,7 @@ class Vehicle:
         component = getattr(message, "target_component", 0)
         return system in (0, self._options.system_id) and component in (0, COMPONENT_AUTOPILOT)
 
-    def _dispatch(self, message: Message, sender: tuple[int, int], wall_ns: int) -> None:
+    def _dispatch(self, message: WireMessage, sender: tuple[int, int], wall_ns: int) -> None:
         match message:
             case dialect.CommandLong() | dialect.CommandInt():
                 self._command(message, sender)
@@ -240,7 +240,7 @@ class Vehicle:
         elif type_ == FENCE:
             self._fence.load(items, self.state)
 
-    def _answer_link(self, message: Message, sender: tuple[int, int], wall_ns: int) -> None:
+    def _answer_link(self, message: WireMessage, sender: tuple[int, int], wall_ns: int) -> None:
         match message:
             case dialect.Ping(target_system=0):
                 self.outbox.append(dialect.Ping(message.time_usec, message.seq, *sender))
@@ -263,7 +263,7 @@ class Vehicle:
         payload = (seq + 1 & 0xFFFF).to_bytes(2, "little") + bytes((0, 129, 1, message.payload[3], 0, 0, 0, 0, 0, 0, 7))
         self.outbox.append(dialect.FileTransferProtocol(0, *sender, payload))
 
-    def _version(self) -> Message:
+    def _version(self) -> WireMessage:
         major, minor, patch, type_ = self._options.personality.version
         capabilities = sum(capability.value for capability in Capability)
         if not self._options.personality.needs_stream:

@@ -18,7 +18,7 @@ from zsim_bridges.mavlink.autopilot.enums import (
 from zsim_bridges.mavlink.flight.mission import COMMANDS, FRAMES, LOCAL, MissionItem
 from zsim_bridges.mavlink.flight.position_guidance import is_place
 from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.wire_message import Message
+from zsim_bridges.mavlink.wire.wire_message import WireMessage
 
 ITEMS_MAX = 1000  # chosen: of one mission; autopilots keep some hundreds
 RETRY_NS = 500_000_000  # ns of wall time until an item is requested again
@@ -46,7 +46,7 @@ class MissionProtocol:
 
     def __init__(
         self,
-        send: Callable[[Message], None],
+        send: Callable[[WireMessage], None],
         loaded: Loaded,
         home: Callable[[], MissionItem] | None,
         asks_int: bool,
@@ -63,7 +63,7 @@ class MissionProtocol:
         items = self._items.get(type_, [])
         return [self._home(), *items] if self._home and type_ == MISSION else items
 
-    def on_message(self, message: Message, sender: tuple[int, int], wall_ns: int) -> bool:
+    def on_message(self, message: WireMessage, sender: tuple[int, int], wall_ns: int) -> bool:
         """Take a message of the protocol; False for any other.
 
         Args:
@@ -201,7 +201,7 @@ def _has_good_place(item: MissionItem) -> bool:
     return is_place((None, None, z)) and abs(x) <= 90.0 and abs(y) <= 180.0
 
 
-def message_of(item: MissionItem, request: Any, sender: tuple[int, int], as_int: bool) -> Message:
+def message_of(item: MissionItem, request: Any, sender: tuple[int, int], as_int: bool) -> WireMessage:
     """Return the message of an item, as MISSION_ITEM_INT or MISSION_ITEM."""
     fields: dict[str, Any] = {
         **dict(zip(("target_system", "target_component"), sender, strict=True)),

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from zsim_bridges.mavlink.wire.checksum import checksum
 from zsim_bridges.mavlink.wire.signing import SIGNATURE_BYTES, Signing
-from zsim_bridges.mavlink.wire.wire_message import BY_ID, LAYOUTS, Message, MessageLayout
+from zsim_bridges.mavlink.wire.wire_message import BY_ID, LAYOUTS, MessageLayout, WireMessage
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD  # first byte of a frame
 HEADER_1, HEADER_2 = 6, 10  # bytes before the payload
@@ -21,7 +21,7 @@ Version = Literal[1, 2]
 class Received(NamedTuple):
     """A message, who sent it, its number on the link, and whether it was signed."""
 
-    message: Message
+    message: WireMessage
     system_id: int
     component_id: int
     seq: int
@@ -43,7 +43,7 @@ class Link:
         self._version = version
         self._seq = 0
 
-    def pack(self, message: Message) -> bytes:
+    def pack(self, message: WireMessage) -> bytes:
         """Return the frame of a message.
 
         Raises:

@@ -3,7 +3,7 @@
 A message is a class with its fields in the order of their definition:
 
     @message(73, extensions=1)
-    class MissionItemInt(Message):
+    class MissionItemInt(WireMessage):
         ...
 
 Source of order, sizes and CRC_EXTRA: https://mavlink.io/en/guide/serialization.html.
@@ -47,7 +47,7 @@ _CODES = {  # of the struct module
 _WORD = re.compile(r"(?<!^)(?=[A-Z])")
 
 
-class Message(msgspec.Struct, gc=False):
+class WireMessage(msgspec.Struct, gc=False):
     """Base of all messages."""
 
 
@@ -93,7 +93,7 @@ class MessageLayout:
         wire_order: names of the fields as they lie in a payload.
     """
 
-    def __init__(self, kind: type[Message], id_: int, extensions: int) -> None:
+    def __init__(self, kind: type[WireMessage], id_: int, extensions: int) -> None:
         self.kind = kind
         self.id = id_
         self.name = _WORD.sub("_", kind.__name__).upper()
@@ -111,7 +111,7 @@ class MessageLayout:
         self._pick = _elements(_places(fields, wire))
         self._texts = tuple(place for place, field in enumerate(fields) if field.c_type == "char")
 
-    def pack(self, message: Message) -> bytes:
+    def pack(self, message: WireMessage) -> bytes:
         """Return the payload, with its extensions, and with the zeros at its end.
 
         Raises:
@@ -122,7 +122,7 @@ class MessageLayout:
             values = [each for write, value in zip(self._parts, values, strict=True) for each in write(value)]
         return self._struct.pack(*values)
 
-    def unpack(self, payload: bytes) -> Message:
+    def unpack(self, payload: bytes) -> WireMessage:
         """Return the message of a payload; what is missing at its end is 0, what it has beyond is left out."""
         if len(payload) != self.size:
             payload = payload[: self.size].ljust(self.size, b"\0")
@@ -134,9 +134,9 @@ class MessageLayout:
         return self.kind(*values)
 
 
-LAYOUTS: dict[type[Message], MessageLayout] = {}
+LAYOUTS: dict[type[WireMessage], MessageLayout] = {}
 BY_ID: dict[int, MessageLayout] = {}
-Kind = TypeVar("Kind", bound=type[Message])
+Kind = TypeVar("Kind", bound=type[WireMessage])
 
 
 def message(id_: int, extensions: int = 0) -> Callable[[Kind], Kind]:
@@ -154,7 +154,7 @@ def message(id_: int, extensions: int = 0) -> Callable[[Kind], Kind]:
     return register
 
 
-def _fields(kind: type[Message]) -> list[WireField]:
+def _fields(kind: type[WireMessage]) -> list[WireField]:
     hints = get_type_hints(kind, include_extras=True)
     return [_field(name, hints[name].__metadata__[0]) for name in kind.__struct_fields__]
 
@@ -172,7 +172,7 @@ def _crc_extra(name: str, base: list[WireField]) -> int:
     return crc & 0xFF ^ crc >> 8
 
 
-def _attributes(names: tuple[str, ...]) -> Callable[[Message], tuple[Any, ...]]:
+def _attributes(names: tuple[str, ...]) -> Callable[[WireMessage], tuple[Any, ...]]:
     get = attrgetter(*names)
     return get if len(names) > 1 else lambda message: (get(message),)
 

@@ -13,7 +13,7 @@ from zsim_bridges.ardrone.wire.pave import FrameType, PaveHeader
 
 av = pytest.importorskip("av")
 
-from zsim_bridges.ardrone.server.video_encoder import IDR_EVERY, PictureError, VideoEncoder, nal_units  # noqa: E402
+from zsim_bridges.ardrone.server.video_encoder import IDR_EVERY, VideoEncoder, VideoError, nal_units  # noqa: E402
 from zsim_bridges.ardrone.server.video_server import VideoServer  # noqa: E402
 
 HOME = "127.0.0.1"
@@ -60,7 +60,7 @@ def test_an_idr_frame_has_sps_and_pps_and_comes_every_second_and_when_it_is_aske
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff", b"\xff\xd8\xff" + bytes(500)])
 def test_what_is_no_picture_is_refused(data: bytes):
-    with pytest.raises(PictureError, match="no JPEG"):
+    with pytest.raises(VideoError, match="no JPEG"):
         VideoEncoder().encode(data, begins=False)
 
 

@@ -10,7 +10,7 @@ from zsim.contract.flight_messages import Mode as ModeCommand
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Event
 from zsim_bridges.mavlink.autopilot.enums import FENCE, FORCE, Cmd, MavFrame, Result, TypeMask
-from zsim_bridges.mavlink.autopilot.personality import COPTER_MODES, PX4_MODES, Mode
+from zsim_bridges.mavlink.autopilot.personality import COPTER_MODES, PX4_MODES, FlightMode
 from zsim_bridges.mavlink.wire import dialect
 
 NAN = math.nan
@@ -23,7 +23,7 @@ def flying(autopilot: str = "px4", altitude_m: float = 3.0) -> FlownDrone:
     """Return a vehicle that holds at a height."""
     drone = FlownDrone(autopilot)
     if autopilot == "ardupilot":
-        set_mode(drone, COPTER_MODES[Mode.OFFBOARD])
+        set_mode(drone, COPTER_MODES[FlightMode.OFFBOARD])
         height = altitude_m
     else:
         height = 400.0 + altitude_m
@@ -97,16 +97,16 @@ def test_in_flight_it_disarms_only_by_force_which_is_an_emergency() -> None:
 
 def test_px4_begins_offboard_only_with_a_stream_and_holds_without_it() -> None:
     drone = flying()
-    assert set_mode(drone, PX4_MODES[Mode.OFFBOARD]) == Result.DENIED
+    assert set_mode(drone, PX4_MODES[FlightMode.OFFBOARD]) == Result.DENIED
     drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
-    assert set_mode(drone, PX4_MODES[Mode.OFFBOARD]) == Result.ACCEPTED
+    assert set_mode(drone, PX4_MODES[FlightMode.OFFBOARD]) == Result.ACCEPTED
     for _ in range(50):
         drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
         drone.step()
     assert drone.position[1] > 0.8  # north is y of W
-    assert heartbeat(drone).custom_mode == PX4_MODES[Mode.OFFBOARD]
+    assert heartbeat(drone).custom_mode == PX4_MODES[FlightMode.OFFBOARD]
     drone.step(52)
-    assert heartbeat(drone).custom_mode == PX4_MODES[Mode.HOLD]
+    assert heartbeat(drone).custom_mode == PX4_MODES[FlightMode.HOLD]
     assert "Offboard lost" in drone.texts()[-1]
     drone.step(200)
     assert drone._velocity == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
@@ -119,7 +119,7 @@ def test_guided_velocity_of_ardupilot_stops_after_three_seconds() -> None:
     assert drone._velocity[1] == 1.0
     drone.step(60)
     assert abs(drone._velocity[1]) < 0.7
-    assert heartbeat(drone).custom_mode == COPTER_MODES[Mode.OFFBOARD]
+    assert heartbeat(drone).custom_mode == COPTER_MODES[FlightMode.OFFBOARD]
 
 
 def test_a_new_setpoint_is_sent_at_once() -> None:
@@ -169,7 +169,7 @@ def test_a_setpoint_upwards_takes_off_an_armed_vehicle() -> None:
     drone.command(Cmd.COMPONENT_ARM_DISARM, 1)
     up = dialect.SetPositionTargetLocalNed(0, 1, 1, MavFrame.LOCAL_NED, POSITION_ONLY, z=-2.0)
     drone.receive(up)
-    set_mode(drone, PX4_MODES[Mode.OFFBOARD])
+    set_mode(drone, PX4_MODES[FlightMode.OFFBOARD])
     for _ in range(300):
         drone.receive(up)
         drone.step()
@@ -250,7 +250,7 @@ def test_a_mission_is_downloaded_as_it_was_uploaded() -> None:
 def test_an_item_that_is_not_flown_ends_an_upload() -> None:
     drone = FlownDrone()
     assert upload(drone, [item(0, 206)]) == 3  # DO_SET_CAM_TRIGG_DIST: unsupported
-    assert set_mode(drone, PX4_MODES[Mode.MISSION]) == Result.DENIED
+    assert set_mode(drone, PX4_MODES[FlightMode.MISSION]) == Result.DENIED
 
 
 def test_an_item_that_does_not_come_is_requested_again_and_in_the_end_given_up() -> None:
@@ -288,7 +288,7 @@ def test_beyond_the_fence_it_holds_and_says_so() -> None:
     drone = flying()
     drone.receive(dialect.ParamSet(1, 1, "GF_MAX_HOR_DIST", 5.0, 9))
     drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
-    set_mode(drone, PX4_MODES[Mode.OFFBOARD])
+    set_mode(drone, PX4_MODES[FlightMode.OFFBOARD])
     for _ in range(400):
         drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
         drone.step()
@@ -345,7 +345,7 @@ def test_who_is_flown_by_somebody_else_denies_and_shows_it() -> None:
     before = len(drone.commands)
     assert drone.command(Cmd.NAV_LAND) == Result.DENIED
     assert drone.texts()[-1] == "Denied: flown by controller.main"
-    assert heartbeat(drone).custom_mode == PX4_MODES[Mode.MISSION]
+    assert heartbeat(drone).custom_mode == PX4_MODES[FlightMode.MISSION]
     drone.step(100)
     assert len(drone.commands) == before
 

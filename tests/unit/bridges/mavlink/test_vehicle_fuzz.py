@@ -10,7 +10,7 @@ from mavlink_drone import FlownDrone
 from zsim.contract import messages
 from zsim.contract.flight_messages import Attitude, Velocity
 from zsim_bridges.mavlink.wire.frame import Link, Parser
-from zsim_bridges.mavlink.wire.wire_message import BY_ID, Message
+from zsim_bridges.mavlink.wire.wire_message import BY_ID, WireMessage
 
 ODD = (math.nan, math.inf, -math.inf, 0.0, 1.0, -1.0, 1e30, -1e30, 400.0, 3.0)
 BITS = {"uint8_t": 8, "int8_t": 7, "uint16_t": 16, "int16_t": 15, "uint32_t": 32, "int32_t": 31, "uint64_t": 64}
@@ -39,7 +39,7 @@ def odd_value(name: str, c_type: str, rng: random.Random) -> Any:
     return tuple(odd_element(element, rng) for _ in range(int(length)))
 
 
-def odd_message(rng: random.Random) -> Message:
+def odd_message(rng: random.Random) -> WireMessage:
     kind = BY_ID[rng.choice(list(BY_ID))].kind
     hints = get_type_hints(kind, include_extras=True)
     values = (odd_value(name, hints[name].__metadata__[0], rng) for name in kind.__struct_fields__)

@@ -11,7 +11,7 @@ from pymavlink.dialects.v10 import ardupilotmega as dialect_1
 from pymavlink.dialects.v20 import ardupilotmega as dialect_2
 
 from zsim_bridges.mavlink.wire import dialect, frame
-from zsim_bridges.mavlink.wire.wire_message import BY_ID, Message, MessageLayout
+from zsim_bridges.mavlink.wire.wire_message import BY_ID, MessageLayout, WireMessage
 
 SEED = 17
 COMMAND_CANCEL = 80  # in common.xml, not in the authority's release
@@ -40,12 +40,12 @@ def random_value(c_type: str, rng: random.Random) -> Any:
     return tuple(random_element(element, rng) for _ in range(int(length)))
 
 
-def random_message(kind: type[Message], rng: random.Random) -> Message:
+def random_message(kind: type[WireMessage], rng: random.Random) -> WireMessage:
     hints = get_type_hints(kind, include_extras=True)
     return kind(*(random_value(hints[name].__metadata__[0], rng) for name in kind.__struct_fields__))
 
 
-def their_message(module: Any, layout: MessageLayout, ours: Message) -> Any:
+def their_message(module: Any, layout: MessageLayout, ours: WireMessage) -> Any:
     """Return the authority's message with the same values."""
     kind = module.mavlink_map[layout.id]
     return kind(**{name: their_value(getattr(ours, name)) for name in kind.fieldnames})

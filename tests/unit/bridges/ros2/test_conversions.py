@@ -16,7 +16,7 @@ from zsim.schema.message import Vector3
 from zsim.sensors.sensor import ErrorModel, Mount
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
-from zsim_bridges.ros2.camera_topics import DroneCameras
+from zsim_bridges.ros2.drone_cameras import DroneCameras
 from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.topics import NavdataSummary
 

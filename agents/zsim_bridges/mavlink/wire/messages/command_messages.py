@@ -5,11 +5,11 @@ Definitions: https://mavlink.io/en/messages/common.html and ardupilotmega.html; 
 
 from typing import Annotated
 
-from zsim_bridges.mavlink.wire.wire_message import Float, Int16, Int32, Message, UInt8, UInt16, UInt32, message
+from zsim_bridges.mavlink.wire.wire_message import Float, Int16, Int32, UInt8, UInt16, UInt32, WireMessage, message
 
 
 @message(75)
-class CommandInt(Message):
+class CommandInt(WireMessage):
     """A command with a place in 1e-7 degrees, or 1e-4 m in local frames."""
 
     target_system: UInt8 = 0
@@ -28,7 +28,7 @@ class CommandInt(Message):
 
 
 @message(76)
-class CommandLong(Message):
+class CommandLong(WireMessage):
     """A command with seven numbers."""
 
     target_system: UInt8 = 0
@@ -45,7 +45,7 @@ class CommandLong(Message):
 
 
 @message(77, extensions=4)
-class CommandAck(Message):
+class CommandAck(WireMessage):
     """How a command was taken."""
 
     command: UInt16 = 0
@@ -57,7 +57,7 @@ class CommandAck(Message):
 
 
 @message(11)
-class SetMode(Message):
+class SetMode(WireMessage):
     """Change the mode, of the old protocol."""
 
     target_system: UInt8 = 0
@@ -66,7 +66,7 @@ class SetMode(Message):
 
 
 @message(66)
-class RequestDataStream(Message):
+class RequestDataStream(WireMessage):
     """Ask for a group of messages at a rate, of the old protocol."""
 
     target_system: UInt8 = 0
@@ -77,7 +77,7 @@ class RequestDataStream(Message):
 
 
 @message(67)
-class DataStream(Message):
+class DataStream(WireMessage):
     """The rate of a group of messages."""
 
     stream_id: UInt8 = 0
@@ -86,7 +86,7 @@ class DataStream(Message):
 
 
 @message(244)
-class MessageInterval(Message):
+class MessageInterval(WireMessage):
     """The interval of a message."""
 
     message_id: UInt16 = 0
@@ -94,7 +94,7 @@ class MessageInterval(Message):
 
 
 @message(20)
-class ParamRequestRead(Message):
+class ParamRequestRead(WireMessage):
     """Ask for a parameter by name, or by index where that is not -1."""
 
     target_system: UInt8 = 0
@@ -104,7 +104,7 @@ class ParamRequestRead(Message):
 
 
 @message(21)
-class ParamRequestList(Message):
+class ParamRequestList(WireMessage):
     """Ask for all parameters."""
 
     target_system: UInt8 = 0
@@ -112,7 +112,7 @@ class ParamRequestList(Message):
 
 
 @message(22)
-class ParamValue(Message):
+class ParamValue(WireMessage):
     """The value of a parameter."""
 
     param_id: Annotated[str, "char[16]"] = ""
@@ -123,7 +123,7 @@ class ParamValue(Message):
 
 
 @message(23)
-class ParamSet(Message):
+class ParamSet(WireMessage):
     """Set a parameter; the answer is its PARAM_VALUE."""
 
     target_system: UInt8 = 0
@@ -134,7 +134,7 @@ class ParamSet(Message):
 
 
 @message(345)
-class ParamError(Message):
+class ParamError(WireMessage):
     """Why a parameter was not read or set."""
 
     target_system: UInt8 = 0
@@ -145,7 +145,7 @@ class ParamError(Message):
 
 
 @message(5)
-class ChangeOperatorControl(Message):
+class ChangeOperatorControl(WireMessage):
     """Ask for control of a system."""
 
     target_system: UInt8 = 0
@@ -155,7 +155,7 @@ class ChangeOperatorControl(Message):
 
 
 @message(117)
-class LogRequestList(Message):
+class LogRequestList(WireMessage):
     """Ask for the logs that there are."""
 
     target_system: UInt8 = 0
@@ -165,7 +165,7 @@ class LogRequestList(Message):
 
 
 @message(118)
-class LogEntry(Message):
+class LogEntry(WireMessage):
     """A log that there is."""
 
     id: UInt16 = 0
@@ -176,7 +176,7 @@ class LogEntry(Message):
 
 
 @message(183)
-class AutopilotVersionRequest(Message):
+class AutopilotVersionRequest(WireMessage):
     """Ask for the version of an ArduPilot, of the old protocol."""
 
     target_system: UInt8 = 0
@@ -184,7 +184,7 @@ class AutopilotVersionRequest(Message):
 
 
 @message(80)
-class CommandCancel(Message):
+class CommandCancel(WireMessage):
     """Cancel a command that is under way."""
 
     target_system: UInt8 = 0

@@ -5,11 +5,21 @@ Definitions: https://mavlink.io/en/messages/common.html and ardupilotmega.html; 
 
 from typing import Annotated
 
-from zsim_bridges.mavlink.wire.wire_message import Float, Int16, Int32, Message, UInt8, UInt16, UInt32, UInt64, message
+from zsim_bridges.mavlink.wire.wire_message import (
+    Float,
+    Int16,
+    Int32,
+    UInt8,
+    UInt16,
+    UInt32,
+    UInt64,
+    WireMessage,
+    message,
+)
 
 
 @message(84)
-class SetPositionTargetLocalNed(Message):
+class SetPositionTargetLocalNed(WireMessage):
     """Fly to a position, or at a velocity, in a local frame; the mask names what is ignored."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -31,7 +41,7 @@ class SetPositionTargetLocalNed(Message):
 
 
 @message(86)
-class SetPositionTargetGlobalInt(Message):
+class SetPositionTargetGlobalInt(WireMessage):
     """Fly to a position on the Earth, or at a velocity; the mask names what is ignored."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -53,7 +63,7 @@ class SetPositionTargetGlobalInt(Message):
 
 
 @message(82)
-class SetAttitudeTarget(Message):
+class SetAttitudeTarget(WireMessage):
     """Hold an attitude or rates, with a thrust."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -68,7 +78,7 @@ class SetAttitudeTarget(Message):
 
 
 @message(69, extensions=10)
-class ManualControl(Message):
+class ManualControl(WireMessage):
     """The axes and buttons of a joystick, each axis within 1000."""
 
     target: UInt8 = 0
@@ -90,7 +100,7 @@ class ManualControl(Message):
 
 
 @message(70, extensions=10)
-class RcChannelsOverride(Message):
+class RcChannelsOverride(WireMessage):
     """Channels in place of those of the radio control."""
 
     target_system: UInt8 = 0
@@ -116,7 +126,7 @@ class RcChannelsOverride(Message):
 
 
 @message(144)
-class FollowTarget(Message):
+class FollowTarget(WireMessage):
     """Where a target that is followed is."""
 
     timestamp: UInt64 = 0  # [ms]

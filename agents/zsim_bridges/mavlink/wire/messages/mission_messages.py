@@ -3,11 +3,11 @@
 Definitions: https://mavlink.io/en/messages/common.html and ardupilotmega.html; units as written there.
 """
 
-from zsim_bridges.mavlink.wire.wire_message import Float, Int16, Int32, Message, UInt8, UInt16, message
+from zsim_bridges.mavlink.wire.wire_message import Float, Int16, Int32, UInt8, UInt16, WireMessage, message
 
 
 @message(39, extensions=1)
-class MissionItem(Message):
+class MissionItem(WireMessage):
     """An item with its place in degrees, of the old protocol."""
 
     target_system: UInt8 = 0
@@ -28,7 +28,7 @@ class MissionItem(Message):
 
 
 @message(73, extensions=1)
-class MissionItemInt(Message):
+class MissionItemInt(WireMessage):
     """An item with its place in 1e-7 degrees, or 1e-4 m in local frames."""
 
     target_system: UInt8 = 0
@@ -49,7 +49,7 @@ class MissionItemInt(Message):
 
 
 @message(40, extensions=1)
-class MissionRequest(Message):
+class MissionRequest(WireMessage):
     """Ask for an item, of the old protocol."""
 
     target_system: UInt8 = 0
@@ -59,7 +59,7 @@ class MissionRequest(Message):
 
 
 @message(51, extensions=1)
-class MissionRequestInt(Message):
+class MissionRequestInt(WireMessage):
     """Ask for an item."""
 
     target_system: UInt8 = 0
@@ -69,7 +69,7 @@ class MissionRequestInt(Message):
 
 
 @message(43, extensions=1)
-class MissionRequestList(Message):
+class MissionRequestList(WireMessage):
     """Ask for the number of items."""
 
     target_system: UInt8 = 0
@@ -78,7 +78,7 @@ class MissionRequestList(Message):
 
 
 @message(37, extensions=1)
-class MissionRequestPartialList(Message):
+class MissionRequestPartialList(WireMessage):
     """Ask for some items."""
 
     target_system: UInt8 = 0
@@ -89,7 +89,7 @@ class MissionRequestPartialList(Message):
 
 
 @message(38, extensions=1)
-class MissionWritePartialList(Message):
+class MissionWritePartialList(WireMessage):
     """Replace some items."""
 
     target_system: UInt8 = 0
@@ -100,7 +100,7 @@ class MissionWritePartialList(Message):
 
 
 @message(44, extensions=1)
-class MissionCount(Message):
+class MissionCount(WireMessage):
     """The number of items that are there, or are to come."""
 
     target_system: UInt8 = 0
@@ -110,7 +110,7 @@ class MissionCount(Message):
 
 
 @message(41)
-class MissionSetCurrent(Message):
+class MissionSetCurrent(WireMessage):
     """Go on with an item."""
 
     target_system: UInt8 = 0
@@ -119,7 +119,7 @@ class MissionSetCurrent(Message):
 
 
 @message(42, extensions=3)
-class MissionCurrent(Message):
+class MissionCurrent(WireMessage):
     """The item that is flown to."""
 
     seq: UInt16 = 0
@@ -129,7 +129,7 @@ class MissionCurrent(Message):
 
 
 @message(45, extensions=1)
-class MissionClearAll(Message):
+class MissionClearAll(WireMessage):
     """Remove all items."""
 
     target_system: UInt8 = 0
@@ -138,14 +138,14 @@ class MissionClearAll(Message):
 
 
 @message(46)
-class MissionItemReached(Message):
+class MissionItemReached(WireMessage):
     """An item has been reached."""
 
     seq: UInt16 = 0
 
 
 @message(47, extensions=1)
-class MissionAck(Message):
+class MissionAck(WireMessage):
     """How an upload, a download or a removal ended."""
 
     target_system: UInt8 = 0

@@ -5,11 +5,21 @@ Definitions: https://mavlink.io/en/messages/common.html and ardupilotmega.html; 
 
 from typing import Annotated
 
-from zsim_bridges.mavlink.wire.wire_message import Float, Int16, Int32, Message, UInt8, UInt16, UInt32, UInt64, message
+from zsim_bridges.mavlink.wire.wire_message import (
+    Float,
+    Int16,
+    Int32,
+    UInt8,
+    UInt16,
+    UInt32,
+    UInt64,
+    WireMessage,
+    message,
+)
 
 
 @message(49, extensions=1)
-class GpsGlobalOrigin(Message):
+class GpsGlobalOrigin(WireMessage):
     """Origin of the local frame on the Earth."""
 
     latitude: Int32 = 0  # [degE7]
@@ -19,7 +29,7 @@ class GpsGlobalOrigin(Message):
 
 
 @message(48, extensions=1)
-class SetGpsGlobalOrigin(Message):
+class SetGpsGlobalOrigin(WireMessage):
     """Set the origin of the local frame."""
 
     target_system: UInt8 = 0
@@ -30,7 +40,7 @@ class SetGpsGlobalOrigin(Message):
 
 
 @message(242, extensions=1)
-class HomePosition(Message):
+class HomePosition(WireMessage):
     """Where a vehicle took off, and returns to."""
 
     latitude: Int32 = 0  # [degE7]
@@ -47,7 +57,7 @@ class HomePosition(Message):
 
 
 @message(243, extensions=1)
-class SetHomePosition(Message):
+class SetHomePosition(WireMessage):
     """Set where a vehicle returns to."""
 
     target_system: UInt8 = 0
@@ -65,7 +75,7 @@ class SetHomePosition(Message):
 
 
 @message(62)
-class NavControllerOutput(Message):
+class NavControllerOutput(WireMessage):
     """Desired attitude, and errors of the course."""
 
     nav_roll: Float = 0.0  # [deg]
@@ -79,7 +89,7 @@ class NavControllerOutput(Message):
 
 
 @message(85)
-class PositionTargetLocalNed(Message):
+class PositionTargetLocalNed(WireMessage):
     """The position, velocity, acceleration, yaw that are flown to, in the local frame."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -99,7 +109,7 @@ class PositionTargetLocalNed(Message):
 
 
 @message(87)
-class PositionTargetGlobalInt(Message):
+class PositionTargetGlobalInt(WireMessage):
     """The position, velocity, acceleration, yaw that are flown to, on the Earth."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -119,7 +129,7 @@ class PositionTargetGlobalInt(Message):
 
 
 @message(83)
-class AttitudeTarget(Message):
+class AttitudeTarget(WireMessage):
     """The attitude, rates and thrust that are held."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -132,7 +142,7 @@ class AttitudeTarget(Message):
 
 
 @message(162, extensions=1)
-class FenceStatus(Message):
+class FenceStatus(WireMessage):
     """Whether a geofence is breached."""
 
     breach_status: UInt8 = 0
@@ -143,7 +153,7 @@ class FenceStatus(Message):
 
 
 @message(149, extensions=6)
-class LandingTarget(Message):
+class LandingTarget(WireMessage):
     """Where a place to land is seen."""
 
     time_usec: UInt64 = 0  # [us]
@@ -163,7 +173,7 @@ class LandingTarget(Message):
 
 
 @message(102, extensions=2)
-class VisionPositionEstimate(Message):
+class VisionPositionEstimate(WireMessage):
     """A pose by a camera."""
 
     usec: UInt64 = 0  # [us]
@@ -178,7 +188,7 @@ class VisionPositionEstimate(Message):
 
 
 @message(138, extensions=1)
-class AttPosMocap(Message):
+class AttPosMocap(WireMessage):
     """A pose by motion capture."""
 
     time_usec: UInt64 = 0  # [us]

@@ -5,11 +5,21 @@ Definitions: https://mavlink.io/en/messages/common.html and ardupilotmega.html; 
 
 from typing import Annotated
 
-from zsim_bridges.mavlink.wire.wire_message import Float, Int16, Int32, Message, UInt8, UInt16, UInt32, UInt64, message
+from zsim_bridges.mavlink.wire.wire_message import (
+    Float,
+    Int16,
+    Int32,
+    UInt8,
+    UInt16,
+    UInt32,
+    UInt64,
+    WireMessage,
+    message,
+)
 
 
 @message(24, extensions=6)
-class GpsRawInt(Message):
+class GpsRawInt(WireMessage):
     """The fix of a GPS receiver."""
 
     time_usec: UInt64 = 0  # [us]
@@ -31,7 +41,7 @@ class GpsRawInt(Message):
 
 
 @message(27, extensions=2)
-class RawImu(Message):
+class RawImu(WireMessage):
     """Raw readings of an inertial unit."""
 
     time_usec: UInt64 = 0  # [us]
@@ -49,7 +59,7 @@ class RawImu(Message):
 
 
 @message(26, extensions=1)
-class ScaledImu(Message):
+class ScaledImu(WireMessage):
     """Readings of an inertial unit in the body, forward, right, down."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -66,7 +76,7 @@ class ScaledImu(Message):
 
 
 @message(116, extensions=1)
-class ScaledImu2(Message):
+class ScaledImu2(WireMessage):
     """Readings of the second inertial unit."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -83,7 +93,7 @@ class ScaledImu2(Message):
 
 
 @message(29, extensions=1)
-class ScaledPressure(Message):
+class ScaledPressure(WireMessage):
     """Readings of a barometer."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -94,7 +104,7 @@ class ScaledPressure(Message):
 
 
 @message(105, extensions=1)
-class HighresImu(Message):
+class HighresImu(WireMessage):
     """Readings of inertial unit, magnetometer and barometer in the body, forward, right, down."""
 
     time_usec: UInt64 = 0  # [us]
@@ -116,7 +126,7 @@ class HighresImu(Message):
 
 
 @message(100, extensions=2)
-class OpticalFlow(Message):
+class OpticalFlow(WireMessage):
     """Flow of a camera that looks down."""
 
     time_usec: UInt64 = 0  # [us]
@@ -132,7 +142,7 @@ class OpticalFlow(Message):
 
 
 @message(106)
-class OpticalFlowRad(Message):
+class OpticalFlowRad(WireMessage):
     """Integrated flow of a camera that looks down."""
 
     time_usec: UInt64 = 0  # [us]
@@ -150,7 +160,7 @@ class OpticalFlowRad(Message):
 
 
 @message(132, extensions=4)
-class DistanceSensor(Message):
+class DistanceSensor(WireMessage):
     """A measured distance."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -168,7 +178,7 @@ class DistanceSensor(Message):
 
 
 @message(173)
-class Rangefinder(Message):
+class Rangefinder(WireMessage):
     """Distance to the ground, of ArduPilot."""
 
     distance: Float = 0.0  # [m]
@@ -176,7 +186,7 @@ class Rangefinder(Message):
 
 
 @message(241)
-class Vibration(Message):
+class Vibration(WireMessage):
     """Levels of vibration, and how often accelerometers clipped."""
 
     time_usec: UInt64 = 0  # [us]
@@ -189,7 +199,7 @@ class Vibration(Message):
 
 
 @message(231)
-class WindCov(Message):
+class WindCov(WireMessage):
     """Estimated wind with its uncertainty."""
 
     time_usec: UInt64 = 0  # [us]
@@ -204,7 +214,7 @@ class WindCov(Message):
 
 
 @message(65)
-class RcChannels(Message):
+class RcChannels(WireMessage):
     """What a radio control receiver received."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -231,7 +241,7 @@ class RcChannels(Message):
 
 
 @message(36, extensions=8)
-class ServoOutputRaw(Message):
+class ServoOutputRaw(WireMessage):
     """Pulses to servos and motors."""
 
     time_usec: UInt32 = 0  # [us]

@@ -10,17 +10,17 @@ from zsim_bridges.mavlink.wire.wire_message import (
     Int8,
     Int16,
     Int32,
-    Message,
     UInt8,
     UInt16,
     UInt32,
     UInt64,
+    WireMessage,
     message,
 )
 
 
 @message(30)
-class Attitude(Message):
+class Attitude(WireMessage):
     """Attitude as Euler angles, and body rates."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -33,7 +33,7 @@ class Attitude(Message):
 
 
 @message(31, extensions=1)
-class AttitudeQuaternion(Message):
+class AttitudeQuaternion(WireMessage):
     """Attitude as a quaternion, body to NED, w first, and body rates."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -48,7 +48,7 @@ class AttitudeQuaternion(Message):
 
 
 @message(32)
-class LocalPositionNed(Message):
+class LocalPositionNed(WireMessage):
     """Position and velocity relative to the local origin."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -61,7 +61,7 @@ class LocalPositionNed(Message):
 
 
 @message(33)
-class GlobalPositionInt(Message):
+class GlobalPositionInt(WireMessage):
     """Fused position and velocity on the Earth."""
 
     time_boot_ms: UInt32 = 0  # [ms]
@@ -76,7 +76,7 @@ class GlobalPositionInt(Message):
 
 
 @message(331, extensions=3)
-class Odometry(Message):
+class Odometry(WireMessage):
     """Pose and twist with covariances, in frames that the message names."""
 
     time_usec: UInt64 = 0  # [us]
@@ -100,7 +100,7 @@ class Odometry(Message):
 
 
 @message(74)
-class VfrHud(Message):
+class VfrHud(WireMessage):
     """What a head-up display shows."""
 
     airspeed: Float = 0.0  # [m/s]
@@ -112,7 +112,7 @@ class VfrHud(Message):
 
 
 @message(141)
-class Altitude(Message):
+class Altitude(WireMessage):
     """Altitudes over several zeros."""
 
     time_usec: UInt64 = 0  # [us]
@@ -125,7 +125,7 @@ class Altitude(Message):
 
 
 @message(230)
-class EstimatorStatus(Message):
+class EstimatorStatus(WireMessage):
     """Flags and test ratios of an estimator, of PX4."""
 
     time_usec: UInt64 = 0  # [us]
@@ -141,7 +141,7 @@ class EstimatorStatus(Message):
 
 
 @message(193, extensions=1)
-class EkfStatusReport(Message):
+class EkfStatusReport(WireMessage):
     """Flags and variances of an estimator, of ArduPilot."""
 
     flags: UInt16 = 0
@@ -154,7 +154,7 @@ class EkfStatusReport(Message):
 
 
 @message(178)
-class Ahrs2(Message):
+class Ahrs2(WireMessage):
     """Attitude and position of the second estimator, of ArduPilot."""
 
     roll: Float = 0.0  # [rad]

@@ -10,17 +10,17 @@ from zsim_bridges.mavlink.wire.wire_message import (
     Int16,
     Int32,
     Int64,
-    Message,
     UInt8,
     UInt16,
     UInt32,
     UInt64,
+    WireMessage,
     message,
 )
 
 
 @message(0)
-class Heartbeat(Message):
+class Heartbeat(WireMessage):
     """A component is alive: what it is, its mode and state."""
 
     type: UInt8 = 0
@@ -32,7 +32,7 @@ class Heartbeat(Message):
 
 
 @message(1, extensions=3)
-class SysStatus(Message):
+class SysStatus(WireMessage):
     """Which sensors a system has and how they are, load, battery, losses of the link."""
 
     onboard_control_sensors_present: UInt32 = 0
@@ -54,7 +54,7 @@ class SysStatus(Message):
 
 
 @message(2)
-class SystemTime(Message):
+class SystemTime(WireMessage):
     """Time of the system: since 1970, and since its start."""
 
     time_unix_usec: UInt64 = 0  # [us]
@@ -62,7 +62,7 @@ class SystemTime(Message):
 
 
 @message(4)
-class Ping(Message):
+class Ping(WireMessage):
     """A question for the round-trip time, with target 0, or the answer to one."""
 
     time_usec: UInt64 = 0  # [us]
@@ -72,7 +72,7 @@ class Ping(Message):
 
 
 @message(111)
-class Timesync(Message):
+class Timesync(WireMessage):
     """A question for the time of the other side, with tc1 0, or the answer to one."""
 
     tc1: Int64 = 0  # [ns]
@@ -80,7 +80,7 @@ class Timesync(Message):
 
 
 @message(148, extensions=1)
-class AutopilotVersion(Message):
+class AutopilotVersion(WireMessage):
     """Capabilities and versions of an autopilot."""
 
     capabilities: UInt64 = 0
@@ -98,7 +98,7 @@ class AutopilotVersion(Message):
 
 
 @message(253, extensions=2)
-class Statustext(Message):
+class Statustext(WireMessage):
     """A text for the operator, with a severity."""
 
     severity: UInt8 = 0
@@ -108,7 +108,7 @@ class Statustext(Message):
 
 
 @message(245)
-class ExtendedSysState(Message):
+class ExtendedSysState(WireMessage):
     """Whether an aircraft is landed or in the air."""
 
     vtol_state: UInt8 = 0
@@ -116,7 +116,7 @@ class ExtendedSysState(Message):
 
 
 @message(147, extensions=5)
-class BatteryStatus(Message):
+class BatteryStatus(WireMessage):
     """State of a battery."""
 
     id: UInt8 = 0
@@ -136,7 +136,7 @@ class BatteryStatus(Message):
 
 
 @message(125)
-class PowerStatus(Message):
+class PowerStatus(WireMessage):
     """Voltages of the supplies."""
 
     Vcc: UInt16 = 0  # [mV]
@@ -145,7 +145,7 @@ class PowerStatus(Message):
 
 
 @message(152, extensions=1)
-class Meminfo(Message):
+class Meminfo(WireMessage):
     """Free memory of an ArduPilot."""
 
     brkval: UInt16 = 0
@@ -154,7 +154,7 @@ class Meminfo(Message):
 
 
 @message(110)
-class FileTransferProtocol(Message):
+class FileTransferProtocol(WireMessage):
     """A part of a session of MAVLink FTP."""
 
     target_network: UInt8 = 0
@@ -164,7 +164,7 @@ class FileTransferProtocol(Message):
 
 
 @message(256)
-class SetupSigning(Message):
+class SetupSigning(WireMessage):
     """A new key for signing; to be sent on a safe link alone."""
 
     target_system: UInt8 = 0
@@ -174,7 +174,7 @@ class SetupSigning(Message):
 
 
 @message(109)
-class RadioStatus(Message):
+class RadioStatus(WireMessage):
     """State of a telemetry radio."""
 
     rssi: UInt8 = 0

@@ -44,7 +44,7 @@ class Polygon(NamedTuple):
         return crossed == self.inside
 
 
-class Geofence:
+class VehicleFence:
     """The fence of one vehicle.
 
     Attributes:
