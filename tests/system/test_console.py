@@ -32,6 +32,7 @@ from zsim_bridges.console.server.page_messages import ViewerCamera
 
 STRIP = {"width": 860, "height": 120}  # of a page whose picture nobody looks at
 STEER = "a-good-token"
+LOOK_S = 0.5  # between two looks of a page at its console
 TRIAD = """
 name: triad
 seed: 3
@@ -350,9 +351,9 @@ def test_a_run_with_a_console_prints_its_link_and_ends_as_a_whole(federation: Fe
 @needs_browser
 def test_the_pages_of_a_run_s_console_keep_its_report_and_record(federation: Federation, opened) -> None:
     where = "--out", str(federation.out), "--listen", federation.endpoint
-    run = federation.start("run", federation.write(TRIAD), "--console", *where)
-    page = opened(run.line("steer at").text.rpartition(" ")[2]).page
-    page.locator("[data-level=running]").wait_for()
+    run = federation.start("run", federation.write(TRIAD), "--console", "--rate", "2", *where)
+    page = opened(run.line("steer at").text.rpartition(" ")[2], STRIP).page
+    page.locator("#zsim-head[data-level=running]").wait_for()
     assert federation.client().request("world/control", "stop")["ok"]
     run.ends(with_code=0)
     federation.nobody_left()
@@ -366,6 +367,52 @@ def test_the_pages_of_a_run_s_console_keep_its_report_and_record(federation: Fed
     with page.expect_download() as record:
         links.nth(1).click()
     assert record.value.path().read_bytes() == (federation.out / "run.mcap").read_bytes()
+
+
+@pytest.fixture
+def waiting(federation: Federation) -> Iterator[Role]:
+    """A run that is over, whose console waits for a page that copies nothing."""
+    run = federation.run(TRIAD, "--console", "--rate", "2")
+    address = run.line("steer at").text.rpartition(" ")[2]
+    client, over, leaves = federation.client(), threading.Event(), threading.Event()
+
+    def look() -> bool:
+        request = urllib.request.Request(f"{address}head", headers={"X-Zsim-Page": "slow"})
+        with urllib.request.urlopen(request, timeout=PATIENCE_S) as head:
+            return json.load(head)["leaves"]
+
+    def keep_looking() -> None:
+        with suppress(OSError):
+            while not over.wait(LOOK_S):
+                if look():
+                    leaves.set()
+
+    assert not look()
+    page = threading.Thread(target=keep_looking)
+    page.start()
+    assert client.request("world/control", "stop")["ok"]
+    run.line("may copy")
+    assert leaves.wait(PATIENCE_S)
+    yield run
+    over.set()
+    page.join(PATIENCE_S)
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 0), (signal.SIGKILL, -signal.SIGKILL)]
+)
+def test_who_waits_for_pages_is_ended_by_a_signal(
+    federation: Federation, waiting: Role, number: int, code: int
+) -> None:
+    waiting.signal(number)
+    waiting.ends(with_code=code)
+    federation.nobody_left()
+
+
+def test_consoles_take_another_port_where_theirs_is_taken(federation: Federation) -> None:
+    links = [federation.role("console").line("steer at").text.rpartition(" ")[2] for _ in range(2)]
+    assert links[0] != links[1]
+    assert [status(link) for link in links] == [200, 200]
 
 
 def test_what_a_run_left_behind_is_served_once_it_is_there(tmp_path: Path) -> None:

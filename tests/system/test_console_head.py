@@ -3,7 +3,7 @@
 import functools
 import importlib.resources
 import json
-import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,14 @@ import pytest
 from chromium import needs_browser
 from console_browser import IN_SIGHT, PATIENCE_MS, POLL_MS, SCREENS
 from page_overflow import overflow
+from wire import PATIENCE_S
 
 from zsim_bridges.console.server.run_files import RunFiles
 
 pytestmark = needs_browser
 
 ADDRESS = "http://console.test/"  # of no machine: all requests are answered here
-LOOKED_AT = re.compile(f"{ADDRESS}head(\\?.*)?$")
+LOOKED_AT = f"{ADDRESS}head"
 AUDIO_JS = """
 window.tones = 0;
 window.AudioContext = class {
@@ -61,7 +62,7 @@ class Head:
 
     def _answer(self, route: Any) -> None:
         self.looks += 1
-        self.copied = "copied" in route.request.url
+        self.copied = "x-zsim-copied" in route.request.headers
         route.fulfill(body=json.dumps(self.state), content_type="application/json")
 
     def _command(self, route: Any) -> None:
@@ -73,6 +74,13 @@ class Head:
         self.state = {**self.state, **state}
         until = self.looks + LOOKS
         while self.looks < until:
+            self.page.wait_for_timeout(POLL_MS)
+
+    def wait_for_copies(self) -> None:
+        """Wait until the page has all that it keeps of a console that leaves."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not self.copied:
+            assert time.monotonic() < until_s
             self.page.wait_for_timeout(POLL_MS)
 
     def tones(self) -> int:
@@ -160,7 +168,7 @@ def test_a_page_keeps_report_and_record_of_a_console_that_leaves(head: Head, tmp
     for name, text in content.items():
         head.page.route(f"{ADDRESS}{name}", functools.partial(serve, text))
     head.show(**ended(tmp_path, leaves=True))
-    assert head.copied
+    head.wait_for_copies()
     gone(head)
     head.page.get_by_text("the console has ended with its run").wait_for()
     links = head.page.locator(".files a")
@@ -176,11 +184,24 @@ def test_a_page_keeps_report_and_record_of_a_console_that_leaves(head: Head, tmp
 def test_a_page_copies_no_record_as_large_as_a_disk(head: Head, tmp_path: Path) -> None:
     state = ended(tmp_path, leaves=True)
     head.show(**{**state, "files": {"record": {"path": "/runs/large/run.mcap", "size_bytes": 10**12}}})
-    assert head.copied
+    head.wait_for_copies()
     gone(head)
     head.page.get_by_text("the console has ended with its run").wait_for()
     assert head.page.locator(".files").text_content() == "record: /runs/large/run.mcap"
     assert head.page.locator(".files a").count() == 0
+
+
+def test_what_cannot_be_copied_is_named(head: Head, tmp_path: Path) -> None:
+    for name in ("report.html", "run.mcap"):
+        (tmp_path / name).write_text(name)
+    head.page.route(f"{ADDRESS}report", lambda route: route.abort())
+    head.page.route(f"{ADDRESS}record", functools.partial(serve, "MCAP"))
+    head.show(**ended(tmp_path, leaves=True))
+    head.wait_for_copies()
+    gone(head)
+    head.page.get_by_text("the console has ended with its run").wait_for()
+    assert head.page.locator(".files a").all_text_contents() == [str(tmp_path / "run.mcap")]
+    assert str(tmp_path / "report.html") in str(head.page.locator(".files").text_content())
 
 
 def test_what_a_run_has_not_left_is_not_named(head: Head, tmp_path: Path) -> None:
@@ -189,6 +210,7 @@ def test_what_a_run_has_not_left_is_not_named(head: Head, tmp_path: Path) -> Non
     head.show(**ended(tmp_path))
     assert "report.html" in str(head.page.locator(".files").text_content())
     head.show(leaves=True)
+    head.wait_for_copies()
     assert head.page.locator(".files").text_content() == f"record: {tmp_path / 'run.mcap'}"
 
 
@@ -196,7 +218,8 @@ def test_the_next_run_on_a_console_s_port_has_none_of_these_copies(head: Head, t
     (tmp_path / "report.html").write_text("")
     head.page.route(f"{ADDRESS}report", functools.partial(serve, ""))
     head.show(**ended(tmp_path, leaves=True))
-    assert str(head.page.locator(".files a").get_attribute("href")).startswith("blob:")
+    head.wait_for_copies()
+    head.page.locator('.files a[href^="blob:"]').wait_for()
     head.show(level="running", leaves=False)
     assert not head.copied
     head.show(level="ended")

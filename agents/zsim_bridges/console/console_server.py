@@ -27,7 +27,7 @@ from zsim_bridges.console.server.run_files import RunFiles
 from zsim_bridges.observer_process import ObserverProcess
 
 REASON_S = 0.1  # wall; between two looks for a reason to end
-OFFER_S = 20.0  # wall; how long pages may take to copy what a run left behind
+OFFER_S = 20.0  # wall; how long pages may take to copy what a run left behind: 100 MB over Wi-Fi of 40 Mbit/s
 
 
 class Console:
@@ -59,6 +59,7 @@ class Console:
         self._files = RunFiles(folder)
         self._name = name
         self._world = world
+        self._ended = ""
         self._rate_hz = rate_hz
         self._say = say
         self._run_page: RunPage | None = None
@@ -107,13 +108,19 @@ class Console:
         finally:
             page.close()
 
-    def remain(self, end_reason: Callable[[], str | None]) -> None:
-        """Serve the pages of a run that is over until there is a reason to end, and they have copies of its files."""
+    def remain(self, end_reason: Callable[[], str | None], deserted: Callable[[], bool]) -> None:
+        """Serve the pages of a run that is over until there is a reason to end, and they have copies of its files.
+
+        Args:
+            end_reason: returns it, None while there is none.
+            deserted: whether nobody waits for this process any more: then pages are not waited for.
+        """
         while not (reason := end_reason()):
             time.sleep(REASON_S)
+        self._ended = reason
         if self._run_page:
             self._run_page.end(reason)
-        self._files.offer(OFFER_S)
+        self._files.offer(OFFER_S, deserted)
 
     def _record(self) -> RecordPlayer | None:
         return self._run_page.record if self._run_page else None
@@ -128,7 +135,7 @@ class Console:
         return self._run_page.state() if self._run_page else {"run_id": None}
 
     def _head(self) -> dict[str, Any]:
-        return self._run_page.head() if self._run_page else no_run_head(self._world)
+        return self._run_page.head() if self._run_page else no_run_head(self._world, self._ended)
 
     def _command(self, op: str) -> str:
         return self._run_page.command(op) if self._run_page else "there is no run yet"

@@ -146,6 +146,8 @@ class RunPage:
         """Show that the run is over; to be called after `run`, which shows that by itself where it learns of it."""
         self._monitor.end(reason)
         self._monitor.update(time.monotonic())
+        with self._server.atomic():
+            self._update_tables(time.monotonic())
 
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""

@@ -277,7 +277,7 @@ class Gateway:
         cameras = CameraTree(self.run, self._pictures, self._client_limit)
         app = application(self._access_check, rest, tree, cameras, self._new_client)
         try:
-            site = await start_site(app, host, http_port, shutdown_s=1.0)
+            site = await start_site(app, host, (http_port,), shutdown_s=1.0)
             try:
                 lines = await asyncio.start_server(line_server.serve, host, lines_port, limit=LINE_MAX)
             except OSError:

@@ -1,10 +1,11 @@
 """What the web servers of console and gateway share: event loop thread, listening, and who may reach them."""
 
 import asyncio
+import errno
 import hmac
 import logging
 import threading
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,6 +15,7 @@ from zsim.errors import RunError
 from zsim_bridges.web.http_connections import HttpConnections
 from zsim_bridges.web.loopback import is_loopback
 
+ANY_PORT = 0  # of the kernel's choice
 BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own
 Resource = TypeVar("Resource")
 _NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, not logged
@@ -25,17 +27,27 @@ class ServedSite(NamedTuple):
     runner: web.AppRunner
     listener: asyncio.Server
 
+    @property
+    def port(self) -> int:
+        return self.listener.sockets[0].getsockname()[1]
+
     async def cleanup(self) -> None:
         """Stop listening, and end what is under way."""
         self.listener.close()
         await self.runner.cleanup()
 
 
-async def start_site(app: web.Application, host: str, port: int, shutdown_s: float) -> ServedSite:
-    """Serve an application on a port, on a bounded number of connections.
+async def start_site(app: web.Application, host: str, ports: Sequence[int], shutdown_s: float) -> ServedSite:
+    """Serve an application, on a bounded number of connections.
+
+    Args:
+        app: the application.
+        host: on whose address.
+        ports: the first of them that is not taken; ANY_PORT for one that is not.
+        shutdown_s: how long what is under way may take at the end [wall].
 
     Raises:
-        OSError: the port cannot be opened.
+        OSError: none of them can be opened.
     """
     connections = HttpConnections()
     app.middlewares.append(connections.observe)
@@ -44,12 +56,21 @@ async def start_site(app: web.Application, host: str, port: int, shutdown_s: flo
     server = runner.server
     assert server is not None
     try:
-        loop = asyncio.get_running_loop()
-        listener = await loop.create_server(lambda: connections.protocol(server()), host, port, backlog=BACKLOG)
+        listener = await _listen(lambda: connections.protocol(server()), host, ports)
     except OSError:
         await runner.cleanup()
         raise
     return ServedSite(runner, listener)
+
+
+async def _listen(protocol: Callable[[], asyncio.Protocol], host: str, ports: Sequence[int]) -> asyncio.Server:
+    loop = asyncio.get_running_loop()
+    try:
+        return await loop.create_server(protocol, host, ports[0], backlog=BACKLOG)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE or len(ports) == 1:
+            raise
+    return await _listen(protocol, host, ports[1:])
 
 
 def check_token(process: str, host: str, token: str | None) -> None:

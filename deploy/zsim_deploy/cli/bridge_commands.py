@@ -42,7 +42,15 @@ app = typer.Typer()
 def console(
     reach: WorldAccess,
     listen: Annotated[str, typer.Option(help="Address on which the page is served.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port of the page.", min=1, max=65535)] = CONSOLE_PORT,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            help=f"Port of the page ({CONSOLE_PORT}, or another where that is taken).",
+            min=1,
+            max=65535,
+            show_default=False,
+        ),
+    ] = None,
     token: Annotated[
         str | None, typer.Option(envvar=TOKEN, help="What operators must show; needed off loopback.")
     ] = None,
@@ -75,7 +83,8 @@ def console(
     say = JsonProgress().say if reach.launched else log_printer(None)
     require_files(SERVER_FILES, "a console and its pages")
     world = f"federation {reach.federation!r} on {reach.endpoint}"
-    shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say, world, folder)
+    address = ListenAddress(listen, port or CONSOLE_PORT, or_any=port is None)
+    shown = Console(address, own_name.removesuffix(".*"), token, rate_hz, say, world, folder)
     with shown.open():
         serve_runs(own_name, shown.serve, reach, remain=shown.remain)
 

@@ -3,10 +3,11 @@
 import os
 import signal
 import sys
+from contextlib import nullcontext
 from functools import cache
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from typer.main import get_command
@@ -41,7 +42,11 @@ from zsim_deploy.cli import (
     role_commands,
 )
 from zsim_deploy.roles.closed_output import STREAMS, is_unread
-from zsim_deploy.roles.stop_channel import REASONS
+from zsim_deploy.roles.stop_channel import REASONS, interruptible
+
+if TYPE_CHECKING:
+    from zsim_deploy.launch.run import RunOptions
+    from zsim_deploy.launch.supervisor import Outcome
 
 app = typer.Typer(
     name="zsim",
@@ -87,29 +92,26 @@ def run(
     order: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
-    from zsim.runtime.progress import Screen
     from zsim_agents.hosting import check_plans
     from zsim_deploy.launch.camera_children import with_cameras
-    from zsim_deploy.launch.console_process import ending_after
+    from zsim_deploy.launch.console_process import RunConsole
     from zsim_deploy.launch.run import (
         RunOptions,
         check_endpoint,
         check_open_files,
         options_of,
-        run_in_process,
-        run_processes,
     )
     from zsim_deploy.launch.run_folder import make_directory
-    from zsim_deploy.launch.supervisor import Outcome
 
     if in_process:
         _refuse_with_others(flight, listen, hosted, console, cameras, detect)
     if console:
         require("console", CONSOLE_NEEDS)
+    shown = RunConsole(_print_aside) if console else None
     if continue_:
         _refuse_to_change(flight, out, in_process, listen, insecure, hosted)
         options, in_process = options_of(flight.path)
-        options.console = console
+        options.console = shown
         options.cameras, options.detect = cameras, detect
     else:
         check_endpoint(listen, insecure)
@@ -118,20 +120,34 @@ def run(
         scenario = with_cameras(flight.scenario()) if cameras else flight.scenario()
         if in_process:
             check_plans(scenario, flight.path.name)  # as processes, controllers refuse them
-        options = RunOptions(scenario, Path(), *pace, listen, insecure, hosted, first, console, cameras, detect)
+        options = RunOptions(scenario, Path(), *pace, listen, insecure, hosted, first, shown, cameras, detect)
     if not in_process:
         if options.camera_children():
             require("run", camera_commands.CAMERA_NEEDS)
         check_open_files(options)
     if not continue_:
         options.out = make_directory(out, options.scenario, force)
+    with shown or nullcontext(), interruptible():
+        outcome = _fly(options, in_process)
+        if shown:
+            shown.outcome = outcome
+        record_commands.conclude(outcome, options.out, report)
+
+
+def _fly(options: "RunOptions", in_process: bool) -> "Outcome":
+    from zsim.runtime.progress import Screen
+    from zsim_deploy.launch.run import run_in_process, run_processes
+    from zsim_deploy.launch.supervisor import Outcome
+
     with Screen(options.scenario.duration_s) as screen:
         try:
-            outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
+            return run_in_process(options, screen) if in_process else run_processes(options, screen)
         except KeyboardInterrupt as error:
-            outcome = Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
-    with ending_after(outcome, lambda line: print(printable(line), file=sys.stderr)):
-        record_commands.conclude(outcome, options.out, report)
+            return Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
+
+
+def _print_aside(line: str) -> None:
+    print(printable(line), file=sys.stderr)
 
 
 def _refuse_with_others(

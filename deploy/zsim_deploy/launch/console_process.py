@@ -5,13 +5,63 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import TracebackType
 
-from zsim_deploy.launch.free_ports import page_port
-from zsim_deploy.launch.supervisor import INTERRUPT_S, Outcome
+from zsim_deploy.launch.supervisor import Outcome, RunProcess
+from zsim_deploy.roles.stop_channel import interruptible
 
 END_S = 10.0  # wall; how long it may take to end
-COPIED_S = 22.0  # wall; how long after a run, as its pages may copy for 20 s
+COPIED_S = 22.0  # wall; how long one may take to end after a run: its pages may copy for 20 s
+INTERRUPTED_S = 1.0  # wall; how long after Ctrl-C: the run itself may take 2 s, the whole is promised within 3 s
 SLOW_S = 2.0  # wall; after which it is shown what is waited for
+
+
+class RunConsole:
+    """Owns the console of a run, which goes on until the report is there and pages have copies.
+
+    To be entered before the run, so that nothing is left of it whatever happens. Ctrl-C ends the wait for its pages.
+
+    Args:
+        say: takes a line on what takes long.
+
+    Attributes:
+        process: once there is one.
+        outcome: of the run, to be set; without one it was interrupted.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self.process: RunProcess | None = None
+        self.outcome = Outcome("interrupted", interrupted=True)
+
+    def own(self, process: RunProcess) -> None:
+        """Take a process that is not started yet; a former one ends."""
+        if self.process is not None:
+            self.process.close()
+        self.process = process
+
+    def __enter__(self) -> "RunConsole":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.process is None:
+            return
+        hurries = self.outcome.interrupted or isinstance(error, (KeyboardInterrupt, SystemExit))
+        try:
+            with interruptible():
+                self._wait(self.process, INTERRUPTED_S if hurries else COPIED_S)
+        except KeyboardInterrupt:
+            pass  # the run is over, and ended as it did
+        finally:
+            self.process.close()
+
+    def _wait(self, process: RunProcess, limit_s: float) -> None:
+        process.request_stop(self.outcome.reason)
+        if not process.wait(min(SLOW_S, limit_s)) and limit_s > SLOW_S:
+            self._say(f"{process.name}: its pages may copy the report and the record; Ctrl-C ends that")
+            process.wait(limit_s - SLOW_S)
 
 
 @contextmanager
@@ -42,7 +92,7 @@ def console_beside(endpoint: str, record: Path, federation: str | None, tls: Pat
 
 def _arguments(endpoint: str, federation: str, tls: Path | None) -> list[str]:
     where = ["--connect", endpoint.replace("0.0.0.0", "127.0.0.1"), "--federation", federation]
-    return ["console", *where, "--port", str(page_port()), *(["--tls", str(tls)] if tls else [])]
+    return ["console", *where, *(["--tls", str(tls)] if tls else [])]
 
 
 def _federation_of(record: Path) -> str:
@@ -50,29 +100,3 @@ def _federation_of(record: Path) -> str:
 
     with open_run(record) as (_, _, scenario):
         return scenario.federation
-
-
-@contextmanager
-def ending_after(outcome: Outcome, say: Callable[[str], None]) -> Iterator[None]:
-    """End what remains of a run after what is done meanwhile; a console may let its pages copy what is there then.
-
-    Args:
-        outcome: of the run.
-        say: takes a line on what takes long.
-    """
-    patience_s = INTERRUPT_S if outcome.interrupted else COPIED_S
-    try:
-        yield
-    except (KeyboardInterrupt, SystemExit):  # Ctrl-C
-        patience_s = INTERRUPT_S
-        raise
-    finally:
-        try:
-            for child in outcome.remaining:
-                child.request_stop(outcome.reason)
-                if not child.wait(min(SLOW_S, patience_s)):
-                    say(f"{child.name}: its pages copy the report and the record")
-                    child.wait(patience_s - SLOW_S)
-        finally:
-            for child in outcome.remaining:
-                child.close()

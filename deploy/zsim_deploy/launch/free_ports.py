@@ -1,9 +1,8 @@
-"""Ports on which a run can listen: the ones that users expect, or others where those are taken."""
+"""The port on which a run listens: the one that users expect, or another where that is taken."""
 
 import socket
 
 from zsim.runtime.progress import Screen
-from zsim_deploy.arguments import CONSOLE_PORT
 
 DEFAULT_PORT = 7447  # Zenoh's own
 
@@ -17,11 +16,6 @@ def is_free(port: int) -> bool:
         except OSError:
             return False
     return True
-
-
-def page_port() -> int:
-    """Return the console's port, or another free one where that is taken."""
-    return CONSOLE_PORT if is_free(CONSOLE_PORT) else _any_port()
 
 
 def _any_port() -> int:

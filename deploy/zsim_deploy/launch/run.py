@@ -21,8 +21,9 @@ from zsim_deploy.inventory.processes import COMMANDS
 from zsim_deploy.launch import interrupted_run
 from zsim_deploy.launch.camera_children import CameraChild, camera_children
 from zsim_deploy.launch.child_process import ChildProcess
+from zsim_deploy.launch.console_process import RunConsole
 from zsim_deploy.launch.end_signals import EndSignals
-from zsim_deploy.launch.free_ports import DEFAULT_PORT, free_port, is_free, page_port
+from zsim_deploy.launch.free_ports import DEFAULT_PORT, free_port, is_free
 from zsim_deploy.launch.interrupted_run import JOURNAL, Launch
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
@@ -40,6 +41,7 @@ class RunOptions:
     Attributes:
         out: folder of the run.
         order: names of processes in the order in which they are started.
+        console: owns the console that is started; None for a run without.
         continued: whether it goes on where an earlier launch of it was interrupted.
     """
 
@@ -51,7 +53,7 @@ class RunOptions:
     insecure: bool = False
     hosted: bool = False
     order: list[str] = field(default_factory=list)
-    console: bool = False
+    console: RunConsole | None = None
     cameras: bool = False
     detect: bool = False
     run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
@@ -88,8 +90,9 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
             ChildProcess(f"{role}.{thing}", [role, *reach, "--", thing], logs, launcher) for role, _, thing in split
         ]
     if options.console:
-        show = ["console", "--name", CONSOLE, "--port", str(page_port()), "--folder", str(options.out), *reach]
+        show = ["console", "--name", CONSOLE, "--folder", str(options.out), *reach]
         children.append(ChildProcess(CONSOLE, show, logs, launcher, supervisor.handle_line))
+        options.console.own(children[-1])
     for role, name, drones in options.camera_children():
         draw = [COMMANDS.get(role, role), "--name", name, *reach, "--", *drones]
         children.append(ChildProcess(name, draw, logs, launcher))
@@ -121,7 +124,7 @@ def check_open_files(options: RunOptions) -> None:
     cameras = {child.name for child in options.camera_children()}
     expected = {*options.scenario.expected(), RECORDER}
     agents = 1 if options.hosted else len(expected - cameras) - 1
-    count = 2 + agents + options.console + len(cameras)
+    count = 2 + agents + (options.console is not None) + len(cameras)
     require_files(launcher_files(count, len(expected)), f"{count} processes")
 
 
@@ -187,8 +190,9 @@ def _interrupt(number: int, _: object) -> None:
 def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher, signals: EndSignals) -> Outcome:
     for line in driver_lines(options.scenario, endpoint):
         screen.say(line)
-    supervisor = Supervisor(options.scenario.processes, screen, remaining=CONSOLE)
+    supervisor = Supervisor(options.scenario.processes, screen)
     supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
+    supervisor.lasting = options.console.process if options.console else None
 
     def end_with_output() -> None:
         signals.look()
@@ -205,8 +209,6 @@ def _run_on_free_port(
     endpoint = f"tcp/127.0.0.1:{port}"
     outcome = _run_on(options, endpoint, screen, launcher, signals)
     if tries > 1 and _lost_port(outcome, endpoint, port):
-        for child in outcome.remaining:
-            child.close()
         return _run_on_free_port(options, screen, launcher, signals, tries - 1)
     return outcome
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any, Protocol
 
@@ -49,17 +49,11 @@ class RunProcess(Protocol):
 
 @dataclass
 class Outcome:
-    """How a run ended.
-
-    Attributes:
-        reason: why.
-        remaining: processes that go on after it, to be stopped and closed.
-    """
+    """How a run ended."""
 
     reason: str
     failed: bool = False
     interrupted: bool = False
-    remaining: Sequence[RunProcess] = field(default=(), repr=False)
 
 
 class Supervisor:
@@ -68,15 +62,15 @@ class Supervisor:
     Args:
         processes: what the scenario says of their deaths.
         show: takes progress.
-        remaining: name of a process that goes on after the run.
 
     Attributes:
         members: to be given before `run`; the world among them.
+        lasting: the one of them that goes on after the run, to be stopped and closed by the caller, whatever happens.
     """
 
-    def __init__(self, processes: Processes, show: ProgressSink, remaining: str = "") -> None:
+    def __init__(self, processes: Processes, show: ProgressSink) -> None:
         self.members: list[RunProcess] = []
-        self._remaining = remaining
+        self.lasting: RunProcess | None = None
         self._deaths = DeathPolicy(processes)
         self._show = show
         self._reason = ""
@@ -99,19 +93,20 @@ class Supervisor:
         """
         if self._interrupted:
             return Outcome(self._interrupted, interrupted=True)
-        remaining: list[RunProcess] = []
         with self._interrupts():
             try:
                 for child in self.members:
                     child.start()
                 self._watch(look)
-                self._finish([child for child in self.members if child.name != self._remaining])
-                remaining = [child for child in self.members if child.name == self._remaining]
+                self._finish()
             finally:
                 self._cancel_requests()
                 replaced = [*(child for child, _ in self._leaving.values()), *self._gone]
-                _close([child for child in (*self.members, *replaced) if child not in remaining])
-        return Outcome(self._reason or "ended", self._failed, self._interrupted is not None, remaining)
+                _close([*self._leaving_with_run(), *replaced])
+        return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
+
+    def _leaving_with_run(self) -> list[RunProcess]:
+        return [child for child in self.members if child is not self.lasting]
 
     def _interrupts(self) -> AbstractContextManager[None]:
         """Take Ctrl-C and SIGTERM as a request to end the run in order; a second Ctrl-C does not wait."""
@@ -307,8 +302,9 @@ class Supervisor:
             self._reason = ""
         self._fail(reason)
 
-    def _finish(self, members: Sequence[RunProcess]) -> None:
+    def _finish(self) -> None:
         """Let everybody leave; the recorder leaves last, by itself."""
+        members = self._leaving_with_run()
         for child in members:
             if self._failed or self._interrupted or child.role != "recorder":
                 child.request_stop(self._reason)

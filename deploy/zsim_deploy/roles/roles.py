@@ -46,8 +46,8 @@ Serve = Callable[[Session, Info, ObserverProcess, Stopped, Say], None]
 """Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
 StandsFor = Callable[[Info], tuple[str, ...]]  # names of processes whose work a process does in a run
 SlackNs = Callable[[Info], int]  # by how much the world of a run may be ahead of a process; 0 for any
-Remain = Callable[[Callable[[], str | None]], None]
-"""Does with (reason) what is left to do after a run; `reason` returns why to stop, None to go on."""
+Remain = Callable[[Callable[[], str | None], Callable[[], bool]], None]
+"""Does with (reason, deserted) what is left to do after a run, until there is a reason to stop; deserted, at once."""
 
 
 def agent(build: Callable[[messages.Info, Scenario], Agent], reach: WorldAccess, name: str = "") -> None:
@@ -212,6 +212,7 @@ def serve_runs(
     Raises:
         NoWorldError: there was no first world within `wait_s`.
         SupersededError: another process of the name that was given has taken over.
+        SystemExit: it is launched, and somebody else than its launcher has ended it.
     """
     launched, wait_s = reach.launched, reach.wait_s
     who = reach.who._replace(process="" if name.endswith(ANY) else name)
@@ -234,14 +235,14 @@ def serve_runs(
                 else:
                     time.sleep(PAUSE_S)
             if launched:
-                if remain is not None and not stop.orphaned():
-                    remain(stop.reason)
-                stop.exit_if_terminated()
-                return
+                break
             wait_s = None
     except NoWorldError:
         if not stop.stopped():
             raise
+    if launched and remain is not None:
+        remain(stop.reason, stop.orphaned)
+    stop.exit_if_terminated()
 
 
 def _free(link: Session, name: str) -> str:

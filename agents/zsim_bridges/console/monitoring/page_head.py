@@ -35,11 +35,17 @@ def page_head(
     return {**head, "age_s": run.silent_s, "refusals": refusals, "alarms": list(alarms)}
 
 
-def no_run_head(world: str) -> dict[str, Any]:
-    """Return the head of a page without a run; `world` says where one is looked for."""
-    reason = "there is no run yet"
+def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
+    """Return the head of a page without a run.
+
+    Args:
+        world: where one is looked for.
+        ended: why that of its launcher was over before the console had found it.
+    """
+    reason = f"the run is over: {ended}" if ended else "there is no run yet"
     refusals = {"land": reason, "emergency": reason}
-    head = {"level": "waiting", "title": "waiting for a world", "detail": world, "t_s": 0.0}
+    words = ("ended", "run over", ended) if ended else ("waiting", "waiting for a world", world)
+    head = {**dict(zip(("level", "title", "detail"), words, strict=True)), "t_s": 0.0}
     return {**head, "age_s": 0.0, "refusals": refusals, "alarms": []}
 
 

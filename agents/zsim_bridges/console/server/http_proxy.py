@@ -19,17 +19,17 @@ from zsim.errors import RunError
 from zsim_bridges.console.frame import page_html
 from zsim_bridges.console.server.page_tokens import OPERATOR, VIEW_PATH, VIEWER, PageRequest, PageTokens
 from zsim_bridges.console.server.run_files import RunFiles
-from zsim_bridges.web.web_server import ServedSite, open_on_thread, start_site, url_host
+from zsim_bridges.web.web_server import ANY_PORT, ServedSite, open_on_thread, start_site, url_host
 
 MESSAGE_MAX = 100_000  # bytes of one message of a page
 BACKEND_HOST = "127.0.0.1"  # where viser listens
-PAGE = "page"  # in a page's query: its name
-COPIED = "copied"  # in a page's query: it has what it keeps of a console that leaves
+PAGE_HEADER = "X-Zsim-Page"  # a page's name: no page of another site can send it without asking first
+COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has what it keeps of a console that leaves
 SECRET_HEADER = "X-Zsim-Console"  # which viser's server asks for
 ALL_ADDRESSES = ("0.0.0.0", "::")
 PAGES_MAX = 50  # open at once, of operators and of viewers: viewers keep no operator out
 HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed
-CLOSE_S = 0.3  # twice: for what is under way, and for pages to close their sockets
+CLOSE_S = 0.3  # wall; twice at the end, for what is under way, and for pages to close their sockets: slow ones do not
 POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
 HEADERS = {
     "Content-Security-Policy": POLICY,  # the page is one file, and nothing it shows comes from elsewhere
@@ -40,10 +40,15 @@ HEADERS = {
 
 
 class ListenAddress(NamedTuple):
-    """Where pages are served."""
+    """Where pages are served.
+
+    Attributes:
+        or_any: whether another port will do where this one is taken.
+    """
 
     host: str
     port: int
+    or_any: bool = False
 
     def url(self, path: str = "/", token: str | None = None) -> str:
         """Return the URL of a page; by the name of this machine where it listens on all addresses."""
@@ -100,12 +105,15 @@ class HttpProxy:
         self._address = address
         self._token = token
         self._view_token = secrets.token_urlsafe(12)
-        self._tokens = PageTokens(address.host, address.port, token, self._view_token)
+        self._tokens = self._tokens_at(address)
         self._backend = backend
         self._pages = {OPERATOR: page_html.operator_page(), VIEWER: page_html.viewer_page()}
         self._open_pages: Counter[str] = Counter()  # sockets, by what they are for
         self._loop = asyncio.new_event_loop()
         self._client: ClientSession | None = None
+
+    def _tokens_at(self, address: ListenAddress) -> PageTokens:
+        return PageTokens(address.host, address.port, self._token, self._view_token)
 
     def urls(self) -> dict[str, str]:
         """Return the URLs to be opened, by role."""
@@ -117,7 +125,7 @@ class HttpProxy:
         """Serve pages, on a thread of its own.
 
         Raises:
-            RunError: the port is taken.
+            RunError: the port is taken, or the address is none of this machine.
         """
         with open_on_thread(self._loop, "console server", self._open, self._close):
             yield
@@ -133,10 +141,13 @@ class HttpProxy:
             shown = partial(self._file, path)
             app.add_routes([web.get(f"/{name}", shown), web.get(f"{VIEW_PATH}/{name}", shown)])
         try:
-            site = await start_site(app, *self._address, shutdown_s=CLOSE_S)
+            host, port, or_any = self._address
+            site = await start_site(app, host, (port, ANY_PORT) if or_any else (port,), shutdown_s=CLOSE_S)
         except OSError as error:
             address = f"{self._address.host}, port {self._address.port}"
             raise RunError(f"console: cannot listen on {address} ({error.strerror}); say --port") from error
+        self._address = self._address._replace(port=site.port)
+        self._tokens = self._tokens_at(self._address)
         self._client = ClientSession()
         return site
 
@@ -173,7 +184,7 @@ class HttpProxy:
         return self._answer(request, self._backend.state)
 
     async def _head(self, request: web.Request) -> web.Response:
-        look = request.query.get(PAGE, ""), COPIED in request.query
+        look = request.headers.get(PAGE_HEADER, ""), COPIED_HEADER in request.headers
         return self._answer(request, lambda: {**self._backend.head(), **self._backend.files.shown(*look)})
 
     def _answer(self, request: web.Request, shown: Callable[[], dict[str, Any]]) -> web.Response:
@@ -185,7 +196,7 @@ class HttpProxy:
         """Serve what a run left behind: a page to be read, or a file to be kept."""
         if self._tokens.role_of(_page_request(request)) is None:
             return _missing_token()
-        if not path.is_file():
+        if self._backend.files.size_bytes(path) is None:
             return web.Response(status=404, text=f"{path} is not there yet\n", headers=HEADERS)
         kept = {} if path.suffix == ".html" else {"Content-Disposition": f'attachment; filename="{path.name}"'}
         return web.FileResponse(path, headers={**HEADERS, **kept})

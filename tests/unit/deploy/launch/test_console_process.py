@@ -1,30 +1,37 @@
-"""A console that goes on after its run, until pages have what that left behind."""
+"""The console of a run: it goes on until the report is there, and ends whatever happens."""
 
+import signal
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from zsim_deploy.launch.console_process import COPIED_S, SLOW_S, ending_after
-from zsim_deploy.launch.supervisor import INTERRUPT_S, Outcome
+from zsim_bridges.console.console_server import OFFER_S
+from zsim_deploy.launch.console_process import COPIED_S, INTERRUPTED_S, SLOW_S, RunConsole
+from zsim_deploy.launch.supervisor import Outcome
+
+REASON = "over"
 
 
 class LateConsole:
-    """A console that ends so long after it is asked to stop."""
+    """A console that ends so long after it is asked to stop; meanwhile a signal may come."""
 
     name = "console.run"
 
-    def __init__(self, ends_after_s: float) -> None:
+    def __init__(self, ends_after_s: float, signal_number: int = 0) -> None:
         self.left_s = ends_after_s
         self.waited_s = 0.0
         self.stopped_for = ""
         self.closed = False
+        self._signal_number = signal_number
 
     def request_stop(self, reason: str) -> None:
         self.stopped_for = reason
 
     def wait(self, timeout_s: float) -> bool:
         assert self.stopped_for
+        if self._signal_number:
+            signal.raise_signal(self._signal_number)
         waited_s = min(timeout_s, self.left_s)
         self.waited_s += waited_s
         self.left_s -= waited_s
@@ -37,31 +44,13 @@ class LateConsole:
 def end(console: LateConsole, interrupted: bool = False, report: Callable[[], None] = lambda: None) -> list[str]:
     """End a run with a console; return what was printed."""
     said: list[str] = []
-    remaining: Any = [console]
-    with ending_after(Outcome("the duration is over", interrupted=interrupted, remaining=remaining), said.append):
-        assert not console.stopped_for
+    process: Any = console
+    with RunConsole(said.append) as run_console:
+        run_console.own(process)
+        run_console.outcome = Outcome(REASON, interrupted=interrupted)
         report()
+        assert not console.stopped_for
     return said
-
-
-def test_a_console_is_asked_to_stop_when_the_report_is_there() -> None:
-    console = LateConsole(0.5)
-    assert end(console) == []
-    assert (console.stopped_for, console.waited_s, console.closed) == ("the duration is over", 0.5, True)
-
-
-def test_what_is_waited_for_long_is_named() -> None:
-    console = LateConsole(SLOW_S + 3.0)
-    assert "console.run" in end(console)[0]
-    assert console.waited_s == SLOW_S + 3.0
-
-
-@pytest.mark.parametrize("interrupted", [True, False])
-def test_nobody_is_waited_for_without_an_end(interrupted: bool) -> None:
-    console = LateConsole(1000.0)
-    end(console, interrupted)
-    assert console.waited_s == (INTERRUPT_S if interrupted else COPIED_S)
-    assert console.closed
 
 
 def raises(error: BaseException) -> Callable[[], None]:
@@ -71,9 +60,74 @@ def raises(error: BaseException) -> Callable[[], None]:
     return report
 
 
+def test_a_console_is_asked_to_stop_when_the_report_is_there() -> None:
+    console = LateConsole(0.5)
+    assert end(console) == []
+    assert (console.stopped_for, console.waited_s, console.closed) == (REASON, 0.5, True)
+
+
+def test_what_is_waited_for_long_is_named() -> None:
+    console = LateConsole(SLOW_S + 3.0)
+    (line,) = end(console)
+    assert console.name in line
+    assert console.waited_s == SLOW_S + 3.0
+
+
+def test_nobody_is_waited_for_without_an_end() -> None:
+    console = LateConsole(1000.0)
+    end(console)
+    assert (console.waited_s, console.closed) == (COPIED_S, True)
+    assert COPIED_S > OFFER_S
+
+
+def test_after_ctrl_c_a_console_has_little_time_and_is_not_named() -> None:
+    console = LateConsole(1000.0)
+    assert end(console, interrupted=True) == []
+    assert (console.waited_s, console.closed) == (INTERRUPTED_S, True)
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(130)])
 def test_who_interrupts_the_report_waits_no_longer_than_in_flight(error: BaseException) -> None:
     console = LateConsole(1000.0)
     with pytest.raises(type(error)):
         end(console, report=raises(error))
-    assert (console.waited_s, console.closed) == (INTERRUPT_S, True)
+    assert (console.waited_s, console.closed) == (INTERRUPTED_S, True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_wait_and_the_run_has_ended_as_it_did(number: int) -> None:
+    console = LateConsole(1000.0, number)
+    end(console)
+    assert (console.waited_s, console.closed) == (0.0, True)
+    failed = LateConsole(1000.0, number)
+    with pytest.raises(ValueError, match="the run failed"):
+        end(failed, report=raises(ValueError("the run failed")))
+
+
+def test_a_run_that_is_broken_off_before_it_has_an_outcome_leaves_nothing() -> None:
+    console = LateConsole(1000.0)
+    process: Any = console
+
+    def run() -> None:
+        with RunConsole(print) as run_console:
+            run_console.own(process)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert (console.waited_s, console.closed) == (INTERRUPTED_S, True)
+
+
+def test_the_console_of_a_run_whose_port_was_taken_makes_way() -> None:
+    first, second = LateConsole(0.5), LateConsole(0.5)
+    processes: Any = [first, second]
+    with RunConsole(print) as run_console:
+        for process in processes:
+            run_console.own(process)
+        assert (first.closed, second.closed) == (True, False)
+    assert second.closed
+
+
+def test_a_run_without_a_console_ends_at_once() -> None:
+    with RunConsole(print) as run_console:
+        assert run_console.process is None

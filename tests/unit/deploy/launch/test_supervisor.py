@@ -100,26 +100,10 @@ def test_a_run_that_ends_well():
 def test_a_process_that_goes_on_after_the_run_is_left_to_the_caller():
     console = Member("console.run")
     team = Team(console, Member("estimator.d1"))
-    team.watch = Supervisor(Processes(), team.show, remaining="console.run")
-    team.watch.members = list(team.members)
-    outcome = team.go()
-    assert outcome.remaining == [console]
+    team.watch.lasting = team.others[0]
+    team.go()
     assert (console.stopped_for, console.closed, console.code) == (None, False, None)
     assert all(member.closed for member in team.members if member is not console)
-
-
-def test_nobody_goes_on_after_a_run_that_was_broken_off():
-    console = Member("console.run")
-    team = Team(console)
-    team.watch = Supervisor(Processes(), team.show, remaining="console.run")
-    team.watch.members = list(team.members)
-
-    def look() -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        team.go(look)
-    assert console.closed
 
 
 @pytest.mark.parametrize("name", ["recorder", "world"])
