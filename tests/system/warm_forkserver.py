@@ -7,13 +7,11 @@ A world that stands publishes its clock more often than the contract wants, sinc
 started ends with the process that runs the test, even if that is killed; what a run under test has started does not.
 """
 
-import atexit
 import ctypes
 import os
 import signal
 import socket
 import sys
-import threading
 import traceback
 from contextlib import suppress
 from typing import NoReturn
@@ -67,23 +65,12 @@ def serve(line: int, run: str) -> NoReturn:
         sys.argv = ["forkserver", run]
         forkserver._prepare = lambda: None  # it is
         forkserver._renew_streams = RENEW_STREAMS
-        code = forkserver.main()
-    except SystemExit as end:
-        code = end.code
+        forkserver.main()
+        code = None
     except BaseException:
         traceback.print_exc()
     finally:
-        _finish(code)
-
-
-def _finish(code: object) -> NoReturn:
-    """End as an interpreter does, without the frames of the launcher that this process was forked in."""
-    with suppress(BaseException):
-        threading._shutdown()  # type: ignore[attr-defined]
-        atexit._run_exitfuncs()
-        sys.stdout.flush()
-        sys.stderr.flush()
-    os._exit(code if isinstance(code, int) else 0 if code is None else 1)
+        forkserver.finish(code)  # without the frames of the launcher that this process was forked in
 
 
 def end_with_parent() -> None:
@@ -96,4 +83,4 @@ if __name__ == "__main__":
     forkserver._renew_streams = end_with_parent
     role_launcher.RoleLauncher._start_forkserver = start
     world_process.CLOCK_STANDING_NS = STANDING_NS
-    sys.exit(forkserver.main())
+    forkserver.main()

@@ -7,6 +7,7 @@ process number. The role is a child of the launcher, not of this process, which 
 socket, or dies. A role whose number has not reached the launcher never gets that byte, and ends too.
 """
 
+import atexit
 import ctypes
 import gc
 import json
@@ -14,9 +15,11 @@ import os
 import signal
 import socket
 import sys
+import threading
+import traceback
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 READY = b"ready"
 PACKET_MAX = 1 << 17  # bytes, of a command line
@@ -25,7 +28,7 @@ ARG_START, ARG_END = 47, 48  # fields of /proc/self/stat, proc(5), counted from 
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # linux/prctl.h
 
 
-def main() -> int | None:
+def main() -> None:
     """Fork roles until the launcher closes the socket; in a role, run it."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # not inherited by what is forked
@@ -36,11 +39,11 @@ def main() -> int | None:
     while True:
         packet, files, _, _ = socket.recv_fds(launcher, PACKET_MAX, FILES)
         if not packet:
-            return None
+            return
         pid = _fork()
         if not pid:
             launcher.close()
-            return _run_role(json.loads(packet), files)
+            _run_role(json.loads(packet), files)
         for file in files:
             os.close(file)
         launcher.send(str(pid).encode())
@@ -80,11 +83,11 @@ def _fork() -> int:
     return 0
 
 
-def _run_role(arguments: list[str], files: list[int]) -> int | None:
-    """Run the role, once the launcher has its number."""
+def _run_role(arguments: list[str], files: list[int]) -> NoReturn:
+    """Run the role, once the launcher has its number, and end this process."""
     *standard, go = files
     if not os.read(go, 1):
-        return None
+        os._exit(0)
     os.close(go)
     os.setsid()
     for number, file in enumerate(standard):
@@ -93,9 +96,32 @@ def _run_role(arguments: list[str], files: list[int]) -> int | None:
     _renew_streams()
     _show_as(arguments[0], [sys.executable, "-m", "zsim_deploy.cli", *arguments])
     sys.argv = ["zsim", *arguments]
-    from zsim_deploy.cli import cli
+    code: object = 1
+    try:
+        from zsim_deploy.cli import cli
 
-    return cli.main()
+        cli.main()
+    except SystemExit as end:
+        code = end.code
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        finish(code)
+
+
+def finish(code: object) -> NoReturn:
+    """End this process as an interpreter does, but leave its memory to the system.
+
+    A role has inherited all that the fork server had imported: freeing it object by object copies every page of it.
+    """
+    with suppress(BaseException):
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+        if isinstance(code, str):
+            print(code, file=sys.stderr)
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(code if isinstance(code, int) else 0 if code is None else 1)
 
 
 def _renew_streams() -> None:
@@ -117,4 +143,4 @@ def _show_as(name: str, command: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
