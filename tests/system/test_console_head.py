@@ -122,6 +122,20 @@ def test_no_alarm_sounds_that_was_acknowledged_or_while_the_sound_is_off(head: H
     assert head.tones() == 1
 
 
+@pytest.mark.parametrize("count", [1, 2, 7])
+@pytest.mark.parametrize("acknowledged", [False, True])
+def test_whatever_alarms_there_are_the_buttons_are_in_sight_and_nothing_is_cut(
+    head: Head, count: int, acknowledged: bool
+) -> None:
+    dead = {**RED, "name": "dead", "acknowledged": acknowledged}
+    detail = "step · waiting for estimator.drone1 on lab-computer-2 (40 s), estimator.drone2 on lab-computer-2 (40 s)"
+    for size in SCREENS:
+        head.page.set_viewport_size(size)
+        head.show(detail=detail, alarms=[{**dead, "subject": f"estimator.drone{i}"} for i in range(count)])
+        assert head.page.evaluate(IN_SIGHT)
+        assert overflow(head.page) == []
+
+
 def test_an_alarm_is_acknowledged_by_its_button(head: Head) -> None:
     head.show(alarms=[RED])
     head.page.locator(".acknowledge").click()

@@ -100,9 +100,8 @@ class Console:
         say: Callable[[str], None],
     ) -> None:
         """Show a run until it is over or `stopped` returns true."""
-        self._run_page = page = RunPage(
-            self._viser.server, link, info, observer, self._camera_follow, self._frustums, self._rate_hz
-        )
+        shown_by = self._camera_follow, self._frustums, self._rate_hz, self._world
+        self._run_page = page = RunPage(self._viser.server, link, info, observer, *shown_by)
         try:
             page.run(stopped)
         finally:

@@ -26,9 +26,14 @@ class RecordPlayer:
         self.timeline: dict[str, Any] = {}
 
     def load(self) -> None:
-        """Request the timeline."""
-        if self._is_replay:
-            self.timeline = self._client.timeline()
+        """Request the timeline; where the replay stands, what it played last too, before anybody subscribed to it."""
+        if not self._is_replay:
+            return
+        self.timeline = self._client.timeline()
+        self._time_monitor.poll()
+        clock = self._time_monitor.clock
+        if clock is not None and clock.state == "paused":
+            self.play("seek", clock.t_ns / 1e9)
 
     def state(self, run: RunCondition) -> dict[str, Any]:
         """Return the timeline, with why each operation of `play` would be refused; empty of a flight."""

@@ -68,6 +68,7 @@ class RunPage:
         camera_follow: moves the page's cameras that follow the formation.
         frustums: of the drones' cameras, on the pages where they are chosen.
         rate_hz: pictures a second; None: fewer where there are many drones, or time flies.
+        world: where the run is, in words.
 
     Attributes:
         views: the newest of everything.
@@ -85,6 +86,7 @@ class RunPage:
         camera_follow: CameraFollow,
         frustums: CameraFrustums,
         rate_hz: float | None,
+        world: str = "",
     ) -> None:
         self._server = server
         self._info = info
@@ -97,7 +99,7 @@ class RunPage:
         age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
         self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
         self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command)
-        self._monitor = RunMonitor(self.views, self._time_monitor, self._scenario, bool(info.replay_of))
+        self._monitor = RunMonitor(self.views, self._time_monitor, self._scenario, bool(info.replay_of), world)
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
         self.record = RecordPlayer(self._client, self._time_monitor, bool(info.replay_of))
         hats = self._scenario.environment.hats

@@ -8,6 +8,7 @@ from zsim_bridges.console.monitoring.run_condition import RunCondition, fleet_re
 
 WAITING_SHOWN = 4  # processes that are named
 SOON_S = 0.5  # wall; a running world waits for so long now and then
+STANDS_S = 2.0  # wall; a running world that waits for longer stands, for whoever looks
 
 
 def page_head(
@@ -17,6 +18,7 @@ def page_head(
     t_ns: int,
     alarms: Sequence[dict[str, object]] = (),
     single: Sequence[str] = (),
+    world: str = "",
 ) -> dict[str, Any]:
     """Return the head of the page of a run.
 
@@ -27,11 +29,13 @@ def page_head(
         t_ns: simulated time of what is shown.
         alarms: as `AlarmBoard.rows`.
         single: drones of no formation.
+        world: where the run is, in words.
     """
-    title, detail = _words(run, clock, t_ns)
-    lines = [each for each in (name, detail, *_phases(run)) if each]
+    level = "waiting" if run.level == "running" and _stands(clock) else run.level
+    title, detail = _words(run, clock, t_ns, world)
+    lines = [each for each in (name, "replay" if run.replayed else "", detail, *_phases(run)) if each]
     refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.grounded()}
-    head = {"level": run.level, "title": title, "detail": " · ".join(lines), "t_s": t_ns / 1e9}
+    head = {"level": level, "title": title, "detail": " · ".join(lines), "t_s": t_ns / 1e9}
     return {**head, "age_s": run.silent_s, "refusals": refusals, "alarms": list(alarms)}
 
 
@@ -49,28 +53,34 @@ def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
     return {**head, "age_s": 0.0, "refusals": refusals, "alarms": []}
 
 
-def _words(run: RunCondition, clock: Clock | None, t_ns: int) -> tuple[str, str]:
+def _stands(clock: Clock | None) -> bool:
+    """Return whether time stands for so long that nobody would call that running."""
+    return clock is not None and any(each.since_wall_s > STANDS_S for each in clock.waiting_for)
+
+
+def _words(run: RunCondition, clock: Clock | None, t_ns: int, world: str) -> tuple[str, str]:
     """Return the title and the detail."""
     t_s = (t_ns or (clock.t_ns if clock else 0)) / 1e9
     if run.level == "ended":
         return f"run over at {t_s:.1f} s", run.ended
     if run.level == "silent":
         return f"no answer from the world for {run.silent_s:.0f} s", f"what is shown is of {t_s:.1f} s, and may be over"
-    state = run.clock or "no clock yet"
+    state = "waiting" if run.clock == "running" and _stands(clock) else run.clock or "no clock yet"
     pace = f" × {clock.rate:.1f}" if clock is not None and state == "running" else ""
     title = f"{state} {t_s:.1f} s{pace}"
-    return f"EMERGENCY · {title}" if run.level == "emergency" else title, _waiting(clock)
+    return f"EMERGENCY · {title}" if run.level == "emergency" else title, _waiting(clock, world)
 
 
-def _waiting(clock: Clock | None) -> str:
-    """Return which processes the world waits for, causes alone."""
+def _waiting(clock: Clock | None, world: str) -> str:
+    """Return which processes the world waits for, causes alone, and where those are awaited that never came."""
     if clock is None:
         return "waiting for the world's clock"
     late = [each for each in clock.waiting_for if clock.state == "waiting" or each.since_wall_s > SOON_S]
     late = [each for each in late if not each.held_by] or late
-    names = [f"{each.name} on {each.host} ({each.since_wall_s:.0f} s)" for each in late]
+    names = [f"{each.name}{each.host and f' on {each.host}'} ({each.since_wall_s:.0f} s)" for each in late]
     rest = [f"{len(names) - WAITING_SHOWN} more"] if len(names) > WAITING_SHOWN else []
-    return f"waiting for {', '.join([*names[:WAITING_SHOWN], *rest])}" if names else ""
+    where = f" in {world}" if world and not all(each.host for each in late) else ""
+    return f"waiting for {', '.join([*names[:WAITING_SHOWN], *rest])}{where}" if names else ""
 
 
 def _phases(run: RunCondition) -> list[str]:

@@ -24,6 +24,7 @@ class RunMonitor:
         time_monitor: of the run's clock.
         scenario: names the drones and formations.
         replayed: whether a record is played back.
+        world: where the run is, in words.
 
     Attributes:
         condition: of the run, at the last update.
@@ -33,8 +34,11 @@ class RunMonitor:
         record_end_s: simulated time of the last gate on record, of a replay.
     """
 
-    def __init__(self, views: ViewBuffer, time_monitor: TimeMonitor, scenario: Scenario, replayed: bool) -> None:
+    def __init__(
+        self, views: ViewBuffer, time_monitor: TimeMonitor, scenario: Scenario, replayed: bool, world: str = ""
+    ) -> None:
         self._views = views
+        self._world = world
         self._time_monitor = time_monitor
         self._name = scenario.name
         in_formation = {name for cluster in scenario.clusters for name in cluster.drones}
@@ -69,7 +73,8 @@ class RunMonitor:
         """Return the head of the page as plain data; called in another thread than that which draws."""
         t_ns = self._views.drones.t_ns if self._views.drones else 0
         run = self.condition._replace(silent_s=self._time_monitor.silent_s)
-        return page_head(self._name, run, self._time_monitor.clock, t_ns, self.board.rows(wall_s), self._single)
+        rows, single = self.board.rows(wall_s), self._single
+        return page_head(self._name, run, self._time_monitor.clock, t_ns, rows, single, self._world)
 
     def _alarms(self) -> list[Alarm]:
         views = self._views

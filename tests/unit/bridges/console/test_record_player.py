@@ -19,7 +19,8 @@ def player(state: str, is_replay: bool = True) -> tuple[RecordPlayer, list[Any]]
         seek=lambda t_s, step: asked.append(("seek", t_s, step)),
         request_world=lambda op, **args: asked.append((op, args)),
     )
-    monitor: Any = SimpleNamespace(clock=SimpleNamespace(state=state))
+    monitor: Any = SimpleNamespace(clock=None)
+    monitor.poll = lambda: setattr(monitor, "clock", SimpleNamespace(state=state, t_ns=8 * 10**9))
     made = RecordPlayer(client, monitor, is_replay)
     made.load()
     return made, asked
@@ -44,7 +45,14 @@ def test_a_replay_is_asked_for_it(op: str, value: float, request_: Any):
 def test_a_replay_that_stands_shows_where_it_was_put():
     made, asked = player("paused")
     made.play("seek", 4.0)
-    assert asked == [("seek", 4.0, True)]
+    assert asked[1:] == [("seek", 4.0, True)]
+
+
+def test_of_a_replay_that_stands_the_last_instant_is_asked_for_again():
+    _, asked = player("paused")
+    assert asked == [("seek", 8.0, True)]
+    for state in ("running", "stopped"):
+        assert player(state)[1] == []
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from refused import has_terms, without_tags
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import LinkState
 from zsim.contract.messages import DroneInfo
-from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health
+from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Waiting
 from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_tables import TableRows
@@ -83,8 +83,14 @@ def sample(key: str, message: Any) -> Any:
     return SimpleNamespace(key=key, payload=message if isinstance(message, bytes) else messages.encode(message))
 
 
-def clock(t_ns: int, rate: float = 1.0, run_id: str = "r1", state: Any = "running") -> Clock:
-    return Clock(t_ns, 0, run_id, 0, state, rate)
+def clock(
+    t_ns: int,
+    rate: float = 1.0,
+    run_id: str = "r1",
+    state: Any = "running",
+    waiting_for: tuple[Waiting, ...] = (),
+) -> Clock:
+    return Clock(t_ns, 0, run_id, 0, state, rate, waiting_for)
 
 
 def drones(t_ns: int) -> tuple[str, ViewDrones]:
@@ -179,6 +185,27 @@ def test_a_silent_world_is_not_called_running():
     assert head["level"] == "silent"
     assert has_terms(head["title"], "12 s")
     assert "running" not in head["title"]
+
+
+def test_a_world_in_which_time_stands_is_not_called_running_either():
+    stands = clock(7 * S, waiting_for=(Waiting("estimator.drone1", "lab", 40.0),))
+    head = page_head("step", RunCondition("running"), stands, 7 * S)
+    assert head["level"] == "waiting"
+    assert "running" not in head["title"]
+    assert has_terms(head["detail"], "estimator.drone1", "lab", "40 s")
+    blinks = clock(7 * S, waiting_for=(Waiting("estimator.drone1", "lab", 0.6),))
+    assert page_head("step", RunCondition("running"), blinks, 7 * S)["level"] == "running"
+
+
+def test_who_never_came_has_no_host_but_an_address_at_which_it_is_awaited():
+    waits = clock(0, state="waiting", waiting_for=(Waiting("controller.main", "", 18.0),))
+    head = page_head("step", RunCondition("waiting"), waits, 0, world="federation 'lab' on tcp/10.0.0.1:7447")
+    assert has_terms(head["detail"], "controller.main (18 s)", "'lab'", "tcp/10.0.0.1:7447")
+    assert " on (" not in head["detail"]
+
+
+def test_a_replay_is_named_as_one():
+    assert has_terms(page_head("step", RunCondition("running", replayed=True), clock(S), S)["detail"], "replay")
 
 
 # Estimators
