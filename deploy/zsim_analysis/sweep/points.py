@@ -181,6 +181,14 @@ class SweepResults:
         planned = self.values("as_planned", point)
         return int((planned == 1).sum()), int(np.isfinite(planned).sum())
 
+    def never_as_planned(self) -> list[int]:
+        """Return the points with finished runs of which none ended well and did what its plan says."""
+        return [point for point in range(self.design.points) if self._is_never_as_planned(point)]
+
+    def _is_never_as_planned(self, point: int) -> bool:
+        (well, runs), (planned, of) = self.ended_well(point), self.as_planned(point)
+        return bool(runs and not planned and (of or not well))  # without a cluster no run that ended well is judged
+
     def windows_s(self) -> tuple[float, float] | None:
         """Return the least start and the greatest end [s] of the judged windows, None where no run has one."""
         start, end = (self.values(f"window_{side}_s") for side in ("from", "to"))

@@ -50,6 +50,7 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: Gri
     if axis.field:
         _join_means(axes, drawn, axis)
     axis.dress(axes)
+    axis.mark(axes, results.never_as_planned())
     scale_to_samples(axes, known(results.values(panel.column)))
     if panel.printed is not None:
         _mark_printed(axes, panel.printed, upright=False)

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 from msgspec import Struct
 
-from zsim_analysis.report.pages import BLACK, BLUE, GREEN, ORANGE, PAPER_PT, PURPLE, SKY
+from zsim_analysis.report.pages import BLACK, BLUE, GREEN, ORANGE, PAPER_PT, PURPLE, SKY, VERMILION
 from zsim_analysis.sweep.axes import Grid, shown
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.report.field_names import field_name
@@ -18,6 +18,8 @@ POINTS_MAX = 24  # beside each other in one panel; the tables have all
 SERIES = (BLUE, GREEN, PURPLE, ORANGE, SKY, BLACK)  # colours of the combinations of the other fields
 DECADES_MIN = 30.0  # ratio of the greatest and the least value from which an axis is logarithmic
 TURNED_FROM = 34  # characters of all labels, with a space each, that stand side by side in a panel
+ABOVE = 1.1  # of the height of axes: clear of runs, and of the marks of intervals that leave the axes
+MARK = VERMILION
 TICKS_MAX = 8  # values that are written at an axis; of more, some
 
 
@@ -68,6 +70,12 @@ class GridAxis:
     def is_turned(self) -> bool:
         """Return whether the labels are too long to stand side by side."""
         return not self.field and sum(len(text) + 1 for text in self._labels()) > TURNED_FROM
+
+    def mark(self, axes: Axes, points: Sequence[int]) -> None:
+        """Draw a cross above axes where some points stand."""
+        style: dict[str, Any] = {"color": MARK, "ms": 6, "mew": 1.6, "clip_on": False}
+        for place in (self.places[point] for point in points if point in self.places):
+            axes.plot([place.x], [ABOVE], "x", transform=axes.get_xaxis_transform(), **style)
 
     def dress(self, axes: Axes) -> None:
         """Give axes this x axis, when all is drawn."""

@@ -21,7 +21,7 @@ from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.field_names import field_name
 from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report
-from zsim_analysis.sweep.report.sweep_figures import BEYOND_AXIS, figures, slices
+from zsim_analysis.sweep.report.sweep_figures import BEYOND_AXIS, NEVER_AS_PLANNED, figures, slices
 from zsim_analysis.sweep.report.terminal_tables import terminal_text
 from zsim_analysis.sweep.sweep_folder import locked, read_table
 from zsim_analysis.sweep.sweep_run import Row
@@ -299,3 +299,29 @@ def test_figures_of_the_user_s_own_are_drawn_and_summed_up() -> None:
     assert summary.points[0].spreads["metrics.overshoot_m"].mean.value == 2.0
     assert summary.points[1].spreads["metrics.overshoot_m"].runs == 2
     assert summary.unmeasured == {"report.metrics my_figures:overshoot: KeyError: 'main'": 1}
+
+
+def crosses(axes: Axes) -> list[float]:
+    """Return the x of the marks of points without a flight as planned."""
+    marks = [line for line in axes.lines if line.get_marker() == "x"]
+    return [float(x) for line in marks for x in np.asarray(line.get_xdata())]
+
+
+def test_points_without_a_flight_as_planned_are_marked_and_their_share_is_drawn() -> None:
+    of = plan("seed", "duration_s=1,2", runs=8)
+    rows = [{**well(of, run), "as_planned": run % 2 == 1 and run > 1} for run in range(8)]
+    results = SweepResults(SweepDesign(of), rows)
+    drawings = {each.name: each.drawing for each in figures(results)}
+    assert {tuple(crosses(axes)) for drawing in drawings.values() for axes in drawing.axes} == {(1.0,)}
+    assert all(NEVER_AS_PLANNED in named(drawing) for drawing in drawings.values())
+    shares = drawings["safety.png"].axes[0]
+    diamonds = [line for line in shares.lines if line.get_marker() == "D"]
+    assert [float(y) for line in diamonds for y in np.asarray(line.get_ydata())] == [0.0, 0.75]
+
+
+def test_figures_of_a_sweep_without_a_flight_as_planned_say_so() -> None:
+    one = plan("seed", runs=4)
+    assert drawn(one, "safety.png", as_planned=False).get_suptitle() == NEVER_AS_PLANNED
+    assert drawn(one, "true_rms.png", as_planned=False).get_suptitle() == NEVER_AS_PLANNED
+    assert drawn(one, "safety.png", as_planned=True).get_suptitle() == ""
+    assert drawn(one, "safety.png").get_suptitle() == ""  # nothing to judge
