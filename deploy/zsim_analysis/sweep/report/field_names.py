@@ -5,6 +5,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from zsim_agents.formation.spaces.cluster_space import unit as unit_of_variable
 from zsim_analysis.sweep.axes import shown
 
 UNITS = {  # by the end of a name, longer ones first
@@ -43,6 +44,7 @@ WORDS = {
     "gyro": "gyroscope",
     "takeoff": "take-off",
 }
+OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
 
 
@@ -66,10 +68,17 @@ def field_name(path: str) -> FieldName:
     kept = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
     kept = [f"{steps[0].removesuffix('s')} {kept[0]}", *kept[1:]] if kept[0].isdigit() else kept
     parted = [_parted(step) for step in kept]
+    if steps[0] == "clusters" and "plan" in steps[2:-2] and steps[-2] in OF_VARIABLES:
+        parted[-1] = _variable(steps[-1])
     unit = parted[-1][1]
     if kept[-1] in OF_CHANNEL and len(kept) > 1 and parted[-2][1]:
         unit = parted[-2][1] + OF_CHANNEL[kept[-1]]
     return FieldName(" ".join(words for words, _ in parted), unit)
+
+
+def _variable(name: str) -> tuple[str, str]:
+    """Return name and unit of a variable of a cluster: angles are in rad, in deg where their name ends so."""
+    return (name[:-4], "deg") if name.endswith("_deg") else (name, unit_of_variable(name))
 
 
 def _parted(step: str) -> tuple[str, str]:
