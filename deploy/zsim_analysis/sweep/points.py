@@ -129,6 +129,11 @@ class SweepSummary(Struct, frozen=True):
         """Return the points that a run has finished."""
         return [point for point in self.points if point.runs]
 
+    @property
+    def known(self) -> set[str]:
+        """Return the columns that some run at some point has a number of."""
+        return {column for point in self.points for column in point.spreads}
+
 
 class SweepResults:
     """The rows of a sweep in columns.

@@ -8,7 +8,7 @@ from matplotlib.ticker import MaxNLocator
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from zsim_analysis.report.pages import BLUE, GREY, PAPER_PT, VERMILION, dress, padded_range
+from zsim_analysis.report.pages import BLUE, PAPER_PT, VERMILION, dress, padded_range
 from zsim_analysis.sweep.intervals import mean_interval
 from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.grid_axis import GridAxis, Place
@@ -64,9 +64,6 @@ def known(samples: Samples) -> Samples:
 
 def _histogram(axes: Axes, samples: Samples, printed: float | None) -> bool:
     axes.set_ylabel("runs", fontsize=PAPER_PT)
-    if not len(samples):
-        axes.text(0.5, 0.5, "no data", transform=axes.transAxes, ha="center", color=GREY)
-        return False
     bins = int(np.clip(len(np.histogram_bin_edges(samples, "auto")) - 1, *BINS))
     axes.hist(samples, bins=bins, color=BLUE, alpha=0.55, edgecolor="white", lw=0.6, zorder=2)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))

@@ -1,6 +1,6 @@
 """Makes the report of a sweep: table in; summary.json, figures/*.png and report.html out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -29,8 +29,8 @@ DETAILS = ("parameter", PAPER_COLUMN, "est. std", "true std", "true RMS", "true 
 def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
     """Return report.html."""
     points = summary.flown[:POINTS_MAX]
-    known = {column for point in points for column in point.spreads}
-    names = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in known}
+    names = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in summary.known}
+    own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
     axes = axes_of(summary)
     return template("sweep.html.j2", "zsim_analysis.sweep.report").render(
         summary=summary,
@@ -40,7 +40,8 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
         points=[(*values_of(point), *overview(point)) for point in points],
         parameters=list(names),
         errors=_blocks(points, axes, {f"{prefix}.true_rms": each.titled for prefix, each in names.items()}),
-        metrics=_blocks(points, axes, {column: str(field_name(column)) for column in summary.metrics}),
+        metrics=_blocks(points, axes, own),
+        without_data=without_data(summary),
         left_out=len(summary.flown) - len(points),
         window=window_text(summary),
         paper_column=PAPER_COLUMN,
@@ -128,6 +129,23 @@ def notes(summary: SweepSummary) -> list[str]:
     return lines
 
 
+def without_data(summary: SweepSummary) -> str:
+    """Return in a sentence which quantities no run has, "" where all are known."""
+    errors = {each.titled: prefix for prefix, each in summary.parameters.items()}
+    own = {str(field_name(column)): column for column in summary.metrics}
+    kinds = (("formation errors", errors), (OWN, own))
+    known = summary.known | {column.rpartition(".")[0] for column in summary.known}
+    parts = [part for what, columns in kinds if (part := _missing(what, columns, known))]
+    return f"No run has {', nor '.join(parts)}; they are in no table and no figure." if parts else ""
+
+
+def _missing(what: str, columns: Mapping[str, str], known: Container[str]) -> str:
+    names = [name for name, column in columns.items() if column not in known]
+    if not names:
+        return ""
+    return what if len(names) == len(columns) else f"{what} of {', '.join(names)}"
+
+
 def overview(point: GridPoint) -> list[str]:
     """Return one row of the table of all points, without its label."""
     separation = point.spreads.get("min_separation_m")
@@ -138,8 +156,10 @@ def overview(point: GridPoint) -> list[str]:
 
 
 def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: dict[str, float]) -> list[list[str]]:
-    """Return the table of one point, a row per formation parameter."""
+    """Return the table of one point, a row per formation parameter; no row where no run there has errors."""
     rows = []
+    if not any(f"{prefix}.true_rms" in point.spreads for prefix in names):
+        return rows
     for prefix, parameter in names.items():
         printed = paper_std.get(parameter.name)
         paper = ["" if printed is None else f"{printed:g}"] if paper_std else []

@@ -40,27 +40,32 @@ SHARES = (("ended well", "o", GREEN), ("of these, as planned", "D", BLUE), ("of 
 
 
 def figures(results: SweepResults) -> Iterator[ReportFigure]:
-    """Yield the figures that the runs have data for."""
+    """Yield the figures that the runs have data for, with a panel for each quantity that they have."""
     parameters = dict(list(results.parameters().items())[:PANELS_MAX])
-    if parameters:
+    rms, std, own = (
+        [panel for panel in panels if len(known(results.values(panel.column)))]
+        for panels in (rms_panels(parameters), std_panels(parameters, results.paper_std), metric_panels(results))
+    )
+    if rms:
         yield ReportFigure(
             "true_rms.png",
             "How well the formation was flown",
             f"RMS of truth − desired within the window{_window(results)}." + _legend(results),
-            _panels(results, rms_panels(parameters)),
+            _panels(results, rms),
         )
+    if std:
         yield ReportFigure(
             "est_std.png",
             f"Standard deviations as the controller sees them{', beside the paper' * bool(results.paper_std)}",
             f"Standard deviation of estimate − desired within the window{_window(results)}." + _legend(results),
-            _panels(results, std_panels(parameters, results.paper_std)),
+            _panels(results, std),
         )
-    if results.metrics:
+    if own:
         yield ReportFigure(
             "metrics.png",
             "Figures of the user's own",
             f"What {results.metrics_function} returned of each run." + _legend(results),
-            _panels(results, metric_panels(results)),
+            _panels(results, own),
         )
     yield ReportFigure(
         "safety.png",
@@ -70,7 +75,7 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
         "Right: least true distance of two drones in the air." + _legend(results),
         _safety(results),
     )
-    panels = [*rms_panels(parameters), *metric_panels(results)]
+    panels = [*rms, *own]
     for i, path in enumerate(results.drawn):
         if panels:
             yield ReportFigure(
@@ -180,11 +185,13 @@ def _name_never_as_planned(figure: Figure, axes: Axes, axis: GridAxis | None) ->
 
 def _safety(results: SweepResults) -> Figure:
     axis = GridAxis(results.design) if results.design.points > 1 else None
-    figure = new_figure(PAGE_IN, 3.0)
-    shares, separation = figure.subplots(1, 2)
+    panel = Panel("min_separation_m", "least separation (m)")
+    panels = [panel] if len(known(results.values(panel.column))) else []
+    figure = new_figure(PAGE_IN if panels else COLUMN_IN, 3.0)
+    shares, *others = figure.subplots(1, 1 + len(panels), squeeze=False).ravel()
     _shares(shares, results, axis)
-    beyond = draw_distribution(separation, results, Panel("min_separation_m", "least separation (m)"), axis)
-    _name(figure, shares, results, axis, beyond)
+    beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(others, panels, strict=True)]
+    _name(figure, shares, results, axis, any(beyond))
     return figure
 
 

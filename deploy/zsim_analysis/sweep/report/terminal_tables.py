@@ -14,7 +14,7 @@ from zsim.runtime.progress import cell
 from zsim_analysis.sweep.intervals import ConfidenceInterval
 from zsim_analysis.sweep.points import FormationParameter, GridPoint, SweepSummary
 from zsim_analysis.sweep.report.field_names import field_name
-from zsim_analysis.sweep.report.make_sweep_report import axes_of, marks_of, values_of, window_text
+from zsim_analysis.sweep.report.make_sweep_report import axes_of, marks_of, values_of, window_text, without_data
 
 POINTS_MAX = 40  # on a terminal
 BETWEEN = 3  # characters between two columns of a table
@@ -51,6 +51,8 @@ class TerminalText(Struct, frozen=True):
         for part in (overview(self.summary), errors(self.summary), own_figures(self.summary)):
             if part.columns:
                 yield from part.lines(self.summary, options.max_width)
+        if missing := without_data(self.summary):
+            yield cell(missing)
 
 
 def terminal_text(summary: SweepSummary) -> TerminalText:
@@ -109,14 +111,14 @@ def own_figures(summary: SweepSummary) -> PointTable:
     columns = [
         _column(summary, str(field_name(name)), lambda point, name=name: _significant(point, name))
         for name in summary.metrics
+        if name in summary.known
     ]
     return PointTable("Figures of your own, means over the runs", "", tuple(columns))
 
 
 def errors_of_terminal(summary: SweepSummary) -> dict[str, FormationParameter]:
     """Return the parameters whose errors stand on a terminal: the paper's, else the first ones that are no heading."""
-    known = {column for point in summary.flown for column in point.spreads}
-    flown = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in known}
+    flown = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in summary.known}
     first = next((each.cluster for each in flown.values()), None)
     own = {prefix: each for prefix, each in flown.items() if each.cluster == first}
     return dict([(prefix, each) for prefix, each in own.items() if not each.name.startswith("phi_")][:ERRORS_MAX])

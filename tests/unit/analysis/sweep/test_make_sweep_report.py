@@ -20,7 +20,7 @@ from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.field_names import field_name
-from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report
+from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report, without_data
 from zsim_analysis.sweep.report.sweep_figures import BEYOND_AXIS, NEVER_AS_PLANNED, figures, slices
 from zsim_analysis.sweep.report.terminal_tables import terminal_text
 from zsim_analysis.sweep.sweep_folder import locked, read_table
@@ -325,3 +325,43 @@ def test_figures_of_a_sweep_without_a_flight_as_planned_say_so() -> None:
     assert drawn(one, "true_rms.png", as_planned=False).get_suptitle() == NEVER_AS_PLANNED
     assert drawn(one, "safety.png", as_planned=True).get_suptitle() == ""
     assert drawn(one, "safety.png").get_suptitle() == ""  # nothing to judge
+
+
+def without_errors(of: SweepPlan, run: int) -> Row:
+    """Return the row of a run whose plan was refused."""
+    row = well(of, run)
+    return {**row, **{name: None for name in row if name.startswith("errors.")}, "metrics.overshoot_m": None}
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_what_no_run_has_is_neither_in_tables_nor_in_figures(tmp_path: Path) -> None:
+    of = plan("seed", runs=2)
+    rows = [without_errors(of, run) for run in range(2)]
+    page = report_of(tmp_path, of, rows)
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"safety.png"}
+    assert page.count("<table") == 1
+    assert has_terms(without_tags(page), "formation errors", "figures of your own", "no figure")
+    summary = SweepResults(SweepDesign(of), rows).summary()
+    console = Console(file=io.StringIO(), width=200)
+    console.print(terminal_text(summary))
+    assert isinstance(console.file, io.StringIO)
+    assert "overshoot" not in console.file.getvalue()
+    assert without_data(summary) in console.file.getvalue()
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_point_without_errors_has_a_sentence_in_place_of_a_table(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=4)
+    rows = [without_errors(of, run) if run % 2 else well(of, run) for run in range(4)]
+    page = report_of(tmp_path, of, rows)
+    assert page.count("<table") == 3  # how runs ended, errors of all points, and of the first one
+    assert has_terms(without_tags(page[page.index("duration 2 s") :]), "No", "formation errors", "here")
+
+
+def test_quantities_without_data_have_no_panel() -> None:
+    of = plan("seed", runs=4)
+    assert [len(drawn(of, "true_rms.png", **{"errors.y_c.true_rms": None}).axes)] == [2]
+    assert len(drawn(of, "safety.png", min_separation_m=None).axes) == 1
+    partly = SweepResults(SweepDesign(of), [{**well(of, 0), "errors.y_c.true_rms": None, "errors.y_c.est_std": None}])
+    assert has_terms(without_data(partly.summary()), "formation errors", "y_c (m)")
+    assert without_data(SweepResults(SweepDesign(of), [well(of, 0)]).summary()) == ""
