@@ -19,6 +19,7 @@ from zsim_analysis.sweep.report.intervals_drawn import (
     mark_beyond_level,
     scale_to_samples,
 )
+from zsim_analysis.sweep.report.labels import LEVEL_LETTERS, UPRIGHT_LETTERS, wrapped
 
 Samples = NDArray[np.float64]
 
@@ -40,9 +41,9 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: Gri
     """Draw one quantity: a histogram where there is one point, else points; return if an interval leaves the axis."""
     if axis is None:
         dress(axes)
-        axes.set_xlabel(panel.label.replace("\n", " "), fontsize=PAPER_PT)
+        axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=PAPER_PT)
         return _histogram(axes, known(results.values(panel.column)), panel.printed)
-    dress(axes, panel.label)
+    dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
     drawn = []
     for point, place in axis.places.items():
         if len(samples := known(results.values(panel.column, point))):

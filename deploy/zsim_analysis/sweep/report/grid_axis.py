@@ -13,6 +13,7 @@ from zsim_analysis.report.pages import BLACK, BLUE, GREEN, ORANGE, PAPER_PT, PUR
 from zsim_analysis.sweep.axes import Grid, shown
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.report.field_names import field_name
+from zsim_analysis.sweep.report.labels import LEVEL_LETTERS, wrapped
 
 POINTS_MAX = 24  # beside each other in one panel; the tables have all
 SERIES = (BLUE, GREEN, PURPLE, ORANGE, SKY, BLACK)  # colours of the combinations of the other fields
@@ -92,7 +93,7 @@ class GridAxis:
             axes.grid(False, axis="x")
             axes.set_xlim(-0.6, len(self.places) - 0.2)
             axes.tick_params(axis="x", labelsize=PAPER_PT - 1.5 if turned else PAPER_PT - 1)
-        axes.set_xlabel(self.label, fontsize=PAPER_PT)
+        axes.set_xlabel(wrapped(self.label, LEVEL_LETTERS), fontsize=PAPER_PT)
 
     def _dress_numbers(self, axes: Axes) -> None:
         values = sorted({float(at[self.field]) for at in self._at}) if self.field else []

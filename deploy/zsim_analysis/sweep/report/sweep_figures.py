@@ -28,6 +28,7 @@ from zsim_analysis.sweep.report.distributions import PAPER, Panel, Samples, draw
 from zsim_analysis.sweep.report.field_names import field_name
 from zsim_analysis.sweep.report.grid_axis import MARK, POINTS_MAX, GridAxis, Place
 from zsim_analysis.sweep.report.intervals_drawn import DrawnInterval, mark_beyond, scale_to_samples
+from zsim_analysis.sweep.report.labels import LEVEL_LETTERS, UPRIGHT_LETTERS, wrapped
 
 PANELS_MAX = 24  # quantities in one figure; 6 drones
 COLUMNS = 3  # of panels
@@ -232,8 +233,8 @@ def _scatter(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figur
     x = results.values(path)
     beyond = False
     for axes, panel in zip(grid, panels, strict=False):
-        dress(axes, panel.label)
-        axes.set_xlabel(str(field_name(path)), fontsize=PAPER_PT)
+        dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
+        axes.set_xlabel(wrapped(str(field_name(path)), LEVEL_LETTERS), fontsize=PAPER_PT)
         y = results.values(panel.column)
         axes.plot(x, y, ".", color=BLUE, ms=4, alpha=0.45, mew=0, zorder=2)
         intervals = [DrawnInterval(middle, mean_interval(samples)) for middle, samples in slices(x, y)]

@@ -340,7 +340,7 @@ def test_what_no_run_has_is_neither_in_tables_nor_in_figures(tmp_path: Path) -> 
     page = report_of(tmp_path, of, rows)
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"safety.png"}
     assert page.count("<table") == 1
-    assert has_terms(without_tags(page), "formation errors", "figures of your own", "no figure")
+    assert has_terms(without_tags(page), "formation errors", "figures", "your own", "no figure")
     summary = SweepResults(SweepDesign(of), rows).summary()
     console = Console(file=io.StringIO(), width=200)
     console.print(terminal_text(summary))
@@ -365,3 +365,18 @@ def test_quantities_without_data_have_no_panel() -> None:
     partly = SweepResults(SweepDesign(of), [{**well(of, 0), "errors.y_c.true_rms": None, "errors.y_c.est_std": None}])
     assert has_terms(without_data(partly.summary()), "formation errors", "y_c (m)")
     assert without_data(SweepResults(SweepDesign(of), [well(of, 0)]).summary()) == ""
+
+
+@pytest.mark.parametrize("vary", [(), ("clusters.main.plan.trajectory.waypoints[0].values.p=1,2",)])
+def test_labels_of_panels_are_whole_and_do_not_touch(vary: tuple[str, ...]) -> None:
+    of = plan("seed", *vary, runs=8)
+    names = {f"errors.left.phi_{i}.est_std": 0.1 for i in range(3)}
+    more = {f"metrics.time_to_the_first_engagement_{i}_s": float(i) for i in range(3)}
+    for name in ("est_std.png", "metrics.png"):
+        figure = drawn(of, name, **names, **more)
+        figure.draw_without_rendering()
+        shown = [axes for axes in figure.axes if axes.get_visible()]
+        boxes = [text.get_window_extent() for axes in shown for text in (axes.xaxis.label, axes.yaxis.label)]
+        edges = figure.bbox.padded(1)
+        assert all(edges.contains(x, y) for box in boxes for x, y in box.corners())
+        assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
