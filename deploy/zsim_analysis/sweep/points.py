@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from zsim.errors import ScenarioError
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.report.paper import paper_table
-from zsim_analysis.sweep.axes import Draw, Seeds, shown
+from zsim_analysis.sweep.axes import Draw, Seeds
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.intervals import LEVEL, ConfidenceInterval, mean_interval, share_interval
 from zsim_analysis.sweep.metrics import metric_columns, metrics_function
@@ -66,6 +66,7 @@ class GridPoint(Struct, frozen=True):
 
     Attributes:
         values: by path; empty where only seeds and drawn values vary.
+        names: the values in short, no two of a field alike.
         runs: finished ones.
         ended_well: share of them; None without a run.
         without_collision: share of those that ended well.
@@ -77,6 +78,7 @@ class GridPoint(Struct, frozen=True):
 
     label: str
     values: dict[str, Any]
+    names: dict[str, str]
     runs: int
     ended_well: ConfidenceInterval | None
     without_collision: ConfidenceInterval | None
@@ -205,8 +207,7 @@ class SweepResults:
 
     def label(self, point: int) -> str:
         """Return the values of a point in short; "all runs" where there is no grid."""
-        values = self.design.at(point).values()
-        return " · ".join(shown(value) for value in values) or "all runs"
+        return " · ".join(self.design.names(point).values()) or "all runs"
 
     def summary(self) -> SweepSummary:
         """Return the content of summary.json."""
@@ -248,6 +249,7 @@ class SweepResults:
         return GridPoint(
             label=self.label(point),
             values=self.design.at(point),
+            names=self.design.names(point),
             runs=runs,
             ended_well=share_interval(well, runs) if runs else None,
             without_collision=share_interval(*self.without_collision(point)) if well else None,

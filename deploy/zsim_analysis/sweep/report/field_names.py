@@ -1,12 +1,10 @@
 """Fields of a scenario as a reader knows them: sensors.gps.position_m.noise is the "GPS position noise" in m. Pure."""
 
 import re
-from typing import Any
 
 from msgspec import Struct
 
 from zsim_agents.formation.spaces.cluster_space import unit as unit_of_variable
-from zsim_analysis.sweep.axes import shown
 
 UNITS = {  # by the end of a name, longer ones first
     "_kg_m2": "kg m²",
@@ -57,9 +55,9 @@ class FieldName(Struct, frozen=True):
     def __str__(self) -> str:
         return f"{self.words} ({self.unit})" if self.unit else self.words
 
-    def at(self, value: Any) -> str:
-        """Return the field with a value of it, e.g. "wind gust 1.5 m/s"."""
-        return f"{self.words} {shown(value)}{f' {self.unit}' if self.unit else ''}"
+    def at(self, value: str) -> str:
+        """Return the field with a value of it in short, e.g. "wind gust 1.5 m/s"."""
+        return f"{self.words} {value}{f' {self.unit}' if self.unit else ''}"
 
 
 def field_name(path: str) -> FieldName:

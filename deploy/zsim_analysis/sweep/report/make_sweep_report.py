@@ -9,7 +9,6 @@ import numpy as np
 from zsim.errors import ReportError
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
-from zsim_analysis.sweep.axes import shown
 from zsim_analysis.sweep.intervals import ConfidenceInterval
 from zsim_analysis.sweep.points import Distribution, FormationParameter, GridPoint, SweepResults, SweepSummary
 from zsim_analysis.sweep.report.field_names import FieldName, field_name
@@ -59,11 +58,11 @@ def axes_of(summary: SweepSummary) -> list[FieldName]:
 
 def values_of(point: GridPoint) -> list[str]:
     """Return the values of a point, as many as `axes_of` has names."""
-    return [shown(value) for value in point.values.values()] or [point.label]
+    return list(point.names.values()) or [point.label]
 
 
 def _heading(point: GridPoint) -> str:
-    return ", ".join(field_name(path).at(value) for path, value in point.values.items()) or point.label
+    return ", ".join(field_name(path).at(value) for path, value in point.names.items()) or point.label
 
 
 def _blocks(points: Sequence[GridPoint], axes: Sequence[FieldName], titles: dict[str, str]) -> list[Block]:

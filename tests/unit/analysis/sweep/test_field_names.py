@@ -37,5 +37,5 @@ def test_a_path_has_words_and_a_unit(path: str, name: str) -> None:
 
 
 def test_a_value_stands_with_its_unit() -> None:
-    assert field_name("environment.wind.gust_m_s").at(1.5) == "wind gust 1.5 m/s"
-    assert field_name("estimation.flow").at(True) == "estimation flow true"
+    assert field_name("environment.wind.gust_m_s").at("1.5") == "wind gust 1.5 m/s"
+    assert field_name("estimation.flow").at("true") == "estimation flow true"

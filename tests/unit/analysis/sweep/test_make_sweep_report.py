@@ -1,5 +1,6 @@
 """The report of a sweep: summary, figures and page."""
 
+import html
 import io
 import re
 from pathlib import Path
@@ -380,3 +381,18 @@ def test_labels_of_panels_are_whole_and_do_not_touch(vary: tuple[str, ...]) -> N
         edges = figure.bbox.padded(1)
         assert all(edges.contains(x, y) for box in boxes for x, y in box.corners())
         assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_values_that_begin_alike_have_rows_and_labels_that_differ(tmp_path: Path) -> None:
+    of = plan("seed", f"faults={dropout('drone1')},{dropout('drone2')}", "wind.gust_m_s=0,1", runs=4)
+    rows = [well(of, run) for run in range(4)]
+    summary = SweepResults(SweepDesign(of), rows).summary()
+    assert len({point.label for point in summary.points}) == 4
+    page = without_tags(report_of(tmp_path, of, rows))
+    assert all(point.names["faults"] in html.unescape(page) for point in summary.points)
+    assert {"drone1", "drone2"} <= set(re.findall(r"drone\d", " ".join(named(drawn(of, "true_rms.png")))))
+
+
+def dropout(drone: str) -> str:
+    return f"[{{kind: gps_dropout, target: {drone}, at_s: 20}}]"
