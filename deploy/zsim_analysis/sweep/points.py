@@ -137,6 +137,12 @@ class SweepSummary(Struct, frozen=True):
         return {column for point in self.points for column in point.spreads}
 
 
+def window_text(window_s: tuple[float, float]) -> str:
+    """Return a judged window, to 0.01 s."""
+    start, end = (f"{side:.2f}".rstrip("0").rstrip(".") for side in window_s)
+    return f"{start} to {end} s"
+
+
 class SweepResults:
     """The rows of a sweep in columns.
 

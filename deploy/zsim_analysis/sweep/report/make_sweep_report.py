@@ -10,7 +10,14 @@ from zsim.errors import ReportError
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
 from zsim_analysis.sweep.intervals import ConfidenceInterval
-from zsim_analysis.sweep.points import Distribution, FormationParameter, GridPoint, SweepResults, SweepSummary
+from zsim_analysis.sweep.points import (
+    Distribution,
+    FormationParameter,
+    GridPoint,
+    SweepResults,
+    SweepSummary,
+    window_text,
+)
 from zsim_analysis.sweep.report.field_names import FieldName, field_name
 from zsim_analysis.sweep.report.sweep_figures import figures
 from zsim_analysis.sweep.sweep_folder import load
@@ -42,7 +49,7 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
         metrics=_blocks(points, axes, own),
         without_data=without_data(summary),
         left_out=len(summary.flown) - len(points),
-        window=window_text(summary),
+        window=windows_of(summary),
         paper_column=PAPER_COLUMN,
         details=[column for column in DETAILS if column != PAPER_COLUMN or summary.paper_std],
         tables=[(_heading(point), details(point, names, summary.paper_std)) for point in points[:DETAILED_MAX]],
@@ -68,7 +75,7 @@ def _heading(point: GridPoint) -> str:
 def _blocks(points: Sequence[GridPoint], axes: Sequence[FieldName], titles: dict[str, str]) -> list[Block]:
     """Return the means of some columns at each point as tables that fit the page: their heads, and their rows."""
     columns, across = list(titles), max(2, BLOCK_COLUMNS - len(axes))
-    parts = [columns[start : start + across] for start in range(0, len(columns), across)]
+    parts = np.array_split(np.array(columns, object), max(1, -(-len(columns) // across))) if columns else []
     return [
         (
             [*map(str, axes), *(titles[column] for column in part)],
@@ -87,15 +94,15 @@ def facts(summary: SweepSummary) -> list[tuple[str, str]]:
         ("Varied", " ".join(summary.vary) or "nothing"),
         ("Runs", f"{summary.finished} of {summary.runs} finished, {well} of them ended well"),
         ("Flown", f"{summary.flown_wall_s:.0f} s of wall time in all, on {hosts or 'no host'}"),
-        ("Window", window_text(summary)),
+        ("Window", windows_of(summary)),
         ("Fingerprint", ", ".join(summary.fingerprints) or "not known"),
         ("Version", summary.version),
     ]
 
 
-def window_text(summary: SweepSummary) -> str:
+def windows_of(summary: SweepSummary) -> str:
     """Return the judged windows of all runs in words."""
-    return "{:g} to {:g} s".format(*summary.windows_s) if summary.windows_s else "not known"
+    return window_text(summary.windows_s) if summary.windows_s else "not known"
 
 
 def marks_of(summary: SweepSummary) -> list[str]:
@@ -105,7 +112,7 @@ def marks_of(summary: SweepSummary) -> list[str]:
     if summary.judged_unengaged:
         lines.append(
             f"{summary.judged_unengaged} {runs} were judged while a cluster was not engaged "
-            f"(window {window_text(summary)}); give a window after the engagement, report.window_s"
+            f"(window {windows_of(summary)}); give a window after the engagement, report.window_s"
         )
     return lines
 

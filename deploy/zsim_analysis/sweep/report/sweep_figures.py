@@ -23,7 +23,7 @@ from zsim_analysis.report.pages import (
     new_figure,
 )
 from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
-from zsim_analysis.sweep.points import FormationParameter, SweepResults
+from zsim_analysis.sweep.points import FormationParameter, SweepResults, window_text
 from zsim_analysis.sweep.report.distributions import PAPER, Panel, Samples, draw_distribution, known
 from zsim_analysis.sweep.report.field_names import field_name
 from zsim_analysis.sweep.report.grid_axis import MARK, POINTS_MAX, GridAxis, Place
@@ -118,7 +118,7 @@ def _symbol(parameter: FormationParameter) -> str:
 
 def _window(results: SweepResults) -> str:
     windows_s = results.windows_s()
-    return " ({:g} to {:g} s)".format(*windows_s) if windows_s else ""
+    return f" ({window_text(windows_s)})" if windows_s else ""
 
 
 def _legend(results: SweepResults) -> str:

@@ -14,7 +14,7 @@ from zsim.runtime.progress import cell
 from zsim_analysis.sweep.intervals import ConfidenceInterval
 from zsim_analysis.sweep.points import FormationParameter, GridPoint, SweepSummary
 from zsim_analysis.sweep.report.field_names import field_name
-from zsim_analysis.sweep.report.make_sweep_report import axes_of, marks_of, values_of, window_text, without_data
+from zsim_analysis.sweep.report.make_sweep_report import axes_of, marks_of, values_of, windows_of, without_data
 
 POINTS_MAX = 40  # on a terminal
 BETWEEN = 3  # characters between two columns of a table
@@ -102,7 +102,7 @@ def errors(summary: SweepSummary) -> PointTable:
         _column(summary, each.name, lambda point, prefix=prefix: _mean(point, f"{prefix}.true_rms"))
         for prefix, each in names.items()
     ]
-    title = f"RMS of truth − desired{of} from {window_text(summary)}, means over the runs"
+    title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs"
     return PointTable(title, "in m; angles in rad\n", tuple(columns))
 
 
@@ -159,17 +159,25 @@ def _axis_columns(summary: SweepSummary) -> list[TerminalColumn]:
     return [TerminalColumn(" · ".join(names), tuple(" · ".join(row) for row in rows))]
 
 
-def _parted(columns: Sequence[TerminalColumn], room: int) -> list[list[TerminalColumn]]:
-    """Return columns in parts that fit a room in characters, at least one in each."""
-    parts: list[list[TerminalColumn]] = [[]]
-    left = room
-    for column in columns:
-        if parts[-1] and column.width + BETWEEN > left:
-            parts.append([])
-            left = room
-        parts[-1].append(column)
-        left -= column.width + BETWEEN
-    return parts
+def _parted(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:
+    """Return columns in parts that fit a room in characters: none of one column if that can be, few, of like number."""
+    best: list[tuple[tuple[int, int, int], list[Sequence[TerminalColumn]]]] = [((0, 0, 0), [])]
+    for end in range(1, len(columns) + 1):
+        starts = [start for start in range(end) if start == end - 1 or _width(columns[start:end]) <= room]
+        ways = [(_with_part(best[start][0], end - start), start) for start in starts]
+        cost, start = min(ways)
+        best.append((cost, [*best[start][1], columns[start:end]]))
+    return best[-1][1]
+
+
+def _width(columns: Sequence[TerminalColumn]) -> int:
+    return sum(column.width + BETWEEN for column in columns)
+
+
+def _with_part(cost: tuple[int, int, int], count: int) -> tuple[int, int, int]:
+    """Return the cost of parts and one more, of `count` columns: single ones, how many, and how unlike they are."""
+    single, parts, squares = cost
+    return single + (count == 1), parts + 1, squares + count**2
 
 
 def _table(columns: Sequence[TerminalColumn], axes: int) -> Table:

@@ -396,3 +396,42 @@ def test_values_that_begin_alike_have_rows_and_labels_that_differ(tmp_path: Path
 
 def dropout(drone: str) -> str:
     return f"[{{kind: gps_dropout, target: {drone}, at_s: 20}}]"
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_windows_have_two_decimals_at_most(tmp_path: Path) -> None:
+    of = plan("seed", runs=2)
+    known = {"window_from_s": 40 / 3, "window_to_s": 1234567.0, "engaged_throughout": False}
+    rows = [{**well(of, run), **known} for run in range(2)]
+    page = report_of(tmp_path, of, rows)
+    assert "13.33 to 1234567 s" in page
+    assert "13.333" not in page
+    captions = [each.caption for each in figures(SweepResults(SweepDesign(of), rows))]
+    assert sum("13.33 to 1234567 s" in caption for caption in captions) == 2
+
+
+def heads(text: str) -> list[list[str]]:
+    """Return the last words of the heads of the tables on a terminal."""
+    lines = text.splitlines()
+    return [lines[place - 1].split() for place, line in enumerate(lines) if "──" in line]
+
+
+@pytest.mark.parametrize("width", [50, 56, 62, 80])
+def test_the_columns_of_a_terminal_are_shared_out_so_that_no_table_has_one(width: int) -> None:
+    of = plan("seed", "clusters.main.plan.target.p=0.5,4", runs=4)
+    more = {f"errors.v_{i}.true_rms": 0.1 for i in range(6)}
+    rows = [{**well(of, run), **more} for run in range(4)]
+    console = Console(file=io.StringIO(), width=width)
+    console.print(terminal_text(SweepResults(SweepDesign(of), rows).summary()))
+    assert isinstance(console.file, io.StringIO)
+    tables = [head[1:] for head in heads(console.file.getvalue())]
+    assert all(len(head) >= 2 for head in tables)
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_the_columns_of_the_page_are_shared_out_so_that_no_table_has_one(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=4)
+    more = {f"errors.v_{i}.true_rms": 0.1 for i in range(8)}
+    page = report_of(tmp_path, of, [{**well(of, run), **more} for run in range(4)])
+    part = page[page.index("Formation errors at") : page.index("<h2>Figures")]
+    assert [row.count("<th>") - 1 for row in part.split("<tr>") if "<th>" in row] == [4, 4, 3]
