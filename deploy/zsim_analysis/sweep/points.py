@@ -86,6 +86,16 @@ class GridPoint(Struct, frozen=True):
     as_planned: ConfidenceInterval | None
     spreads: dict[str, Distribution]
 
+    @property
+    def well(self) -> int:
+        """Return how many runs ended well."""
+        return round(self.ended_well.value * self.runs) if self.ended_well else 0
+
+    def count(self, column: str) -> str:
+        """Return of how many runs a mean is, "" where it is of all that ended well."""
+        spread = self.spreads.get(column)
+        return count_text(spread.runs, self.well) if spread else ""
+
 
 class SweepSummary(Struct, frozen=True):
     """summary.json of a sweep.
@@ -135,6 +145,11 @@ class SweepSummary(Struct, frozen=True):
     def known(self) -> set[str]:
         """Return the columns that some run at some point has a number of."""
         return {column for point in self.points for column in point.spreads}
+
+
+def count_text(count: int, of: int) -> str:
+    """Return the number of runs behind a mean where it is less than the whole, else ""."""
+    return f"n = {count}" if count < of else ""
 
 
 def window_text(window_s: tuple[float, float]) -> str:

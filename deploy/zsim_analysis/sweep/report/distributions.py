@@ -1,6 +1,7 @@
 """One quantity of a sweep in a panel: a histogram of one point, else the runs of every point with their mean."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from zsim_analysis.report.pages import BLUE, PAPER_PT, VERMILION, dress, padded_range
 from zsim_analysis.sweep.intervals import mean_interval
-from zsim_analysis.sweep.points import SweepResults
+from zsim_analysis.sweep.points import SweepResults, count_text
 from zsim_analysis.sweep.report.grid_axis import GridAxis, Place
 from zsim_analysis.sweep.report.intervals_drawn import (
     ROOM,
@@ -42,12 +43,16 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: Gri
     if axis is None:
         dress(axes)
         axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=PAPER_PT)
-        return _histogram(axes, known(results.values(panel.column)), panel.printed)
+        samples = known(results.values(panel.column))
+        count = count_text(len(samples), results.ended_well(0)[0])
+        axes.text(0.98, 0.9, count, transform=axes.transAxes, ha="right", fontsize=PAPER_PT - 1, zorder=6)
+        return _histogram(axes, samples, panel.printed)
     dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
     drawn = []
     for point, place in axis.places.items():
         if len(samples := known(results.values(panel.column, point))):
             drawn.append(_draw_point(axes, samples, place, axis))
+            _count_beside(axes, drawn[-1][1], count_text(len(samples), results.ended_well(point)[0]))
     if axis.field:
         _join_means(axes, drawn, axis)
     axis.dress(axes)
@@ -94,6 +99,14 @@ def _draw_point(axes: Axes, samples: Samples, place: Place, axis: GridAxis) -> t
     interval = DrawnInterval(mean_x, mean_interval(samples), mean_colour)
     interval.draw(axes)
     return place, interval
+
+
+def _count_beside(axes: Axes, interval: DrawnInterval, count: str) -> None:
+    """Write at a mean of how many runs it is, where that is less than the legend says."""
+    if count:
+        at = (interval.x, interval.mean.value)
+        offset: dict[str, Any] = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
+        axes.annotate(count, at, fontsize=PAPER_PT - 1, color=interval.colour, zorder=6, **offset)
 
 
 def _join_means(axes: Axes, drawn: Sequence[tuple[Place, DrawnInterval]], axis: GridAxis) -> None:

@@ -158,7 +158,8 @@ def overview(point: GridPoint) -> list[str]:
     least = "–" if separation is None else f"{separation.least:.2f}"
     engaged = "–" if point.engaged is None else str(point.engaged)
     well, planned, apart = map(_share, (point.ended_well, point.as_planned, point.without_collision))
-    return [str(point.runs), well, planned, engaged, apart, _spread(separation), least]
+    mean = _noted(_spread(separation), point.count("min_separation_m"))
+    return [str(point.runs), well, planned, engaged, apart, mean, least]
 
 
 def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: dict[str, float]) -> list[list[str]]:
@@ -177,7 +178,11 @@ def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: d
 
 
 def _mean(point: GridPoint, column: str) -> str:
-    return _spread(point.spreads.get(column), 4)
+    return _noted(_spread(point.spreads.get(column), 4), point.count(column))
+
+
+def _noted(text: str, count: str) -> str:
+    return f"{text} ({count})" if count else text
 
 
 def _spread(samples: Distribution | None, digits: int = 2) -> str:

@@ -134,12 +134,18 @@ def _percent(share: ConfidenceInterval | None) -> str:
 
 def _mean(point: GridPoint, column: str, digits: int = 3) -> str:
     samples = point.spreads.get(column)
-    return "–" if samples is None else f"{samples.mean.value:.{digits}f}"
+    return "–" if samples is None else f"{samples.mean.value:.{digits}f}{_count(point, column)}"
 
 
 def _significant(point: GridPoint, column: str) -> str:
     samples = point.spreads.get(column)
-    return "–" if samples is None else f"{samples.mean.value:.4g}"
+    return "–" if samples is None else f"{samples.mean.value:.4g}{_count(point, column)}"
+
+
+def _count(point: GridPoint, column: str) -> str:
+    """Return of how many runs a mean is, where they are fewer than ended well."""
+    count = point.count(column).replace(" ", "")
+    return f" ({count})" if count else ""
 
 
 def _least(point: GridPoint) -> str:

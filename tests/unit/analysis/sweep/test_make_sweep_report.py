@@ -435,3 +435,33 @@ def test_the_columns_of_the_page_are_shared_out_so_that_no_table_has_one(tmp_pat
     page = report_of(tmp_path, of, [{**well(of, run), **more} for run in range(4)])
     part = page[page.index("Formation errors at") : page.index("<h2>Figures")]
     assert [row.count("<th>") - 1 for row in part.split("<tr>") if "<th>" in row] == [4, 4, 3]
+
+
+def counts(axes: Axes) -> list[str]:
+    """Return the numbers of runs that are written in a panel."""
+    return [text.get_text() for text in axes.texts if text.get_text().startswith("n ")]
+
+
+@pytest.mark.parametrize("vary", [(), ("duration_s=1,2",)])
+def test_a_mean_of_fewer_runs_than_the_legend_says_has_its_number(vary: tuple[str, ...]) -> None:
+    of = plan("seed", *vary, runs=2 * (1 + len(vary)))
+    rows = [{**well(of, run), "metrics.settled_s": None if run == 0 else 10.3 + run} for run in range(of.runs)]
+    results = SweepResults(SweepDesign(of), rows)
+    drawings = {each.name: each.drawing for each in figures(results)}
+    assert [counts(axes) for axes in drawings["metrics.png"].axes] == [["n = 1"]]
+    assert not any(counts(axes) for axes in drawings["true_rms.png"].axes)
+    summary = results.summary()
+    assert summary.points[0].count("metrics.settled_s") == "n = 1"
+    console = Console(file=io.StringIO(), width=80)
+    console.print(terminal_text(summary))
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue().count("(n=1)") == 1
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_table_has_the_number_of_a_mean_of_fewer_runs(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=4)
+    rows = [{**well(of, run), "metrics.settled_s": None if run == 0 else 10.3} for run in range(4)]
+    page = report_of(tmp_path, of, rows)
+    assert "<td>10.3000 (n = 1)</td>" in page
+    assert page.count("(n = ") == 1
