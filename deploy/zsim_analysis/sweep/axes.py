@@ -4,7 +4,8 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,11 @@ class Grid(Struct, frozen=True):
 
     path: str
     values: tuple[Any, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Return the values in short, no two of them alike."""
+        return _distinct(self.values)
 
 
 class Draw(Struct, frozen=True):
@@ -113,6 +119,33 @@ def text_of(value: Any) -> str:
 def shown(value: Any) -> str:
     """Return a value in short, for tables and figures."""
     text = f"{value:g}" if isinstance(value, float) else text_of(value)
+    return _cut(text)
+
+
+def _distinct(values: Sequence[Any]) -> list[str]:
+    """Return values in short; of those that are cut to the same text the part that differs, else their place too."""
+    names = [shown(value) for value in values]
+    for short in [name for name, count in Counter(names).items() if count > 1]:
+        alike = [place for place, name in enumerate(names) if name == short]
+        parts = _differing([text_of(values[place]) for place in alike])
+        others = {name for name in names if name != short}
+        is_distinct = len({*parts, *others}) == len(parts) + len(others)
+        for place, part in zip(alike, parts, strict=True):
+            names[place] = part if is_distinct else f"{short} ({place + 1})"
+    return names
+
+
+def _differing(texts: Sequence[str]) -> list[str]:
+    """Return what texts have from the word on that is not the same in all of them, cut; short ones are whole."""
+    if all(len(text) <= SHOWN_MAX for text in texts):
+        return list(texts)
+    letters = enumerate(zip(*texts, strict=False))
+    whole = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
+    start = max(texts[0].rfind(mark, 0, whole) for mark in " ,[{:") + 1
+    return [_cut(f"…{text[start:]}" if start else text) for text in texts]
+
+
+def _cut(text: str) -> str:
     return text if len(text) <= SHOWN_MAX else f"{text[: SHOWN_MAX - 1]}…"
 
 

@@ -109,11 +109,23 @@ class SweepDesign:
 
     def at(self, point: int) -> dict[str, Any]:
         """Return the values of a point by path; those of the last axis change fastest."""
-        values = {}
+        return {grid.path: grid.values[place] for grid, place in self._places(point)}
+
+    def names(self, point: int) -> dict[str, str]:
+        """Return the values of a point in short by path, no two values of a field alike."""
+        return {grid.path: self._names[grid.path][place] for grid, place in self._places(point)}
+
+    def _places(self, point: int) -> list[tuple[Grid, int]]:
+        """Return the axes of the grid, each with the place of a point's value in it."""
+        places = []
         for grid in reversed(self._grids):
-            point, index = divmod(point, len(grid.values))
-            values[grid.path] = grid.values[index]
-        return dict(reversed(values.items()))
+            point, place = divmod(point, len(grid.values))
+            places.append((grid, place))
+        return places[::-1]
+
+    @cached_property
+    def _names(self) -> dict[str, list[str]]:
+        return {grid.path: grid.names for grid in self._grids}
 
     def values(self, run: int) -> dict[str, Any]:
         """Return what a run sets, by path, in the order of the axes."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from zsim.errors import ScenarioError
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.report.paper import paper_table
-from zsim_analysis.sweep.axes import Draw, Seeds, shown
+from zsim_analysis.sweep.axes import Draw, Seeds
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.intervals import LEVEL, ConfidenceInterval, mean_interval, share_interval
 from zsim_analysis.sweep.metrics import metric_columns, metrics_function
@@ -66,6 +66,7 @@ class GridPoint(Struct, frozen=True):
 
     Attributes:
         values: by path; empty where only seeds and drawn values vary.
+        names: the values in short, no two of a field alike.
         runs: finished ones.
         ended_well: share of them; None without a run.
         without_collision: share of those that ended well.
@@ -77,12 +78,23 @@ class GridPoint(Struct, frozen=True):
 
     label: str
     values: dict[str, Any]
+    names: dict[str, str]
     runs: int
     ended_well: ConfidenceInterval | None
     without_collision: ConfidenceInterval | None
     engaged: int | None
     as_planned: ConfidenceInterval | None
     spreads: dict[str, Distribution]
+
+    @property
+    def well(self) -> int:
+        """Return how many runs ended well."""
+        return round(self.ended_well.value * self.runs) if self.ended_well else 0
+
+    def count(self, column: str) -> str:
+        """Return of how many runs a mean is, "" where it is of all that ended well."""
+        spread = self.spreads.get(column)
+        return count_text(spread.runs, self.well) if spread else ""
 
 
 class SweepSummary(Struct, frozen=True):
@@ -128,6 +140,22 @@ class SweepSummary(Struct, frozen=True):
     def flown(self) -> list[GridPoint]:
         """Return the points that a run has finished."""
         return [point for point in self.points if point.runs]
+
+    @property
+    def known(self) -> set[str]:
+        """Return the columns that some run at some point has a number of."""
+        return {column for point in self.points for column in point.spreads}
+
+
+def count_text(count: int, of: int) -> str:
+    """Return the number of runs behind a mean where it is less than the whole, else ""."""
+    return f"n = {count}" if count < of else ""
+
+
+def window_text(window_s: tuple[float, float]) -> str:
+    """Return a judged window, to 0.01 s."""
+    start, end = (f"{side:.2f}".rstrip("0").rstrip(".") for side in window_s)
+    return f"{start} to {end} s"
 
 
 class SweepResults:
@@ -181,6 +209,14 @@ class SweepResults:
         planned = self.values("as_planned", point)
         return int((planned == 1).sum()), int(np.isfinite(planned).sum())
 
+    def never_as_planned(self) -> list[int]:
+        """Return the points with finished runs of which none ended well and did what its plan says."""
+        return [point for point in range(self.design.points) if self._is_never_as_planned(point)]
+
+    def _is_never_as_planned(self, point: int) -> bool:
+        (well, runs), (planned, of) = self.ended_well(point), self.as_planned(point)
+        return bool(runs and not planned and (of or not well))  # without a cluster no run that ended well is judged
+
     def windows_s(self) -> tuple[float, float] | None:
         """Return the least start and the greatest end [s] of the judged windows, None where no run has one."""
         start, end = (self.values(f"window_{side}_s") for side in ("from", "to"))
@@ -192,8 +228,7 @@ class SweepResults:
 
     def label(self, point: int) -> str:
         """Return the values of a point in short; "all runs" where there is no grid."""
-        values = self.design.at(point).values()
-        return " · ".join(shown(value) for value in values) or "all runs"
+        return " · ".join(self.design.names(point).values()) or "all runs"
 
     def summary(self) -> SweepSummary:
         """Return the content of summary.json."""
@@ -235,6 +270,7 @@ class SweepResults:
         return GridPoint(
             label=self.label(point),
             values=self.design.at(point),
+            names=self.design.names(point),
             runs=runs,
             ended_well=share_interval(well, runs) if runs else None,
             without_collision=share_interval(*self.without_collision(point)) if well else None,

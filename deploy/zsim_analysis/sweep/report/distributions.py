@@ -1,6 +1,7 @@
 """One quantity of a sweep in a panel: a histogram of one point, else the runs of every point with their mean."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,9 +9,9 @@ from matplotlib.ticker import MaxNLocator
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from zsim_analysis.report.pages import BLUE, GREY, PAPER_PT, VERMILION, dress, padded_range
+from zsim_analysis.report.pages import BLUE, PAPER_PT, VERMILION, dress, padded_range
 from zsim_analysis.sweep.intervals import mean_interval
-from zsim_analysis.sweep.points import SweepResults
+from zsim_analysis.sweep.points import SweepResults, count_text
 from zsim_analysis.sweep.report.grid_axis import GridAxis, Place
 from zsim_analysis.sweep.report.intervals_drawn import (
     ROOM,
@@ -19,6 +20,7 @@ from zsim_analysis.sweep.report.intervals_drawn import (
     mark_beyond_level,
     scale_to_samples,
 )
+from zsim_analysis.sweep.report.labels import LEVEL_LETTERS, UPRIGHT_LETTERS, wrapped
 
 Samples = NDArray[np.float64]
 
@@ -40,16 +42,21 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: Gri
     """Draw one quantity: a histogram where there is one point, else points; return if an interval leaves the axis."""
     if axis is None:
         dress(axes)
-        axes.set_xlabel(panel.label.replace("\n", " "), fontsize=PAPER_PT)
-        return _histogram(axes, known(results.values(panel.column)), panel.printed)
-    dress(axes, panel.label)
+        axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=PAPER_PT)
+        samples = known(results.values(panel.column))
+        count = count_text(len(samples), results.ended_well(0)[0])
+        axes.text(0.98, 0.9, count, transform=axes.transAxes, ha="right", fontsize=PAPER_PT - 1, zorder=6)
+        return _histogram(axes, samples, panel.printed)
+    dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
     drawn = []
     for point, place in axis.places.items():
         if len(samples := known(results.values(panel.column, point))):
             drawn.append(_draw_point(axes, samples, place, axis))
+            _count_beside(axes, drawn[-1][1], count_text(len(samples), results.ended_well(point)[0]))
     if axis.field:
         _join_means(axes, drawn, axis)
     axis.dress(axes)
+    axis.mark(axes, results.never_as_planned())
     scale_to_samples(axes, known(results.values(panel.column)))
     if panel.printed is not None:
         _mark_printed(axes, panel.printed, upright=False)
@@ -63,9 +70,6 @@ def known(samples: Samples) -> Samples:
 
 def _histogram(axes: Axes, samples: Samples, printed: float | None) -> bool:
     axes.set_ylabel("runs", fontsize=PAPER_PT)
-    if not len(samples):
-        axes.text(0.5, 0.5, "no data", transform=axes.transAxes, ha="center", color=GREY)
-        return False
     bins = int(np.clip(len(np.histogram_bin_edges(samples, "auto")) - 1, *BINS))
     axes.hist(samples, bins=bins, color=BLUE, alpha=0.55, edgecolor="white", lw=0.6, zorder=2)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
@@ -95,6 +99,14 @@ def _draw_point(axes: Axes, samples: Samples, place: Place, axis: GridAxis) -> t
     interval = DrawnInterval(mean_x, mean_interval(samples), mean_colour)
     interval.draw(axes)
     return place, interval
+
+
+def _count_beside(axes: Axes, interval: DrawnInterval, count: str) -> None:
+    """Write at a mean of how many runs it is, where that is less than the legend says."""
+    if count:
+        at = (interval.x, interval.mean.value)
+        offset: dict[str, Any] = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
+        axes.annotate(count, at, fontsize=PAPER_PT - 1, color=interval.colour, zorder=6, **offset)
 
 
 def _join_means(axes: Axes, drawn: Sequence[tuple[Place, DrawnInterval]], axis: GridAxis) -> None:

@@ -1,11 +1,10 @@
 """Fields of a scenario as a reader knows them: sensors.gps.position_m.noise is the "GPS position noise" in m. Pure."""
 
 import re
-from typing import Any
 
 from msgspec import Struct
 
-from zsim_analysis.sweep.axes import shown
+from zsim_agents.formation.spaces.cluster_space import unit as unit_of_variable
 
 UNITS = {  # by the end of a name, longer ones first
     "_kg_m2": "kg m²",
@@ -43,6 +42,7 @@ WORDS = {
     "gyro": "gyroscope",
     "takeoff": "take-off",
 }
+OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
 
 
@@ -55,9 +55,9 @@ class FieldName(Struct, frozen=True):
     def __str__(self) -> str:
         return f"{self.words} ({self.unit})" if self.unit else self.words
 
-    def at(self, value: Any) -> str:
-        """Return the field with a value of it, e.g. "wind gust 1.5 m/s"."""
-        return f"{self.words} {shown(value)}{f' {self.unit}' if self.unit else ''}"
+    def at(self, value: str) -> str:
+        """Return the field with a value of it in short, e.g. "wind gust 1.5 m/s"."""
+        return f"{self.words} {value}{f' {self.unit}' if self.unit else ''}"
 
 
 def field_name(path: str) -> FieldName:
@@ -66,10 +66,17 @@ def field_name(path: str) -> FieldName:
     kept = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
     kept = [f"{steps[0].removesuffix('s')} {kept[0]}", *kept[1:]] if kept[0].isdigit() else kept
     parted = [_parted(step) for step in kept]
+    if steps[0] == "clusters" and "plan" in steps[2:-2] and steps[-2] in OF_VARIABLES:
+        parted[-1] = _variable(steps[-1])
     unit = parted[-1][1]
     if kept[-1] in OF_CHANNEL and len(kept) > 1 and parted[-2][1]:
         unit = parted[-2][1] + OF_CHANNEL[kept[-1]]
     return FieldName(" ".join(words for words, _ in parted), unit)
+
+
+def _variable(name: str) -> tuple[str, str]:
+    """Return name and unit of a variable of a cluster: angles are in rad, in deg where their name ends so."""
+    return (name[:-4], "deg") if name.endswith("_deg") else (name, unit_of_variable(name))
 
 
 def _parted(step: str) -> tuple[str, str]:

@@ -1,6 +1,6 @@
 """Makes the report of a sweep: table in; summary.json, figures/*.png and report.html out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -9,9 +9,15 @@ import numpy as np
 from zsim.errors import ReportError
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
-from zsim_analysis.sweep.axes import shown
 from zsim_analysis.sweep.intervals import ConfidenceInterval
-from zsim_analysis.sweep.points import Distribution, FormationParameter, GridPoint, SweepResults, SweepSummary
+from zsim_analysis.sweep.points import (
+    Distribution,
+    FormationParameter,
+    GridPoint,
+    SweepResults,
+    SweepSummary,
+    window_text,
+)
 from zsim_analysis.sweep.report.field_names import FieldName, field_name
 from zsim_analysis.sweep.report.sweep_figures import figures
 from zsim_analysis.sweep.sweep_folder import load
@@ -29,8 +35,8 @@ DETAILS = ("parameter", PAPER_COLUMN, "est. std", "true std", "true RMS", "true 
 def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
     """Return report.html."""
     points = summary.flown[:POINTS_MAX]
-    known = {column for point in points for column in point.spreads}
-    names = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in known}
+    names = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in summary.known}
+    own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
     axes = axes_of(summary)
     return template("sweep.html.j2", "zsim_analysis.sweep.report").render(
         summary=summary,
@@ -40,9 +46,10 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
         points=[(*values_of(point), *overview(point)) for point in points],
         parameters=list(names),
         errors=_blocks(points, axes, {f"{prefix}.true_rms": each.titled for prefix, each in names.items()}),
-        metrics=_blocks(points, axes, {column: str(field_name(column)) for column in summary.metrics}),
+        metrics=_blocks(points, axes, own),
+        without_data=without_data(summary),
         left_out=len(summary.flown) - len(points),
-        window=window_text(summary),
+        window=windows_of(summary),
         paper_column=PAPER_COLUMN,
         details=[column for column in DETAILS if column != PAPER_COLUMN or summary.paper_std],
         tables=[(_heading(point), details(point, names, summary.paper_std)) for point in points[:DETAILED_MAX]],
@@ -58,17 +65,17 @@ def axes_of(summary: SweepSummary) -> list[FieldName]:
 
 def values_of(point: GridPoint) -> list[str]:
     """Return the values of a point, as many as `axes_of` has names."""
-    return [shown(value) for value in point.values.values()] or [point.label]
+    return list(point.names.values()) or [point.label]
 
 
 def _heading(point: GridPoint) -> str:
-    return ", ".join(field_name(path).at(value) for path, value in point.values.items()) or point.label
+    return ", ".join(field_name(path).at(value) for path, value in point.names.items()) or point.label
 
 
 def _blocks(points: Sequence[GridPoint], axes: Sequence[FieldName], titles: dict[str, str]) -> list[Block]:
     """Return the means of some columns at each point as tables that fit the page: their heads, and their rows."""
     columns, across = list(titles), max(2, BLOCK_COLUMNS - len(axes))
-    parts = [columns[start : start + across] for start in range(0, len(columns), across)]
+    parts = np.array_split(np.array(columns, object), max(1, -(-len(columns) // across))) if columns else []
     return [
         (
             [*map(str, axes), *(titles[column] for column in part)],
@@ -87,15 +94,15 @@ def facts(summary: SweepSummary) -> list[tuple[str, str]]:
         ("Varied", " ".join(summary.vary) or "nothing"),
         ("Runs", f"{summary.finished} of {summary.runs} finished, {well} of them ended well"),
         ("Flown", f"{summary.flown_wall_s:.0f} s of wall time in all, on {hosts or 'no host'}"),
-        ("Window", window_text(summary)),
+        ("Window", windows_of(summary)),
         ("Fingerprint", ", ".join(summary.fingerprints) or "not known"),
         ("Version", summary.version),
     ]
 
 
-def window_text(summary: SweepSummary) -> str:
+def windows_of(summary: SweepSummary) -> str:
     """Return the judged windows of all runs in words."""
-    return "{:g} to {:g} s".format(*summary.windows_s) if summary.windows_s else "not known"
+    return window_text(summary.windows_s) if summary.windows_s else "not known"
 
 
 def marks_of(summary: SweepSummary) -> list[str]:
@@ -105,7 +112,7 @@ def marks_of(summary: SweepSummary) -> list[str]:
     if summary.judged_unengaged:
         lines.append(
             f"{summary.judged_unengaged} {runs} were judged while a cluster was not engaged "
-            f"(window {window_text(summary)}); give a window after the engagement, report.window_s"
+            f"(window {windows_of(summary)}); give a window after the engagement, report.window_s"
         )
     return lines
 
@@ -128,18 +135,38 @@ def notes(summary: SweepSummary) -> list[str]:
     return lines
 
 
+def without_data(summary: SweepSummary) -> str:
+    """Return in a sentence which quantities no run has, "" where all are known."""
+    errors = {each.titled: prefix for prefix, each in summary.parameters.items()}
+    own = {str(field_name(column)): column for column in summary.metrics}
+    kinds = (("formation errors", errors), (OWN, own))
+    known = summary.known | {column.rpartition(".")[0] for column in summary.known}
+    parts = [part for what, columns in kinds if (part := _missing(what, columns, known))]
+    return f"No run has {', nor '.join(parts)}; they are in no table and no figure." if parts else ""
+
+
+def _missing(what: str, columns: Mapping[str, str], known: Container[str]) -> str:
+    names = [name for name, column in columns.items() if column not in known]
+    if not names:
+        return ""
+    return what if len(names) == len(columns) else f"{what} of {', '.join(names)}"
+
+
 def overview(point: GridPoint) -> list[str]:
     """Return one row of the table of all points, without its label."""
     separation = point.spreads.get("min_separation_m")
     least = "–" if separation is None else f"{separation.least:.2f}"
     engaged = "–" if point.engaged is None else str(point.engaged)
     well, planned, apart = map(_share, (point.ended_well, point.as_planned, point.without_collision))
-    return [str(point.runs), well, planned, engaged, apart, _spread(separation), least]
+    mean = _noted(_spread(separation), point.count("min_separation_m"))
+    return [str(point.runs), well, planned, engaged, apart, mean, least]
 
 
 def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: dict[str, float]) -> list[list[str]]:
-    """Return the table of one point, a row per formation parameter."""
+    """Return the table of one point, a row per formation parameter; no row where no run there has errors."""
     rows = []
+    if not any(f"{prefix}.true_rms" in point.spreads for prefix in names):
+        return rows
     for prefix, parameter in names.items():
         printed = paper_std.get(parameter.name)
         paper = ["" if printed is None else f"{printed:g}"] if paper_std else []
@@ -151,7 +178,11 @@ def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: d
 
 
 def _mean(point: GridPoint, column: str) -> str:
-    return _spread(point.spreads.get(column), 4)
+    return _noted(_spread(point.spreads.get(column), 4), point.count(column))
+
+
+def _noted(text: str, count: str) -> str:
+    return f"{text} ({count})" if count else text
 
 
 def _spread(samples: Distribution | None, digits: int = 2) -> str:

@@ -1,14 +1,16 @@
 """The figures of a sweep: the runs of each point of the grid, with the mean's confidence interval upon them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from zsim_analysis.report.pages import (
+    BLACK,
     BLUE,
     COLUMN_IN,
+    GREEN,
     GREY,
     PAGE_IN,
     PAPER_PT,
@@ -17,14 +19,16 @@ from zsim_analysis.report.pages import (
     dress,
     label,
     legend_above,
+    mark_figure,
     new_figure,
 )
 from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
-from zsim_analysis.sweep.points import FormationParameter, SweepResults
+from zsim_analysis.sweep.points import FormationParameter, SweepResults, window_text
 from zsim_analysis.sweep.report.distributions import PAPER, Panel, Samples, draw_distribution, known
 from zsim_analysis.sweep.report.field_names import field_name
-from zsim_analysis.sweep.report.grid_axis import POINTS_MAX, GridAxis, Place
+from zsim_analysis.sweep.report.grid_axis import MARK, POINTS_MAX, GridAxis, Place
 from zsim_analysis.sweep.report.intervals_drawn import DrawnInterval, mark_beyond, scale_to_samples
+from zsim_analysis.sweep.report.labels import LEVEL_LETTERS, UPRIGHT_LETTERS, wrapped
 
 PANELS_MAX = 24  # quantities in one figure; 6 drones
 COLUMNS = 3  # of panels
@@ -32,39 +36,47 @@ NARROW_MAX = 8  # points side by side in a panel of a third of the page
 SLICES = 6  # of a drawn value's range, each with a mean of its own
 LEGEND_COLUMNS = 4
 ONE_RUN, BEYOND_AXIS, TABLE_I = "one run", "the interval goes beyond the axis", "the paper's Table I"
+NEVER_AS_PLANNED = "no run as planned"
+SHARES = (("ended well", "o", GREEN), ("of these, as planned", "D", BLUE), ("of these, without collision", "s", BLACK))
 
 
 def figures(results: SweepResults) -> Iterator[ReportFigure]:
-    """Yield the figures that the runs have data for."""
+    """Yield the figures that the runs have data for, with a panel for each quantity that they have."""
     parameters = dict(list(results.parameters().items())[:PANELS_MAX])
-    if parameters:
+    rms, std, own = (
+        [panel for panel in panels if len(known(results.values(panel.column)))]
+        for panels in (rms_panels(parameters), std_panels(parameters, results.paper_std), metric_panels(results))
+    )
+    if rms:
         yield ReportFigure(
             "true_rms.png",
             "How well the formation was flown",
             f"RMS of truth − desired within the window{_window(results)}." + _legend(results),
-            _panels(results, rms_panels(parameters)),
+            _panels(results, rms),
         )
+    if std:
         yield ReportFigure(
             "est_std.png",
             f"Standard deviations as the controller sees them{', beside the paper' * bool(results.paper_std)}",
             f"Standard deviation of estimate − desired within the window{_window(results)}." + _legend(results),
-            _panels(results, std_panels(parameters, results.paper_std)),
+            _panels(results, std),
         )
-    if results.metrics:
+    if own:
         yield ReportFigure(
             "metrics.png",
             "Figures of the user's own",
             f"What {results.metrics_function} returned of each run." + _legend(results),
-            _panels(results, metric_panels(results)),
+            _panels(results, own),
         )
     yield ReportFigure(
         "safety.png",
         "How the runs ended, and how near the drones came to each other",
-        "Left: share of runs that ended well, and of those without a collision, with exact intervals. "
+        "Left: share of runs that ended well, and of those flown as planned and without a collision, "
+        "with exact intervals. "
         "Right: least true distance of two drones in the air." + _legend(results),
         _safety(results),
     )
-    panels = [*rms_panels(parameters), *metric_panels(results)]
+    panels = [*rms, *own]
     for i, path in enumerate(results.drawn):
         if panels:
             yield ReportFigure(
@@ -106,7 +118,7 @@ def _symbol(parameter: FormationParameter) -> str:
 
 def _window(results: SweepResults) -> str:
     windows_s = results.windows_s()
-    return " ({:g} to {:g} s)".format(*windows_s) if windows_s else ""
+    return f" ({window_text(windows_s)})" if windows_s else ""
 
 
 def _legend(results: SweepResults) -> str:
@@ -154,6 +166,8 @@ def _name(
         axes.plot([], [], "s", color="#d55e0066", ms=8, label=mean_label(results))
     if beyond:
         axes.plot([], [], "^", color=mean, ms=7, mec="white", mew=0.6, label=BEYOND_AXIS)
+    if results.never_as_planned():
+        _name_never_as_planned(figure, axes, axis)
     if paper:
         axes.plot([], [], color=PAPER, ls="--", lw=1.2, label=TABLE_I)
     if axis and len(axis.series) > 1:
@@ -162,52 +176,65 @@ def _name(
     legend_above(figure, axes, LEGEND_COLUMNS)
 
 
+def _name_never_as_planned(figure: Figure, axes: Axes, axis: GridAxis | None) -> None:
+    """Say of a figure that all its runs left their plan, or in its legend what the cross at a point is."""
+    if axis is None:
+        mark_figure(figure, NEVER_AS_PLANNED)
+    else:
+        axes.plot([], [], "x", color=MARK, ms=6, mew=1.6, label=NEVER_AS_PLANNED)
+
+
 def _safety(results: SweepResults) -> Figure:
     axis = GridAxis(results.design) if results.design.points > 1 else None
-    figure = new_figure(PAGE_IN, 3.0)
-    shares, separation = figure.subplots(1, 2)
+    panel = Panel("min_separation_m", "least separation (m)")
+    panels = [panel] if len(known(results.values(panel.column))) else []
+    figure = new_figure(PAGE_IN if panels else COLUMN_IN, 3.0)
+    shares, *others = figure.subplots(1, 1 + len(panels), squeeze=False).ravel()
     _shares(shares, results, axis)
-    beyond = draw_distribution(separation, results, Panel("min_separation_m", "least separation (m)"), axis)
-    _name(figure, shares, results, axis, beyond)
+    beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(others, panels, strict=True)]
+    _name(figure, shares, results, axis, any(beyond))
     return figure
 
 
 def _shares(axes: Axes, results: SweepResults, axis: GridAxis | None) -> None:
-    """Draw the shares of the runs of each point that ended well, and of those that met no other drone."""
+    """Draw the shares of the runs of each point that ended well, and of those as planned and without a collision."""
     dress(axes, "share of runs")
     places = axis.places if axis else {0: Place(0.0, (-0.12, 0.12))}
-    of_kind: tuple[tuple[str, str, int, Callable[[int], tuple[int, int]]], ...] = (
-        ("ended well", "o", 0, results.ended_well),
-        ("of these, without collision", "s", 1, results.without_collision),
-    )
-    for name, mark, side, counted in of_kind:
+    counts = (results.ended_well, results.as_planned, results.without_collision)
+    for side, ((name, mark, own), counted) in enumerate(zip(SHARES, counts, strict=True), -1):
         for point, place in places.items():
-            count, of = counted(point)
-            if of:
-                share = share_interval(count, of)
-                ends = [[share.value - share.low], [share.high - share.value]]
-                tint = axis.colour(place) if axis and len(axis.series) > 1 else ("#009e73", "#000000")[side]
-                face = "white" if side else tint
-                x = place.x + (0.2, -0.2)[side == 0] * (place.room[1] - place.room[0])
-                axes.errorbar([x], [share.value], yerr=ends, fmt=mark, ms=5, lw=1.4, capsize=4, color=tint, mfc=face)
-        axes.plot([], [], mark, color=("#009e73", "#000000")[side], mfc="white" if side else None, ms=5, label=name)
+            tint = axis.colour(place) if axis and len(axis.series) > 1 else own
+            _share(axes, *counted(point), place.x + 0.5 * side * (place.room[1] - place.room[0]), mark, tint)
+        axes.plot([], [], mark, color=own, mfc="white" if side >= 0 else own, ms=5, label=name)
     axes.set_ylim(-0.03, 1.03)
     if axis:
         axis.dress(axes)
+        axis.mark(axes, results.never_as_planned())
     else:
         axes.set_xticks([])
         axes.set_xlim(-0.8, 0.8)
 
 
+def _share(axes: Axes, count: int, of: int, x: float, mark: str, colour: str) -> None:
+    """Draw a share with its interval; nothing of no runs."""
+    if of:
+        share = share_interval(count, of)
+        ends = [[share.value - share.low], [share.high - share.value]]
+        face = colour if mark == SHARES[0][1] else "white"
+        axes.errorbar([x], [share.value], yerr=ends, fmt=mark, ms=5, lw=1.4, capsize=4, color=colour, mfc=face)
+
+
 def _scatter(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figure:
     rows = -(-len(panels) // COLUMNS)
     figure = new_figure(PAGE_IN, 0.8 + 1.8 * rows)
+    if len(results.never_as_planned()) == results.design.points:
+        mark_figure(figure, NEVER_AS_PLANNED)
     grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
     x = results.values(path)
     beyond = False
     for axes, panel in zip(grid, panels, strict=False):
-        dress(axes, panel.label)
-        axes.set_xlabel(str(field_name(path)), fontsize=PAPER_PT)
+        dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
+        axes.set_xlabel(wrapped(str(field_name(path)), LEVEL_LETTERS), fontsize=PAPER_PT)
         y = results.values(panel.column)
         axes.plot(x, y, ".", color=BLUE, ms=4, alpha=0.45, mew=0, zorder=2)
         intervals = [DrawnInterval(middle, mean_interval(samples)) for middle, samples in slices(x, y)]

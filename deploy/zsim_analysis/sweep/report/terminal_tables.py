@@ -14,7 +14,7 @@ from zsim.runtime.progress import cell
 from zsim_analysis.sweep.intervals import ConfidenceInterval
 from zsim_analysis.sweep.points import FormationParameter, GridPoint, SweepSummary
 from zsim_analysis.sweep.report.field_names import field_name
-from zsim_analysis.sweep.report.make_sweep_report import axes_of, marks_of, values_of, window_text
+from zsim_analysis.sweep.report.make_sweep_report import axes_of, marks_of, values_of, windows_of, without_data
 
 POINTS_MAX = 40  # on a terminal
 BETWEEN = 3  # characters between two columns of a table
@@ -51,6 +51,8 @@ class TerminalText(Struct, frozen=True):
         for part in (overview(self.summary), errors(self.summary), own_figures(self.summary)):
             if part.columns:
                 yield from part.lines(self.summary, options.max_width)
+        if missing := without_data(self.summary):
+            yield cell(missing)
 
 
 def terminal_text(summary: SweepSummary) -> TerminalText:
@@ -100,7 +102,7 @@ def errors(summary: SweepSummary) -> PointTable:
         _column(summary, each.name, lambda point, prefix=prefix: _mean(point, f"{prefix}.true_rms"))
         for prefix, each in names.items()
     ]
-    title = f"RMS of truth − desired{of} from {window_text(summary)}, means over the runs"
+    title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs"
     return PointTable(title, "in m; angles in rad\n", tuple(columns))
 
 
@@ -109,14 +111,14 @@ def own_figures(summary: SweepSummary) -> PointTable:
     columns = [
         _column(summary, str(field_name(name)), lambda point, name=name: _significant(point, name))
         for name in summary.metrics
+        if name in summary.known
     ]
     return PointTable("Figures of your own, means over the runs", "", tuple(columns))
 
 
 def errors_of_terminal(summary: SweepSummary) -> dict[str, FormationParameter]:
     """Return the parameters whose errors stand on a terminal: the paper's, else the first ones that are no heading."""
-    known = {column for point in summary.flown for column in point.spreads}
-    flown = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in known}
+    flown = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in summary.known}
     first = next((each.cluster for each in flown.values()), None)
     own = {prefix: each for prefix, each in flown.items() if each.cluster == first}
     return dict([(prefix, each) for prefix, each in own.items() if not each.name.startswith("phi_")][:ERRORS_MAX])
@@ -132,12 +134,18 @@ def _percent(share: ConfidenceInterval | None) -> str:
 
 def _mean(point: GridPoint, column: str, digits: int = 3) -> str:
     samples = point.spreads.get(column)
-    return "–" if samples is None else f"{samples.mean.value:.{digits}f}"
+    return "–" if samples is None else f"{samples.mean.value:.{digits}f}{_count(point, column)}"
 
 
 def _significant(point: GridPoint, column: str) -> str:
     samples = point.spreads.get(column)
-    return "–" if samples is None else f"{samples.mean.value:.4g}"
+    return "–" if samples is None else f"{samples.mean.value:.4g}{_count(point, column)}"
+
+
+def _count(point: GridPoint, column: str) -> str:
+    """Return of how many runs a mean is, where they are fewer than ended well."""
+    count = point.count(column).replace(" ", "")
+    return f" ({count})" if count else ""
 
 
 def _least(point: GridPoint) -> str:
@@ -157,17 +165,25 @@ def _axis_columns(summary: SweepSummary) -> list[TerminalColumn]:
     return [TerminalColumn(" · ".join(names), tuple(" · ".join(row) for row in rows))]
 
 
-def _parted(columns: Sequence[TerminalColumn], room: int) -> list[list[TerminalColumn]]:
-    """Return columns in parts that fit a room in characters, at least one in each."""
-    parts: list[list[TerminalColumn]] = [[]]
-    left = room
-    for column in columns:
-        if parts[-1] and column.width + BETWEEN > left:
-            parts.append([])
-            left = room
-        parts[-1].append(column)
-        left -= column.width + BETWEEN
-    return parts
+def _parted(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:
+    """Return columns in parts that fit a room in characters: none of one column if that can be, few, of like number."""
+    best: list[tuple[tuple[int, int, int], list[Sequence[TerminalColumn]]]] = [((0, 0, 0), [])]
+    for end in range(1, len(columns) + 1):
+        starts = [start for start in range(end) if start == end - 1 or _width(columns[start:end]) <= room]
+        ways = [(_with_part(best[start][0], end - start), start) for start in starts]
+        cost, start = min(ways)
+        best.append((cost, [*best[start][1], columns[start:end]]))
+    return best[-1][1]
+
+
+def _width(columns: Sequence[TerminalColumn]) -> int:
+    return sum(column.width + BETWEEN for column in columns)
+
+
+def _with_part(cost: tuple[int, int, int], count: int) -> tuple[int, int, int]:
+    """Return the cost of parts and one more, of `count` columns: single ones, how many, and how unlike they are."""
+    single, parts, squares = cost
+    return single + (count == 1), parts + 1, squares + count**2
 
 
 def _table(columns: Sequence[TerminalColumn], axes: int) -> Table:

@@ -250,3 +250,19 @@ def test_external_drones_cannot_be_swept() -> None:
     with pytest.raises(ScenarioError) as caught:
         make_plan("t.yaml", document, ["seed"], 2)
     assert has_terms(str(caught.value), "d1", "external", "lockstep")
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("x=1,2.5,true,paper", ["1", "2.5", "true", "paper"]),
+        ("x=1000000.1,1000000.2", ["1000000.1", "1000000.2"]),
+        ("x=[{kind: gps_dropout, target: d1}],[{kind: gps_dropout, target: d2}]", ['…"d1"}]', '…"d2"}]']),
+        ("x=true,'true'", ["true (1)", "true (2)"]),
+        (f"x={'a' * 30},{'a' * 30}b,c", [f"{'a' * 23}… (1)", f"{'a' * 23}… (2)", "c"]),
+    ],
+)
+def test_no_two_values_of_a_field_have_the_same_name(text: str, names: list[str]) -> None:
+    grid = parse(text)
+    assert isinstance(grid, Grid)
+    assert grid.names == names

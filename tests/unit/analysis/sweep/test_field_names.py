@@ -17,6 +17,15 @@ from zsim_analysis.sweep.report.field_names import field_name
         ("drones[1].mass_kg", "drone 1 mass (kg)"),
         ("clusters.main.gains.proportional_1_s", "main gains proportional (1/s)"),
         ("clusters.main.plan.takeoff_s", "main plan take-off (s)"),
+        ("clusters.main.plan.target.p", "main plan target p (m)"),
+        ("clusters.main.plan.target.x_c", "main plan target x_c (m)"),
+        ("clusters[0].plan.target.beta", "cluster 0 plan target beta (rad)"),
+        ("clusters.main.plan.target.yaw_deg", "main plan target yaw (deg)"),
+        ("clusters.main.plan.target[left.phi_2]", "main plan target left.phi_2 (rad)"),
+        ("clusters.main.plan.trajectory.waypoints[0].values.w_1", "main plan trajectory waypoints 0 values w_1 (m)"),
+        ("clusters.main.plan.trajectory.expressions.z_c", "main plan trajectory expressions z_c (m)"),
+        ("clusters.main.plan.trajectory.constants.r", "main plan trajectory constants r"),
+        ("clusters.plan.gains.proportional_1_s", "plan gains proportional (1/s)"),
         ("sensors.preset", "sensors preset"),
         ("duration_s", "duration (s)"),
         ("seed", "seed"),
@@ -28,5 +37,5 @@ def test_a_path_has_words_and_a_unit(path: str, name: str) -> None:
 
 
 def test_a_value_stands_with_its_unit() -> None:
-    assert field_name("environment.wind.gust_m_s").at(1.5) == "wind gust 1.5 m/s"
-    assert field_name("estimation.flow").at(True) == "estimation flow true"
+    assert field_name("environment.wind.gust_m_s").at("1.5") == "wind gust 1.5 m/s"
+    assert field_name("estimation.flow").at("true") == "estimation flow true"

@@ -1,5 +1,6 @@
 """The report of a sweep: summary, figures and page."""
 
+import html
 import io
 import re
 from pathlib import Path
@@ -20,8 +21,8 @@ from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.field_names import field_name
-from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report
-from zsim_analysis.sweep.report.sweep_figures import BEYOND_AXIS, figures, slices
+from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report, without_data
+from zsim_analysis.sweep.report.sweep_figures import BEYOND_AXIS, NEVER_AS_PLANNED, figures, slices
 from zsim_analysis.sweep.report.terminal_tables import terminal_text
 from zsim_analysis.sweep.sweep_folder import locked, read_table
 from zsim_analysis.sweep.sweep_run import Row
@@ -299,3 +300,168 @@ def test_figures_of_the_user_s_own_are_drawn_and_summed_up() -> None:
     assert summary.points[0].spreads["metrics.overshoot_m"].mean.value == 2.0
     assert summary.points[1].spreads["metrics.overshoot_m"].runs == 2
     assert summary.unmeasured == {"report.metrics my_figures:overshoot: KeyError: 'main'": 1}
+
+
+def crosses(axes: Axes) -> list[float]:
+    """Return the x of the marks of points without a flight as planned."""
+    marks = [line for line in axes.lines if line.get_marker() == "x"]
+    return [float(x) for line in marks for x in np.asarray(line.get_xdata())]
+
+
+def test_points_without_a_flight_as_planned_are_marked_and_their_share_is_drawn() -> None:
+    of = plan("seed", "duration_s=1,2", runs=8)
+    rows = [{**well(of, run), "as_planned": run % 2 == 1 and run > 1} for run in range(8)]
+    results = SweepResults(SweepDesign(of), rows)
+    drawings = {each.name: each.drawing for each in figures(results)}
+    assert {tuple(crosses(axes)) for drawing in drawings.values() for axes in drawing.axes} == {(1.0,)}
+    assert all(NEVER_AS_PLANNED in named(drawing) for drawing in drawings.values())
+    shares = drawings["safety.png"].axes[0]
+    diamonds = [line for line in shares.lines if line.get_marker() == "D"]
+    assert [float(y) for line in diamonds for y in np.asarray(line.get_ydata())] == [0.0, 0.75]
+
+
+def test_figures_of_a_sweep_without_a_flight_as_planned_say_so() -> None:
+    one = plan("seed", runs=4)
+    assert drawn(one, "safety.png", as_planned=False).get_suptitle() == NEVER_AS_PLANNED
+    assert drawn(one, "true_rms.png", as_planned=False).get_suptitle() == NEVER_AS_PLANNED
+    assert drawn(one, "safety.png", as_planned=True).get_suptitle() == ""
+    assert drawn(one, "safety.png").get_suptitle() == ""  # nothing to judge
+
+
+def without_errors(of: SweepPlan, run: int) -> Row:
+    """Return the row of a run whose plan was refused."""
+    row = well(of, run)
+    return {**row, **{name: None for name in row if name.startswith("errors.")}, "metrics.overshoot_m": None}
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_what_no_run_has_is_neither_in_tables_nor_in_figures(tmp_path: Path) -> None:
+    of = plan("seed", runs=2)
+    rows = [without_errors(of, run) for run in range(2)]
+    page = report_of(tmp_path, of, rows)
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"safety.png"}
+    assert page.count("<table") == 1
+    assert has_terms(without_tags(page), "formation errors", "figures", "your own", "no figure")
+    summary = SweepResults(SweepDesign(of), rows).summary()
+    console = Console(file=io.StringIO(), width=200)
+    console.print(terminal_text(summary))
+    assert isinstance(console.file, io.StringIO)
+    assert "overshoot" not in console.file.getvalue()
+    assert without_data(summary) in console.file.getvalue()
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_point_without_errors_has_a_sentence_in_place_of_a_table(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=4)
+    rows = [without_errors(of, run) if run % 2 else well(of, run) for run in range(4)]
+    page = report_of(tmp_path, of, rows)
+    assert page.count("<table") == 3  # how runs ended, errors of all points, and of the first one
+    assert has_terms(without_tags(page[page.index("duration 2 s") :]), "No", "formation errors", "here")
+
+
+def test_quantities_without_data_have_no_panel() -> None:
+    of = plan("seed", runs=4)
+    assert [len(drawn(of, "true_rms.png", **{"errors.y_c.true_rms": None}).axes)] == [2]
+    assert len(drawn(of, "safety.png", min_separation_m=None).axes) == 1
+    partly = SweepResults(SweepDesign(of), [{**well(of, 0), "errors.y_c.true_rms": None, "errors.y_c.est_std": None}])
+    assert has_terms(without_data(partly.summary()), "formation errors", "y_c (m)")
+    assert without_data(SweepResults(SweepDesign(of), [well(of, 0)]).summary()) == ""
+
+
+@pytest.mark.parametrize("vary", [(), ("clusters.main.plan.trajectory.waypoints[0].values.p=1,2",)])
+def test_labels_of_panels_are_whole_and_do_not_touch(vary: tuple[str, ...]) -> None:
+    of = plan("seed", *vary, runs=8)
+    names = {f"errors.left.phi_{i}.est_std": 0.1 for i in range(3)}
+    more = {f"metrics.time_to_the_first_engagement_{i}_s": float(i) for i in range(3)}
+    for name in ("est_std.png", "metrics.png"):
+        figure = drawn(of, name, **names, **more)
+        figure.draw_without_rendering()
+        shown = [axes for axes in figure.axes if axes.get_visible()]
+        boxes = [text.get_window_extent() for axes in shown for text in (axes.xaxis.label, axes.yaxis.label)]
+        edges = figure.bbox.padded(1)
+        assert all(edges.contains(x, y) for box in boxes for x, y in box.corners())
+        assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_values_that_begin_alike_have_rows_and_labels_that_differ(tmp_path: Path) -> None:
+    of = plan("seed", f"faults={dropout('drone1')},{dropout('drone2')}", "wind.gust_m_s=0,1", runs=4)
+    rows = [well(of, run) for run in range(4)]
+    summary = SweepResults(SweepDesign(of), rows).summary()
+    assert len({point.label for point in summary.points}) == 4
+    page = without_tags(report_of(tmp_path, of, rows))
+    assert all(point.names["faults"] in html.unescape(page) for point in summary.points)
+    assert {"drone1", "drone2"} <= set(re.findall(r"drone\d", " ".join(named(drawn(of, "true_rms.png")))))
+
+
+def dropout(drone: str) -> str:
+    return f"[{{kind: gps_dropout, target: {drone}, at_s: 20}}]"
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_windows_have_two_decimals_at_most(tmp_path: Path) -> None:
+    of = plan("seed", runs=2)
+    known = {"window_from_s": 40 / 3, "window_to_s": 1234567.0, "engaged_throughout": False}
+    rows = [{**well(of, run), **known} for run in range(2)]
+    page = report_of(tmp_path, of, rows)
+    assert "13.33 to 1234567 s" in page
+    assert "13.333" not in page
+    captions = [each.caption for each in figures(SweepResults(SweepDesign(of), rows))]
+    assert sum("13.33 to 1234567 s" in caption for caption in captions) == 2
+
+
+def heads(text: str) -> list[list[str]]:
+    """Return the last words of the heads of the tables on a terminal."""
+    lines = text.splitlines()
+    return [lines[place - 1].split() for place, line in enumerate(lines) if "──" in line]
+
+
+@pytest.mark.parametrize("width", [50, 56, 62, 80])
+def test_the_columns_of_a_terminal_are_shared_out_so_that_no_table_has_one(width: int) -> None:
+    of = plan("seed", "clusters.main.plan.target.p=0.5,4", runs=4)
+    more = {f"errors.v_{i}.true_rms": 0.1 for i in range(6)}
+    rows = [{**well(of, run), **more} for run in range(4)]
+    console = Console(file=io.StringIO(), width=width)
+    console.print(terminal_text(SweepResults(SweepDesign(of), rows).summary()))
+    assert isinstance(console.file, io.StringIO)
+    tables = [head[1:] for head in heads(console.file.getvalue())]
+    assert all(len(head) >= 2 for head in tables)
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_the_columns_of_the_page_are_shared_out_so_that_no_table_has_one(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=4)
+    more = {f"errors.v_{i}.true_rms": 0.1 for i in range(8)}
+    page = report_of(tmp_path, of, [{**well(of, run), **more} for run in range(4)])
+    part = page[page.index("Formation errors at") : page.index("<h2>Figures")]
+    assert [row.count("<th>") - 1 for row in part.split("<tr>") if "<th>" in row] == [4, 4, 3]
+
+
+def counts(axes: Axes) -> list[str]:
+    """Return the numbers of runs that are written in a panel."""
+    return [text.get_text() for text in axes.texts if text.get_text().startswith("n ")]
+
+
+@pytest.mark.parametrize("vary", [(), ("duration_s=1,2",)])
+def test_a_mean_of_fewer_runs_than_the_legend_says_has_its_number(vary: tuple[str, ...]) -> None:
+    of = plan("seed", *vary, runs=2 * (1 + len(vary)))
+    rows = [{**well(of, run), "metrics.settled_s": None if run == 0 else 10.3 + run} for run in range(of.runs)]
+    results = SweepResults(SweepDesign(of), rows)
+    drawings = {each.name: each.drawing for each in figures(results)}
+    assert [counts(axes) for axes in drawings["metrics.png"].axes] == [["n = 1"]]
+    assert not any(counts(axes) for axes in drawings["true_rms.png"].axes)
+    summary = results.summary()
+    assert summary.points[0].count("metrics.settled_s") == "n = 1"
+    console = Console(file=io.StringIO(), width=80)
+    console.print(terminal_text(summary))
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue().count("(n=1)") == 1
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_table_has_the_number_of_a_mean_of_fewer_runs(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=4)
+    rows = [{**well(of, run), "metrics.settled_s": None if run == 0 else 10.3} for run in range(4)]
+    page = report_of(tmp_path, of, rows)
+    assert "<td>10.3000 (n = 1)</td>" in page
+    assert page.count("(n = ") == 1
