@@ -11,6 +11,7 @@ import msgspec
 
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.summary import RunSummary
 
 ABSENT = "–"
@@ -181,7 +182,7 @@ def _windows(runs: Sequence[ComparedRun]) -> list[str]:
     windows = {run.summary.window_s for run in runs}
     if len(windows) < 2:
         return []
-    ranges = "; ".join("{}: {:.5g} to {:.5g} s".format(run.name, *run.summary.window_s) for run in runs)
+    ranges = "; ".join(f"{run.name}: {span_text(run.summary.window_s)}" for run in runs)
     return [f"The windows of the statistics differ ({ranges})."]
 
 

@@ -15,6 +15,7 @@ from zsim_analysis.reading.driver_links import link_text
 from zsim_analysis.reading.flight import read_flight
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.comparison import (
     ABSENT,
     ComparedRun,
@@ -81,6 +82,7 @@ def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
     return template("page.html.j2").render(
         summary=summary,
         facts=facts(summary),
+        window=span_text(summary.window_s),
         paper_column=PAPER_COLUMN,
         tables={name: error_table(cluster) for name, cluster in summary.clusters.items()},
         paper_note=PAPER_NOTE if any(cluster.paper_std for cluster in summary.clusters.values()) else "",
@@ -99,7 +101,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Scenario", f"{summary.scenario or 'not known'}, seed {seed}"),
         ("Mode", summary.mode or "not known"),
         ("Ended", summary.ended),
-        ("Flown as planned", "yes" if summary.as_planned else "no"),
+        ("Flown as planned", _planned(summary)),
         ("Record", summary.record.state),
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
         ("Deadlines missed", _misses(summary)),
@@ -109,6 +111,11 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
         ("Fingerprint", summary.fingerprint or "not known"),
     ]
+
+
+def _planned(summary: RunSummary) -> str:
+    early = any(each.kind == "early" for each in summary.shortfalls)
+    return ("as far as the run went" if early else "yes") if summary.as_planned else "no"
 
 
 def _misses(summary: RunSummary) -> str:

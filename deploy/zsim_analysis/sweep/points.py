@@ -11,8 +11,9 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.errors import ScenarioError
+from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.report.paper import paper_table
+from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
 from zsim_analysis.sweep.axes import Draw, Seeds, shown
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.intervals import LEVEL, ConfidenceInterval, mean_interval, share_interval
@@ -281,11 +282,15 @@ def _error_columns(rows: Sequence[Row]) -> list[str]:
 
 
 def _paper_std(design: SweepDesign) -> Mapping[str, float]:
-    """Return Table I where all runs fly Test 1; empty where another flight is swept, or its plan varies."""
-    if any("plan" in path for path in design.varied):
+    """Return Table I where every point flies Test 1; empty where only some do, or a field other than seed is drawn."""
+    if any(isinstance(axis, Draw) for axis in design.axes):
         return {}
     try:
-        scenario = design.scenario(0)
+        flown = all(_flies_test_1(design.scenario(point)) for point in range(design.points))
+        return PAPER_TABLE_1 if flown else {}
     except ScenarioError:
         return {}
-    return paper_table(scenario, scenario.clusters[0].name) if len(scenario.clusters) == 1 else {}
+
+
+def _flies_test_1(scenario: Scenario) -> bool:
+    return len(scenario.clusters) == 1 and bool(paper_table(scenario, scenario.clusters[0].name))

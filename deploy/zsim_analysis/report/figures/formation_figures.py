@@ -11,6 +11,7 @@ from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.goal import GoalErrors
 from zsim_analysis.reading.recorded_flight import Array
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.figures.spread import draw_spread
 from zsim_analysis.report.figures.time_marks import TimeMarks, draw_marks
 from zsim_analysis.report.pages import (
@@ -58,7 +59,7 @@ def draw_errors(
             _draw_goal(axes[0], formation, goal, name)
         draw_error(axes[-2], formation, name, every)
         draw_error(axes[-1], formation, name, rows)
-        _write_statistics(axes[-1], formation, name, rows)
+        _write_statistics(axes[-1], formation, name, formation.judged(window_s))
         axes[0].set_ylabel(label(name), fontsize=PAPER_PT)
     for (measure, members), axes in zip(others.items(), grid[len(names) :], strict=True):
         if goal:
@@ -71,7 +72,7 @@ def draw_errors(
 
 
 def _finish_errors(figure: Figure, grid: Any, window_s: tuple[float, float], marks: TimeMarks) -> None:
-    titles = ("against the final goal", "against the reference", f"the same, {window_s[0]:g} to {window_s[1]:g} s")
+    titles = ("against the final goal", "against the reference", f"the same, {span_text(window_s)}")
     for column, title in zip(grid.T, titles[-grid.shape[1] :], strict=True):
         column[0].set_title(title, fontsize=PAPER_PT)
     for axes in grid[:, :-1].flat:

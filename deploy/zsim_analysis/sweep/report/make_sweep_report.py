@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from zsim.errors import ReportError
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
 from zsim_analysis.sweep.axes import shown
@@ -95,7 +96,7 @@ def facts(summary: SweepSummary) -> list[tuple[str, str]]:
 
 def window_text(summary: SweepSummary) -> str:
     """Return the judged windows of all runs in words."""
-    return "{:g} to {:g} s".format(*summary.windows_s) if summary.windows_s else "not known"
+    return span_text(summary.windows_s) if summary.windows_s else "not known"
 
 
 def marks_of(summary: SweepSummary) -> list[str]:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.pages import (
     BLUE,
     COLUMN_IN,
@@ -106,7 +107,7 @@ def _symbol(parameter: FormationParameter) -> str:
 
 def _window(results: SweepResults) -> str:
     windows_s = results.windows_s()
-    return " ({:g} to {:g} s)".format(*windows_s) if windows_s else ""
+    return f" ({span_text(windows_s)})" if windows_s else ""
 
 
 def _legend(results: SweepResults) -> str:

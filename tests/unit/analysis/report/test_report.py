@@ -28,6 +28,7 @@ from zsim.terminal.fitted_table import FittedTable
 from zsim_analysis.reading.formation import window
 from zsim_analysis.report.make_report import judge, make_report, page
 from zsim_analysis.report.pages import thinned
+from zsim_analysis.report.paper import PAPER_TABLE_1
 from zsim_analysis.report.tables import PAPER_COLUMN, TERMINAL_COLUMNS, table, terminal_text
 
 NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
@@ -371,7 +372,9 @@ def test_figures_show_something(run):
 
 
 def test_the_terminal_table_stands_beside_the_paper(run):
-    _, summary = run
+    _, judged = run
+    cluster = msgspec.structs.replace(judged.clusters["main"], paper_std=PAPER_TABLE_1)
+    summary = msgspec.structs.replace(judged, clusters={"main": cluster})
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(table(summary, "main"))
     console.file.close()
