@@ -77,8 +77,9 @@ def _finish_errors(figure: Figure, grid: Any, window_s: tuple[float, float], mar
         column[0].set_title(title, fontsize=PAPER_PT)
     for axes in grid[:, :-1].flat:
         axes.axvspan(*window_s, **SHADE)
-    for column in grid.T:
+    for column in grid.T[:-1]:
         draw_marks(column, marks)
+    draw_marks(grid[:, -1], marks, whole=False)
     label_time(grid[-1])
     figure.align_ylabels(grid[:, 0])
     legend_above(figure, grid[0, 0], columns=6)

@@ -87,7 +87,8 @@ def _answers(flight: RecordedFlight, window_s: tuple[float, float], marks: TimeM
             "Estimates",
             "Estimate − truth with the band of two standard deviations that the estimator states, and NEES, the error "
             "of position and velocity squared and divided by its covariance: 6 on average where that is true. Shares "
-            "and means are those of the window.",
+            "and means, above the panels, are those of the window; the axes hold all since the engagement, and what is "
+            "larger before it leaves them.",
             draw_estimates(errors, colours, window_s, marks),
         )
     if responses := velocity_responses(flight):
