@@ -13,6 +13,9 @@ from zsim_analysis.reading.window_text import percent_text, seconds_text
 ENGAGES_S = 20.0  # chosen: a formation engages 4 to 12 s after its take-off; a run may end before
 
 
+MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second, and m or rad by which a reference at rest never moves
+
+
 class Shortfall(Struct, frozen=True):
     """One thing that a flight did not do.
 
@@ -90,6 +93,18 @@ def _not_begun(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortf
         if due_s is not None and due_s >= end_s:
             text = f"{states.name}: the run ended before its {step} at {seconds_text(due_s)} s"
             yield Shortfall("early", states.name, end_s, text, False)
+    follows = plan.trajectory is not None and plan.trajectory.start_s < end_s
+    if plan.target and not follows and _moves(states):
+        text = f"{states.name}: the run ended before its reference was at the target"
+        yield Shortfall("early", states.name, end_s, text, False)
+
+
+def _moves(states: ClusterStates) -> bool:
+    """Return whether the reference moves at the end, and not since the guard parts drones, or the formation is held."""
+    last = states.t_ns > states.t_ns[-1] - MOVES_NS
+    phases = {phase for phase, row in zip(states.phases, last, strict=True) if row}
+    moved = float(np.ptp(states.desired[last], axis=0).max())
+    return phases == {"engaged"} and not states.reasons[-1] and moved > MOVES_MIN
 
 
 def _outside(states: ClusterStates, window_s: tuple[float, float]) -> Iterator[Shortfall]:

@@ -18,6 +18,7 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.comparison import (
     ABSENT,
+    UNPLANNED,
     ComparedRun,
     ComparisonRow,
     clusters,
@@ -26,6 +27,7 @@ from zsim_analysis.report.comparison import (
     run_names,
     runs_id,
     scenario_rows,
+    table_groups,
 )
 from zsim_analysis.report.figures.comparison_figures import comparison_figures
 from zsim_analysis.report.figures.report_figures import figures
@@ -133,7 +135,8 @@ def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) ->
         facts=fact_rows(runs),
         notes=notes(runs),
         statistics=STATISTICS,
-        tables={cluster: statistics_rows(runs, cluster) for cluster in clusters(runs)},
+        unplanned=UNPLANNED if any(not run.summary.as_planned for run in runs) else "",
+        tables={cluster: _statistics_tables(runs, cluster) for cluster in clusters(runs)},
         scenario=scenario_rows(runs),
         without=[run.name for run in runs if run.flight.scenario is None],
         figures=sources(pictures),
@@ -157,6 +160,13 @@ def _more(run: ComparedRun) -> list[tuple[str, str]]:
         ("Scenario's hash", flight.info.scenario_sha256[:16] if flight.info else "not known"),
         ("Messages", f"{summary.record.messages}"),
     ]
+
+
+def _statistics_tables(
+    runs: Sequence[ComparedRun], cluster: str
+) -> list[tuple[Sequence[ComparedRun], list[ComparisonRow]]]:
+    """Return the runs and the lines of each table of a cluster's errors."""
+    return [(group, statistics_rows(group, cluster)) for group in table_groups(runs)]
 
 
 def statistics_rows(runs: Sequence[ComparedRun], cluster: str) -> list[ComparisonRow]:

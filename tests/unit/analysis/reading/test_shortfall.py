@@ -110,6 +110,13 @@ def test_a_step_of_the_plan_for_which_the_run_was_too_short_is_named(overrides: 
     assert step in line.text
 
 
+def test_a_run_that_ends_on_the_way_to_the_target_is_named() -> None:
+    (line,) = found(lambda t_s: {"phase": "engaged"}, climb_s=40.0)
+    assert (line.kind, line.subject, line.fails) == ("early", "main", False)
+    assert found(lambda t_s: {"phase": "engaged"}, climb_s=20.0) == []
+    assert found(lambda t_s: {"phase": "engaged", "reason": "guard"}, climb_s=40.0) == []
+
+
 def test_errors_are_those_of_the_engaged_part_of_the_window() -> None:
     """Where it was not engaged, estimate − desired is zero whatever the drones did."""
     window_s = (4.0, 30.0)
