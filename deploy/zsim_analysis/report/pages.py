@@ -127,12 +127,14 @@ def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
 
 
 def _lower(figure: Figure, top: float) -> None:
-    """Lay out axes and legend of a figure below a share of its height."""
-    below_in = 0.0
-    for legend in figure.legends:
-        below_in = max(below_in, legend.get_window_extent().height / figure.dpi + PAPER_PT / 72)
-        legend.set_bbox_to_anchor((0.0, 0.0, 1.0, top), figure.transFigure)
-    axes_top = top - below_in / figure.get_size_inches()[1]  # a legend with a place of its own is not laid out for
+    """Lay out axes of a figure, and the legends above them, below a share of its height."""
+    height_px, room_px = figure.bbox.height, 0.0
+    boxes = [(legend, legend.get_window_extent()) for legend in figure.legends]
+    for legend, box in boxes:
+        if box.y0 > height_px / 2:  # not one below the axes
+            room_px = max(room_px, box.height + figure.dpi * PAPER_PT / 72)
+            legend.set_bbox_to_anchor((0.0, 0.0, 1.0, top), figure.transFigure)
+    axes_top = top - room_px / height_px  # a legend with a place of its own is not laid out for
     if isinstance(engine := figure.get_layout_engine(), ConstrainedLayoutEngine):
         engine.set(rect=(0.0, 0.0, 1.0, axes_top))
 

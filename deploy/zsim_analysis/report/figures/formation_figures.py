@@ -141,7 +141,13 @@ def _write_statistics(axes: Axes, formation: Formation, name: str, rows: np.ndar
     i = formation.column(name)
     for y, error, style in ((0.75, formation.est_error, MEASURED), (0.25, formation.true_error, TRUE)):
         known = error[rows, i][np.isfinite(error[rows, i])]
-        text = f"std {known.std():.3g}\nmean {known.mean():+.2g}" if len(known) else "no data"
+        text = (
+            f"std {known.std():.3g}\nmean {known.mean():+.2g}"
+            if len(known)
+            else "no data"
+            if rows.any()
+            else "not\nengaged"
+        )
         place = {"transform": axes.transAxes, "fontsize": PAPER_PT - 1.5, "va": "center", "linespacing": 1.0}
         axes.text(1.03, y, text, color=_darker(style["color"]), **place)
 

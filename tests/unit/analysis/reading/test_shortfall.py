@@ -164,11 +164,15 @@ def test_the_mark_of_a_figure_is_whole_and_covers_nothing(reason: str) -> None:
         for k in range(6):
             axes.plot([0, 1], [k, k], label=f"line {k}")
         legend_above(figure, axes, columns=2)
+        lowest = figure.legend(handles=axes.lines[:2], loc="outside lower center")
         mark_figure(figure, "Not as planned", f"main: refused: {reason}", VERMILION)
         figure.draw_without_rendering()
         assert figure.get_suptitle().partition("\n")[0] == "Not as planned"
-        (mark,), (legend,) = figure.texts, figure.legends
+        (mark,), legend = figure.texts, figure.legends[0]
         above, middle, below = (each.get_window_extent() for each in (mark, legend, axes))
+        axis = axes.get_tightbbox()
+        assert axis is not None
+        assert axis.y0 >= lowest.get_window_extent().y1
         assert 0 <= above.x0 <= above.x1 <= figure.bbox.width
         assert above.y1 <= figure.bbox.height
         assert above.y0 >= middle.y1
