@@ -138,16 +138,10 @@ def draw_error(axes: Axes, formation: Formation, name: str, rows: np.ndarray) ->
 
 def _write_statistics(axes: Axes, formation: Formation, name: str, rows: np.ndarray) -> None:
     """Write standard deviations and means beside the axes, in the colours of their lines."""
-    i = formation.column(name)
+    i, missing = formation.column(name), "no data" if rows.any() else "not\nengaged"
     for y, error, style in ((0.75, formation.est_error, MEASURED), (0.25, formation.true_error, TRUE)):
         known = error[rows, i][np.isfinite(error[rows, i])]
-        text = (
-            f"std {known.std():.3g}\nmean {known.mean():+.2g}"
-            if len(known)
-            else "no data"
-            if rows.any()
-            else "not\nengaged"
-        )
+        text = f"std {known.std():.3g}\nmean {known.mean():+.2g}" if len(known) else missing
         place = {"transform": axes.transAxes, "fontsize": PAPER_PT - 1.5, "va": "center", "linespacing": 1.0}
         axes.text(1.03, y, text, color=_darker(style["color"]), **place)
 

@@ -102,6 +102,16 @@ def test_time_axes_are_those_of_the_run_but_for_that_of_the_window(
     assert window.get_xlim() == pytest.approx((7.98, 10.02))
 
 
+def test_the_statistics_beside_the_window_are_those_of_the_table(flight: RecordedFlight, formation: Formation) -> None:
+    marks = time_marks(flight, formation)
+    errors = formation.errors((2.0, 10.0))["roll"]
+    est, true = (text.get_text() for text in draw_errors(formation, (2.0, 10.0), marks).axes[2 * ROLL + 1].texts)
+    assert est.startswith(f"std {errors.est_std:.3g}\n")
+    assert true.startswith(f"std {errors.true_std:.3g}\n")
+    before = draw_errors(formation, (1.0, 3.0), marks).axes[2 * ROLL + 1].texts
+    assert [text.get_text().split() for text in before] == [["not", "engaged"]] * 2
+
+
 def bands_of(figure: Figure, place: int) -> list[Any]:
     return [patch for patch in figure.axes[place].patches if patch.get_alpha() == pytest.approx(0.16)]
 
