@@ -126,7 +126,7 @@ def _never_engaged(states: ClusterStates, due_s: float | None, end_s: float) -> 
         text = f"{name}: the run ended before its take-off at {seconds_text(due_s)} s"
         yield Shortfall("early", name, end_s, text, False)
     elif end_s - due_s < ENGAGES_S:
-        text = f"{name}: never engaged; the run ended {end_s - due_s:.4g} s after its take-off, {phase}"
+        text = f"{name}: never engaged; the run ended {seconds_text(end_s - due_s)} s after its take-off, {phase}"
         yield Shortfall("early", name, end_s, text, False)
     else:
         why = f": {states.reasons[-1]}" if states.reasons[-1] else ""

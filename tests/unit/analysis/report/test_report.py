@@ -26,6 +26,7 @@ from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.terminal.fitted_table import FittedTable
 from zsim_analysis.reading.formation import window
+from zsim_analysis.reading.window_text import percent_text, span_text
 from zsim_analysis.report.make_report import judge, make_report, page
 from zsim_analysis.report.pages import thinned
 from zsim_analysis.report.paper import PAPER_TABLE_1
@@ -384,6 +385,15 @@ def test_the_terminal_table_stands_beside_the_paper(run):
     assert f"{AMPLITUDE[9] / math.sqrt(2):.4f}" in row
     assert any("beta (rad)" in line for line in text.splitlines())  # 80 columns do not break a name …
     assert table(summary, "main").left_out(80) == []  # … nor leave a figure out
+
+
+def test_times_of_a_window_have_two_decimals_at_most(tmp_path):
+    summary = report_of(tmp_path, flown(duration_s=20.12, overrides=("report.window_s=null",)))
+    assert summary.window_s == pytest.approx((20.12 / 3, 20.12))
+    assert "6.71 to 20.12 s" in (table(summary, "main").title or "")
+    assert "6.71 to 20.12 s" in page(summary, [])
+    assert span_text((40 / 3, 40.0)) == "13.33 to 40 s"
+    assert [percent_text(share) for share in (0.0, 1e-4, 0.3014, 0.9999, 1.0)] == ["0", "0.1", "30.1", "99.9", "100"]
 
 
 def test_the_paper_stands_beside_its_test_1_alone(tmp_path):
