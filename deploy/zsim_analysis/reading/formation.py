@@ -10,6 +10,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, Times, Track
+from zsim_analysis.reading.window_text import span_text
 
 BLOCK = 512  # instants whose distances are held at once
 
@@ -54,9 +55,9 @@ def window(wanted_s: tuple[float, float] | None, length_s: float) -> tuple[tuple
     if end <= length_s:
         return wanted_s, ""
     if start < length_s:
-        return (start, length_s), f"The run ended at {length_s:.2f} s, inside the window {start:g} to {end:g} s."
+        return (start, length_s), f"The run ended at {length_s:.2f} s, inside the window {span_text(wanted_s)}."
     return default, (
-        f"The run ended at {length_s:.2f} s, before the window {start:g} to {end:g} s; "
+        f"The run ended at {length_s:.2f} s, before the window {span_text(wanted_s)}; "
         "the last two thirds of what there is are used."
     )
 
@@ -152,9 +153,18 @@ class Formation:
         """Return which instants (K,) are in a window."""
         return (self.t_s >= window_s[0]) & (self.t_s <= window_s[1])
 
-    def errors(self, window_s: tuple[float, float]) -> dict[str, ParameterErrors]:
-        """Return the statistics of every parameter over a window."""
+    def judged(self, window_s: tuple[float, float]) -> NDArray[np.bool_]:
+        """Return which instants (K,) of a window are judged: at others the desired value is the estimate's own."""
+        return self.within(window_s) & np.array([phase == "engaged" for phase in self.phases], bool)
+
+    def engaged_share(self, window_s: tuple[float, float]) -> float | None:
+        """Return at which share of a window's instants it was engaged, None without any instant."""
         rows = self.within(window_s)
+        return float(self.judged(window_s).sum() / rows.sum()) if rows.any() else None
+
+    def errors(self, window_s: tuple[float, float]) -> dict[str, ParameterErrors]:
+        """Return the statistics of every parameter over the engaged part of a window."""
+        rows = self.judged(window_s)
         return {name: errors(self.est_error[rows, i], self.true_error[rows, i]) for i, name in enumerate(self.names)}
 
 

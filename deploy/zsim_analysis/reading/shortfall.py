@@ -5,11 +5,15 @@ from collections.abc import Iterator
 import numpy as np
 from msgspec import Struct
 
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario import ClusterPlan, Scenario
 from zsim_agents.formation.flight_plan import waiting_step
 from zsim_analysis.reading.recorded_flight import ClusterStates, RecordedFlight
+from zsim_analysis.reading.window_text import percent_text, seconds_text
 
 ENGAGES_S = 20.0  # chosen: a formation engages 4 to 12 s after its take-off; a run may end before
+
+
+MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second, and m or rad by which a reference at rest never moves
 
 
 class Shortfall(Struct, frozen=True):
@@ -17,7 +21,7 @@ class Shortfall(Struct, frozen=True):
 
     Attributes:
         kind: plan (a step refused to the end), engagement (never), early (the run ended before it was due), window
-            (judged while a cluster was not engaged), collision, record (not all of it is there).
+            (it holds instants at which a cluster was not engaged), collision, record (not all of it is there).
         subject: the cluster, the drone, or "record".
         t_s: since when, simulated time.
         fails: the flight is no example of its plan; the command ends with code 1.
@@ -56,6 +60,7 @@ def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[f
         return
     yield from _refused(states)
     if "engaged" in states.phases:
+        yield from _not_begun(states, flight)
         yield from _outside(states, window_s)
     else:
         yield from _never_engaged(states, takeoff_s(flight.scenario, states.name), flight.last_ns / 1e9)
@@ -78,14 +83,39 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
             yield Shortfall("plan", states.name, begun[1], text, True)
 
 
+def _not_begun(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield the later steps of the plan that were not due before the run ended."""
+    plan, end_s = _plan(flight.scenario, states.name), flight.last_ns / 1e9
+    if plan is None or plan.takeoff_s is None:
+        return
+    steps = {"trajectory": plan.trajectory and plan.trajectory.start_s, "landing": plan.land_s}
+    for step, due_s in steps.items():
+        if due_s is not None and due_s >= end_s:
+            text = f"{states.name}: the run ended before its {step} at {seconds_text(due_s)} s"
+            yield Shortfall("early", states.name, end_s, text, False)
+    follows = plan.trajectory is not None and plan.trajectory.start_s < end_s
+    if plan.target and not follows and _moves(states):
+        text = f"{states.name}: the run ended before its reference was at the target"
+        yield Shortfall("early", states.name, end_s, text, False)
+
+
+def _moves(states: ClusterStates) -> bool:
+    """Return whether the reference moves at the end, and not since the guard parts drones, or the formation is held."""
+    last = states.t_ns > states.t_ns[-1] - MOVES_NS
+    phases = {phase for phase, row in zip(states.phases, last, strict=True) if row}
+    moved = float(np.ptp(states.desired[last], axis=0).max())
+    return phases == {"engaged"} and not states.reasons[-1] and moved > MOVES_MIN
+
+
 def _outside(states: ClusterStates, window_s: tuple[float, float]) -> Iterator[Shortfall]:
     t_s = states.t_ns / 1e9
     rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1]))
     out = [row for row in rows if states.phases[row] != "engaged"]
     if out:
-        share = 100 * (1 - len(out) / len(rows))
-        text = f"{states.name}: engaged in {share:.3g} % of the window only ({states.phases[out[0]]} else)"
-        yield Shortfall("window", states.name, float(t_s[out[0]]), text, False)
+        share, phase = 1 - len(out) / len(rows), states.phases[out[0]]
+        part = f"engaged in {percent_text(share)} % of the window only ({phase} else)"
+        text = part if share else f"never engaged within the window, but {phase}"
+        yield Shortfall("window", states.name, float(t_s[out[0]]), f"{states.name}: {text}", False)
 
 
 def _never_engaged(states: ClusterStates, due_s: float | None, end_s: float) -> Iterator[Shortfall]:
@@ -93,9 +123,10 @@ def _never_engaged(states: ClusterStates, due_s: float | None, end_s: float) -> 
     if due_s is None:
         yield Shortfall("window", name, 0.0, f"{name}: never engaged; it has no plan to take off by", False)
     elif due_s >= end_s:
-        yield Shortfall("early", name, end_s, f"{name}: the run ended before its take-off at {due_s:g} s", False)
+        text = f"{name}: the run ended before its take-off at {seconds_text(due_s)} s"
+        yield Shortfall("early", name, end_s, text, False)
     elif end_s - due_s < ENGAGES_S:
-        text = f"{name}: never engaged; the run ended {end_s - due_s:.4g} s after its take-off, {phase}"
+        text = f"{name}: never engaged; the run ended {seconds_text(end_s - due_s)} s after its take-off, {phase}"
         yield Shortfall("early", name, end_s, text, False)
     else:
         why = f": {states.reasons[-1]}" if states.reasons[-1] else ""
@@ -105,5 +136,10 @@ def _never_engaged(states: ClusterStates, due_s: float | None, end_s: float) -> 
 
 def takeoff_s(scenario: Scenario | None, cluster: str) -> float | None:
     """Return when a cluster's plan takes it off [s]; None without a plan."""
+    plan = _plan(scenario, cluster)
+    return plan.takeoff_s if plan else None
+
+
+def _plan(scenario: Scenario | None, cluster: str) -> ClusterPlan | None:
     clusters = scenario.clusters if scenario else ()
-    return next((each.plan.takeoff_s for each in clusters if each.name == cluster), None)
+    return next((each.plan for each in clusters if each.name == cluster), None)

@@ -11,9 +11,12 @@ import msgspec
 
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.summary import RunSummary
 
 ABSENT = "–"
+UNPLANNED = "†"  # behind the name of a run that did not fly as planned
+RUNS_PER_TABLE = 2  # beside each other with all their statistics: what the page is wide enough for
 THERE = "there"  # cell of an item with a name, such as a drone, that another run does not have
 
 
@@ -31,6 +34,11 @@ class ComparedRun:
     formations: list[Formation]
     summary: RunSummary
 
+    @property
+    def label(self) -> str:
+        """Return its name with a mark if it did not fly as planned: what tables and figures call it."""
+        return self.name if self.summary.as_planned else f"{self.name} {UNPLANNED}"
+
     def formation(self, cluster: str) -> Formation | None:
         """Return a cluster's formation, None if this run has none that can be judged."""
         return next((formation for formation in self.formations if formation.name == cluster), None)
@@ -45,6 +53,11 @@ def run_names(directories: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return [f"{path.name} ({number})" for number, path in enumerate(paths, start=1)]
+
+
+def table_groups(runs: Sequence[ComparedRun]) -> list[Sequence[ComparedRun]]:
+    """Return runs in groups that have room beside each other in a table of errors."""
+    return [runs[start : start + RUNS_PER_TABLE] for start in range(0, len(runs), RUNS_PER_TABLE)]
 
 
 def runs_id(directories: Sequence[Path]) -> str:
@@ -181,7 +194,7 @@ def _windows(runs: Sequence[ComparedRun]) -> list[str]:
     windows = {run.summary.window_s for run in runs}
     if len(windows) < 2:
         return []
-    ranges = "; ".join("{}: {:.5g} to {:.5g} s".format(run.name, *run.summary.window_s) for run in runs)
+    ranges = "; ".join(f"{run.name}: {span_text(run.summary.window_s)}" for run in runs)
     return [f"The windows of the statistics differ ({ranges})."]
 
 

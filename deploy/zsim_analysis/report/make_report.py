@@ -15,8 +15,10 @@ from zsim_analysis.reading.driver_links import link_text
 from zsim_analysis.reading.flight import read_flight
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.comparison import (
     ABSENT,
+    UNPLANNED,
     ComparedRun,
     ComparisonRow,
     clusters,
@@ -25,6 +27,7 @@ from zsim_analysis.report.comparison import (
     run_names,
     runs_id,
     scenario_rows,
+    table_groups,
 )
 from zsim_analysis.report.figures.comparison_figures import comparison_figures
 from zsim_analysis.report.figures.report_figures import figures
@@ -81,6 +84,7 @@ def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
     return template("page.html.j2").render(
         summary=summary,
         facts=facts(summary),
+        window=span_text(summary.window_s),
         paper_column=PAPER_COLUMN,
         tables={name: error_table(cluster) for name, cluster in summary.clusters.items()},
         paper_note=PAPER_NOTE if any(cluster.paper_std for cluster in summary.clusters.values()) else "",
@@ -99,7 +103,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Scenario", f"{summary.scenario or 'not known'}, seed {seed}"),
         ("Mode", summary.mode or "not known"),
         ("Ended", summary.ended),
-        ("Flown as planned", "yes" if summary.as_planned else "no"),
+        ("Flown as planned", _planned(summary)),
         ("Record", summary.record.state),
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
         ("Deadlines missed", _misses(summary)),
@@ -109,6 +113,11 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
         ("Fingerprint", summary.fingerprint or "not known"),
     ]
+
+
+def _planned(summary: RunSummary) -> str:
+    early = any(each.kind == "early" for each in summary.shortfalls)
+    return ("as far as the run went" if early else "yes") if summary.as_planned else "no"
 
 
 def _misses(summary: RunSummary) -> str:
@@ -126,7 +135,8 @@ def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) ->
         facts=fact_rows(runs),
         notes=notes(runs),
         statistics=STATISTICS,
-        tables={cluster: statistics_rows(runs, cluster) for cluster in clusters(runs)},
+        unplanned=UNPLANNED if any(not run.summary.as_planned for run in runs) else "",
+        tables={cluster: _statistics_tables(runs, cluster) for cluster in clusters(runs)},
         scenario=scenario_rows(runs),
         without=[run.name for run in runs if run.flight.scenario is None],
         figures=sources(pictures),
@@ -150,6 +160,13 @@ def _more(run: ComparedRun) -> list[tuple[str, str]]:
         ("Scenario's hash", flight.info.scenario_sha256[:16] if flight.info else "not known"),
         ("Messages", f"{summary.record.messages}"),
     ]
+
+
+def _statistics_tables(
+    runs: Sequence[ComparedRun], cluster: str
+) -> list[tuple[Sequence[ComparedRun], list[ComparisonRow]]]:
+    """Return the runs and the lines of each table of a cluster's errors."""
+    return [(group, statistics_rows(group, cluster)) for group in table_groups(runs)]
 
 
 def statistics_rows(runs: Sequence[ComparedRun], cluster: str) -> list[ComparisonRow]:

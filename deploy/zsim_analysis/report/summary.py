@@ -15,7 +15,8 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight, RecordedProces
 from zsim_analysis.reading.recorded_run import command_age_ms
 from zsim_analysis.reading.shortfall import Shortfall, shortfalls
 from zsim_analysis.reading.verdict import window_of
-from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
+from zsim_analysis.reading.window_text import percent_text
+from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table_of
 from zsim_analysis.report.record_facts import RecordFacts, facts_of_record
 
 EVENTS_PER_KIND = 100  # a flood of refusals must not push a restart out of the list
@@ -33,19 +34,37 @@ class EventLine(Struct, frozen=True):
 
 
 class ClusterErrors(Struct, frozen=True):
-    """How one cluster flew within the window; `paper_std` is Table I beside a flight of Test 1, else empty."""
+    """How one cluster flew within the window.
+
+    Attributes:
+        drones: of the cluster.
+        errors: over the instants of the window at which it was engaged; None each where it never was.
+        paper_std: Table I beside a flight of Test 1, else empty.
+        engaged_share: of the window's instants, those at which it was engaged; None without any.
+    """
 
     drones: tuple[str, ...]
     errors: dict[str, ParameterErrors]
     paper_std: dict[str, float] = {}
+    engaged_share: float | None = None
+
+    @property
+    def part(self) -> str:
+        """Return of which part of the window the errors are; empty where they are of all of it."""
+        if self.engaged_share in (None, 1.0):
+            return ""
+        if not self.engaged_share:
+            return "it was never engaged within the window: there are no errors"
+        return f"errors are over the {percent_text(self.engaged_share)} % of the window in which it was engaged"
 
 
 class RunSummary(Struct, frozen=True):
     """The content of summary.json; None where the record does not show a value.
 
     Attributes:
-        as_planned: the flight did what its plan says; `shortfalls` has what it did not do.
+        as_planned: the flight did what its plan says, as far as the run went; `shortfalls` has what it did not do.
         links: to the aircraft that flew as external drones, by drone.
+        window_note: why the window is not that of the scenario, empty where it is.
     """
 
     scenario: str | None
@@ -66,6 +85,7 @@ class RunSummary(Struct, frozen=True):
     command_age_ms: dict[str, float] | None
     links: dict[str, DriverLink]
     window_s: tuple[float, float]
+    window_note: str
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
@@ -88,11 +108,17 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     info = flight.info
     record_facts = facts_of_record(flight, end.get("last_ns", flight.last_ns))
     window_s, window_note = window_of(flight)
+    short = shortfalls(flight, window_s)
+    as_planned = not any(each.fails for each in short)
     clusters = {
-        f.name: ClusterErrors(f.drones, f.errors(window_s), dict(paper_table(flight.scenario, f.name)))
+        f.name: ClusterErrors(
+            f.drones,
+            f.errors(window_s),
+            dict(paper_table_of(flight, f, window_s) if as_planned else {}),
+            f.engaged_share(window_s),
+        )
         for f in formations
     }
-    short = shortfalls(flight, window_s)
     wall_s, span_s = end.get("wall_s", flight.wall_s), (flight.last_ns - flight.first_ns) / 1e9
     sim_s = end.get("sim_s", span_s if flight.replay_of else flight.last_ns / 1e9)
     lines, left_out = _lines(flight.events)
@@ -107,7 +133,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         wall_s=wall_s,
         sim_s=sim_s,
         ended=_ended(flight),
-        as_planned=not any(each.fails for each in short),
+        as_planned=as_planned,
         shortfalls=short,
         deadlines=end.get("deadlines"),
         deadline_misses=end.get("deadline_misses"),
@@ -115,6 +141,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         command_age_ms=end["command_age_ms"] if "command_age_ms" in end else command_age_ms(record),
         links=driver_links(record) if any(track.external for track in flight.tracks) else {},
         window_s=window_s,
+        window_note=window_note,
         errors=next((cluster.errors for cluster in clusters.values()), {}),
         clusters=clusters,
         min_separation_m=min_separation_m(flight.tracks),

@@ -13,6 +13,7 @@ from zsim.terminal.fitted_table import Column, FittedTable
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import ParameterErrors
 from zsim_analysis.reading.verdict import NOT_AS_PLANNED, marks_of
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.summary import ClusterErrors, RunSummary
 
 PAPER_COLUMN = "paper std"
@@ -86,20 +87,22 @@ def _together(values: Sequence[float | None]) -> float | None:
 
 def terminal_text(summary: RunSummary) -> Group:
     """Return what the flight did not do of its plan, and a table of errors for each cluster, for the terminal."""
-    marks = marks_of(summary.shortfalls)
+    notes = [(f"note: {summary.window_note}", False)] if summary.window_note else []
+    marks = [*marks_of(summary.shortfalls), *notes]
     lines = [Text(printable(mark), style="bold red" if fails else "yellow") for mark, fails in marks]
     return Group(*lines, *(table(summary, name) for name in summary.clusters))
 
 
 def table(summary: RunSummary, cluster: str) -> FittedTable:
     """Return the errors of one cluster, with the paper's Table I beside Test 1, for the terminal."""
-    start, end = summary.window_s
     judged = summary.clusters[cluster]
     content = error_table(judged)
-    title = f"Formation errors of {cluster} from {start:g} to {end:g} s"
+    title = f"Formation errors of {cluster} from {span_text(summary.window_s)}"
     beside = ", beside Table I of the paper" if judged.paper_std else ""
     mark = "" if summary.as_planned else f" ({NOT_AS_PLANNED})"
     caption = "est. = estimate − desired, true = truth − desired"
+    if judged.part:
+        caption += f"; {judged.part}"
     if content.rest:
         caption += f"; all {len(content.rest.rows)} parameters: report.html, summary.json"
     columns = [TERMINAL_COLUMNS[column] for column in content.columns]

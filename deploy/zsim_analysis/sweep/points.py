@@ -11,8 +11,9 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.errors import ScenarioError
+from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.report.paper import paper_table
+from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
 from zsim_analysis.sweep.axes import Draw, Seeds
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.intervals import LEVEL, ConfidenceInterval, mean_interval, share_interval
@@ -150,12 +151,6 @@ class SweepSummary(Struct, frozen=True):
 def count_text(count: int, of: int) -> str:
     """Return the number of runs behind a mean where it is less than the whole, else ""."""
     return f"n = {count}" if count < of else ""
-
-
-def window_text(window_s: tuple[float, float]) -> str:
-    """Return a judged window, to 0.01 s."""
-    start, end = (f"{side:.2f}".rstrip("0").rstrip(".") for side in window_s)
-    return f"{start} to {end} s"
 
 
 class SweepResults:
@@ -317,11 +312,15 @@ def _error_columns(rows: Sequence[Row]) -> list[str]:
 
 
 def _paper_std(design: SweepDesign) -> Mapping[str, float]:
-    """Return Table I where all runs fly Test 1; empty where another flight is swept, or its plan varies."""
-    if any("plan" in path for path in design.varied):
+    """Return Table I where every point flies Test 1; empty where only some do, or a field other than seed is drawn."""
+    if any(isinstance(axis, Draw) for axis in design.axes):
         return {}
     try:
-        scenario = design.scenario(0)
+        flown = all(_flies_test_1(design.scenario(point)) for point in range(design.points))
+        return PAPER_TABLE_1 if flown else {}
     except ScenarioError:
         return {}
-    return paper_table(scenario, scenario.clusters[0].name) if len(scenario.clusters) == 1 else {}
+
+
+def _flies_test_1(scenario: Scenario) -> bool:
+    return len(scenario.clusters) == 1 and bool(paper_table(scenario, scenario.clusters[0].name))

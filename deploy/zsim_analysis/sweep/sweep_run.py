@@ -219,7 +219,7 @@ def _row(
         min_separation_m=summary.min_separation_m,
         collisions=sum(event.kind == "collision" for event in flight.events),
         engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
-        engaged_throughout=not _outside_plan(summary, ("window", "early", "engagement")) if clusters else None,
+        engaged_throughout=all(_is_engaged_throughout(summary, name) for name in clusters) if clusters else None,
         as_planned=summary.as_planned,
         shortfall=next((each.text for each in summary.shortfalls if each.fails), None),
         metrics_failure=metrics.failure,
@@ -233,9 +233,9 @@ def _row(
     return make_row(result, task.varied, {**columns, **metrics.columns})
 
 
-def _outside_plan(summary: RunSummary, kinds: tuple[str, ...]) -> set[str]:
-    """Return the clusters that have a shortfall of one of some kinds."""
-    return {each.subject for each in summary.shortfalls if each.kind in kinds}
+def _is_engaged_throughout(summary: RunSummary, cluster: str) -> bool:
+    judged = summary.clusters.get(cluster)
+    return judged is not None and judged.engaged_share == 1.0
 
 
 def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, float | None]:
@@ -245,7 +245,7 @@ def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, 
     drones that hover in place of a trajectory, hold no formation that was asked for.
     """
     columns: dict[str, float | None] = {}
-    refused = _outside_plan(summary, ("plan",))
+    refused = {each.subject for each in summary.shortfalls if each.kind == "plan"}
     for i, (name, cluster) in enumerate(summary.clusters.items()):
         prefix = "errors" if i == 0 else f"clusters.{name}.errors"
         for parameter, errors in cluster.errors.items():

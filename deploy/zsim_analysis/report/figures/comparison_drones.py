@@ -32,7 +32,7 @@ def draw_plans(runs: Sequence[ComparedRun]) -> Figure:
         axes.set_axis_off()
     for run, axes in zip(runs, grid.flat, strict=False):
         dress(axes)
-        axes.set_title(run.name, fontsize=PAPER_PT)
+        axes.set_title(run.label, fontsize=PAPER_PT)
         axes.set_aspect("equal", adjustable="box")
         draw_obstacles(axes, run.flight.scenario)
         for track in run.flight.tracks:
@@ -91,7 +91,7 @@ def _draw_run_drones(run: ComparedRun, panels: Any, colours: Mapping[str, str], 
     for axes, quantity in zip(panels, ("true altitude (m)", "", "battery (%)"), strict=True):
         axes.set_axis_on()
         dress(axes, quantity if first else "")
-    panels[0].set_title(run.name, fontsize=PAPER_PT)
+    panels[0].set_title(run.label, fontsize=PAPER_PT)
     draw_drone_panels(panels, run.flight.tracks, colours, named=0)
     panels[-1].tick_params(labelbottom=True)
     draw_marks(panels, time_marks(run.flight, run.formations[0] if run.formations else None))

@@ -99,7 +99,7 @@ def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -
         axes.set_xlabel(f"RMS error ({measure})", fontsize=PAPER_PT)
     for i, run in enumerate(runs):
         look = run_style(i)
-        panels[0].plot([], [], look.marker, color=look.color, ms=7, label=run.name)
+        panels[0].plot([], [], look.marker, color=look.color, ms=7, label=run.label)
     legend_above(figure, panels[0])
     return figure
 
@@ -132,7 +132,7 @@ def _draw_errors(
     grid = figure.subplots(len(shown), len(some), squeeze=False, sharex=True, sharey="row")
     for run, column in zip(some, grid.T, strict=True):
         formation = run.formation(cluster)
-        column[0].set_title(run.name, fontsize=PAPER_PT)
+        column[0].set_title(run.label, fontsize=PAPER_PT)
         label_time(column[-1:])
         for name, axes in zip(shown, column, strict=True):
             if formation is None or name not in formation.names:
@@ -176,7 +176,7 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
         for i, run in enumerate(runs):
             formation = run.formation(cluster)
             if formation is not None and name in formation.names:
-                drawn += _draw_run(true_axes, measured_axes, formation, name, i, run.name)
+                drawn += _draw_run(true_axes, measured_axes, formation, name, i, run.label)
         if drawn:
             scale(true_axes, *drawn)
         for axes in (true_axes, measured_axes):

@@ -30,7 +30,7 @@ from zsim_analysis.report.pages import (
 EACH_MAX = 4  # drones with a column of their own on a page
 QUANTITIES = ("x (m)", "y (m)", "z (m)", "yaw (rad)")
 INSIDE = 0.9545  # share of a normal error within SIGMAS standard deviations
-SMALL_PT = PAPER_PT - 1.5
+SMALL_PT, NOTE_PAD_PT = PAPER_PT - 1.5, 2.0  # of a figure of merit above its axes
 CONSISTENT = "95 % of χ²"  # the range of NEES that nineteen of twenty have whose covariance is true
 FLOOR = 0.1  # of NEES on its axis, which is logarithmic
 
@@ -41,13 +41,13 @@ def draw_estimates(
     """Return estimate − truth with its band and NEES of every drone, or of many their spread."""
     if len(errors) > EACH_MAX:
         return _draw_many(errors, colours, window_s, marks)
-    figure = new_figure(PAGE_IN, 0.8 + 0.85 * (len(QUANTITIES) + 1))
+    figure = new_figure(PAGE_IN, 0.8 + 0.95 * (len(QUANTITIES) + 1))
     grid = figure.subplots(len(QUANTITIES) + 1, len(errors), squeeze=False, sharex=True, sharey="row")
     for (name, each), column in zip(errors.items(), grid.T, strict=True):
-        column[0].set_title(name, fontsize=PAPER_PT)
+        column[0].set_title(name, loc="left", fontsize=PAPER_PT)
         _draw_drone(column, each, colours[name], _rows(each, window_s))
         draw_marks(column, marks)
-    _share_ranges(grid, errors.values(), window_s)
+    _share_ranges(grid, errors.values(), marks.engaged_s)
     for axes, quantity in zip(grid[:, 0], (*QUANTITIES, "NEES"), strict=True):
         axes.set_ylabel(quantity, fontsize=PAPER_PT)
     label_time(grid[-1])
@@ -90,10 +90,8 @@ def draw_band(axes: Axes, t_s: Array, half: Array) -> None:
 
 
 def _note(axes: Axes, text: str) -> None:
-    place = {"transform": axes.transAxes, "ha": "right", "va": "top", "zorder": 7}
-    axes.text(
-        0.99, 0.97, text, fontsize=SMALL_PT, bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.8}, **place
-    )
+    """Write a figure of merit above axes, where it covers no curve."""
+    axes.set_title(text, loc="right", fontsize=SMALL_PT, pad=NOTE_PAD_PT)
 
 
 def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, of: int = 1) -> None:
@@ -106,16 +104,16 @@ def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, of: int = 1) ->
     axes.tick_params(which="both", labelsize=PAPER_PT - 1)
 
 
-def _share_ranges(grid: Any, errors: Any, window_s: tuple[float, float]) -> None:
-    """Give each row the range of errors and bands within the window: the start's large sigmas leave it."""
+def _share_ranges(grid: Any, errors: Any, engaged_s: float | None) -> None:
+    """Give each row the range of all errors and bands since the engagement: the start's large sigmas leave it."""
     for i, row in enumerate(grid[:-1]):
         reach = 0.0
         for each in errors:
-            rows = _rows(each, window_s)
+            rows = each.t_s >= (-np.inf if engaged_s is None else engaged_s)
             seen = np.maximum(np.abs(each.error[rows, i]), SIGMAS * each.sigma[rows, i])
             reach = max(reach, float(np.nanmax(seen, initial=0.0)))
         if reach > 0:
-            row[0].set_ylim(-1.35 * reach, 1.35 * reach)
+            row[0].set_ylim(-1.05 * reach, 1.05 * reach)
 
 
 def _draw_many(

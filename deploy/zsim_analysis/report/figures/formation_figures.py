@@ -11,6 +11,7 @@ from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.goal import GoalErrors
 from zsim_analysis.reading.recorded_flight import Array
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.figures.spread import draw_spread
 from zsim_analysis.report.figures.time_marks import TimeMarks, draw_marks
 from zsim_analysis.report.pages import (
@@ -58,7 +59,7 @@ def draw_errors(
             _draw_goal(axes[0], formation, goal, name)
         draw_error(axes[-2], formation, name, every)
         draw_error(axes[-1], formation, name, rows)
-        _write_statistics(axes[-1], formation, name, rows)
+        _write_statistics(axes[-1], formation, name, formation.judged(window_s))
         axes[0].set_ylabel(label(name), fontsize=PAPER_PT)
     for (measure, members), axes in zip(others.items(), grid[len(names) :], strict=True):
         if goal:
@@ -71,13 +72,14 @@ def draw_errors(
 
 
 def _finish_errors(figure: Figure, grid: Any, window_s: tuple[float, float], marks: TimeMarks) -> None:
-    titles = ("against the final goal", "against the reference", f"the same, {window_s[0]:g} to {window_s[1]:g} s")
+    titles = ("against the final goal", "against the reference", f"the same, {span_text(window_s)}")
     for column, title in zip(grid.T, titles[-grid.shape[1] :], strict=True):
         column[0].set_title(title, fontsize=PAPER_PT)
     for axes in grid[:, :-1].flat:
         axes.axvspan(*window_s, **SHADE)
-    for column in grid.T:
+    for column in grid.T[:-1]:
         draw_marks(column, marks)
+    draw_marks(grid[:, -1], marks, whole=False)
     label_time(grid[-1])
     figure.align_ylabels(grid[:, 0])
     legend_above(figure, grid[0, 0], columns=6)
@@ -136,10 +138,10 @@ def draw_error(axes: Axes, formation: Formation, name: str, rows: np.ndarray) ->
 
 def _write_statistics(axes: Axes, formation: Formation, name: str, rows: np.ndarray) -> None:
     """Write standard deviations and means beside the axes, in the colours of their lines."""
-    i = formation.column(name)
+    i, missing = formation.column(name), "no data" if rows.any() else "not\nengaged"
     for y, error, style in ((0.75, formation.est_error, MEASURED), (0.25, formation.true_error, TRUE)):
         known = error[rows, i][np.isfinite(error[rows, i])]
-        text = f"std {known.std():.3g}\nmean {known.mean():+.2g}" if len(known) else "no data"
+        text = f"std {known.std():.3g}\nmean {known.mean():+.2g}" if len(known) else missing
         place = {"transform": axes.transAxes, "fontsize": PAPER_PT - 1.5, "va": "center", "linespacing": 1.0}
         axes.text(1.03, y, text, color=_darker(style["color"]), **place)
 

@@ -1,7 +1,6 @@
 """The figures of a report: of its formations, of every drone, and from above, in the order of its page."""
 
 from collections.abc import Iterator, Sequence
-from textwrap import shorten
 
 from zsim.drone_colours import colours_of
 from zsim_analysis.reading.distances import distances, separations
@@ -15,10 +14,9 @@ from zsim_analysis.report.figures.formation_figures import ROWS_MAX, draw_errors
 from zsim_analysis.report.figures.motion_figures import PAIRS_MAX, draw_distances, draw_velocities
 from zsim_analysis.report.figures.plan_view import draw_plan
 from zsim_analysis.report.figures.time_marks import TimeMarks, time_marks
-from zsim_analysis.report.pages import ReportFigure, mark_figure
+from zsim_analysis.report.pages import DARK, VERMILION, ReportFigure, mark_figure
 from zsim_analysis.report.summary import RunSummary
 
-MARK_MAX = 110  # characters of a line above a figure
 REFERENCE = (
     "Estimate − desired is what the controller sees; truth − desired is what the drones do. Until the formation is "
     "engaged, the controller takes its own estimate as the desired value."
@@ -29,19 +27,18 @@ SPREAD = "Of the variables that have no row: median, 5 to 95 % and extremes of t
 
 def figures(flight: RecordedFlight, formations: Sequence[Formation], summary: RunSummary) -> Iterator[ReportFigure]:
     """Yield the figures that the record has data for, the first cluster's under the plain names, marked if need be."""
-    mark = shortfall_mark(summary)
     for figure in _plain(flight, formations, summary.window_s):
-        mark_figure(figure.drawing, mark)
+        if summary.shortfalls:
+            mark_figure(figure.drawing, *shortfall_mark(summary))
         yield figure
 
 
-def shortfall_mark(summary: RunSummary) -> str:
-    """Return what every figure of a flight that did not fly its plan says of it; empty for one that did."""
-    failed = [each.text for each in summary.shortfalls if each.fails]
-    if not failed:
-        return ""
-    more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
-    return f"Not as planned: {shorten(failed[0], MARK_MAX, placeholder=' …')}{more}"
+def shortfall_mark(summary: RunSummary) -> tuple[str, str, str]:
+    """Return what every figure of a flight with shortfalls says of it: head, what matters most of them, and colour."""
+    found = [each.text for each in summary.shortfalls if each.fails or summary.as_planned]
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    head, colour = ("Note", DARK) if summary.as_planned else ("Not as planned", VERMILION)
+    return f"{head}{more}", found[0], colour
 
 
 def _plain(
@@ -90,7 +87,8 @@ def _answers(flight: RecordedFlight, window_s: tuple[float, float], marks: TimeM
             "Estimates",
             "Estimate − truth with the band of two standard deviations that the estimator states, and NEES, the error "
             "of position and velocity squared and divided by its covariance: 6 on average where that is true. Shares "
-            "and means are those of the window.",
+            "and means, above the panels, are those of the window; the axes hold all since the engagement, and what is "
+            "larger before it leaves them.",
             draw_estimates(errors, colours, window_s, marks),
         )
     if responses := velocity_responses(flight):

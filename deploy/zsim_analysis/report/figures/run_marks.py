@@ -34,7 +34,7 @@ class RunMarks(Struct, frozen=True):
 def run_marks(runs: Sequence[ComparedRun], cluster: str) -> list[RunMarks]:
     """Return the marks of all runs, phases and engagement being those of a cluster."""
     return [
-        RunMarks(run.name, time_marks(run.flight, run.formation(cluster)), _collisions_s(run.flight)) for run in runs
+        RunMarks(run.label, time_marks(run.flight, run.formation(cluster)), _collisions_s(run.flight)) for run in runs
     ]
 
 

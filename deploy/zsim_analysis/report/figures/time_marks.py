@@ -33,17 +33,26 @@ class Band(Struct, frozen=True):
 
 
 class TimeMarks(Struct, frozen=True):
-    """What is marked on the time axes of a flight; times [s], None where it never happened."""
+    """What is marked on the time axes of a flight; times [s], None where it never happened.
+
+    Attributes:
+        takeoff_s, engaged_s: of the first drone, and of the formation.
+        bands: what lasted.
+        span_s: the run, which every time axis shows all of; None: what is drawn.
+    """
 
     takeoff_s: float | None = None
     engaged_s: float | None = None
     bands: tuple[Band, ...] = ()
+    span_s: tuple[float, float] | None = None
 
 
 def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> TimeMarks:
     """Return the marks of a flight, phases and engagement being those of a formation."""
     bands = [*fault_bands(flight), *take_over_bands(flight), *(phase_bands(formation) if formation else ())]
-    return TimeMarks(_takeoff_s(flight), formation.engaged_s if formation else None, tuple(bands))
+    start_s = flight.first_ns / 1e9 if flight.replay_of else 0.0  # a replay may begin anywhere
+    span_s = (start_s, flight.last_ns / 1e9)
+    return TimeMarks(_takeoff_s(flight), formation.engaged_s if formation else None, tuple(bands), span_s)
 
 
 def _takeoff_s(flight: RecordedFlight) -> float | None:
@@ -94,9 +103,18 @@ def _ends(begun: Event, later: Sequence[Event]) -> Iterator[int]:
             yield event.t_ns
 
 
-def draw_marks(axes: Sequence[Axes], marks: TimeMarks) -> None:
-    """Draw marks into axes that hold their lines already, and which they do not widen; the first ones name them."""
+def draw_marks(axes: Sequence[Axes], marks: TimeMarks, whole: bool = True) -> None:
+    """Draw marks into axes that hold their lines already; the first ones name them.
+
+    Args:
+        axes: of one time axis.
+        marks: of the flight.
+        whole: the axes show the whole run; else what is drawn, which the marks do not widen.
+    """
     for number, each in enumerate(axes):
+        if whole and marks.span_s:
+            each.update_datalim([(t_s, 0.0) for t_s in marks.span_s], updatey=False)
+            each.autoscale_view(scaley=False)
         _draw(each, marks, named=number == 0)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from zsim.errors import ReportError
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
 from zsim_analysis.sweep.intervals import ConfidenceInterval
@@ -16,7 +17,6 @@ from zsim_analysis.sweep.points import (
     GridPoint,
     SweepResults,
     SweepSummary,
-    window_text,
 )
 from zsim_analysis.sweep.report.field_names import FieldName, field_name
 from zsim_analysis.sweep.report.sweep_figures import figures
@@ -102,7 +102,7 @@ def facts(summary: SweepSummary) -> list[tuple[str, str]]:
 
 def windows_of(summary: SweepSummary) -> str:
     """Return the judged windows of all runs in words."""
-    return window_text(summary.windows_s) if summary.windows_s else "not known"
+    return span_text(summary.windows_s) if summary.windows_s else "not known"
 
 
 def marks_of(summary: SweepSummary) -> list[str]:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.pages import (
     BLACK,
     BLUE,
@@ -23,7 +24,7 @@ from zsim_analysis.report.pages import (
     new_figure,
 )
 from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
-from zsim_analysis.sweep.points import FormationParameter, SweepResults, window_text
+from zsim_analysis.sweep.points import FormationParameter, SweepResults
 from zsim_analysis.sweep.report.distributions import PAPER, Panel, Samples, draw_distribution, known
 from zsim_analysis.sweep.report.field_names import field_name
 from zsim_analysis.sweep.report.grid_axis import MARK, POINTS_MAX, GridAxis, Place
@@ -118,7 +119,7 @@ def _symbol(parameter: FormationParameter) -> str:
 
 def _window(results: SweepResults) -> str:
     windows_s = results.windows_s()
-    return f" ({window_text(windows_s)})" if windows_s else ""
+    return f" ({span_text(windows_s)})" if windows_s else ""
 
 
 def _legend(results: SweepResults) -> str:
@@ -166,22 +167,17 @@ def _name(
         axes.plot([], [], "s", color="#d55e0066", ms=8, label=mean_label(results))
     if beyond:
         axes.plot([], [], "^", color=mean, ms=7, mec="white", mew=0.6, label=BEYOND_AXIS)
-    if results.never_as_planned():
-        _name_never_as_planned(figure, axes, axis)
+    never = results.never_as_planned()
+    if never and axis:
+        axes.plot([], [], "x", color=MARK, ms=6, mew=1.6, label=NEVER_AS_PLANNED)
     if paper:
         axes.plot([], [], color=PAPER, ls="--", lw=1.2, label=TABLE_I)
     if axis and len(axis.series) > 1:
         for place in {place.series: place for place in axis.places.values()}.values():
             axes.plot([], [], color=axis.colour(place), lw=3, label=axis.series[place.series])
     legend_above(figure, axes, LEGEND_COLUMNS)
-
-
-def _name_never_as_planned(figure: Figure, axes: Axes, axis: GridAxis | None) -> None:
-    """Say of a figure that all its runs left their plan, or in its legend what the cross at a point is."""
-    if axis is None:
-        mark_figure(figure, NEVER_AS_PLANNED)
-    else:
-        axes.plot([], [], "x", color=MARK, ms=6, mew=1.6, label=NEVER_AS_PLANNED)
+    if never and not axis:
+        mark_figure(figure, NEVER_AS_PLANNED, "", MARK)  # all its runs left their plan
 
 
 def _safety(results: SweepResults) -> Figure:
@@ -227,8 +223,6 @@ def _share(axes: Axes, count: int, of: int, x: float, mark: str, colour: str) ->
 def _scatter(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figure:
     rows = -(-len(panels) // COLUMNS)
     figure = new_figure(PAGE_IN, 0.8 + 1.8 * rows)
-    if len(results.never_as_planned()) == results.design.points:
-        mark_figure(figure, NEVER_AS_PLANNED)
     grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
     x = results.values(path)
     beyond = False
@@ -250,6 +244,8 @@ def _scatter(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figur
     if beyond:
         grid[0].plot([], [], "^", color=VERMILION, ms=7, mec="white", mew=0.6, label=BEYOND_AXIS)
     legend_above(figure, grid[0], LEGEND_COLUMNS)
+    if len(results.never_as_planned()) == results.design.points:
+        mark_figure(figure, NEVER_AS_PLANNED, "", MARK)
     return figure
 
 

@@ -1,13 +1,16 @@
 """A flight that did not do what its plan says is marked, wherever it is shown; one that did is not."""
 
 from collections.abc import Callable, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 import synthetic_record
 import typer
+from rich.console import Console
 from synthetic_record import Flown
 
 from zsim.contract import keys, messages
@@ -16,11 +19,13 @@ from zsim.contract.run_messages import Clock, Event
 from zsim.record import RecordWriter
 from zsim_agents.formation.flight_plan import WAITS, waiting_step
 from zsim_analysis.reading.flight import FlightReader
+from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.shortfall import Shortfall, shortfalls
 from zsim_analysis.reading.verdict import NOT_AS_PLANNED, marks_of, verdict
 from zsim_analysis.report.figures.report_figures import figures
-from zsim_analysis.report.make_report import judge, page
+from zsim_analysis.report.make_report import facts, judge, page
+from zsim_analysis.report.pages import COLUMN_IN, PAGE_IN, VERMILION, legend_above, mark_figure, new_figure
 from zsim_analysis.report.tables import table
 from zsim_deploy.cli import record_commands
 
@@ -28,9 +33,9 @@ State = Callable[[float], dict[str, Any]]
 SOON: tuple[str, ...] = ("clusters.main.plan.takeoff_s=1", "report.window_s=[4, 30]")
 
 
-def traffic(state: State, events: Sequence[Event] = (), duration_s: float = 30.0, overrides=SOON):
+def traffic(state: State, events: Sequence[Event] = (), duration_s: float = 30.0, overrides=SOON, **more: Any):
     """Yield a synthetic flight whose cluster states are other ones from `state`, by time [s]."""
-    flown = Flown(duration_s=duration_s, overrides=tuple(overrides), events=tuple(events))
+    flown = Flown(duration_s=duration_s, overrides=tuple(overrides), events=tuple(events), **more)
     for key, message, wall_ns in synthetic_record.traffic(flown):
         if isinstance(message, ClusterState):
             message = msgspec.structs.replace(message, **state(message.t_ns / 1e9))
@@ -86,6 +91,92 @@ def test_a_window_that_holds_the_take_off_is_marked() -> None:
     (line,) = found(lambda t_s: {"phase": "engaged" if t_s > 17 else "assembling"})
     assert (line.kind, line.fails) == ("window", False)
     assert "50 %" in line.text
+
+
+def engaged_between(start_s: float, end_s: float) -> State:
+    """Return the states of a cluster that is engaged for a part of a run, and assembles before and after."""
+    return lambda t_s: {"phase": "engaged" if start_s <= t_s <= end_s else "assembling"}
+
+
+LATE = "clusters.main.plan.trajectory={start_s: 60, expressions: {x_c: '5*t'}}"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "step"), [(LATE, "trajectory at 60 s"), ("clusters.main.plan.land_s=33.3333", "landing at 33.33 s")]
+)
+def test_a_step_of_the_plan_for_which_the_run_was_too_short_is_named(overrides: str, step: str) -> None:
+    (line,) = found(lambda t_s: {"phase": "engaged"}, overrides=(*SOON, overrides))
+    assert (line.kind, line.subject, line.t_s, line.fails) == ("early", "main", 30.0, False)
+    assert step in line.text
+
+
+def test_a_run_that_ends_on_the_way_to_the_target_is_named() -> None:
+    (line,) = found(lambda t_s: {"phase": "engaged"}, climb_s=40.0)
+    assert (line.kind, line.subject, line.fails) == ("early", "main", False)
+    assert found(lambda t_s: {"phase": "engaged"}, climb_s=20.0) == []
+    assert found(lambda t_s: {"phase": "engaged", "reason": "guard"}, climb_s=40.0) == []
+
+
+def test_errors_are_those_of_the_engaged_part_of_the_window() -> None:
+    """Where it was not engaged, estimate − desired is zero whatever the drones did."""
+    window_s = (4.0, 30.0)
+    error = np.full(12, 0.2)
+    whole, part, none = (
+        formations_of(flight_of(state, est_amplitude=error))[0]
+        for state in (lambda t_s: {"phase": "engaged"}, engaged_between(16.0, 22.0), engaged_between(31.0, 32.0))
+    )
+    assert part.errors(window_s) == whole.errors((16.0, 22.0))
+    assert part.errors(window_s) != whole.errors(window_s)
+    assert part.engaged_share(window_s) == pytest.approx(301 / 1301)
+    assert none.engaged_share(window_s) == 0.0
+    assert {value for errors in none.errors(window_s).values() for value in msgspec.structs.astuple(errors)} == {None}
+
+
+@pytest.mark.usefixtures("unrendered")
+@pytest.mark.parametrize(
+    ("state", "part"), [(engaged_between(17.0, 30.0), "50"), (engaged_between(2.0, 3.0), "no errors")]
+)
+def test_table_figures_and_page_say_of_which_part_the_errors_are(state: State, part: str, tmp_path: Path) -> None:
+    write(tmp_path / "run.mcap", state, ())
+    flight, formations, summary = judge(tmp_path / "run.mcap")
+    assert summary.clusters["main"].engaged_share is not None
+    assert part in summary.clusters["main"].part
+    console = Console(width=200, file=StringIO())
+    console.print(table(summary, "main"))
+    assert summary.clusters["main"].part in console.file.getvalue()  # type: ignore[attr-defined]
+    assert part in page(summary, [])
+    assert all("window" in figure.drawing.get_suptitle() for figure in figures(flight, formations, summary))
+
+
+def test_the_head_of_a_flight_that_was_cut_short_does_not_say_that_its_plan_was_flown(tmp_path: Path) -> None:
+    answers = []
+    for name, overrides in (("all", SOON), ("short", (*SOON, LATE))):
+        write(tmp_path / name, lambda t_s: {"phase": "engaged"}, (), overrides=overrides)
+        answers.append(dict(facts(judge(tmp_path / name)[-1]))["Flown as planned"])
+    assert answers[0] == "yes" != answers[1]
+
+
+@pytest.mark.parametrize("reason", ["too fast", "allowed: " + "sin(beta) min(p, q) is 0.35 m, " * 12])
+def test_the_mark_of_a_figure_is_whole_and_covers_nothing(reason: str) -> None:
+    for width_in in (COLUMN_IN, PAGE_IN):
+        figure = new_figure(width_in, 2.0)
+        axes = figure.subplots()
+        for k in range(6):
+            axes.plot([0, 1], [k, k], label=f"line {k}")
+        legend_above(figure, axes, columns=2)
+        lowest = figure.legend(handles=axes.lines[:2], loc="outside lower center")
+        mark_figure(figure, "Not as planned", f"main: refused: {reason}", VERMILION)
+        figure.draw_without_rendering()
+        assert figure.get_suptitle().partition("\n")[0] == "Not as planned"
+        (mark,), legend = figure.texts, figure.legends[0]
+        above, middle, below = (each.get_window_extent() for each in (mark, legend, axes))
+        axis = axes.get_tightbbox()
+        assert axis is not None
+        assert axis.y0 >= lowest.get_window_extent().y1
+        assert 0 <= above.x0 <= above.x1 <= figure.bbox.width
+        assert above.y1 <= figure.bbox.height
+        assert above.y0 >= middle.y1
+        assert middle.y0 >= below.y1
 
 
 def test_a_collision_is_one() -> None:
@@ -146,9 +237,9 @@ def test_the_verdict_is_the_same_with_and_without_a_report(
     assert plain[0] == code
 
 
-def write(record: Path, state: State, events: Sequence[Event]) -> None:
+def write(record: Path, state: State, events: Sequence[Event], **options: Any) -> None:
     """Write a record that is complete."""
-    flown = list(traffic(state, events))
+    flown = list(traffic(state, events, **options))
     clock = next(message for _, message, _ in reversed(flown) if isinstance(message, Clock))
     with RecordWriter(record) as writer:
         for key, message, wall_ns in flown:

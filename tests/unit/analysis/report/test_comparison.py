@@ -10,10 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
+import msgspec
 import numpy as np
 import pytest
 import synthetic_record
 from matplotlib.colors import to_hex
+from matplotlib.text import Text
 from refused import has_terms, refused
 from synthetic_record import Flown
 from typer.testing import CliRunner
@@ -23,17 +25,27 @@ from zsim.errors import RecordError, ReportError
 from zsim_analysis.report.comparison import (
     ABSENT,
     THERE,
+    UNPLANNED,
     ComparedRun,
     clusters,
     flattened,
     notes,
     run_names,
     scenario_rows,
+    table_groups,
 )
 from zsim_analysis.report.figures.comparison_figures import comparison_figures
 from zsim_analysis.report.figures.run_marks import POINTS
 from zsim_analysis.report.figures.run_style import STYLES, run_style
-from zsim_analysis.report.make_report import STATISTICS, compare, comparison_path, fact_rows, judge, statistics_rows
+from zsim_analysis.report.make_report import (
+    STATISTICS,
+    compare,
+    comparison_page,
+    comparison_path,
+    fact_rows,
+    judge,
+    statistics_rows,
+)
 from zsim_deploy.cli.cli import app
 
 WINDOW = "report.window_s=[2, 9.98]"
@@ -211,12 +223,12 @@ def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
     labels = [axes.get_xlabel() for axes in drawn["rms_main.png"].axes]
     assert [text.rpartition("(")[2] for text in labels] == ["m)", "rad)"]
     lanes, _, x_true, x_measured = drawn["figure_6_position_main.png"].axes[:4]
-    assert [text.get_text() for text in lanes.get_yticklabels()] == ["calm", "rough", "alone", "calm again"]
+    assert [text.get_text() for text in lanes.get_yticklabels()] == [run.label for run in four]
     largest = [float(np.nanmax(np.abs(np.asarray(line.get_ydata()) - 5.0))) for line in x_true.lines[::2][:3]]
-    assert [line.get_label() for line in x_true.lines[::2][:3]] == ["calm", "rough", "calm again"]
+    assert [line.get_label() for line in x_true.lines[::2][:3]] == [four[i].label for i in (0, 1, 3)]
     assert largest == pytest.approx([ERRORS[0], 3 * ERRORS[0], ERRORS[0]], rel=1e-3)
     assert len(x_measured.lines) == 9  # measured, desired, and the engagement of three runs
-    assert [axes.get_title() for axes in drawn["plan_view.png"].axes] == [run.name for run in four]
+    assert [axes.get_title() for axes in drawn["plan_view.png"].axes] == [run.label for run in four]
 
 
 def test_runs_over_each_other_have_each_its_marks_in_its_colour(tmp_path: Path) -> None:
@@ -229,7 +241,7 @@ def test_runs_over_each_other_have_each_its_marks_in_its_colour(tmp_path: Path) 
     both = judged([record(tmp_path / name, flight) for name, flight in flights.items()])
     figure = next(each.drawing for each in comparison_figures(both) if each.name == "figure_6_position_main.png")
     lanes, _, curves = figure.axes[:3]
-    assert [text.get_text() for text in lanes.get_yticklabels()] == ["first", "second"]
+    assert [text.get_text() for text in lanes.get_yticklabels()] == [run.label for run in both]
     colours = [run_style(index).color for index in range(2)]
     assert [text.get_color() for text in lanes.get_yticklabels()] == colours
     pointed = [line for line in lanes.lines if line.get_marker() in POINTS.values()]
@@ -270,6 +282,32 @@ def test_the_page_is_one_file_that_asks_nothing_of_the_network(runs: list[Path],
     assert has_terms("\n".join(steps), "calm", "reading")
     for run in compared:
         assert run.summary.truth_sha256 in text
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_run_that_did_not_fly_as_planned_is_marked_in_every_table_and_figure(compared: list[ComparedRun]) -> None:
+    bad = replace(compared[1], summary=msgspec.structs.replace(compared[1].summary, as_planned=False))
+    good = replace(compared[0], summary=msgspec.structs.replace(compared[0].summary, as_planned=True))
+    text = comparison_page([good, bad], [])
+    heads = re.findall(r"<th[^>]*>((?:calm|rough)[^<]*)</th>", text)
+    assert heads == ["calm", f"rough {UNPLANNED}"] * 3
+    assert UNPLANNED not in comparison_page([good, replace(good, name="again")], [])
+    for figure in comparison_figures([good, bad]):
+        assert any(UNPLANNED in each.get_text() for each in figure.drawing.findobj(Text)), figure.name
+
+
+def test_a_table_of_errors_has_no_more_runs_than_fit_the_page(compared: list[ComparedRun]) -> None:
+    many = [replace(compared[0], name=f"run{number}") for number in range(5)]
+    assert [[run.name for run in group] for group in table_groups(many)] == [
+        ["run0", "run1"],
+        ["run2", "run3"],
+        ["run4"],
+    ]
+    text = comparison_page(many, [])
+    tables = re.findall(r'<table class="numbers">.*?</table>', text, re.DOTALL)
+    assert [len(re.findall(r'colspan="4"', each)) for each in tables] == [2, 2, 1]
+    for each in tables:
+        assert len(re.findall(r"<td", each)) % (1 + 4 * each.count('colspan="4"')) == 0
 
 
 @pytest.mark.usefixtures("unrendered")

@@ -10,6 +10,7 @@ import pytest
 import synthetic_record
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from msgspec.structs import replace
 from synthetic_record import Flown
 
 from zsim.drone_colours import drone_colours
@@ -104,11 +105,33 @@ def test_figures_of_drones_fit_a_page(count: int) -> None:
 def test_few_drones_have_a_column_each_with_band_and_nees() -> None:
     figure = draw_estimates(estimates(3), colours(3), WINDOW_S, MARKS)
     assert len(figure.axes) == 5 * 3
-    assert {axes.get_title() for axes in figure.axes[:3]} == set(names(3))
+    assert {axes.get_title(loc="left") for axes in figure.axes[:3]} == set(names(3))
     for axes in figure.axes[: 4 * 3]:
         assert len(axes.collections) == 1  # the band
-        assert any("2σ" in text.get_text() for text in axes.texts)
+        assert "2σ" in axes.get_title(loc="right")
     assert all(axes.get_yscale() == "log" for axes in figure.axes[4 * 3 :])
+    assert not any(axes.texts for axes in figure.axes)  # which would stand upon the curves
+
+
+def test_the_axes_of_estimates_hold_all_since_the_engagement() -> None:
+    """An error that is large before the window belongs to the flight; one before the engagement is the start's noise."""
+    errors = estimates(3)
+    first = errors["drone1"].error
+    first[np.searchsorted(T_S, 3.5), 3], first[np.searchsorted(T_S, 0.5), 3] = 2.0, 50.0
+    yaw = draw_estimates(errors, colours(3), WINDOW_S, MARKS).axes[3 * 3]
+    assert 2.0 < yaw.get_ylim()[1] < 3.0
+
+
+@pytest.mark.parametrize("count", [3, 30])
+def test_the_time_axis_of_velocities_is_that_of_the_run_with_its_marks(count: int) -> None:
+    late = {name: VelocityResponse(*(each[T_S >= 5.0] for each in one)) for name, one in responses(count).items()}
+    figure = draw_velocities(late, colours(count), replace(MARKS, span_s=(0.0, 20.0)))
+    for axes in figure.axes:
+        low, high = axes.get_xlim()
+        assert -1.0 < low <= 0.0
+        assert 20.0 <= high < 21.0
+        along = [np.asarray(line.get_xdata()).tolist() for line in axes.lines]
+        assert [each for each in along if len(each) == 2] == [[1.0, 1.0], [3.0, 3.0]]
 
 
 def test_a_drone_is_drawn_in_its_colour() -> None:

@@ -26,8 +26,10 @@ from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.terminal.fitted_table import FittedTable
 from zsim_analysis.reading.formation import window
+from zsim_analysis.reading.window_text import percent_text, span_text
 from zsim_analysis.report.make_report import judge, make_report, page
 from zsim_analysis.report.pages import thinned
+from zsim_analysis.report.paper import PAPER_TABLE_1
 from zsim_analysis.report.tables import PAPER_COLUMN, TERMINAL_COLUMNS, table, terminal_text
 
 NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
@@ -371,7 +373,9 @@ def test_figures_show_something(run):
 
 
 def test_the_terminal_table_stands_beside_the_paper(run):
-    _, summary = run
+    _, judged = run
+    cluster = msgspec.structs.replace(judged.clusters["main"], paper_std=PAPER_TABLE_1)
+    summary = msgspec.structs.replace(judged, clusters={"main": cluster})
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(table(summary, "main"))
     console.file.close()
@@ -381,6 +385,15 @@ def test_the_terminal_table_stands_beside_the_paper(run):
     assert f"{AMPLITUDE[9] / math.sqrt(2):.4f}" in row
     assert any("beta (rad)" in line for line in text.splitlines())  # 80 columns do not break a name …
     assert table(summary, "main").left_out(80) == []  # … nor leave a figure out
+
+
+def test_times_of_a_window_have_two_decimals_at_most(tmp_path):
+    summary = report_of(tmp_path, flown(duration_s=20.12, overrides=("report.window_s=null",)))
+    assert summary.window_s == pytest.approx((20.12 / 3, 20.12))
+    assert "6.71 to 20.12 s" in (table(summary, "main").title or "")
+    assert "6.71 to 20.12 s" in page(summary, [])
+    assert span_text((40 / 3, 40.0)) == "13.33 to 40 s"
+    assert [percent_text(share) for share in (0.0, 1e-4, 0.3014, 0.9999, 1.0)] == ["0", "0.1", "30.1", "99.9", "100"]
 
 
 def test_the_paper_stands_beside_its_test_1_alone(tmp_path):

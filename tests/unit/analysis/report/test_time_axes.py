@@ -1,5 +1,6 @@
 """Figures over time: angles from the engagement on, axes that noise before it does not set, marks on every axis."""
 
+import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +22,7 @@ from zsim_analysis.report.figures.plan_view import draw_plan
 from zsim_analysis.report.figures.time_marks import time_marks
 
 ROLL, ENGAGED_S = 3, 4.0
+ROWS = ("t_s", "desired", "value", "true", "est_error", "true_error", "phases")  # of a formation, an instant each
 OBSTACLES = (
     "environment.obstacles=[{name: mast, shape: cylinder, position_m: [1, 2, 0], radius_m: 0.5, height_m: 9}, "
     "{name: wall, shape: box, position_m: [3, 3, 0], size_m: [4, 1, 2], yaw_deg: 30}]",
@@ -87,6 +89,27 @@ def test_marks_stand_on_every_time_axis(flight: RecordedFlight, formation: Forma
         draw_drones(flight, marks),
     ):
         assert all(len(bands_of(figure, place)) >= 3 for place in range(len(figure.axes)))
+
+
+def test_time_axes_are_those_of_the_run_but_for_that_of_the_window(
+    flight: RecordedFlight, formation: Formation
+) -> None:
+    marks = time_marks(flight, formation)
+    assert marks.span_s == (0.0, 12.0)
+    late = dataclasses.replace(formation, **{name: getattr(formation, name)[300:] for name in ROWS})
+    whole, window = draw_errors(late, (8.0, 10.0), marks).axes[:2]
+    assert whole.get_xlim() == pytest.approx((-0.12, 12.12))
+    assert window.get_xlim() == pytest.approx((7.98, 10.02))
+
+
+def test_the_statistics_beside_the_window_are_those_of_the_table(flight: RecordedFlight, formation: Formation) -> None:
+    marks = time_marks(flight, formation)
+    errors = formation.errors((2.0, 10.0))["roll"]
+    est, true = (text.get_text() for text in draw_errors(formation, (2.0, 10.0), marks).axes[2 * ROLL + 1].texts)
+    assert est.startswith(f"std {errors.est_std:.3g}\n")
+    assert true.startswith(f"std {errors.true_std:.3g}\n")
+    before = draw_errors(formation, (1.0, 3.0), marks).axes[2 * ROLL + 1].texts
+    assert [text.get_text().split() for text in before] == [["not", "engaged"]] * 2
 
 
 def bands_of(figure: Figure, place: int) -> list[Any]:
