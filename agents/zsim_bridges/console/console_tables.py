@@ -9,7 +9,7 @@ from html import escape
 from typing import NamedTuple
 
 from zsim.contract.run_messages import Fault
-from zsim_bridges.console.monitoring.alarms import BATTERY_LOW_PERCENT, LATE_MS, Severity
+from zsim_bridges.console.monitoring.alarms import BATTERY_EMPTY_PERCENT, BATTERY_LOW_PERCENT, LATE_MS, Severity
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 from zsim_bridges.console.monitoring.sensor_rates import Counts, SensorRates
@@ -86,10 +86,16 @@ def _drone_cells(row: DroneRow, figures: FlightFigures | None) -> str:
     if figures is not None:
         flown = [f"{figures.position_m[2]:.1f}", f"{figures.speed_m_s:.1f}", f"{figures.heading_deg:.0f}°"]
     left = battery_left_text(figures.battery_left_s if figures else None)
-    colour = RED if row.battery_percent < BATTERY_LOW_PERCENT else "inherit"
-    battery = _coloured(f"{row.battery_percent:.0f} %{left}", colour)
+    battery = _coloured(f"{row.battery_percent:.0f} %{left}", _battery_colour(row.battery_percent))
     sigma = "–" if row.sigma_m is None else f"{row.sigma_m:.2f}"
     return _cells((name, state, *flown, battery, sigma)) + _drone_notes(row)
+
+
+def _battery_colour(percent: float) -> str:
+    """Return the colour of the alarm of a battery."""
+    if percent < BATTERY_EMPTY_PERCENT:
+        return RED
+    return AMBER if percent < BATTERY_LOW_PERCENT else "inherit"
 
 
 def _drone_notes(row: DroneRow) -> str:
