@@ -1,6 +1,7 @@
 """The console's pure parts: what is drawn, how far a slider goes, what is typed, who may pass, the texts."""
 
 import math
+import re
 import socket
 from pathlib import Path
 from types import SimpleNamespace
@@ -566,8 +567,16 @@ def test_tables_show_text_of_others_as_text():
     event = Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")
     events = console_tables.event_table([EventRow(event, 3, False)])
     assert "1.50" in events
+    assert html_marks(events) == html_marks(console_tables.event_table([EventRow(event, 4, False)]))
     assert "&lt;b&gt;no" in events
     assert has_terms(without_tags(events), "3 ×")
+
+
+def html_marks(html: str) -> list[str]:
+    """Return by which rows of events are known to the page."""
+    found = re.findall("data-zsim-event='([0-9a-f]+)'", html)
+    assert found
+    return found
 
 
 @pytest.mark.parametrize(
