@@ -93,16 +93,19 @@ class BrowserPage:
             self.page.wait_for_timeout(POLL_MS)
 
     def until_ground(self, is_so: Callable[[float, float], bool]) -> None:
-        """Wait until a condition holds of the mean lightness, from 0 to 1, and its deviation at the scene's foot."""
-        image = pytest.importorskip("PIL.Image")
-        box = self.page.locator("canvas[data-engine]").bounding_box()
-        clip = {**box, "y": box["y"] + 0.85 * box["height"], "height": 0.12 * box["height"]}
+        """Wait until a condition holds of what `ground` returns."""
         until_s, found = time.monotonic() + PATIENCE_S, (math.nan, math.nan)
         while not is_so(*found):
             assert time.monotonic() < until_s, f"the ground is of lightness and deviation {found}"
-            picture = image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("L")
-            light = np.asarray(picture) / 255.0
-            found = float(light.mean()), float(light.std())
+            found = self.ground()
+
+    def ground(self) -> tuple[float, float]:
+        """Return the mean lightness, from 0 to 1, and its deviation at the scene's foot, where the ground is."""
+        image = pytest.importorskip("PIL.Image")
+        box = self.page.locator("canvas[data-engine]").bounding_box()
+        clip = {**box, "y": box["y"] + 0.85 * box["height"], "height": 0.12 * box["height"]}
+        light = np.asarray(image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("L")) / 255.0
+        return float(light.mean()), float(light.std())
 
     def outside(self) -> set[str]:
         """Return the hosts that it requested for something, beside this machine."""

@@ -58,6 +58,9 @@ UNFOLDED_JS = """() => {
   const text = document.querySelector(".zsim-event-text");
   return text.scrollHeight <= text.clientHeight + 1;
 }"""
+GRID_CONTRAST = 0.03  # at least, of a ground with its grid; of parts of it 0.02, of none 0.005
+ZOOMS, ZOOM_PX = 4, 150  # away from the drones, which are 15 m up
+DRAWN_MS = 1000  # in which a page without a graphics card has drawn what it zoomed to
 LOW = {"width": 1280, "height": 560}  # the panel of drones has a scroll bar
 DRAIN_PERCENT_S = 0.06  # of a battery that lasts about as long as the AR.Drone's
 WIDTHS_JS = "() => [...document.querySelectorAll('.uplot-container')].map(each => each.offsetWidth)"
@@ -222,8 +225,13 @@ def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: 
 def test_the_grid_is_on_the_ground_from_any_height(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page = opened(flight, SCREENS[1])
     page.wait_for_text("running")
-    page.press("Side")  # from 15 m: most of the ground is far below
-    page.until_ground(lambda _, contrast: contrast > 0.01)
+    page.press("Side")
+    page.until_ground(lambda _, contrast: contrast > GRID_CONTRAST)
+    page.page.locator("canvas[data-engine]").hover(position={"x": 200, "y": 300})
+    for _ in range(ZOOMS):
+        page.page.mouse.wheel(0, ZOOM_PX)
+        page.page.wait_for_timeout(DRAWN_MS)
+        assert page.ground()[1] > GRID_CONTRAST
 
 
 @pytest.mark.slow
