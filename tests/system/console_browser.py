@@ -1,11 +1,14 @@
 """Pages of the console in a real browser, and all that they request."""
 
+import io
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 from federation import Federation, Role, free_port
 from wire import PATIENCE_S
@@ -88,6 +91,21 @@ class BrowserPage:
                 return state
             assert time.monotonic() < until_s, f"{condition} never came true: {state}"
             self.page.wait_for_timeout(POLL_MS)
+
+    def until_ground(self, is_so: Callable[[float, float], bool]) -> None:
+        """Wait until a condition holds of what `ground` returns."""
+        until_s, found = time.monotonic() + PATIENCE_S, (math.nan, math.nan)
+        while not is_so(*found):
+            assert time.monotonic() < until_s, f"the ground is of lightness and deviation {found}"
+            found = self.ground()
+
+    def ground(self) -> tuple[float, float]:
+        """Return the mean lightness, from 0 to 1, and its deviation at the scene's foot, where the ground is."""
+        image = pytest.importorskip("PIL.Image")
+        box = self.page.locator("canvas[data-engine]").bounding_box()
+        clip = {**box, "y": box["y"] + 0.85 * box["height"], "height": 0.12 * box["height"]}
+        light = np.asarray(image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("L")) / 255.0
+        return float(light.mean()), float(light.std())
 
     def outside(self) -> set[str]:
         """Return the hosts that it requested for something, beside this machine."""

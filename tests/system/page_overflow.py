@@ -17,13 +17,13 @@ FAULTS_JS = """() => {
     let { left, right, top, bottom } = box, cut = "", scrolls = false;
     for (let each = node.parentElement; each && each !== document.body; each = each.parentElement) {
       const style = getComputedStyle(each), frame = each.getBoundingClientRect();
-      const ellipsis = style.textOverflow === "ellipsis";
+      const ellipsis = style.textOverflow === "ellipsis", folded = style.webkitLineClamp !== "none";
       for (const [overflow, low, high, from, to, axis] of [
         [style.overflowX, left, right, frame.left, frame.right, "sideways"],
         [style.overflowY, top, bottom, frame.top, frame.bottom, "in height"]]) {
         if (overflow === "visible" || (low >= from - SLACK_PX && high <= to + SLACK_PX)) continue;
         if (axis === "in height" && (overflow === "auto" || overflow === "scroll")) scrolls = true;
-        else if (!scrolls && !(ellipsis && axis === "sideways")) cut = `cut ${axis} by ${name(each).slice(0, 60)}`;
+        else if (!scrolls && !(axis === "sideways" ? ellipsis : folded)) cut = `cut ${axis} by ${name(each).slice(0, 60)}`;
       }
       if (style.overflowX !== "visible") { left = Math.max(left, frame.left); right = Math.min(right, frame.right); }
       if (style.overflowY !== "visible") { top = Math.max(top, frame.top); bottom = Math.min(bottom, frame.bottom); }
@@ -60,6 +60,12 @@ FAULTS_JS = """() => {
     const width = Math.min(a.right, b.right) - Math.max(a.left, b.left);
     const height = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
     if (width > OVER_PX && height > OVER_PX) faults.push(`${name(a.node)} is written over ${name(b.node)}`);
+  }
+  for (const bar of document.querySelectorAll(".mantine-ScrollArea-scrollbar[data-orientation=vertical]")) {
+    const { left, right, top, bottom } = bar.getBoundingClientRect();
+    const under = ({ node, ...box }) => bar.parentElement.contains(node)
+      && Math.min(box.right, right) - Math.max(box.left, left) > OVER_PX && box.bottom > top && box.top < bottom;
+    if (bar.checkVisibility()) faults.push(...texts.filter(under).map(({ node }) => `${name(node)} is under a scroll bar`));
   }
   for (const panel of document.querySelectorAll("#zsim-head, #zsim-tools, #zsim-record, .mantine-ScrollArea-viewport"))
     if (panel.checkVisibility() && panel.scrollWidth > panel.clientWidth + 1)

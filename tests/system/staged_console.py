@@ -14,6 +14,7 @@ from federation import free_port
 from wire import PATIENCE_S
 
 from zsim.contract import keys, messages
+from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, ControlAnswer, Event
 from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
@@ -32,6 +33,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
 ROTORS = (300.0, 300.0, 300.0, 300.0)  # rad/s
 COVARIANCE_M2 = (0.04, 0.0, 0.0, 0.04, 0.0, 0.09)
 GPS = {"gps": (700, 3), "baro": (3000, 0), "mag": (3000, 0), "imu": (30000, 0), "sonar": (0, 120)}  # used, refused
+APART_M = 4.0  # of drones, where the scenario asks for nothing else
 SWAY_M, SWAY_S = 0.4, 25.0  # of the drones about their places, so that curves are none
 
 
@@ -70,11 +72,14 @@ class StagedLink:
 
 
 class StagedRun:
-    """Three drones in the formation of scenarios/step.yaml, engaged.
+    """The drones of a formation, engaged; three, in that of scenarios/step.yaml, unless another one is given.
 
     Args:
         past_s: simulated time that has gone by when a page is opened.
         timeline: of a replay; empty for a flight.
+        scenario: of the run.
+        state: of each drone.
+        drain_percent_s: of each battery.
 
     Attributes:
         link: of the console.
@@ -83,8 +88,17 @@ class StagedRun:
         stands: whether time stands.
     """
 
-    def __init__(self, past_s: float = 156.0, timeline: dict[str, Any] | None = None) -> None:
-        self._scenario = scenario_file.load(STEP)
+    def __init__(
+        self,
+        past_s: float = 156.0,
+        timeline: dict[str, Any] | None = None,
+        scenario: Path = STEP,
+        state: DroneState = "flying",
+        drain_percent_s: float = 0.0,
+    ) -> None:
+        self._scenario = scenario_file.load(scenario)
+        self._state: DroneState = state
+        self._drain_percent_s = drain_percent_s
         self._cluster = self._scenario.clusters[0]
         self._space = scenario_space(self._scenario, self._cluster)
         self._past_s = past_s
@@ -96,7 +110,7 @@ class StagedRun:
         self.percent = 73.0  # of each battery
         drones = tuple(DroneInfo(drone.name, "ardrone2") for drone in self._scenario.drones)
         self.info: Any = SimpleNamespace(
-            run_id="staged", rate=1.0, gate_ns=GATE_NS, mode="lockstep", drones=drones, scenario=STEP.read_text(),
+            run_id="staged", rate=1.0, gate_ns=GATE_NS, mode="lockstep", drones=drones, scenario=scenario.read_text(),
             replay_of="r0" if timeline else "",
         )  # fmt: skip
         self.observer: Any = SimpleNamespace(
@@ -118,13 +132,15 @@ class StagedRun:
     def publish_views(self) -> None:
         """Publish where all drones are at `t_s`, where they are believed to be, and where they are to be."""
         t_ns, names = round(self.t_s * 1e9), self._cluster.drones
-        desired = np.array([float(self._cluster.plan.target[name]) for name in self._space.names])
+        desired = self._space.specimen(APART_M)
+        for name, value in self._cluster.plan.target.items():
+            desired[self._space.index(name)] = float(value)
         p_W, yaw = self._space.inverse(desired)
         phase = math.tau * self.t_s / SWAY_S
         sway = SWAY_M * np.array([(math.sin(phase + k), math.cos(phase + 2 * k), 0.0) for k in range(len(names))])
         true_W, believed_W = p_W + sway, p_W + 0.8 * sway
         views = tuple(
-            DroneView(name, tuple(p), LEVEL, ROTORS, "flying", self.percent)
+            DroneView(name, tuple(p), LEVEL, ROTORS, self._state, self.percent - self._drain_percent_s * self.t_s)
             for name, p in zip(names, true_W.tolist(), strict=True)
         )
         self.link.publish(keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((1.0, 0.5, 0.0),)))

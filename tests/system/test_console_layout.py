@@ -51,6 +51,18 @@ CURVE_PX = 100  # at least, of a curve across a plot; its sign in the legend is 
 DRAWN_JS = (
     f"() => {{ const found = ({CURVES_JS})(); return found.length === 3 && found.every(c => c[1] > {CURVE_PX}); }}"
 )
+SIZES_JS = "() => [...document.querySelectorAll('.uplot')].map(each => [each.offsetWidth, each.offsetHeight])"
+KINDS_CUT_JS = """() => [...document.querySelectorAll("[data-zsim-event]")].map(row => row.children[1])
+  .filter(kind => kind.scrollWidth > kind.clientWidth || getComputedStyle(kind).textOverflow === "ellipsis").length"""
+UNFOLDED_JS = """() => {
+  const text = document.querySelector(".zsim-event-text");
+  return text.scrollHeight <= text.clientHeight + 1;
+}"""
+GRID_CONTRAST = 0.03  # at least, of a ground with its grid; of parts of it 0.02, of none 0.005
+ZOOMS, ZOOM_PX = 4, 150  # away from the drones, which are 15 m up
+DRAWN_MS = 1000  # in which a page without a graphics card has drawn what it zoomed to
+LOW = {"width": 1280, "height": 560}  # the panel of drones has a scroll bar
+DRAIN_PERCENT_S = 0.06  # of a battery that lasts about as long as the AR.Drone's
 WIDTHS_JS = "() => [...document.querySelectorAll('.uplot-container')].map(each => each.offsetWidth)"
 
 
@@ -58,6 +70,7 @@ WIDTHS_JS = "() => [...document.querySelectorAll('.uplot-container')].map(each =
 def flight() -> Iterator[str]:
     run = StagedRun()
     with staged_console(run) as address:
+        run.happen("superseded", "estimator.drone1", "another one has its name")
         run.happen("fault", "drone1", LONG)
         yield address
 
@@ -100,6 +113,38 @@ def test_nothing_is_cut_off_on_any_panel_at_any_size(
 
 
 @pytest.mark.slow
+def test_drones_in_an_emergency_have_all_their_figures_in_sight(opened: Callable[..., BrowserPage]) -> None:
+    with staged_console(StagedRun(state="emergency", drain_percent_s=DRAIN_PERCENT_S)) as address:
+        page = opened(address, SCREENS[0])
+        page.page.locator("td", has_text="min").first.wait_for()
+        found = {}
+        for size in (LOW, *SCREENS[:2]):
+            page.page.set_viewport_size(size)
+            page.select_tab("Drones")
+            if faults := settled(page):
+                found[f"{size['width']} × {size['height']}"] = faults
+        assert found == {}
+
+
+@pytest.mark.slow
+def test_an_event_is_unfolded_by_a_click_and_stays_so(flight: str, opened: Callable[..., BrowserPage]) -> None:
+    page = opened(flight, SCREENS[0])
+    page.wait_for_text("running")
+    page.select_tab("Events")
+    text = page.page.locator(".zsim-event-text").first
+    text.wait_for()
+    assert page.page.evaluate(KINDS_CUT_JS) == 0
+    assert not page.page.evaluate(UNFOLDED_JS)
+    text.click()
+    page.page.wait_for_function(UNFOLDED_JS)
+    shown_s = page.state()["t_s"]
+    page.until(f"s.t_s > {shown_s + 2.0}")  # its row has been made anew
+    assert page.page.evaluate(UNFOLDED_JS)
+    text.click()
+    page.page.wait_for_function(f"() => !({UNFOLDED_JS})()")
+
+
+@pytest.mark.slow
 def test_a_phone_shows_the_scene_above_one_panel(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page = opened(flight, SCREENS[-1])
     page.wait_for_text("running")
@@ -128,6 +173,18 @@ def test_plots_have_curves_as_soon_as_they_are_opened_and_hold_their_width(
     widths, shown_s = page.page.evaluate(WIDTHS_JS), page.state()["t_s"]
     page.until(f"s.t_s > {shown_s + 2.0}")
     assert page.page.evaluate(WIDTHS_JS) == widths
+
+
+@pytest.mark.slow
+def test_a_plot_keeps_its_size_where_the_cursor_enters_it(flight: str, opened: Callable[..., BrowserPage]) -> None:
+    page = opened(flight, SCREENS[1])
+    page.wait_for_text("running")
+    page.select_tab("Plots")
+    page.page.wait_for_function(DRAWN_JS)
+    sizes = page.page.evaluate(SIZES_JS)
+    page.page.locator(".uplot .u-over").first.hover()
+    page.page.wait_for_function("() => !document.querySelector('.uplot .u-value').textContent.includes('-')")
+    assert page.page.evaluate(SIZES_JS) == sizes
 
 
 @pytest.mark.slow
@@ -160,6 +217,21 @@ def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: 
     # What a change lays out anew is not there for a moment; the head is dark in both themes while nothing arrives.
     page.page.wait_for_function(dark, arg=LIT)
     other.page.wait_for_function(light, arg=LIT)
+    page.until_ground(lambda lightness, _: lightness < 0.35)
+    other.until_ground(lambda lightness, _: lightness > 0.65)
+
+
+@pytest.mark.slow
+def test_the_grid_is_on_the_ground_from_any_height(flight: str, opened: Callable[..., BrowserPage]) -> None:
+    page = opened(flight, SCREENS[1])
+    page.wait_for_text("running")
+    page.press("Side")
+    page.until_ground(lambda _, contrast: contrast > GRID_CONTRAST)
+    page.page.locator("canvas[data-engine]").hover(position={"x": 200, "y": 300})
+    for _ in range(ZOOMS):
+        page.page.mouse.wheel(0, ZOOM_PX)
+        page.page.wait_for_timeout(DRAWN_MS)
+        assert page.ground()[1] > GRID_CONTRAST
 
 
 @pytest.mark.slow

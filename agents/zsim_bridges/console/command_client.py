@@ -296,4 +296,7 @@ def _format_value(value: Any) -> str:
         return f"{value:g}"
     if isinstance(value, dict):
         return " ".join(f"{name}={_format_value(item)}" for name, item in value.items())[:120]
+    if isinstance(value, list):
+        of_figures = all(isinstance(item, int | float) for item in value)
+        return " ".join(map(_format_value, value))[:120] if of_figures else f"({len(value)})"
     return str(value)[:120]

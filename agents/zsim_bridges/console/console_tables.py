@@ -4,12 +4,13 @@ Order of this file: HTML, which is pure and in which all texts of other processe
 """
 
 import math
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
 from zsim.contract.run_messages import Fault
-from zsim_bridges.console.monitoring.alarms import BATTERY_LOW_PERCENT, LATE_MS, Severity
+from zsim_bridges.console.monitoring.alarms import BATTERY_EMPTY_PERCENT, BATTERY_LOW_PERCENT, LATE_MS, Severity
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 from zsim_bridges.console.monitoring.sensor_rates import Counts, SensorRates
@@ -42,12 +43,13 @@ LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 SEVERITY_COLOURS = {"red": RED, "amber": AMBER}
 LEFT_MAX_S = 24 * 3600.0  # of a battery that lasts longer no time is shown
 COLUMNS = 7  # of the table of drones
-ONE_LINE = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
 NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
 BESIDE = "padding:2px 10px"  # of a text in a panel, which viser lets touch the edge; as wide as of its controls
-TABLE_BESIDE = "padding:2px 6px;overflow-x:auto"  # and of a table, whose cells are 4 px apart
+TABLE_BESIDE = "padding:2px 12px 2px 8px;overflow-x:auto"  # and of a table; the panel's scroll bar is 12 px wide
+NAME_WHOLE = 8  # characters of a name that stand on one line of the table of drones
+WRAP = "white-space:normal"
 
 
 class DroneRow(NamedTuple):
@@ -81,15 +83,25 @@ def drone_table(rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures] |
 
 def _drone_cells(row: DroneRow, figures: FlightFigures | None) -> str:
     name = _coloured(row.name, SEVERITY_COLOURS[row.severity]) if row.severity else escape(row.name)
+    if len(row.name) > NAME_WHOLE:
+        name = f"<div style='{WRAP};overflow-wrap:anywhere'>{name}</div>"
     state = _coloured(row.state.replace("_", " "), STATE_COLOURS.get(row.state, GREY))
     flown = ["–"] * 3
     if figures is not None:
         flown = [f"{figures.position_m[2]:.1f}", f"{figures.speed_m_s:.1f}", f"{figures.heading_deg:.0f}°"]
     left = battery_left_text(figures.battery_left_s if figures else None)
-    colour = RED if row.battery_percent < BATTERY_LOW_PERCENT else "inherit"
-    battery = _coloured(f"{row.battery_percent:.0f} %{left}", colour)
+    colour = _battery_colour(row.battery_percent)
+    charge = _coloured(f"{row.battery_percent:.0f} %{',' if left else ''}", colour)
+    battery = f"<div style='{WRAP}'>{charge} {_coloured(left, colour)}</div>" if left else charge
     sigma = "–" if row.sigma_m is None else f"{row.sigma_m:.2f}"
     return _cells((name, state, *flown, battery, sigma)) + _drone_notes(row)
+
+
+def _battery_colour(percent: float) -> str:
+    """Return the colour of the alarm of a battery."""
+    if percent < BATTERY_EMPTY_PERCENT:
+        return RED
+    return AMBER if percent < BATTERY_LOW_PERCENT else "inherit"
 
 
 def _drone_notes(row: DroneRow) -> str:
@@ -109,8 +121,8 @@ def _drone_notes(row: DroneRow) -> str:
 
 
 def battery_left_text(left_s: float | None) -> str:
-    """Return the time that a battery lasts, to be written behind its charge; empty where it is not known."""
-    return "" if left_s is None or left_s > LEFT_MAX_S else f", {left_s / 60.0:.0f} min"
+    """Return the time that a battery lasts, which stands on one line; empty where it is not known."""
+    return "" if left_s is None or left_s > LEFT_MAX_S else f"{left_s / 60.0:.0f}\N{NO-BREAK SPACE}min"
 
 
 def figure_lines(figures: FlightFigures | None) -> str:
@@ -170,19 +182,21 @@ def formation_lines(states: Mapping[str, tuple[str, str]]) -> str:
 
 
 def event_table(newest_first: Iterable[EventRow]) -> str:
-    """Return the table of events, which are given newest first: a line each, whole in its tooltip."""
+    """Return the table of events, which are given newest first; the page unfolds what is longer than a few lines."""
     lines = map(_event_cells, newest_first)
-    widths = "<colgroup><col style='width:52px'><col style='width:66px'><col></colgroup>"
     head = _head(("t [s]", "simulated time of the newest"), ("event", ""), ("newest first", ""))
-    return _table(widths + head + "".join(lines), "table-layout:fixed")
+    return _table(head + "".join(lines))
 
 
 def _event_cells(row: EventRow) -> str:
     event = row.event
     kind = _coloured(event.kind, EVENT_COLOURS.get(event.kind, GREY))
+    mark = f"{zlib.crc32(f'{event.kind} {event.subject} {event.text}'.encode()):x}"  # by which the page has it unfolded
+    text = f"<div class='zsim-event-text'>{_times(row.times)}{escape(event.text)}</div>"
     return (
-        f"<tr title='{escape(event.text)}'><td style='text-align:right;color:{GREY}'>{event.t_ns / 1e9:.2f}</td>"
-        f"<td style='{ONE_LINE}'>{kind}</td><td style='{ONE_LINE}'>{_times(row.times)}{escape(event.text)}</td></tr>"
+        f"<tr title='{escape(event.text)}' data-zsim-event='{mark}' style='vertical-align:top'>"
+        f"<td style='text-align:right;color:{GREY}'>{event.t_ns / 1e9:.2f}</td>"
+        f"<td>{kind}</td><td style='width:100%'>{text}</td></tr>"
     )
 
 
@@ -197,14 +211,17 @@ def fault_lines(faults: Sequence[str]) -> str:
     return f"<div style='{style}'>{lines or NO_FAULT}</div>"
 
 
-def _table(body: str, wrap: str = "white-space:nowrap") -> str:
-    table = f"<table style='{STYLE};{wrap};border-spacing:4px 1px;width:100%'>{body}</table>"
+def _table(body: str) -> str:
+    table = f"<table style='{STYLE};white-space:nowrap;border-spacing:2px 1px;width:100%'>{body}</table>"
     return f"<div style='{TABLE_BESIDE}'>{table}</div>"
 
 
 def _head(*titles: tuple[str, str]) -> str:
     """Return a row of titles, each with its tooltip."""
-    cells = (f"<th align=left title='{escape(tooltip)}'>{escape(title)}</th>" for title, tooltip in titles)
+    cells = (
+        f"<th align=left valign=bottom style='{WRAP}' title='{escape(tooltip)}'>{escape(title)}</th>"
+        for title, tooltip in titles
+    )
     return f"<tr>{''.join(cells)}</tr>"
 
 

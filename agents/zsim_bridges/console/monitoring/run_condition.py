@@ -1,6 +1,6 @@
 """The condition of the run that a page shows, and which of an operator's requests it would refuse, and why. Pure."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from zsim.contract.state_rules import state_refusal
@@ -96,7 +96,7 @@ def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
     on_request = phase == "held" and not held
     steered = off or held or ("" if phase == "held" else flown)
     return {
-        "takeoff": off or ("" if phase == "idle" else f"{cluster} is {_words(phase)}, not idle"),
+        "takeoff": off or _takeoff_refusal(run, cluster, phase),
         "engage": off or _engage_refusal(cluster, phase, reason, on_request),
         "hold": off or ("" if REJOINING in reason else held or flown),
         "rejoin": off or _rejoin_refusal(run, cluster, reason if held else ""),
@@ -104,6 +104,22 @@ def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
         "target": steered,
         "trajectory": steered,
     }
+
+
+def _takeoff_refusal(run: RunCondition, cluster: str, phase: str) -> str:
+    """Return why a formation would not take off; it starts with drones that are landed or in the air."""
+    if phase != "idle":
+        return f"{cluster} is {_words(phase)}, not idle"
+    members = [(name, run.drones.get(name, "landed")) for name in run.members.get(cluster, ())]
+    stopped = [name for name, state in members if state == "emergency"]
+    if stopped:
+        return _reset_first(stopped)
+    moving = [(name, state) for name, state in members if state not in AIRBORNE | DOWN]
+    return f"{moving[0][0]} is {_words(moving[0][1])}; it must be landed or in the air" if moving else ""
+
+
+def _reset_first(stopped: Sequence[str]) -> str:
+    return f"{', '.join(stopped)} in emergency; reset first"
 
 
 def _rejoin_refusal(run: RunCondition, cluster: str, fault: str) -> str:
@@ -130,15 +146,24 @@ def fleet_refusals(run: RunCondition, single: Collection[str] = ()) -> dict[str,
     """
     off = run.grounded()
     phases = [phase for phase, _ in run.phases.values()]
-    singles = [run.drones.get(name) for name in single]
-    can_rise = "idle" in phases or "landed" in singles
     in_air = not _all_down(run) or any(phase not in ("idle", "landing") for phase in phases)
     in_emergency = "emergency" in run.drones.values()
     return {
-        "takeoff": off or ("" if can_rise else "nobody is on the ground and idle"),
+        "takeoff": off or _fleet_takeoff_refusal(run, single),
         "land": off or ("" if in_air else "all drones are on the ground"),
         "reset": off or ("" if in_emergency else "no drone is in an emergency"),
     }
+
+
+def _fleet_takeoff_refusal(run: RunCondition, single: Collection[str]) -> str:
+    """Return why neither a formation nor a drone of none would take off."""
+    idle = [_takeoff_refusal(run, name, phase) for name, (phase, _) in run.phases.items() if phase == "idle"]
+    singles = {name: run.drones.get(name) for name in single}
+    if "" in idle or "landed" in singles.values():
+        return ""
+    stopped = [name for name, state in singles.items() if state == "emergency"]
+    reasons = [*idle, *([_reset_first(stopped)] if stopped else [])]
+    return reasons[0] if reasons else "nobody is on the ground and idle"
 
 
 def _all_down(run: RunCondition) -> bool:

@@ -42,7 +42,7 @@ class VariableSlider:
         self._moved: tuple[float, float] | None = None
         self._out_of_range = False
         self._held: _HeldValue | None = None
-        self._slider: Any = gui.add_slider(range_.label, range_.low, range_.high, range_.step, range_.to_display(0.0))
+        self._slider: Any = gui.add_slider(range_.label, range_.low, range_.high, range_.step, range_.start)
         self._slider.label = range_.label_unknown
         self._slider.on_update(self._on_update)
 
@@ -71,11 +71,18 @@ class VariableSlider:
         """Show the formation's goal [m, rad], unless it was moved and the formation is on its way."""
         shown = self.range.to_display(goal)
         if self._moved is None and not self._is_held(shown, wall_s):
+            self._widen(shown)
             self._slider.value = shown
             self._mark(goal)
 
+    def _widen(self, shown: float) -> None:
+        """Let the slider reach as far as what it shows, which is as it is: what it may ask for stays the range."""
+        low, high = min(self.range.low, shown), max(self.range.high, shown)
+        if (self._slider.min, self._slider.max) != (low, high):
+            self._slider.min, self._slider.max = low, high
+
     def _mark(self, goal: float) -> None:
-        """Let the label have the true value where the slider cannot show it."""
+        """Let the label say that a value is out of range."""
         label = self.range.label_of(goal)
         if self._slider.label != label:
             self._slider.label = label
@@ -96,7 +103,7 @@ class VariableSlider:
         value = float(self._slider.value)
         with self._lock:
             # A page accepts numbers beyond the limits, and sets them to the nearest limit when the field loses focus.
-            if self._out_of_range and value in (self.range.low, self.range.high):
+            if self._out_of_range and value in (self._slider.min, self._slider.max):
                 self._out_of_range = False
                 return
             self._out_of_range = self.range.refusal(value) is not None
@@ -150,9 +157,13 @@ class FormationForm:
         self._space = space
         self._ranges = {each.name: each for each in ranges}
         self._shown: tuple[float, ...] | None = None
+        self._written: tuple[float, ...] | None = None  # where the waypoints begin that the console wrote
+        self._edited = False
         self._controls = {op: self._button(gui, label, op) for label, op in OPERATIONS.items()}
         self._reasons = gui.add_html("")
         hint = "Duration of a move; 0: as fast as the robots' limits let it"
+        self._moves: dict[str, Any] = {}  # the control of other variables, if there is one
+        self._flights: dict[str, Any] = {}  # controls of trajectories
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
         shown = primary_variables(space.names)
         self._sliders = {name: VariableSlider(gui, self._ranges[name]) for name in shown}
@@ -164,6 +175,8 @@ class FormationForm:
         """Grey out what the controller would refuse, with its reason; a slider shows all the same where it stands."""
         refusals = formation_refusals(run, self._cluster.name)
         set_refusals(self._controls, refusals)
+        set_refusals(self._flights, dict.fromkeys(self._flights, refusals["trajectory"]))
+        set_refusals(self._moves, dict.fromkeys(self._moves, refusals["target"]))
         self._offer_rejoin(run)
         for slider in self._sliders.values():
             slider.lock(bool(refusals["target"]))
@@ -177,13 +190,12 @@ class FormationForm:
             self._controls["rejoin"].visible = held
 
     def refresh(self, view: ViewCluster | None, wall_s: float) -> None:
-        """Let the sliders that were not moved follow the formation."""
+        """Let the sliders that were not moved follow the formation, and the waypoints that nobody has edited."""
         if view is None:
             return
         shown = view.desired if view.phase in SHAPED_PHASES else view.value
-        first = self._shown is None
-        self._shown = tuple(shown)
-        if first:
+        before, self._shown = self._shown, tuple(shown)
+        if not self._edited and (self._shown == before or self._has_left()):
             self._prefill()
         for name, slider in self._sliders.items():
             slider.follow(shown[self._space.index(name)], wall_s)
@@ -220,7 +232,9 @@ class FormationForm:
             name = gui.add_dropdown("variable", names)
             value = gui.add_number(self._value_label(names[0]), 0.0, step=0.1)
             name.on_update(lambda _: setattr(value, "label", self._value_label(name.value)))
-            gui.add_button("Move it").on_click(lambda _: self._move(name.value, float(value.value)))
+            move = gui.add_button("Move it")
+            move.on_click(lambda _: self._move(name.value, float(value.value)))
+            self._moves["move"] = move
 
     def _value_label(self, name: str) -> str:
         return f"value [{self._ranges[name].unit}]"
@@ -231,22 +245,43 @@ class FormationForm:
     def _trajectories(self, gui: viser.GuiApi, planned: Trajectory | None) -> None:
         with gui.add_folder("Trajectory", expand_by_default=False):
             if planned is not None:
-                planned_button = gui.add_button("Fly the scenario's")
-                planned_button.on_click(lambda _: self._fly(lambda: _planned_trajectory(planned)))
+                self._flight_button(gui, "Fly the scenario's", lambda: self._fly(lambda: _planned_trajectory(planned)))
             gui.add_markdown(f"<sub>{EXPRESSION_UNITS}</sub>")
             text = gui.add_text("expressions [m, deg]", EXAMPLES["expressions"], multiline=True)
-            fly = gui.add_button("Fly the expressions")
-            fly.on_click(lambda _: self._fly(lambda: self._read_expressions(text.value)))
+            self._flight_button(
+                gui, "Fly the expressions", lambda: self._fly(lambda: self._read_expressions(text.value))
+            )
             gui.add_markdown(f"<sub>{WAYPOINT_UNITS}</sub>")
             self._points = gui.add_text("waypoints [s, m, deg]", EXAMPLES["waypoints"], multiline=True)
-            here = gui.add_button("Waypoints from here")
-            here.on_click(lambda _: self._prefill())
-            gui.add_button("Fly the waypoints").on_click(lambda _: self._fly(self._read_waypoints))
+            self._points.on_update(self._on_edit)
+            self._flight_button(gui, "Waypoints from here", self._prefill)
+            self._flight_button(gui, "Fly the waypoints", lambda: self._fly(self._read_waypoints))
+
+    def _flight_button(self, gui: viser.GuiApi, label: str, act: Callable[[], None]) -> None:
+        self._flights[label] = gui.add_button(label)
+        self._flights[label].on_click(lambda _: act())
+
+    def _on_edit(self, event: viser.GuiEvent[Any]) -> None:
+        """Keep what somebody has written, from now on."""
+        self._edited = self._edited or event.client_id is not None
+
+    def _has_left(self) -> bool:
+        """Return whether the formation is away from where the waypoints begin, by more than an estimate's noise."""
+        if self._shown is None or self._written is None:
+            return True
+        return operator_input.is_apart(self._shown, self._written, list(self._ranges.values()))
 
     def _prefill(self) -> None:
-        """Write where the formation is as the first waypoint, and the same place as the next, to be changed."""
-        if self._shown is not None:
-            self._points.value = operator_input.waypoints_from(self._shown, list(self._ranges.values()))
+        """Write where the formation is as the first waypoint, and the same place as the next, to be changed.
+
+        The waypoints then follow the formation, until somebody edits them.
+        """
+        if self._shown is None:
+            return
+        self._edited, self._written = False, self._shown
+        text = operator_input.waypoints_from(self._shown, list(self._ranges.values()))
+        if self._points.value != text:
+            self._points.value = text
 
     def _read_expressions(self, text: str) -> dict[str, Any]:
         angles = [each.name for each in self._ranges.values() if each.unit == "deg"]

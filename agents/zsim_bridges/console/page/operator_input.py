@@ -45,10 +45,20 @@ class SliderRange(NamedTuple):
         """The label while nothing is known of the variable: where the slider stands then means nothing."""
         return f"{self.label}: not known"
 
+    @property
+    def start(self) -> float:
+        """Where the slider stands while nothing is known of the variable."""
+        return min(max(0.0, self.low), self.high)
+
     def to_display(self, value: float) -> float:
-        """Return a value [m, rad] in the unit of the range, to its step, within it."""
+        """Return a value [m, rad] in the unit of the range, to its step; one that is hardly beyond a limit, as it.
+
+        Limits need not be whole steps: those of sides are of the scenario.
+        """
         shown = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
-        return min(max(round(round(shown / self.step) * self.step, DIGITS), self.low), self.high)
+        rounded = round(round(shown / self.step) * self.step, DIGITS)
+        within = min(max(rounded, self.low), self.high)
+        return within if abs(shown - within) <= self.step / 2.0 else rounded
 
     def label_of(self, value: float) -> str:
         """Return the label beside a value [m, rad]: with the value itself where the range does not hold it."""
@@ -169,6 +179,18 @@ def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str
         if each.name in PREFILLED
     ]
     return "\n".join(f"{at_s:g}: {', '.join(pairs)}" for at_s in (0.0, WAYPOINT_STEP_S))
+
+
+def is_apart(value: Sequence[float], other: Sequence[float], ranges: Sequence[SliderRange]) -> bool:
+    """Return whether a formation at one place (its variables [m, rad]) has other prefilled waypoints than at another.
+
+    They are the same within a step of the sliders: text that followed each estimate would never stand still.
+    """
+    return any(
+        abs(_in_unit(each, here - there)) > each.step
+        for each, here, there in zip(ranges, value, other, strict=True)
+        if each.name in PREFILLED
+    )
 
 
 def _in_unit(range_: SliderRange, value: float) -> float:

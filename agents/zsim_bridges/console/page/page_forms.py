@@ -12,6 +12,7 @@ from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.page.run_forms import DroneForm
 from zsim_bridges.console.scene.chosen_ring import ChosenRing
+from zsim_bridges.console.scene.ground import draw_ground
 from zsim_bridges.console.scene.picture import Array, DronePoses
 
 ROWS_SHOWN = 60  # events
@@ -110,7 +111,7 @@ class PageForms:
             events = EventForm(page.gui, self._names)
         with theme_folder:
             theme = page.gui.add_checkbox("Dark theme", False)
-        theme.on_update(lambda _: set_theme(page.gui, dark=theme.value))
+        theme.on_update(lambda _: _set_page_theme(page, dark=theme.value))
         self._forms[page.client_id] = _PageForm(drone, ChosenRing(page.scene, self._radii_m), figures, events)
         if page.client_id not in self._server.get_clients():
             self._remove(page)  # it has disconnected meanwhile
@@ -136,6 +137,12 @@ class EventForm:
         """Show those of the rows, newest first, that are chosen."""
         chosen = event_log.chosen_rows(rows, self._drone.value, self._kind.value)
         self.table.content = event_table(chosen[:ROWS_SHOWN])
+
+
+def _set_page_theme(page: viser.ClientHandle, *, dark: bool) -> None:
+    """Set the theme of one page, with the ground of its scene."""
+    set_theme(page.gui, dark=dark)
+    draw_ground(page.scene, dark=dark)
 
 
 def set_theme(gui: viser.GuiApi, *, dark: bool = False) -> None:

@@ -13,6 +13,7 @@ from zsim.drone_colours import drone_colours, rgb
 from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console.scene import airframe
+from zsim_bridges.console.scene.ground import draw_ground
 from zsim_bridges.console.scene.picture import (
     Array,
     DronePoses,
@@ -29,8 +30,6 @@ SMALL = 0.8  # of the size of a name
 SOLID = (134, 142, 150)
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
 SIDE_PX = 2.0  # of a formation's sides: as wide from afar
-FIELD_M = 150.0  # half a side of the ground
-GREEN = (206, 219, 196)
 WIND_M_PER_M_S = 0.5  # length of the arrow
 WIND_MIN_M_S = 0.05  # below it no arrow
 WIND_ABOVE_M = 1.5  # of the arrow over the highest drone
@@ -71,7 +70,8 @@ class SceneNodes:
         self._trails_shown = True
         server.scene.reset()
         server.scene.set_up_direction("+z")
-        self._ground()
+        draw_ground(server.scene)
+        self._origin()
         looks = [airframe.shape_of(*each) for each in zip(drones, arms_m, strict=True)]
         self.radii_m: Array = np.array([look.reach_m for look in looks])
         self._airframes = _AirframeNodes(self._scene, looks)
@@ -173,15 +173,7 @@ class SceneNodes:
         if node is not None:
             node.visible = visible
 
-    def _ground(self) -> None:
-        # Opaque, and no background image: what viser draws of a grid's plane or of a sky hides whatever is transparent.
-        self._scene.add_box(
-            "/field", GREEN, (2 * FIELD_M, 2 * FIELD_M, 0.02), position=(0.0, 0.0, -0.015), cast_shadow=False
-        )
-        self._scene.add_grid(
-            "/ground", 2 * FIELD_M, 2 * FIELD_M, cell_size=1.0, section_size=5.0, cell_color=(190, 200, 184),
-            section_color=(138, 150, 132), fade_distance=80.0, shadow_opacity=0.0,
-        )  # fmt: skip
+    def _origin(self) -> None:
         self._scene.add_frame("/origin", axes_length=1.0, axes_radius=0.02, position=(0.0, 0.0, 0.01))
         self._scene.add_label("/origin/e", "east", position=(1.1, 0.0, 0.0))
         self._scene.add_label("/origin/n", "north", position=(0.0, 1.1, 0.0))

@@ -95,6 +95,14 @@ def test_a_request_goes_out_in_the_console_s_name(table: Table):
     assert table.link.sent == [("cluster/main/control", "target", "console.1", args)]
 
 
+def test_waypoints_are_told_by_how_many_they_are(table: Table):
+    points = [{"at_s": 10.0 * k, "values": {"x_c": 5.0}} for k in range(3)]
+    table.client.request_cluster("main", "trajectory", waypoints=points)
+    assert has_terms(table.outcomes.get(timeout=PATIENCE_S).request, "main", "waypoints (3)")
+    table.client.request_world("fault_add", kind="gust", velocity_m_s=[4.0, 0.0, -1.5])
+    assert has_terms(table.outcomes.get(timeout=PATIENCE_S).request, "gust", "velocity_m_s 4 0 -1.5")
+
+
 def test_a_refusal_is_told_with_its_reason(table: Table):
     table.link.refusals["pause"] = "not now"
     table.client.request_world("pause")

@@ -1,6 +1,7 @@
 """The console's pure parts: what is drawn, how far a slider goes, what is typed, who may pass, the texts."""
 
 import math
+import re
 import socket
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_agents.formation.trajectory import ExpressionTrajectory
 from zsim_bridges.console import console_tables
+from zsim_bridges.console.monitoring.alarms import DroneCondition, drone_alarms
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.sensor_rates import SensorRates
 from zsim_bridges.console.page import operator_input
@@ -300,7 +302,7 @@ def test_what_is_out_of_range_is_refused_with_what_is_allowed():
     found = {each.name: each for each in slider_ranges(space, scenario.clusters[0], scenario)}
     assert has_terms(found["p"].refusal(0.5) or "", "p", "0.5")
     assert found["p"].refusal(math.nan) is not None
-    assert found["p"].to_display(1.0) == 2.0
+    assert found["p"].to_display(1.0) == 1.0  # as it is: only what is asked for must be within
 
 
 @pytest.mark.parametrize(
@@ -312,7 +314,7 @@ def test_every_range_has_room_whatever_the_scenario_allows(altitude_m: float, se
     cluster = scenario.clusters[0]
     for found in slider_ranges(scenario_space(scenario, cluster), cluster, scenario):
         assert found.low < found.high, found.name
-        assert found.low <= found.to_display(0.0) <= found.high
+        assert found.low <= found.start <= found.high
 
 
 def test_of_many_variables_those_of_the_whole_are_shown():
@@ -554,19 +556,38 @@ def test_nobody_says_what_no_control_says(change: bytes):
 
 
 def test_tables_show_text_of_others_as_text():
-    row = console_tables.DroneRow("d1", "flying", 12.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
+    row = console_tables.DroneRow("d1", "flying", 9.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
     html = console_tables.drone_table([row])
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
     assert "gps_dropout" in html
     assert html.count(console_tables.AMBER) == 2  # late, and a fault
-    assert has_terms(without_tags(html), "flying", "12 %", "lag 400 ms")
+    assert has_terms(without_tags(html), "flying", "9 %", "lag 400 ms")
     assert console_tables.RED in html  # the battery
     event = Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")
     events = console_tables.event_table([EventRow(event, 3, False)])
     assert "1.50" in events
+    assert html_marks(events) == html_marks(console_tables.event_table([EventRow(event, 4, False)]))
     assert "&lt;b&gt;no" in events
     assert has_terms(without_tags(events), "3 ×")
+
+
+def html_marks(html: str) -> list[str]:
+    """Return by which rows of events are known to the page."""
+    found = re.findall("data-zsim-event='([0-9a-f]+)'", html)
+    assert found
+    return found
+
+
+@pytest.mark.parametrize(
+    ("percent", "colour"),
+    [(20.0, "inherit"), (17.0, console_tables.AMBER), (10.0, console_tables.AMBER), (9.0, console_tables.RED)],
+)
+def test_a_battery_has_the_colour_of_its_alarm(percent: float, colour: str):
+    html = console_tables.drone_table([console_tables.DroneRow("d1", "flying", percent, 0.0, None, "–", ())])
+    assert f"<span style='color:{colour}'>{percent:.0f} %" in html
+    alarms = drone_alarms(DroneCondition("d1", "flying", percent))
+    assert [console_tables.SEVERITY_COLOURS[each.severity] for each in alarms] == [c for c in [colour] if c[0] == "#"]
 
 
 def test_many_formations_leave_room_for_the_emergency_button():

@@ -17,7 +17,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, REJOINING
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.monitoring.run_condition import RunCondition
+from zsim_bridges.console.monitoring.run_condition import RunCondition, fleet_refusals
 from zsim_bridges.console.page.console_page import SWITCHES, ConsolePage
 from zsim_bridges.console.page.formation_form import OPERATIONS, REST_S, STILL_S, FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
@@ -42,6 +42,7 @@ class Control:
 
     def __init__(self, value: Any = None) -> None:
         self.value = value
+        self.min, self.max = -math.inf, math.inf  # of a slider
         self.content = ""
         self.visible = True
         self.disabled = False
@@ -105,7 +106,9 @@ class Gui:
         return self._add(label, value)
 
     def add_slider(self, label: str, low: float, high: float, step: float, value: float) -> Control:
-        return self._add(label, value)
+        slider = self._add(label, value)
+        slider.min, slider.max = low, high
+        return slider
 
     def add_text(self, label: str, value: str, **_: Any) -> Control:
         return self._add(label, value)
@@ -289,6 +292,39 @@ def test_a_formation_is_offered_what_its_controller_would_grant(bench: Bench, ru
     assert all(bench.gui.at[label].hint for label in locked)
     steered = run.off() == "" and not run.replayed and run.phases["main"] in STEERED
     assert bench.gui.at["p [m]"].disabled is not steered
+    flights = [bench.gui.at[label] for label in FLIGHTS]
+    assert [bool(each.hint) for each in flights] == [each.disabled for each in flights] == [not steered] * len(FLIGHTS)
+
+
+def test_the_other_variables_and_the_scenarios_trajectory_are_locked_as_the_sliders_are():
+    grid, planned = Bench("grid30"), Bench("trajectory")
+    for bench, label in ((grid, "Move it"), (planned, "Fly the scenario's")):
+        form = bench.formation()
+        for phase, locked in (("idle", True), ("engaged", False)):
+            form.offer(flown(phase))
+            assert bench.gui.at[label].disabled is locked
+
+
+@pytest.mark.parametrize(
+    ("states", "off"),
+    [(("landed", "flying"), False), (("landed", "emergency"), True), (("landing", "landed"), True)],
+)
+def test_a_take_off_is_offered_of_drones_that_can_rise(bench: Bench, states: tuple[str, ...], off: bool):
+    names = bench.names[: len(states)]
+    run = flown("idle", drones=dict(zip(names, states, strict=True)), members={"main": names})
+    bench.formation().offer(run)
+    button = bench.gui.at["Take off"]
+    assert button.disabled is off
+    assert ("reset" in (button.hint or "")) is ("emergency" in states)
+    assert fleet_refusals(run)["takeoff"] == (button.hint or "")
+
+
+def test_all_take_off_while_one_of_them_can():
+    run = flown("idle", drones={"d1": "emergency", "d2": "landed"}, members={"main": ("d1",)})
+    assert has_terms(fleet_refusals(run)["takeoff"], "d1", "reset")
+    assert fleet_refusals(run, ["d2"])["takeoff"] == ""
+    stopped = RunCondition(drones={"d2": "emergency"})
+    assert has_terms(fleet_refusals(stopped, ["d2"])["takeoff"], "d2", "reset")
 
 
 @pytest.mark.parametrize(
@@ -306,6 +342,7 @@ def test_rejoin_is_there_while_a_fault_holds_the_formation(bench: Bench, run: Ru
     assert (button.visible, button.disabled and button.visible) == (there, False)
 
 
+FLIGHTS = ("Fly the expressions", "Fly the waypoints", "Waypoints from here")
 STEERED = {("engaged", ""), ("held", HELD_ON_REQUEST)}
 
 
@@ -361,9 +398,23 @@ def test_a_value_out_of_range_stands_beside_its_slider(bench: Bench):
     assert has_terms(slider.label, "p", "not known")
     form.refresh(bench.view(p=25.37), LATER_S)
     assert has_terms(slider.label, "p", "25.4 m")
-    assert slider.value == 20.0
     form.refresh(bench.view(p=4.0), LATER_S)
     assert slider.label == "p [m]"
+
+
+def test_a_slider_shows_a_value_out_of_its_range_as_it_is_and_does_not_ask_for_it(bench: Bench):
+    form = bench.formation()
+    height, tilt, side = (bench.gui.at[label] for label in ("z_c [m]", "pitch [deg]", "p [m]"))
+    limits = [(each.min, each.max) for each in (height, tilt, side)]
+    form.refresh(bench.view(z_c=0.1, pitch=math.radians(74.9), p=25.37), LATER_S)
+    assert (height.value, tilt.value, side.value) == (0.1, 75.0, 25.4)
+    assert (height.min, tilt.max, side.max) == (0.1, 75.0, 25.4)
+    tilt.put(60.0)
+    form.send(LATER_S)
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, "pitch", "60 deg")
+    form.refresh(bench.view(z_c=3.0, p=4.0), LATER_S)
+    assert [(each.min, each.max) for each in (height, tilt, side)] == limits
 
 
 def test_waypoints_begin_where_the_formation_is_in_the_units_of_the_page(bench: Bench):
@@ -374,6 +425,32 @@ def test_waypoints_begin_where_the_formation_is_in_the_units_of_the_page(bench: 
     ((_, op, args),) = bench.client.asked
     assert op == "trajectory"
     assert args["waypoints"][1]["values"]["yaw"] == pytest.approx(math.pi / 2)
+
+
+WAYPOINTS = "waypoints [s, m, deg]"
+
+
+def test_waypoints_follow_the_formation_until_somebody_edits_them(bench: Bench):
+    form, text = bench.formation(), bench.gui.at[WAYPOINTS]
+    form.refresh(bench.view(x_c=-1.43), LATER_S)
+    form.refresh(bench.view(x_c=5.0), LATER_S)
+    assert has_terms(text.value, "x_c = 5")
+    text.put("20: x_c = 7")
+    form.refresh(bench.view(x_c=9.0), LATER_S)
+    assert text.value == "20: x_c = 7"
+    bench.gui.press("Waypoints from here")
+    form.refresh(bench.view(x_c=11.0), LATER_S)
+    assert has_terms(text.value, "x_c = 11")
+
+
+def test_waypoints_stand_still_in_the_noise_of_an_estimate_and_end_where_the_formation_does(bench: Bench):
+    form, text = bench.formation(), bench.gui.at[WAYPOINTS]
+    form.refresh(bench.view(x_c=5.0), LATER_S)
+    first = text.value
+    form.refresh(bench.view(x_c=5.05), LATER_S)
+    assert text.value == first
+    form.refresh(bench.view(x_c=5.05), LATER_S)
+    assert has_terms(text.value, "x_c = 5.05")
 
 
 # Faults

@@ -5,6 +5,7 @@ from typing import Any
 from unittest.mock import MagicMock
 
 from zsim_bridges.console.page.page_forms import PageForms
+from zsim_bridges.console.scene import ground
 
 NAMES = ["drone1", "drone2"]
 
@@ -62,3 +63,18 @@ def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
     assert (pages.figures[1].shown, pages.figures[2].shown) == ("", "figures of drone1")
     assert forms.chosen(1) == ""
     assert forms.chosen(2) == "drone1"
+
+
+def test_the_ground_of_a_page_has_its_theme():
+    pages, folder = Pages(), MagicMock()
+    server: Any = pages
+    PageForms(server, MagicMock(), NAMES, MagicMock(), folder, folder, folder, folder)
+    pages.open(1)
+    page = pages.clients[1]
+    theme = page.gui.add_checkbox.return_value
+    (switch,) = theme.on_update.call_args.args
+    for dark, colours in ((True, ground.DARK), (False, ground.LIGHT)):
+        theme.value = dark
+        switch(None)
+        assert page.scene.add_box.call_args.args[:2] == ("/field", colours[0])
+        assert page.scene.add_grid.call_args.kwargs["cell_color"] == colours[1]
