@@ -127,6 +127,7 @@ def test_drones_in_an_emergency_have_all_their_figures_in_sight(opened: Callable
 
 
 @pytest.mark.slow
+@pytest.mark.soak
 def test_an_event_is_unfolded_by_a_click_and_stays_so(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page = opened(flight, SCREENS[0])
     page.wait_for_text("running")
@@ -157,7 +158,7 @@ def test_a_phone_shows_the_scene_above_one_panel(flight: str, opened: Callable[.
     sheet = page.page.locator(".zsim-sheet").bounding_box()
     assert sheet["width"] == SCREENS[-1]["width"]
     page.close_notice()
-    assert page.page.evaluate(COVERED_JS)["free"] > 0.7  # beside the tools over the scene
+    page.page.wait_for_function(f"({COVERED_JS})().free > 0.7")  # beside the tools over the scene
     page.select_tab("Drones")
     assert page.page.get_by_role("tab", name="Fly", exact=True).is_hidden()  # one panel at a time
 
@@ -176,6 +177,7 @@ def test_plots_have_curves_as_soon_as_they_are_opened_and_hold_their_width(
 
 
 @pytest.mark.slow
+@pytest.mark.soak
 def test_a_plot_keeps_its_size_where_the_cursor_enters_it(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page = opened(flight, SCREENS[1])
     page.wait_for_text("running")
@@ -222,6 +224,7 @@ def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(replay: str, opened: 
 
 
 @pytest.mark.slow
+@pytest.mark.soak
 def test_the_grid_is_on_the_ground_from_any_height(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page = opened(flight, SCREENS[1])
     page.wait_for_text("running")

@@ -21,6 +21,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
+from zsim.errors import printable
+
 READY = b"ready"
 PACKET_MAX = 1 << 17  # bytes, of a command line
 FILES = 4  # standard input, output, error, and the byte to begin
@@ -118,7 +120,7 @@ def finish(code: object) -> NoReturn:
         threading._shutdown()  # type: ignore[attr-defined]
         atexit._run_exitfuncs()
         if isinstance(code, str):
-            print(code, file=sys.stderr)
+            print(printable(code), file=sys.stderr)
         sys.stdout.flush()
         sys.stderr.flush()
     os._exit(code if isinstance(code, int) else 0 if code is None else 1)
