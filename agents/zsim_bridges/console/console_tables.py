@@ -10,7 +10,7 @@ from html import escape
 from typing import NamedTuple
 
 from zsim.contract.run_messages import Fault
-from zsim_bridges.console.monitoring.alarms import BATTERY_EMPTY_PERCENT, BATTERY_LOW_PERCENT, LATE_MS, Severity
+from zsim_bridges.console.monitoring.alarms import LATE_MS, Severity, battery_severity
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 from zsim_bridges.console.monitoring.sensor_rates import Counts, SensorRates
@@ -90,18 +90,12 @@ def _drone_cells(row: DroneRow, figures: FlightFigures | None) -> str:
     if figures is not None:
         flown = [f"{figures.position_m[2]:.1f}", f"{figures.speed_m_s:.1f}", f"{figures.heading_deg:.0f}°"]
     left = battery_left_text(figures.battery_left_s if figures else None)
-    colour = _battery_colour(row.battery_percent)
+    severity = battery_severity(row.battery_percent)
+    colour = SEVERITY_COLOURS[severity] if severity else "inherit"
     charge = _coloured(f"{row.battery_percent:.0f} %{',' if left else ''}", colour)
     battery = f"<div style='{WRAP}'>{charge} {_coloured(left, colour)}</div>" if left else charge
     sigma = "–" if row.sigma_m is None else f"{row.sigma_m:.2f}"
     return _cells((name, state, *flown, battery, sigma)) + _drone_notes(row)
-
-
-def _battery_colour(percent: float) -> str:
-    """Return the colour of the alarm of a battery."""
-    if percent < BATTERY_EMPTY_PERCENT:
-        return RED
-    return AMBER if percent < BATTERY_LOW_PERCENT else "inherit"
 
 
 def _drone_notes(row: DroneRow) -> str:

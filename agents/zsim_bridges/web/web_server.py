@@ -29,6 +29,7 @@ class ServedSite(NamedTuple):
 
     @property
     def port(self) -> int:
+        """Return the port on which it is served."""
         return self.listener.sockets[0].getsockname()[1]
 
     async def cleanup(self) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Te
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from msgspec import Struct
 
 from zsim.errors import ReportError
@@ -26,8 +24,6 @@ COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's con
 DPI = 200  # of PNG files
 PAPER_PT = 8.0  # of text, points: that of a paper's captions
 LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of an entry of a legend besides its name, in its text's size
-MARK_EMS, LINE_EMS = 0.75, 1.25  # width of a bold letter and height of a line, in the text's size
-MARK_LINES, MARK_PAD_IN = 4, 0.05  # of the reason in a mark above a figure, and room above the mark
 FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE takes no Type 3
 POINTS = 2000  # per line: more than a page has pixels
 # Okabe and Ito's colours, distinct with every kind of colour vision.
@@ -103,40 +99,6 @@ def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
         return None
     room = share * (known.max() - known.min())
     return float(known.min() - room), float(known.max() + room)
-
-
-def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
-    """Write above a figure that its flight is not what it may be taken for, on room of its own.
-
-    Args:
-        figure: already drawn, with its legend; it grows by the height of the mark.
-        head: the first line.
-        reason: in as many lines below as it takes, cut where these are too many.
-        colour: of the text.
-    """
-    width_in, height_in = figure.get_size_inches()
-    letters = int(72 * width_in / (MARK_EMS * PAPER_PT))
-    lines = [head, *wrap(reason, letters, max_lines=MARK_LINES, placeholder=" …")]
-    mark_in = len(lines) * LINE_EMS * PAPER_PT / 72 + MARK_PAD_IN
-    whole_in = height_in + mark_in
-    mark = figure.suptitle("\n".join(lines), va="top", color=colour, fontsize=PAPER_PT, fontweight="bold")
-    mark.set_y(1 - MARK_PAD_IN / whole_in)
-    mark.set_in_layout(False)  # matplotlib would lay it over a legend that stands above the axes
-    figure.set_size_inches(width_in, whole_in)
-    _lower(figure, height_in / whole_in)
-
-
-def _lower(figure: Figure, top: float) -> None:
-    """Lay out axes of a figure, and the legends above them, below a share of its height."""
-    height_px, room_px = figure.bbox.height, 0.0
-    boxes = [(legend, legend.get_window_extent()) for legend in figure.legends]
-    for legend, box in boxes:
-        if box.y0 > height_px / 2:  # not one below the axes
-            room_px = max(room_px, box.height + figure.dpi * PAPER_PT / 72)
-            legend.set_bbox_to_anchor((0.0, 0.0, 1.0, top), figure.transFigure)
-    axes_top = top - room_px / height_px  # a legend with a place of its own is not laid out for
-    if isinstance(engine := figure.get_layout_engine(), ConstrainedLayoutEngine):
-        engine.set(rect=(0.0, 0.0, 1.0, axes_top))
 
 
 def dress(axes: Axes, label: str = "") -> None:

@@ -1,13 +1,12 @@
 """The command line: thin commands that read options, call one function, and print one line for a fault."""
 
 import os
-import signal
 import sys
 from contextlib import nullcontext
 from functools import cache
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.main import get_command
@@ -42,11 +41,7 @@ from zsim_deploy.cli import (
     role_commands,
 )
 from zsim_deploy.roles.closed_output import STREAMS, is_unread
-from zsim_deploy.roles.stop_channel import REASONS, interruptible
-
-if TYPE_CHECKING:
-    from zsim_deploy.launch.run import RunOptions
-    from zsim_deploy.launch.supervisor import Outcome
+from zsim_deploy.roles.stop_channel import interruptible
 
 app = typer.Typer(
     name="zsim",
@@ -99,6 +94,7 @@ def run(
         RunOptions,
         check_endpoint,
         check_open_files,
+        fly,
         options_of,
     )
     from zsim_deploy.launch.run_folder import make_directory
@@ -107,7 +103,7 @@ def run(
         _refuse_with_others(flight, listen, hosted, console, cameras, detect)
     if console:
         require("console", CONSOLE_NEEDS)
-    shown = RunConsole(_print_aside) if console else None
+    shown = RunConsole() if console else None
     if continue_:
         _refuse_to_change(flight, out, in_process, listen, insecure, hosted)
         options, in_process = options_of(flight.path)
@@ -128,26 +124,10 @@ def run(
     if not continue_:
         options.out = make_directory(out, options.scenario, force)
     with shown or nullcontext(), interruptible():
-        outcome = _fly(options, in_process)
+        outcome = fly(options, in_process)
         if shown:
             shown.outcome = outcome
         record_commands.conclude(outcome, options.out, report)
-
-
-def _fly(options: "RunOptions", in_process: bool) -> "Outcome":
-    from zsim.runtime.progress import Screen
-    from zsim_deploy.launch.run import run_in_process, run_processes
-    from zsim_deploy.launch.supervisor import Outcome
-
-    with Screen(options.scenario.duration_s) as screen:
-        try:
-            return run_in_process(options, screen) if in_process else run_processes(options, screen)
-        except KeyboardInterrupt as error:
-            return Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
-
-
-def _print_aside(line: str) -> None:
-    print(printable(line), file=sys.stderr)
 
 
 def _refuse_with_others(

@@ -2,11 +2,12 @@
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
+from zsim.errors import printable
 from zsim_deploy.launch.supervisor import Outcome, RunProcess
 from zsim_deploy.roles.stop_channel import interruptible
 
@@ -21,16 +22,12 @@ class RunConsole:
 
     To be entered before the run, so that nothing is left of it whatever happens. Ctrl-C ends the wait for its pages.
 
-    Args:
-        say: takes a line on what takes long.
-
     Attributes:
         process: once there is one.
         outcome: of the run, to be set; without one it was interrupted.
     """
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
+    def __init__(self) -> None:
         self.process: RunProcess | None = None
         self.outcome = Outcome("interrupted", interrupted=True)
 
@@ -60,7 +57,8 @@ class RunConsole:
     def _wait(self, process: RunProcess, limit_s: float) -> None:
         process.request_stop(self.outcome.reason)
         if not process.wait(min(SLOW_S, limit_s)) and limit_s > SLOW_S:
-            self._say(f"{process.name}: its pages may copy the report and the record; Ctrl-C ends that")
+            text = f"{process.name}: its pages may copy the report and the record; Ctrl-C ends that"
+            print(printable(text), file=sys.stderr)
             process.wait(limit_s - SLOW_S)
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import signal
 import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -143,6 +144,15 @@ def options_of(folder: Path) -> tuple[RunOptions, bool]:
     pace = (launch.mode, launch.rate)
     where = (launch.listen, launch.insecure, launch.hosted)
     return RunOptions(scenario, folder, *pace, *where, run_id=launch.run_id, continued=True), launch.in_process
+
+
+def fly(options: RunOptions, in_process: bool) -> Outcome:
+    """Run a scenario, as real processes or in this one, and show its progress; Ctrl-C is an outcome, too."""
+    with Screen(options.scenario.duration_s) as screen:
+        try:
+            return run_in_process(options, screen) if in_process else run_processes(options, screen)
+        except KeyboardInterrupt as error:
+            return Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
 
 
 def run_processes(options: RunOptions, screen: Screen) -> Outcome:

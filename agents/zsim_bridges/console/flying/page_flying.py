@@ -12,7 +12,7 @@ from zsim_bridges.console.flying import map_view
 from zsim_bridges.console.flying.flight_conditions import DroneSight, RunSight
 from zsim_bridges.console.flying.flown_velocity import DronePose
 from zsim_bridges.console.flying.geofence import geofence_of
-from zsim_bridges.console.flying.manual_control import ManualControl
+from zsim_bridges.console.flying.manual_flight import ManualFlight
 from zsim_bridges.console.monitoring.run_monitor import RunMonitor
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
@@ -63,7 +63,7 @@ class PageFlying:
         names = self._surroundings["names"]
         self._members = {each.name: [names.index(drone) for drone in each.drones] for each in scenario.clusters}
         limits = {drone.name: drone.limits for drone in scenario.drones}
-        self.control = ManualControl(client, name, limits, fence, info.gate_ns / 1e9, self._sight, self._run_sight)
+        self.control = ManualFlight(client, name, limits, fence, info.gate_ns / 1e9, self._sight, self._run_sight)
 
     @contextmanager
     def running(self) -> Iterator[None]:

@@ -51,6 +51,13 @@ class DroneCondition(NamedTuple):
     link_loss_percent: float | None = None
 
 
+def battery_severity(percent: float) -> Severity | None:
+    """Return the severity of the alarm of a battery, None where there is none."""
+    if percent < BATTERY_EMPTY_PERCENT:
+        return "red"
+    return "amber" if percent < BATTERY_LOW_PERCENT else None
+
+
 def drone_alarms(drone: DroneCondition) -> list[Alarm]:
     """Return the alarms of one drone."""
     found: list[Alarm] = []
@@ -60,9 +67,8 @@ def drone_alarms(drone: DroneCondition) -> list[Alarm]:
 
     if drone.state == "emergency":
         add("red", "emergency", "rotors stopped")
-    if drone.battery_percent < BATTERY_LOW_PERCENT:
-        empty = drone.battery_percent < BATTERY_EMPTY_PERCENT
-        add("red" if empty else "amber", "battery", f"{drone.battery_percent:.0f} %")
+    if severity := battery_severity(drone.battery_percent):
+        add(severity, "battery", f"{drone.battery_percent:.0f} %")
     if drone.estimate_lost:
         add("red", "no estimate")
     elif drone.lag_ms is not None and drone.lag_ms > LATE_MS:

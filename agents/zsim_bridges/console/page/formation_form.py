@@ -1,9 +1,8 @@
 """Controls of one formation: phases, sliders of its variables, trajectories."""
 
-import threading
-import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import viser
 
@@ -15,100 +14,8 @@ from zsim_bridges.console.monitoring.run_condition import RunCondition, formatio
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
 from zsim_bridges.console.page.run_forms import refusal_lines, set_refusals
+from zsim_bridges.console.page.variable_slider import VariableSlider
 from zsim_bridges.console.scene.picture import SHAPED_PHASES
-
-STILL_S = 2.0  # wall; a formation whose goal has not changed for so long is not on its way: the slider shows its goal
-
-
-class _HeldValue(NamedTuple):
-    """Value of a slider that was moved, the formation's newest goal, and since when it is the goal [s, wall]."""
-
-    value: float
-    goal: float
-    since_s: float
-
-
-class VariableSlider:
-    """A slider of one cluster variable, which follows the formation while the operator does not move it.
-
-    Args:
-        gui: viser's, in the folder where it is to be.
-        range_: of the variable, in whose unit all values here are.
-    """
-
-    def __init__(self, gui: viser.GuiApi, range_: SliderRange) -> None:
-        self.range = range_
-        self._lock = threading.Lock()
-        self._moved: tuple[float, float] | None = None
-        self._out_of_range = False
-        self._held: _HeldValue | None = None
-        self._slider: Any = gui.add_slider(range_.label, range_.low, range_.high, range_.step, range_.start)
-        self._slider.label = range_.label_unknown
-        self._slider.on_update(self._on_update)
-
-    def lock(self, locked: bool) -> None:
-        """Let nobody move it, or let them."""
-        if self._slider.disabled != locked:
-            self._slider.disabled = locked
-
-    @property
-    def moved_s(self) -> float | None:
-        """When an operator moved it last [s, wall], None once the value has been popped."""
-        moved = self._moved
-        return None if moved is None else moved[1]
-
-    def pop_value(self) -> float | None:
-        """Return the value to which it was moved, once; None where it was not moved."""
-        with self._lock:
-            moved, self._moved = self._moved, None
-        return None if moved is None else moved[0]
-
-    def hold(self, wall_s: float) -> None:
-        """Keep its value while the formation goes there."""
-        self._held = _HeldValue(float(self._slider.value), float("nan"), wall_s)
-
-    def follow(self, goal: float, wall_s: float) -> None:
-        """Show the formation's goal [m, rad], unless it was moved and the formation is on its way."""
-        shown = self.range.to_display(goal)
-        if self._moved is None and not self._is_held(shown, wall_s):
-            self._widen(shown)
-            self._slider.value = shown
-            self._mark(goal)
-
-    def _widen(self, shown: float) -> None:
-        """Let the slider reach as far as what it shows, which is as it is: what it may ask for stays the range."""
-        low, high = min(self.range.low, shown), max(self.range.high, shown)
-        if (self._slider.min, self._slider.max) != (low, high):
-            self._slider.min, self._slider.max = low, high
-
-    def _mark(self, goal: float) -> None:
-        """Let the label say that a value is out of range."""
-        label = self.range.label_of(goal)
-        if self._slider.label != label:
-            self._slider.label = label
-
-    def _is_held(self, goal: float, wall_s: float) -> bool:
-        kept = self._held
-        if kept is None:
-            return False
-        if goal != kept.goal:
-            self._held = kept._replace(goal=goal, since_s=wall_s)
-        elif goal == kept.value or wall_s - kept.since_s > STILL_S:
-            self._held = None
-        return self._held is not None
-
-    def _on_update(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client_id is None:
-            return  # set by `follow`
-        value = float(self._slider.value)
-        with self._lock:
-            # A page accepts numbers beyond the limits, and sets them to the nearest limit when the field loses focus.
-            if self._out_of_range and value in (self._slider.min, self._slider.max):
-                self._out_of_range = False
-                return
-            self._out_of_range = self.range.refusal(value) is not None
-            self._moved = (value, time.monotonic())
-
 
 REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
@@ -162,8 +69,7 @@ class FormationForm:
         self._controls = {op: self._button(gui, label, op) for label, op in OPERATIONS.items()}
         self._reasons = gui.add_html("")
         hint = "Duration of a move; 0: as fast as the robots' limits let it"
-        self._moves: dict[str, Any] = {}  # the control of other variables, if there is one
-        self._flights: dict[str, Any] = {}  # controls of trajectories
+        self._others: list[tuple[str, Any]] = []  # further controls, each with the operation that it requests
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
         shown = primary_variables(space.names)
         self._sliders = {name: VariableSlider(gui, self._ranges[name]) for name in shown}
@@ -175,8 +81,8 @@ class FormationForm:
         """Grey out what the controller would refuse, with its reason; a slider shows all the same where it stands."""
         refusals = formation_refusals(run, self._cluster.name)
         set_refusals(self._controls, refusals)
-        set_refusals(self._flights, dict.fromkeys(self._flights, refusals["trajectory"]))
-        set_refusals(self._moves, dict.fromkeys(self._moves, refusals["target"]))
+        for op, control in self._others:
+            set_refusals({op: control}, refusals)
         self._offer_rejoin(run)
         for slider in self._sliders.values():
             slider.lock(bool(refusals["target"]))
@@ -232,9 +138,7 @@ class FormationForm:
             name = gui.add_dropdown("variable", names)
             value = gui.add_number(self._value_label(names[0]), 0.0, step=0.1)
             name.on_update(lambda _: setattr(value, "label", self._value_label(name.value)))
-            move = gui.add_button("Move it")
-            move.on_click(lambda _: self._move(name.value, float(value.value)))
-            self._moves["move"] = move
+            self._other_button(gui, "target", "Move it", lambda: self._move(name.value, float(value.value)))
 
     def _value_label(self, name: str) -> str:
         return f"value [{self._ranges[name].unit}]"
@@ -243,23 +147,23 @@ class FormationForm:
         self.request_target({name: shown})
 
     def _trajectories(self, gui: viser.GuiApi, planned: Trajectory | None) -> None:
+        add = partial(self._other_button, gui, "trajectory")
         with gui.add_folder("Trajectory", expand_by_default=False):
             if planned is not None:
-                self._flight_button(gui, "Fly the scenario's", lambda: self._fly(lambda: _planned_trajectory(planned)))
+                add("Fly the scenario's", lambda: self._fly(lambda: _planned_trajectory(planned)))
             gui.add_markdown(f"<sub>{EXPRESSION_UNITS}</sub>")
             text = gui.add_text("expressions [m, deg]", EXAMPLES["expressions"], multiline=True)
-            self._flight_button(
-                gui, "Fly the expressions", lambda: self._fly(lambda: self._read_expressions(text.value))
-            )
+            add("Fly the expressions", lambda: self._fly(lambda: self._read_expressions(text.value)))
             gui.add_markdown(f"<sub>{WAYPOINT_UNITS}</sub>")
             self._points = gui.add_text("waypoints [s, m, deg]", EXAMPLES["waypoints"], multiline=True)
             self._points.on_update(self._on_edit)
-            self._flight_button(gui, "Waypoints from here", self._prefill)
-            self._flight_button(gui, "Fly the waypoints", lambda: self._fly(self._read_waypoints))
+            add("Waypoints from here", self._prefill)
+            add("Fly the waypoints", lambda: self._fly(self._read_waypoints))
 
-    def _flight_button(self, gui: viser.GuiApi, label: str, act: Callable[[], None]) -> None:
-        self._flights[label] = gui.add_button(label)
-        self._flights[label].on_click(lambda _: act())
+    def _other_button(self, gui: viser.GuiApi, op: str, label: str, act: Callable[[], None]) -> None:
+        button = gui.add_button(label)
+        button.on_click(lambda _: act())
+        self._others.append((op, button))
 
     def _on_edit(self, event: viser.GuiEvent[Any]) -> None:
         """Keep what somebody has written, from now on."""

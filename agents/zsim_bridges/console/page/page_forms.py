@@ -12,7 +12,7 @@ from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.page.run_forms import DroneForm
 from zsim_bridges.console.scene.chosen_ring import ChosenRing
-from zsim_bridges.console.scene.ground import draw_ground
+from zsim_bridges.console.scene.ground_grid import draw_ground
 from zsim_bridges.console.scene.picture import Array, DronePoses
 
 ROWS_SHOWN = 60  # events

@@ -13,7 +13,7 @@ from zsim.drone_colours import drone_colours, rgb
 from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console.scene import airframe
-from zsim_bridges.console.scene.ground import draw_ground
+from zsim_bridges.console.scene.ground_grid import draw_ground
 from zsim_bridges.console.scene.picture import (
     Array,
     DronePoses,

@@ -7,7 +7,7 @@ import msgspec
 from aiohttp import WSMsgType, web
 
 from zsim_bridges.console.flying.flight_conditions import FlightAnswer
-from zsim_bridges.console.flying.manual_control import ManualControl
+from zsim_bridges.console.flying.manual_flight import ManualFlight
 from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.scene.camera_follow import CameraFollow
@@ -113,7 +113,7 @@ class ActionSockets:
         return {} if flying is None else {"flight": _fly(flying.control, page, action)._asdict()}
 
 
-def _fly(control: ManualControl, page: Any, action: FlyDrone) -> FlightAnswer:
+def _fly(control: ManualFlight, page: Any, action: FlyDrone) -> FlightAnswer:
     if isinstance(action, TakeDrone):
         return control.take(page, action.drone, action.over)
     if isinstance(action, SteerDrone):

@@ -1,6 +1,6 @@
 """The setpoints that a vehicle sends to its drone: at once while few are sent, and never more than the world takes."""
 
-from zsim_bridges.mavlink.flight.position_guidance import AttitudeTarget, Steering
+from zsim_bridges.mavlink.flight.position_guidance import Steering, TiltTarget
 from zsim_bridges.vehicle_links.command_sender import CommandSender, ModeName
 
 BURST = 500  # commands at once: half of what the world records of a source that is not in the lockstep
@@ -48,7 +48,7 @@ class CommandOutput:
         frame = "heading" if steering.along_heading else "world"
         self._sender.velocity(self.now_ns, steering.velocity_m_s, steering.yaw_rate_rad_s, frame)
 
-    def tilt(self, target: AttitudeTarget) -> None:
+    def tilt(self, target: TiltTarget) -> None:
         """Hold a tilt and a thrust."""
         self._note()
         self._sender.attitude(self.now_ns, target.q_WB, target.thrust_n, target.yaw_rate_rad_s)

@@ -5,7 +5,7 @@ from typing import Literal
 from zsim_bridges.mavlink.autopilot.personality import Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.command_output import CommandOutput
-from zsim_bridges.mavlink.flight.position_guidance import NOWHERE, AttitudeTarget, Target, distance_m, steer
+from zsim_bridges.mavlink.flight.position_guidance import NOWHERE, Target, TiltTarget, distance_m, steer
 
 ANSWER_NS = 1_000_000_000  # ns within which the drone is to begin a take-off or a landing
 ARRIVED_M = 0.3  # m of the height at which a climb is over
@@ -24,7 +24,7 @@ class FlightControl:
         self._settings = settings
         self._state = state
         self._output = output
-        self.target: Target | AttitudeTarget | None = None
+        self.target: Target | TiltTarget | None = None
         self._climb_to_m: float | None = None  # z in W
         self._asked: tuple[Asked, int] | None = None  # a mode of the firmware, and since when
         self._stepped_ns = 0
@@ -44,7 +44,7 @@ class FlightControl:
         """Whether the firmware has yet to do what was asked."""
         return self._asked is not None
 
-    def hold(self, target: Target | AttitudeTarget) -> None:
+    def hold(self, target: Target | TiltTarget) -> None:
         """Hold a target from now on, and send it at once; a climb goes on first."""
         self.target = target
         if self._state.is_steerable and not self.is_climbing:

@@ -36,7 +36,7 @@ COMMANDS = (
 )
 
 
-class MissionItem(NamedTuple):
+class PlanItem(NamedTuple):
     """An item: x and y are latitude and longitude [deg], or [m] in local frames; z is [m]."""
 
     frame: int
@@ -63,7 +63,7 @@ class MissionStep(NamedTuple):
     is_over: bool = False
 
 
-def place_of(item: MissionItem, state: VehicleState) -> Vector:
+def place_of(item: PlanItem, state: VehicleState) -> Vector:
     """Return p_W [m] of an item; without a place of its own it is above or below the vehicle."""
     home = state.home_m or state.position_m
     z = item.z if math.isfinite(item.z) else 0.0
@@ -93,7 +93,7 @@ class Mission:
     def __init__(self, first: int = 0, turns: bool = True) -> None:
         self.first = first
         self._turns = turns
-        self.items: list[MissionItem] = []
+        self.items: list[PlanItem] = []
         self.reached: list[int] = []
         self._index = 0
         self._since_ns: int | None = None  # at this item
@@ -106,7 +106,7 @@ class Mission:
         """The number of the item that is flown to."""
         return self.first + min(self._index, max(0, len(self.items) - 1))
 
-    def load(self, items: Sequence[MissionItem]) -> None:
+    def load(self, items: Sequence[PlanItem]) -> None:
         """Replace the items, and begin anew."""
         self.items = list(items)
         self.rewind()
@@ -144,7 +144,7 @@ class Mission:
                 return step
         return MissionStep(is_over=True)
 
-    def _step(self, item: MissionItem, state: VehicleState, settings: Settings) -> MissionStep | None:
+    def _step(self, item: PlanItem, state: VehicleState, settings: Settings) -> MissionStep | None:
         """Return what an item asks for; None once it is done."""
         match item.command:
             case Cmd.DO_CHANGE_SPEED:
@@ -163,12 +163,12 @@ class Mission:
                 return self._visit(item, state, settings)
         return self._done()
 
-    def _take_off(self, item: MissionItem, state: VehicleState) -> MissionStep | None:
+    def _take_off(self, item: PlanItem, state: VehicleState) -> MissionStep | None:
         if self._climbed:
             return self._done()
         return MissionStep(climb_to_m=place_of(item, state)[2])
 
-    def _land(self, item: MissionItem, state: VehicleState, settings: Settings) -> MissionStep:
+    def _land(self, item: PlanItem, state: VehicleState, settings: Settings) -> MissionStep:
         if not item.has_place or self._since_ns is not None:
             return MissionStep(land=True)
         x, y, _ = place_of(item, state)
@@ -178,7 +178,7 @@ class Mission:
             return MissionStep(land=True)
         return MissionStep(Target((x, y, None), speed_m_s=self._speed_m_s))
 
-    def _visit(self, item: MissionItem, state: VehicleState, settings: Settings) -> MissionStep | None:
+    def _visit(self, item: PlanItem, state: VehicleState, settings: Settings) -> MissionStep | None:
         yaw_deg = item.params[3]
         yaw = ned_axes.yaw_ned(math.radians(yaw_deg)) if self._turns and math.isfinite(yaw_deg) else None
         target = Target(place_of(item, state), yaw_rad=yaw, speed_m_s=self._speed_m_s)
@@ -198,7 +198,7 @@ class Mission:
             return MissionStep(target)
         return self._done()
 
-    def _jump(self, item: MissionItem) -> None:
+    def _jump(self, item: PlanItem) -> None:
         left = self._jumps.setdefault(self._index, int(max(-1.0, min(1e6, item.params[1]))))
         index = int(max(0.0, min(1e6, item.params[0]))) - self.first
         if left and 0 <= index < len(self.items):

@@ -50,7 +50,7 @@ class Target(NamedTuple):
         return self.velocity_m_s[2] > 0.0 or (z is not None and z > z_m)
 
 
-class AttitudeTarget(NamedTuple):
+class TiltTarget(NamedTuple):
     """A tilt that is to be held: attitude B to W, thrust [N], yaw rate [rad/s] counter-clockwise."""
 
     q_WB: Quaternion

@@ -11,7 +11,7 @@ from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.autopilot.enums import Cmd
 from zsim_bridges.mavlink.autopilot.personality import Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.mission import MissionItem, place_of
+from zsim_bridges.mavlink.flight.mission import PlanItem, place_of
 
 Point = tuple[float, float]
 BREACH_NONE, BREACH_ALTITUDE, BREACH_BOUNDARY = 0, 2, 3  # FENCE_BREACH
@@ -54,7 +54,7 @@ class VehicleFence:
     def __init__(self) -> None:
         self.shapes: list[Circle | Polygon] = []
 
-    def load(self, items: Sequence[MissionItem], state: VehicleState) -> None:
+    def load(self, items: Sequence[PlanItem], state: VehicleState) -> None:
         """Replace the shapes."""
         self.shapes = []
         corners: list[Point] = []

@@ -11,7 +11,7 @@ from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.command_output import CommandOutput
 from zsim_bridges.mavlink.flight.flight_control import ARRIVED_M, FlightControl
 from zsim_bridges.mavlink.flight.mission import Mission
-from zsim_bridges.mavlink.flight.position_guidance import AttitudeTarget, Target
+from zsim_bridges.mavlink.flight.position_guidance import Target, TiltTarget
 from zsim_bridges.mavlink.flight.return_course import ReturnCourse
 from zsim_bridges.mavlink.flight.setpoint_stream import SetpointStream
 
@@ -58,7 +58,7 @@ class Flight:
     # What clients ask
 
     @property
-    def target(self) -> Target | AttitudeTarget | None:
+    def target(self) -> Target | TiltTarget | None:
         """What is held; None while nothing is sent."""
         return self._control.target
 
@@ -120,16 +120,13 @@ class Flight:
 
     def take_off(self, altitude_m: float) -> str | None:
         """Take off to an altitude over home."""
+        has_mode = FlightMode.TAKEOFF in self._personality.modes
         reason = self.refusal() or self._not_ready()
-        if (
-            reason is None
-            and FlightMode.TAKEOFF not in self._personality.modes
-            and self.mode is not FlightMode.OFFBOARD
-        ):
+        if reason is None and not has_mode and self.mode is not FlightMode.OFFBOARD:
             reason = "a take-off needs GUIDED"
         if reason:
             return reason
-        if FlightMode.TAKEOFF in self._personality.modes:
+        if has_mode:
             self.mode = FlightMode.TAKEOFF
         self._is_armed = True
         self._control.climb(self._state.home_z_m + altitude_m)
@@ -154,7 +151,7 @@ class Flight:
             self._control.hold(target)
         return reason
 
-    def set_point(self, target: Target | AttitudeTarget) -> str | None:
+    def set_point(self, target: Target | TiltTarget) -> str | None:
         """Take a setpoint of a stream; it is flown in OFFBOARD (GUIDED), and at once."""
         self._stream.note()
         if self.mode is not FlightMode.OFFBOARD:
@@ -290,7 +287,7 @@ class Flight:
         z_m = self.mission.takeoff_height_m(self._state)
         self._control.climb(self._state.home_z_m + self._settings["takeoff_altitude_m"] if z_m is None else z_m)
 
-    def _take_off_for(self, target: Target | AttitudeTarget) -> None:
+    def _take_off_for(self, target: Target | TiltTarget) -> None:
         """Take off where a setpoint leads up from the ground."""
         if self._is_armed and not self._state.is_airborne and target.leads_up(self._state.position_m[2] + ARRIVED_M):
             self._control.ask("takeoff")

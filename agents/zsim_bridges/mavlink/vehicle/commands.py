@@ -13,7 +13,7 @@ from zsim_bridges.mavlink.autopilot.enums import FORCE, Cmd, Result
 from zsim_bridges.mavlink.autopilot.parameters import Parameters
 from zsim_bridges.mavlink.autopilot.personality import FlightMode, Personality, Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.mission import ABSOLUTE, FRAMES, LOCAL, MissionItem, place_of
+from zsim_bridges.mavlink.flight.mission import ABSOLUTE, FRAMES, LOCAL, PlanItem, place_of
 from zsim_bridges.mavlink.flight.position_guidance import Target, is_place
 from zsim_bridges.mavlink.flight.vehicle_flight import Flight
 from zsim_bridges.mavlink.telemetry.telemetry import Telemetry
@@ -33,9 +33,9 @@ class Request(NamedTuple):
     frame: int
 
     @property
-    def place(self) -> MissionItem:
+    def place(self) -> PlanItem:
         p = self.params
-        return MissionItem(self.frame, self.command, p[:4], p[4], p[5], p[6])
+        return PlanItem(self.frame, self.command, p[:4], p[4], p[5], p[6])
 
 
 class Answer(NamedTuple):

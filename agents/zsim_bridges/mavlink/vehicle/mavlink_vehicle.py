@@ -11,7 +11,7 @@ from zsim_bridges.mavlink.autopilot.enums import COMPONENT_AUTOPILOT, FENCE, MIS
 from zsim_bridges.mavlink.autopilot.personality import Personality, Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.command_output import CommandOutput
-from zsim_bridges.mavlink.flight.mission import MissionItem, place_of
+from zsim_bridges.mavlink.flight.mission import PlanItem, place_of
 from zsim_bridges.mavlink.flight.position_guidance import Target
 from zsim_bridges.mavlink.flight.vehicle_fence import VehicleFence
 from zsim_bridges.mavlink.flight.vehicle_flight import Flight
@@ -79,7 +79,7 @@ class MavlinkVehicle:
         self._refused: set[str] = set()
 
     def _mission_protocol(self) -> MissionProtocol:
-        def home() -> MissionItem:
+        def home() -> PlanItem:
             return home_item(*self.state.to_global(self.state.home_m or self.state.position_m))
 
         is_px4 = self._options.personality.needs_stream
@@ -234,7 +234,7 @@ class MavlinkVehicle:
         self._answer(reason or "")
         self.outbox.append(dialect.MissionAck(*sender, type=fault or (1 if reason else 0)))
 
-    def _on_mission(self, type_: int, items: list[MissionItem]) -> None:
+    def _on_mission(self, type_: int, items: list[PlanItem]) -> None:
         if type_ == MISSION:
             self.flight.mission.load(items)
         elif type_ == FENCE:

@@ -15,7 +15,7 @@ from zsim_bridges.mavlink.autopilot.enums import (
     MavFrame,
     MissionResult,
 )
-from zsim_bridges.mavlink.flight.mission import COMMANDS, FRAMES, LOCAL, MissionItem
+from zsim_bridges.mavlink.flight.mission import COMMANDS, FRAMES, LOCAL, PlanItem
 from zsim_bridges.mavlink.flight.position_guidance import is_place
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.wire_message import WireMessage
@@ -31,7 +31,7 @@ PLACED = (
     Cmd.FENCE_CIRCLE_INCLUSION,
     Cmd.FENCE_CIRCLE_EXCLUSION,
 )
-Loaded = Callable[[int, list[MissionItem]], None]
+Loaded = Callable[[int, list[PlanItem]], None]
 
 
 class MissionProtocol:
@@ -48,17 +48,17 @@ class MissionProtocol:
         self,
         send: Callable[[WireMessage], None],
         loaded: Loaded,
-        home: Callable[[], MissionItem] | None,
+        home: Callable[[], PlanItem] | None,
         asks_int: bool,
     ) -> None:
         self._send = send
         self._loaded = loaded
         self._home = home
         self._asks_int = asks_int
-        self._items: dict[int, list[MissionItem]] = {}
+        self._items: dict[int, list[PlanItem]] = {}
         self._upload: _Upload | None = None
 
-    def stored(self, type_: int) -> list[MissionItem]:
+    def stored(self, type_: int) -> list[PlanItem]:
         """Return all items of a type, ArduPilot's item 0 included."""
         items = self._items.get(type_, [])
         return [self._home(), *items] if self._home and type_ == MISSION else items
@@ -167,22 +167,22 @@ class _Upload:
         self.sender = sender
         self.type = type_
         self.count = count
-        self.items: list[MissionItem] = []
+        self.items: list[PlanItem] = []
         self.asked_ns = 0
         self.tries = 0
 
 
-def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> MissionItem:
+def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> PlanItem:
     """Return the item in a message."""
     unit = 1.0
     if isinstance(message, dialect.MissionItemInt):
         unit = LOCAL_M if message.frame in LOCAL else DEGREES
     params = message.param1, message.param2, message.param3, message.param4
     x, y = unit * message.x, unit * message.y
-    return MissionItem(message.frame, message.command, params, x, y, message.z, bool(message.autocontinue))
+    return PlanItem(message.frame, message.command, params, x, y, message.z, bool(message.autocontinue))
 
 
-def item_fault(item: MissionItem, type_: int) -> MissionResult | None:
+def item_fault(item: PlanItem, type_: int) -> MissionResult | None:
     """Return what is wrong with an item, None if nothing is."""
     known: Sequence[Any] = COMMANDS if type_ == MISSION else PLACED
     if item.command not in known:
@@ -192,7 +192,7 @@ def item_fault(item: MissionItem, type_: int) -> MissionResult | None:
     return None if _has_good_place(item) and (type_ != FENCE or item.has_place) else MissionResult.INVALID
 
 
-def _has_good_place(item: MissionItem) -> bool:
+def _has_good_place(item: PlanItem) -> bool:
     """Return whether the place of an item is left out, or is one."""
     z = 0.0 if math.isnan(item.z) and item.command == Cmd.NAV_LAND else item.z
     x, y = (0.0 if math.isnan(value) else value for value in (item.x, item.y))
@@ -201,7 +201,7 @@ def _has_good_place(item: MissionItem) -> bool:
     return is_place((None, None, z)) and abs(x) <= 90.0 and abs(y) <= 180.0
 
 
-def message_of(item: MissionItem, request: Any, sender: tuple[int, int], as_int: bool) -> WireMessage:
+def message_of(item: PlanItem, request: Any, sender: tuple[int, int], as_int: bool) -> WireMessage:
     """Return the message of an item, as MISSION_ITEM_INT or MISSION_ITEM."""
     fields: dict[str, Any] = {
         **dict(zip(("target_system", "target_component"), sender, strict=True)),
@@ -220,6 +220,6 @@ def message_of(item: MissionItem, request: Any, sender: tuple[int, int], as_int:
     return dialect.MissionItemInt(**fields, x=x, y=y)
 
 
-def home_item(latitude_deg: float, longitude_deg: float, height_m: float) -> MissionItem:
+def home_item(latitude_deg: float, longitude_deg: float, height_m: float) -> PlanItem:
     """Return item 0 of ArduPilot's missions."""
-    return MissionItem(MavFrame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), latitude_deg, longitude_deg, height_m)
+    return PlanItem(MavFrame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), latitude_deg, longitude_deg, height_m)

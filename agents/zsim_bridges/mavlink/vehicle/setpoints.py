@@ -12,7 +12,7 @@ from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.autopilot.enums import AttitudeMask, MavFrame, TypeMask
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
 from zsim_bridges.mavlink.flight.mission import ABSOLUTE, RELATIVE
-from zsim_bridges.mavlink.flight.position_guidance import NOWHERE, AttitudeTarget, Axes, Target, is_place
+from zsim_bridges.mavlink.flight.position_guidance import NOWHERE, Axes, Target, TiltTarget, is_place
 from zsim_bridges.mavlink.wire import dialect
 
 POSITION = TypeMask.X | TypeMask.Y | TypeMask.Z
@@ -28,7 +28,7 @@ LOCAL_FRAMES = (MavFrame.LOCAL_NED, *FROM_HERE)
 HOVER_THRUST = 0.5  # of the thrust of a setpoint; MPC_THR_HOVER
 SPEED_MAX_M_S = 1e3  # m/s; beyond it nothing flies here
 
-Setpoint = Target | AttitudeTarget
+Setpoint = Target | TiltTarget
 
 
 class SetpointRefusal(NamedTuple):
@@ -136,4 +136,4 @@ def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoi
     q_WB = w / length, x / length, y / length, z / length
     thrust = HOVER_THRUST if mask & AttitudeMask.THRUST else max(0.0, min(1.0, message.thrust))
     rate = 0.0 if mask & AttitudeMask.YAW_RATE else -max(-10.0, min(10.0, message.body_yaw_rate))
-    return AttitudeTarget(q_WB, weight_n * thrust / HOVER_THRUST, rate)
+    return TiltTarget(q_WB, weight_n * thrust / HOVER_THRUST, rate)

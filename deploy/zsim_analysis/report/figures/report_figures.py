@@ -10,11 +10,12 @@ from zsim_analysis.reading.goal import goal_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.figures.drone_panels import draw_drones
 from zsim_analysis.report.figures.estimate_figures import draw_estimates
+from zsim_analysis.report.figures.figure_mark import mark_figure
 from zsim_analysis.report.figures.formation_figures import ROWS_MAX, draw_errors, draw_parameters, parameter_groups
 from zsim_analysis.report.figures.motion_figures import PAIRS_MAX, draw_distances, draw_velocities
 from zsim_analysis.report.figures.plan_view import draw_plan
 from zsim_analysis.report.figures.time_marks import TimeMarks, time_marks
-from zsim_analysis.report.pages import DARK, VERMILION, ReportFigure, mark_figure
+from zsim_analysis.report.pages import DARK, VERMILION, ReportFigure
 from zsim_analysis.report.summary import RunSummary
 
 REFERENCE = (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from zsim_analysis.report.pages import BLUE, PAPER_PT, VERMILION, dress, padded_range
 from zsim_analysis.sweep.intervals import mean_interval
-from zsim_analysis.sweep.points import SweepResults, count_text
+from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.grid_axis import GridAxis, Place
 from zsim_analysis.sweep.report.intervals_drawn import (
     ROOM,
@@ -21,6 +21,7 @@ from zsim_analysis.sweep.report.intervals_drawn import (
     scale_to_samples,
 )
 from zsim_analysis.sweep.report.labels import LEVEL_LETTERS, UPRIGHT_LETTERS, wrapped
+from zsim_analysis.sweep.sweep_summary import count_text
 
 Samples = NDArray[np.float64]
 

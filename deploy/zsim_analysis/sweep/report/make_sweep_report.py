@@ -11,16 +11,11 @@ from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
 from zsim_analysis.sweep.intervals import ConfidenceInterval
-from zsim_analysis.sweep.points import (
-    Distribution,
-    FormationParameter,
-    GridPoint,
-    SweepResults,
-    SweepSummary,
-)
+from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.field_names import FieldName, field_name
 from zsim_analysis.sweep.report.sweep_figures import figures
 from zsim_analysis.sweep.sweep_folder import load
+from zsim_analysis.sweep.sweep_summary import Distribution, FormationParameter, GridPoint, SweepSummary
 
 POINTS_MAX = 200  # in a table of the page; sweep.parquet has all
 DETAILED_MAX = 24  # points with a table of their own

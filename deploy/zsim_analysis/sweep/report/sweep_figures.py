@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from zsim_analysis.reading.window_text import span_text
+from zsim_analysis.report.figures.figure_mark import mark_figure
 from zsim_analysis.report.pages import (
     BLACK,
     BLUE,
@@ -20,16 +21,16 @@ from zsim_analysis.report.pages import (
     dress,
     label,
     legend_above,
-    mark_figure,
     new_figure,
 )
 from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
-from zsim_analysis.sweep.points import FormationParameter, SweepResults
+from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.distributions import PAPER, Panel, Samples, draw_distribution, known
 from zsim_analysis.sweep.report.field_names import field_name
 from zsim_analysis.sweep.report.grid_axis import MARK, POINTS_MAX, GridAxis, Place
 from zsim_analysis.sweep.report.intervals_drawn import DrawnInterval, mark_beyond, scale_to_samples
 from zsim_analysis.sweep.report.labels import LEVEL_LETTERS, UPRIGHT_LETTERS, wrapped
+from zsim_analysis.sweep.sweep_summary import FormationParameter
 
 PANELS_MAX = 24  # quantities in one figure; 6 drones
 COLUMNS = 3  # of panels

@@ -12,9 +12,9 @@ from rich.text import Text
 from zsim.errors import printable
 from zsim.runtime.progress import cell
 from zsim_analysis.sweep.intervals import ConfidenceInterval
-from zsim_analysis.sweep.points import FormationParameter, GridPoint, SweepSummary
 from zsim_analysis.sweep.report.field_names import field_name
 from zsim_analysis.sweep.report.make_sweep_report import axes_of, marks_of, values_of, windows_of, without_data
+from zsim_analysis.sweep.sweep_summary import FormationParameter, GridPoint, SweepSummary
 
 POINTS_MAX = 40  # on a terminal
 BETWEEN = 3  # characters between two columns of a table

@@ -23,9 +23,10 @@ from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.shortfall import Shortfall, shortfalls
 from zsim_analysis.reading.verdict import NOT_AS_PLANNED, marks_of, verdict
+from zsim_analysis.report.figures.figure_mark import mark_figure
 from zsim_analysis.report.figures.report_figures import figures
 from zsim_analysis.report.make_report import facts, judge, page
-from zsim_analysis.report.pages import COLUMN_IN, PAGE_IN, VERMILION, legend_above, mark_figure, new_figure
+from zsim_analysis.report.pages import COLUMN_IN, PAGE_IN, VERMILION, legend_above, new_figure
 from zsim_analysis.report.tables import table
 from zsim_deploy.cli import record_commands
 

@@ -10,7 +10,8 @@ from sweep_rows import made, plan, well
 from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.intervals import mean_interval, share_interval
-from zsim_analysis.sweep.points import FormationParameter, SweepResults, distribution, parameters
+from zsim_analysis.sweep.points import SweepResults, distribution, parameters
+from zsim_analysis.sweep.sweep_summary import FormationParameter
 
 
 @pytest.mark.parametrize("n", [2, 3, 10, 200])

@@ -41,16 +41,14 @@ class LateConsole:
         self.closed = True
 
 
-def end(console: LateConsole, interrupted: bool = False, report: Callable[[], None] = lambda: None) -> list[str]:
-    """End a run with a console; return what was printed."""
-    said: list[str] = []
+def end(console: LateConsole, interrupted: bool = False, report: Callable[[], None] = lambda: None) -> None:
+    """End a run with a console."""
     process: Any = console
-    with RunConsole(said.append) as run_console:
+    with RunConsole() as run_console:
         run_console.own(process)
         run_console.outcome = Outcome(REASON, interrupted=interrupted)
         report()
         assert not console.stopped_for
-    return said
 
 
 def raises(error: BaseException) -> Callable[[], None]:
@@ -60,16 +58,17 @@ def raises(error: BaseException) -> Callable[[], None]:
     return report
 
 
-def test_a_console_is_asked_to_stop_when_the_report_is_there() -> None:
+def test_a_console_is_asked_to_stop_when_the_report_is_there(capfd: pytest.CaptureFixture[str]) -> None:
     console = LateConsole(0.5)
-    assert end(console) == []
+    end(console)
+    assert capfd.readouterr().err == ""
     assert (console.stopped_for, console.waited_s, console.closed) == (REASON, 0.5, True)
 
 
-def test_what_is_waited_for_long_is_named() -> None:
+def test_what_is_waited_for_long_is_named(capfd: pytest.CaptureFixture[str]) -> None:
     console = LateConsole(SLOW_S + 3.0)
-    (line,) = end(console)
-    assert console.name in line
+    end(console)
+    assert console.name in capfd.readouterr().err
     assert console.waited_s == SLOW_S + 3.0
 
 
@@ -80,9 +79,10 @@ def test_nobody_is_waited_for_without_an_end() -> None:
     assert COPIED_S > OFFER_S
 
 
-def test_after_ctrl_c_a_console_has_little_time_and_is_not_named() -> None:
+def test_after_ctrl_c_a_console_has_little_time_and_is_not_named(capfd: pytest.CaptureFixture[str]) -> None:
     console = LateConsole(1000.0)
-    assert end(console, interrupted=True) == []
+    end(console, interrupted=True)
+    assert capfd.readouterr().err == ""
     assert (console.waited_s, console.closed) == (INTERRUPTED_S, True)
 
 
@@ -109,7 +109,7 @@ def test_a_run_that_is_broken_off_before_it_has_an_outcome_leaves_nothing() -> N
     process: Any = console
 
     def run() -> None:
-        with RunConsole(print) as run_console:
+        with RunConsole() as run_console:
             run_console.own(process)
             raise KeyboardInterrupt
 
@@ -121,7 +121,7 @@ def test_a_run_that_is_broken_off_before_it_has_an_outcome_leaves_nothing() -> N
 def test_the_console_of_a_run_whose_port_was_taken_makes_way() -> None:
     first, second = LateConsole(0.5), LateConsole(0.5)
     processes: Any = [first, second]
-    with RunConsole(print) as run_console:
+    with RunConsole() as run_console:
         for process in processes:
             run_console.own(process)
         assert (first.closed, second.closed) == (True, False)
@@ -129,5 +129,5 @@ def test_the_console_of_a_run_whose_port_was_taken_makes_way() -> None:
 
 
 def test_a_run_without_a_console_ends_at_once() -> None:
-    with RunConsole(print) as run_console:
+    with RunConsole() as run_console:
         assert run_console.process is None

@@ -19,7 +19,7 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, fleet_refusals
 from zsim_bridges.console.page.console_page import SWITCHES, ConsolePage
-from zsim_bridges.console.page.formation_form import OPERATIONS, REST_S, STILL_S, FormationForm
+from zsim_bridges.console.page.formation_form import OPERATIONS, REST_S, FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.run_forms import (
     DURATION_S,
@@ -31,6 +31,7 @@ from zsim_bridges.console.page.run_forms import (
     FleetForm,
     RunForm,
 )
+from zsim_bridges.console.page.variable_slider import STILL_S
 
 SCENARIOS = Path(__file__).parents[5] / "scenarios"
 PERSON, NOBODY = 1, None  # who moved a slider

@@ -5,7 +5,7 @@ from typing import Any
 from unittest.mock import MagicMock
 
 from zsim_bridges.console.page.page_forms import PageForms
-from zsim_bridges.console.scene import ground
+from zsim_bridges.console.scene import ground_grid
 
 NAMES = ["drone1", "drone2"]
 
@@ -73,7 +73,7 @@ def test_the_ground_of_a_page_has_its_theme():
     page = pages.clients[1]
     theme = page.gui.add_checkbox.return_value
     (switch,) = theme.on_update.call_args.args
-    for dark, colours in ((True, ground.DARK), (False, ground.LIGHT)):
+    for dark, colours in ((True, ground_grid.DARK), (False, ground_grid.LIGHT)):
         theme.value = dark
         switch(None)
         assert page.scene.add_box.call_args.args[:2] == ("/field", colours[0])

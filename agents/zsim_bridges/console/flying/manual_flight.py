@@ -55,7 +55,7 @@ class _Flight:
     lost: bool = False
 
 
-class ManualControl:
+class ManualFlight:
     """Flies drones for pages.
 
     Args:

@@ -11,7 +11,7 @@ from zsim.vehicles.vehicle import Limits
 from zsim_bridges.console.flying.flight_conditions import DroneSight, RunSight
 from zsim_bridges.console.flying.flown_velocity import DronePose, Stick
 from zsim_bridges.console.flying.geofence import Geofence
-from zsim_bridges.console.flying.manual_control import GONE_S, PERIOD_S, SETTLED_S, STALE_S, ManualControl
+from zsim_bridges.console.flying.manual_flight import GONE_S, PERIOD_S, SETTLED_S, STALE_S, ManualFlight
 
 NAME = "console.1"
 FORWARD = Stick(1.0, 0.0, 0.0, 0.0, 1.0)
@@ -59,7 +59,7 @@ class Cockpit:
         limits = dict.fromkeys(self.sights, Limits())
         fence = Geofence((-50.0, -50.0, 1.0), (50.0, 50.0, 30.0))
         client: Any = self.client
-        self.control = ManualControl(
+        self.control = ManualFlight(
             client, NAME, limits, fence, 0.02, lambda drone: self.sights[drone], lambda: self.run, lambda: self.now_s
         )
 
