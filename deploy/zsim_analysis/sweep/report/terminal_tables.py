@@ -1,8 +1,10 @@
 """The tables of a sweep on a terminal: as many columns in each as fit it, every name whole."""
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from textwrap import wrap
 
+import numpy as np
 from msgspec import Struct
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -166,24 +168,17 @@ def _axis_columns(summary: SweepSummary) -> list[TerminalColumn]:
 
 
 def _parted(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:
-    """Return columns in parts that fit a room in characters: none of one column if that can be, few, of like number."""
-    best: list[tuple[tuple[int, int, int], list[Sequence[TerminalColumn]]]] = [((0, 0, 0), [])]
-    for end in range(1, len(columns) + 1):
-        starts = [start for start in range(end) if start == end - 1 or _width(columns[start:end]) <= room]
-        ways = [(_with_part(best[start][0], end - start), start) for start in starts]
-        cost, start = min(ways)
-        best.append((cost, [*best[start][1], columns[start:end]]))
-    return best[-1][1]
+    """Return columns in as few parts of like number as fit a room in characters; one that does not fit stands alone."""
+    for count in range(1, len(columns) + 1):
+        ends = np.linspace(0, len(columns), count + 1).round().astype(int).tolist()
+        parts = [columns[start:end] for start, end in pairwise(ends)]
+        if all(len(part) == 1 or _width(part) <= room for part in parts):
+            return parts
+    return []
 
 
 def _width(columns: Sequence[TerminalColumn]) -> int:
     return sum(column.width + BETWEEN for column in columns)
-
-
-def _with_part(cost: tuple[int, int, int], count: int) -> tuple[int, int, int]:
-    """Return the cost of parts and one more, of `count` columns: single ones, how many, and how unlike they are."""
-    single, parts, squares = cost
-    return single + (count == 1), parts + 1, squares + count**2
 
 
 def _table(columns: Sequence[TerminalColumn], axes: int) -> Table:
