@@ -53,11 +53,15 @@ class OpenChunk:
 
     def add(self, channel: int, payload: bytes, t_ns: int, wall_ns: int) -> None:
         """Take one message; its times are such as MCAP can hold."""
-        if not self.size:
+        start = self.size + MESSAGE.size
+        if start == MESSAGE.size:
             self.since_ns = wall_ns
-        self._put(self.size + MESSAGE.size, payload)
+        self.size = end = start + len(payload)
+        if end > len(self._data):
+            self._make_room(end)
+        self._data[start:end] = payload
         self._channels.append(channel)
-        self._ends.append(self.size)
+        self._ends.append(end)
         self._log.append(t_ns)
         self._published.append(wall_ns)
 
@@ -73,13 +77,13 @@ class OpenChunk:
         self._ends.frombytes((gate.ends + self.size).tobytes())
         self._log.frombytes(gate.stamps.tobytes())
         self._published.extend([wall_ns] * len(gate))
-        self._put(self.size, gate.buffer)
+        start, self.size = self.size, self.size + len(gate.buffer)
+        if self.size > len(self._data):
+            self._make_room(self.size)
+        self._data[start : self.size] = gate.buffer
 
-    def _put(self, start: int, data: bytes | bytearray) -> None:
-        self.size = end = start + len(data)
-        if end > len(self._data):
-            self._data = self._data + bytes(max(end - len(self._data), self._room))
-        self._data[start:end] = data
+    def _make_room(self, size: int) -> None:
+        self._data = self._data + bytes(max(size - len(self._data), self._room))
 
     def take(self) -> "Content":
         """Return all that came, and begin anew; what is returned holds until the next message."""
