@@ -8,19 +8,9 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from zsim.contract.framing import GateMessages
-from zsim.record.mcap_layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE
+from zsim.record.mcap_layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE, MESSAGE_HEAD
 
 _SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
-_HEAD = np.dtype(  # MESSAGE, as numpy has it
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-    ]
-)
 
 
 class OpenChunk:
@@ -110,7 +100,7 @@ class Content:
         Args:
             counted: messages that channels have had before.
         """
-        heads = np.empty(len(self._ends), dtype=_HEAD)
+        heads = np.empty(len(self._ends), dtype=MESSAGE_HEAD)
         heads["opcode"], heads["channel"] = int(Opcode.MESSAGE), self._channels
         heads["length"] = self._ends - self._starts - HEAD.size
         heads["log_time"], heads["publish_time"] = self._log, self._published
@@ -118,7 +108,7 @@ class Content:
         before = np.pad(counted, (0, len(came) - len(counted)))
         rank = np.arange(len(heads)) - np.repeat(np.cumsum(came) - came, came)
         heads["sequence"][self._order] = (np.repeat(before, came) + rank) & _SEQUENCE_MASK
-        places = np.ndarray(len(self.data) - _HEAD.itemsize + 1, _HEAD, self.data, strides=(1,))
+        places = np.ndarray(len(self.data) - MESSAGE.size + 1, MESSAGE_HEAD, self.data, strides=(1,))
         places[self._starts] = heads
         return before + came
 
