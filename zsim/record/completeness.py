@@ -4,18 +4,18 @@ The world numbers what it publishes without gaps, so what is missing shows in th
 is not counted: a number that is missing there may never have reached the world, and what did not is not missing here.
 """
 
-from array import array
-from collections.abc import Container, Iterable
+from collections.abc import Container
 from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from zsim.contract import keys, messages, run_messages
 from zsim.errors import DecodeError
-from zsim.record.record_reader import RecordReader, shown
+from zsim.record.record_reader import MessageSpans, RecordReader, shown
 
 
 class GateGap(Struct, frozen=True):
@@ -129,43 +129,82 @@ class _Numbered(Struct):
     seq: int
 
 
+_decode_numbered = msgspec.msgpack.Decoder(_Numbered).decode
+UNREAD = -1  # in place of a number that stands otherwise than our own encoder writes it
+_WIDTH = np.full(256, -1, dtype=np.int64)  # bytes of an unsigned integer behind its first byte, by that (MessagePack)
+_WIDTH[:0x80] = 0
+_WIDTH[[0xCC, 0xCD, 0xCE, 0xCF]] = 1, 2, 4, 8
+_T_NS, _SEQ = (np.frombuffer(msgspec.msgpack.encode(name), np.uint8) for name in ("t_ns", "seq"))
+_MAP_16 = 0xDE  # of more than 15 fields
+_LOOKED_AT = 1 << 5  # bytes from the beginning of a message in which both of its first fields end
+
+
+def sequence_numbers(spans: MessageSpans) -> NDArray[np.int64]:
+    """Return `seq` of each message (M,), that begins with `t_ns` and `seq`; UNREAD of any other."""
+    data = np.frombuffer(spans.content + bytes(_LOOKED_AT), np.uint8)
+    start = spans.start
+    first = start + np.where(data[start] == _MAP_16, 3, 1)
+    width = _WIDTH[data[first + len(_T_NS)]]
+    second = first + len(_T_NS) + 1 + width
+    known = (data[first[:, None] + np.arange(len(_T_NS))] == _T_NS).all(axis=1) & (width >= 0)
+    known &= (data[second[:, None] + np.arange(len(_SEQ))] == _SEQ).all(axis=1)
+    tag = data[second + len(_SEQ)].astype(np.int64)
+    width = _WIDTH[tag]
+    value = second + len(_SEQ) + 1
+    known &= (width >= 0) & (value + width <= spans.end)
+    numbers = np.where(known & (width == 0), tag, UNREAD)
+    for size in (1, 2, 4, 8):
+        rows = np.flatnonzero(known & (width == size))
+        written = data[value[rows, None] + np.arange(size)]
+        numbers[rows] = np.ascontiguousarray(written).view(f">u{size}")[:, 0].astype(np.int64)
+    return numbers
+
+
 class _Numbers:
-    """Collects the numbers of the messages of some keys; in whatever order they stand, from 0 on all must be there.
+    """Collects the numbers of the messages of some channels, which may stand in any order."""
 
-    Args:
-        wanted: keys that are numbered.
-    """
+    def __init__(self) -> None:
+        self._channels: list[NDArray[np.int64]] = []
+        self._numbers: list[NDArray[np.int64]] = []
 
-    def __init__(self, wanted: Iterable[str]) -> None:
-        self._found = {key: array("q") for key in wanted}
-        self._decode = msgspec.msgpack.Decoder(_Numbered).decode
-
-    def add(self, key: str, payload: bytes) -> None:
-        """Take a message; garbage has no number, and other keys are not numbered."""
-        found = self._found.get(key)
-        if found is not None:
+    def add(self, spans: MessageSpans, rows: NDArray[np.bool_]) -> None:
+        """Take those of the messages of a chunk that are numbered."""
+        read = np.where(rows, sequence_numbers(spans), 0)
+        for m in np.flatnonzero(read < 0).tolist():  # by another encoder, or garbage, which has no number
             with suppress(*messages.REFUSALS, OverflowError):
-                found.append(self._decode(payload).seq)
+                read[m] = _decode_numbered(spans.content[spans.start[m] : spans.end[m]]).seq
+        rows = rows & (read >= 0)
+        self._channels.append(spans.channel[rows])
+        self._numbers.append(read[rows])
 
     def missing(self) -> int:
-        """Return how many numbers are missing below the highest one of each key."""
-        unique = (np.unique(np.frombuffer(found, np.int64)) for found in self._found.values() if found)
-        return sum(int(numbers[-1]) + 1 - len(numbers) for numbers in unique)
+        """Return how many numbers are missing below the highest one of each channel."""
+        if not self._numbers:
+            return 0
+        channel, number = np.concatenate(self._channels), np.concatenate(self._numbers)
+        order = np.lexsort((number, channel))
+        channel, number = channel[order], number[order]
+        is_new, is_last = np.ones((2, len(channel)), dtype=bool)
+        is_last[:-1] = channel[1:] != channel[:-1]
+        is_new[1:] = is_last[:-1] | (number[1:] != number[:-1])
+        return int(number[is_last].sum() + is_last.sum() - is_new.sum())
 
 
 def completeness(reader: RecordReader) -> Completeness:
     """Return whether a record has everything: all of it is read, and every check sum compared."""
     info = _info(reader)
     is_replay, external = info is not None and bool(info.replay_of), _external(info)
-    numbers = _Numbers(key for key in reader.topics() if not is_replay and _is_numbered(key, external))
+    numbered = {n for n, key in reader.channels().items() if not is_replay and _is_numbered(key, external)}
+    of_clock = {n for n, key in reader.channels().items() if key == keys.CLOCK}
+    numbers = _Numbers()
     clocks: list[run_messages.Clock] = []
     decode = msgspec.msgpack.Decoder(run_messages.Clock).decode
-    for recorded in reader.messages(by_time=False):
-        if recorded.key == keys.CLOCK:
+    for spans in reader.spans(numbered | of_clock):
+        is_clock = np.isin(spans.channel, list(of_clock))
+        numbers.add(spans, ~is_clock)
+        for start, end in zip(spans.start[is_clock].tolist(), spans.end[is_clock].tolist(), strict=True):
             with suppress(*messages.REFUSALS):  # garbage by somebody else, recorded as it came
-                clocks.append(decode(recorded.payload))
-        else:
-            numbers.add(recorded.key, recorded.payload)
+                clocks.append(decode(spans.content[start:end]))
     gates = GateCount()
     for clock in sorted(clocks, key=lambda clock: (clock.seq if is_replay else clock.t_ns, clock.seq)):
         gates.add(clock)

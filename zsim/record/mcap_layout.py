@@ -15,18 +15,30 @@ from io import BytesIO
 from mmap import mmap
 from typing import NamedTuple, TypeVar
 
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, McapRecord, Schema
 from mcap.writer import MCAP0_MAGIC as MAGIC
+from numpy.typing import NDArray
 
 from zsim import __version__
 from zsim.errors import RecordError
 
 HEAD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish time; then the payload
+MESSAGE_HEAD = np.dtype(  # MESSAGE, as numpy has it
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
 CHUNK_HEAD = struct.Struct("<QQQII")  # first, last log time, plain size, plain CRC, bytes of name
 SIZE = struct.Struct("<Q")  # of a chunk's content, behind the name
 ZSTD = b"zstd"  # the name of our compression
@@ -250,6 +262,11 @@ def indexes_of(content: bytes) -> dict[int, list[int]]:
             indexes[channel] += (log_time, at)
         at += HEAD.size + length
     return indexes
+
+
+def heads_at(content: bytes, places: NDArray[np.int64]) -> NDArray:
+    """Return the heads of the messages at some places of a chunk's content, as MESSAGE_HEAD."""
+    return np.ndarray(max(0, len(content) - MESSAGE.size + 1), MESSAGE_HEAD, content, strides=(1,))[places]
 
 
 def packed_indexes(indexes: dict[int, list[int]]) -> Iterable[bytes]:

@@ -8,19 +8,9 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from zsim.contract.framing import GateMessages
-from zsim.record.mcap_layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE
+from zsim.record.mcap_layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE, MESSAGE_HEAD
 
 _SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
-_HEAD = np.dtype(  # MESSAGE, as numpy has it
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-    ]
-)
 
 
 class OpenChunk:
@@ -53,11 +43,15 @@ class OpenChunk:
 
     def add(self, channel: int, payload: bytes, t_ns: int, wall_ns: int) -> None:
         """Take one message; its times are such as MCAP can hold."""
-        if not self.size:
+        start = self.size + MESSAGE.size
+        if start == MESSAGE.size:
             self.since_ns = wall_ns
-        self._put(self.size + MESSAGE.size, payload)
+        self.size = end = start + len(payload)
+        if end > len(self._data):
+            self._make_room(end)
+        self._data[start:end] = payload
         self._channels.append(channel)
-        self._ends.append(self.size)
+        self._ends.append(end)
         self._log.append(t_ns)
         self._published.append(wall_ns)
 
@@ -73,13 +67,13 @@ class OpenChunk:
         self._ends.frombytes((gate.ends + self.size).tobytes())
         self._log.frombytes(gate.stamps.tobytes())
         self._published.extend([wall_ns] * len(gate))
-        self._put(self.size, gate.buffer)
+        start, self.size = self.size, self.size + len(gate.buffer)
+        if self.size > len(self._data):
+            self._make_room(self.size)
+        self._data[start : self.size] = gate.buffer
 
-    def _put(self, start: int, data: bytes | bytearray) -> None:
-        self.size = end = start + len(data)
-        if end > len(self._data):
-            self._data = self._data + bytes(max(end - len(self._data), self._room))
-        self._data[start:end] = data
+    def _make_room(self, size: int) -> None:
+        self._data = self._data + bytes(max(size - len(self._data), self._room))
 
     def take(self) -> "Content":
         """Return all that came, and begin anew; what is returned holds until the next message."""
@@ -106,7 +100,7 @@ class Content:
         Args:
             counted: messages that channels have had before.
         """
-        heads = np.empty(len(self._ends), dtype=_HEAD)
+        heads = np.empty(len(self._ends), dtype=MESSAGE_HEAD)
         heads["opcode"], heads["channel"] = int(Opcode.MESSAGE), self._channels
         heads["length"] = self._ends - self._starts - HEAD.size
         heads["log_time"], heads["publish_time"] = self._log, self._published
@@ -114,7 +108,7 @@ class Content:
         before = np.pad(counted, (0, len(came) - len(counted)))
         rank = np.arange(len(heads)) - np.repeat(np.cumsum(came) - came, came)
         heads["sequence"][self._order] = (np.repeat(before, came) + rank) & _SEQUENCE_MASK
-        places = np.ndarray(len(self.data) - _HEAD.itemsize + 1, _HEAD, self.data, strides=(1,))
+        places = np.ndarray(len(self.data) - MESSAGE.size + 1, MESSAGE_HEAD, self.data, strides=(1,))
         places[self._starts] = heads
         return before + came
 

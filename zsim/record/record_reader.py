@@ -9,20 +9,26 @@ from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel
+from numpy.typing import NDArray
 
 from zsim.errors import RecordError, RunError
 from zsim.record.mcap_layout import (
     HEAD,
+    INDEX_ENTRY,
+    INDEX_HEAD,
     MAGIC,
     MESSAGE,
+    Index,
     RecordGroup,
     RecordSpan,
     Source,
     chunk_head,
     content_of,
     groups,
+    heads_at,
     indexes_of,
     is_complete,
     is_cut,
@@ -46,11 +52,21 @@ class Recorded(NamedTuple):
     wall_ns: int
 
 
+class MessageSpans(NamedTuple):
+    """Messages of a chunk, channel by channel, in the order in which they were written."""
+
+    content: bytes  # of the chunk
+    channel: NDArray[np.int64]  # number of each one's channel, (M,)
+    start: NDArray[np.int64]  # where its payload begins in the content, (M,)
+    end: NDArray[np.int64]  # where it ends, (M,)
+
+
 class _Chunk(NamedTuple):
     place: RecordSpan
     first_ns: int
     last_ns: int
     channels: frozenset[int]
+    indexes: tuple[Index, ...]
 
 
 _Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, message
@@ -106,6 +122,45 @@ class RecordReader:
 
     def __iter__(self) -> Iterator[Recorded]:
         return self.messages()
+
+    def channels(self) -> dict[int, str]:
+        """Return the key of each channel, by its number."""
+        return dict(self._keys)
+
+    def spans(self, wanted: Collection[int]) -> Iterator[MessageSpans]:
+        """Yield where the payloads of some channels are, a chunk at a time: for reading many messages as arrays.
+
+        Raises:
+            RecordError: compressed by another tool in a way that is not ours.
+        """
+        for chunk in self._chunks:
+            if chunk.channels.isdisjoint(wanted):
+                continue
+            content = content_of(self._source, chunk.place)
+            if content is None:
+                self._damaged.add(chunk.place)
+                continue
+            channel, places = self._indexed(chunk, content)
+            rows = np.isin(channel, list(wanted))
+            starts = places[rows]
+            ends = starts + HEAD.size + heads_at(content, starts)["length"].astype(np.int64)
+            yield MessageSpans(content, channel[rows], starts + MESSAGE.size, ends)
+
+    def _indexed(self, chunk: _Chunk, content: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return channel and place of every message of a chunk: by its indexes, if they lead to all of its content."""
+        at = [(index.start + HEAD.size + INDEX_HEAD.size, INDEX_ENTRY * index.messages) for index in chunk.indexes]
+        entries = np.frombuffer(b"".join([self._source[start : start + size] for start, size in at]), "<u8")
+        channel = np.repeat([index.channel for index in chunk.indexes], [index.messages for index in chunk.indexes])
+        places = entries[1::2].astype(np.int64)
+        if len(places) and places.min() >= 0 and places.max() <= len(content) - MESSAGE.size:
+            heads = heads_at(content, places)
+            is_whole = int(heads["length"].sum()) + HEAD.size * len(places) == len(content)
+            if is_whole and (heads["opcode"] == Opcode.MESSAGE).all() and (heads["channel"] == channel).all():
+                return channel.astype(np.int64), places
+        found = indexes_of(content)
+        channel = np.repeat(list(found), [len(each) // 2 for each in found.values()])
+        places = [place for each in found.values() for place in each[1::2]]
+        return channel.astype(np.int64), np.array(places, dtype=np.int64)
 
     @property
     def damaged(self) -> tuple[str, ...]:
@@ -181,7 +236,8 @@ class RecordReader:
             self._counts.update(counts)
             channels = frozenset(counts)
             head = chunk_head(self._source, group.place)
-            yield _Chunk(group.place, head.first_ns, head.last_ns, known.setdefault(channels, channels))
+            known_channels = known.setdefault(channels, channels)
+            yield _Chunk(group.place, head.first_ns, head.last_ns, known_channels, () if cut else group.indexes)
 
     def _counted(self, group: RecordGroup) -> dict[int, int]:
         """Return the messages per channel of a chunk whose message indexes may have been cut."""

@@ -16,7 +16,7 @@ from zsim.contract.flight_messages import Estimate
 from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
 from zsim.contract.snapshot import State
-from zsim.math.compiled import portable
+from zsim.math.compiled import Held, hold, portable
 from zsim.math.rotation import axpy, multiply, normalised, scaled
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation import measurement_update, strapdown
@@ -84,6 +84,7 @@ class EstimatorBank:
         self, drones: Sequence[Drone], environment: Environment, estimation: Estimation, gate_s: float
     ) -> None:
         self.rows, self._estimates = initial_rows(drones, environment, estimation, gate_s)
+        self._held, self._held_rows = hold(self.rows), self.rows
         self._make_room(_ROOM)
         self._count = 0
         self._reader = GateReader([drone.name for drone in drones])
@@ -119,7 +120,9 @@ class EstimatorBank:
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Use readings (M, READING.size) and return the estimates for `t_s`, (N, ESTIMATE.size)."""
-        step(self.rows, t_s, readings, self._estimates)
+        if self._held_rows is not self.rows:
+            self._held, self._held_rows = hold(self.rows), self.rows
+        step(self._held, t_s, readings, self._estimates)
         return self._estimates
 
     def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
@@ -180,15 +183,16 @@ def _estimate(row: list[float], count: list[int], counted: Sequence[tuple[str, i
 
 
 @portable
-def step(rows: Rows, t_s: float, readings: np.ndarray, estimates: np.ndarray) -> None:
+def step(held: Held, t_s: float, readings: np.ndarray, estimates: np.ndarray) -> None:
     """Use the readings of a gate of all drones and write their estimates for `t_s`.
 
     Args:
-        rows: of N drones; changed.
+        held: the Rows of N drones, by `hold`; changed.
         t_s: instant of the gate [s].
         readings: (M, READING.size), each drone's in the order of their arrival.
         estimates: (N, ESTIMATE.size), written.
     """
+    rows = held.content
     count = rows.nominal.shape[0]
     first = np.full(count, -1)
     after = np.full(readings.shape[0], -1)

@@ -19,6 +19,7 @@ from zsim.contract.messages import RotorInfo
 from zsim.contract.snapshot import State
 from zsim.contract.state_rules import state_refusal
 from zsim.errors import RunError
+from zsim.math.compiled import hold
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.gps import GpsConfig
 from zsim.sensors.sensor import noise_sigma
@@ -67,6 +68,9 @@ class TrueState(NamedTuple):
     rotor_rad_s: NDArray[np.float64]  # (N, R), 0 where a drone has fewer
 
 
+_TAKES_SETPOINT = {mode for mode, state in enumerate(firmware.MODES) if state_refusal("", state, "setpoint") is None}
+
+
 class Fleet:
     """All drones of a scenario, stepped together gate by gate from t = 0, standing on the ground.
 
@@ -109,7 +113,7 @@ class Fleet:
         self._sampler = Sampler(scenario, self.sensors, self._w.senses)
         self._sightings = _sighting_sampler(scenario, self._w.bodies.vehicle[:, VEHICLE.hull_radius])
         self.sightings: dict[int, PictureSightings] = {}
-        self._held = kernel.hold(self._w)
+        self._held = hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
         self.impairment = Impairment(self._w, self.names, vehicles, self.sensors)
         self.touching = np.zeros(self.count, dtype=bool)
@@ -299,13 +303,11 @@ class Fleet:
         self.boards.setpoint[i, SETPOINT.kind] = firmware.NONE
 
     def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
-        if refusal := self._state_refusal(i, "setpoint"):
-            return refusal
+        if self._mode(i) not in _TAKES_SETPOINT:
+            return self._state_refusal(i, "setpoint")
         if not math.isfinite(sum(values)):
             return f"{self.names[i]} was sent a setpoint with {list(values)}; must be finite"
-        row = self.boards.setpoint[i]
-        row[SETPOINT.kind] = kind
-        row[SETPOINT.value : SETPOINT.value + len(values)] = values
+        self.boards.setpoint[i, SETPOINT.kind : SETPOINT.value + len(values)] = (kind, *values)
         self.boards.set_tick[i] = self._tick
         return None
 

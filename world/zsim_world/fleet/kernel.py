@@ -6,12 +6,10 @@ due sample the new state.
 """
 
 import math
-from typing import Any
 
-from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
-from zsim.math.compiled import apart, inlined, kernel
+from zsim.math.compiled import Held, apart, inlined, kernel
 from zsim.math.rotation import norm
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.air import WIND, blow
@@ -259,24 +257,16 @@ def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
 
 
 @kernel()
-def hold(w: Any) -> Any:
-    """Return the arrays in a list of one, for `advance`: numba takes a list as one thing, and each array apart."""
-    held = List()
-    held.append(w)
-    return held
-
-
-@kernel()
-def advance(held: List, ticks: int) -> tuple[int, float, int]:
+def advance(held: Held, ticks: int) -> tuple[int, float, int]:
     """Integrate so many physics ticks; 0 ticks: take the samples of the present instant.
 
     Args:
-        held: the arrays, by `hold`.
+        held: the arrays, by `zsim.math.compiled.hold`.
 
     Returns:
         number of samples logged, least distance of two drones [m], diverged drone or -1.
     """
-    return _advance(held[0], ticks)
+    return _advance(held.content, ticks)
 
 
 @inlined

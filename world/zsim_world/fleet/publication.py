@@ -7,7 +7,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
 from zsim.contract import encoding, flight_messages, keys, messages
@@ -16,12 +15,11 @@ from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.snapshot import State
 from zsim.errors import RunError
-from zsim.math.compiled import compiled, inlined, kernel
+from zsim.math.compiled import Held, compiled, hold, inlined, kernel
 from zsim.sensors.sensor import Sample, as_fields, field_types, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
-from zsim_world.fleet.kernel import hold
 from zsim_world.physics.rotors import charge_percent
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
@@ -120,6 +118,7 @@ class GatePublication:
         rotors = np.array(fleet.rotors, dtype=np.int64)
         own_messages = np.array([0 if i in fleet.external else OWN_MESSAGES for i in range(fleet.count)])
         self._first = int(np.argmax(own_messages))  # a drone with a status, which numbers the gates
+        self._own_count = int(own_messages.sum())
         sigmas_m = np.array(fleet.gps_sigma_m)
         self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, counts, rotors, own_messages)
         self._known: dict[str | None, int] = {None: COMMANDER}
@@ -145,7 +144,7 @@ class GatePublication:
     def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the present gate; `commanders` are those of the drones, None for none."""
         fleet, wide = self._fleet, self._fleetwide
-        count = len(fleet.sampled.whose) + int(wide.own.sum())
+        count = len(fleet.sampled.whose) + self._own_count
         payloads = self._payloads()
         if count > self._written.columns.shape[1] or len(payloads.data) > self._room_beside:
             self._room_beside = 2 * len(payloads.data)
@@ -336,7 +335,7 @@ def _fill(
 
 
 @kernel()
-def publish(held: List, whose: NDArray, values: NDArray, data: NDArray, ends: NDArray, now_ns: int) -> int:
+def publish(held: Held, whose: NDArray, values: NDArray, data: NDArray, ends: NDArray, now_ns: int) -> int:
     """Write the messages of a gate, drone by drone, and count them; return how many bytes that were.
 
     Args:
@@ -344,7 +343,7 @@ def publish(held: List, whose: NDArray, values: NDArray, data: NDArray, ends: ND
         whose, values: of Sampled.
         data, ends: of UserPayloads.
     """
-    words, seen, wide, out = held[0]
+    words, seen, wide, out = held.content
     sampled, user = Sampled(whose, values), UserPayloads(data, ends)
     floats = np.zeros(FLOATS)
     row, program = MessageRow(np.zeros(INTS, np.int64), floats, floats.view(np.uint64)), Program(OPS, FIRST, LITERALS)

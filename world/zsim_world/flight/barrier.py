@@ -88,10 +88,11 @@ class Participant:
 
     def required_ns(self, need_ns: int) -> int | None:
         """Return the newest done required of it for `need_ns`, None if none is yet."""
-        if self.gating:
-            required = need_ns // self.join.period_ns * self.join.period_ns
-        elif self.join.slack_ns:
-            required = need_ns - self.join.slack_ns
+        join = self.join
+        if join.period_ns > 0:
+            required = need_ns - need_ns % join.period_ns
+        elif join.slack_ns:
+            required = need_ns - join.slack_ns
         else:
             return None
         return required if required >= self.from_ns else None
@@ -99,7 +100,7 @@ class Participant:
     def blocks(self, need_ns: int) -> bool:
         """Tell whether its done for `need_ns`, or an output that it counted, is not in yet."""
         required = self.required_ns(need_ns)
-        return required is not None and (self.done_ns < required or self.incomplete)
+        return required is not None and (self.done_ns < required or self.missing > 0 or self.lost_done)
 
     def note_done(self, message: Done) -> None:
         """Take the number of a done, of which a gap shows that one was lost, and its count of outputs.

@@ -36,24 +36,26 @@ class CommandLinks:
     def __post_init__(self) -> None:
         self._cluster_of = {drone: cluster.name for cluster in self.scenario.clusters for drone in cluster.drones}
 
-    def delay_ns(self, drone: str, key: str, message: Any, gate_ns: int) -> int | None:
-        """Return by how many whole gates a command comes later [ns]; None if it does not.
+    def delay_ns(self, drone: str, kind: str, message: Any, gate_ns: int) -> int | None:
+        """Return the delay of a command by faults of its link [ns], in whole gates; None if the link loses it.
 
         Args:
             gate_ns: the gate that it belongs to.
         """
-        faults = [fault for fault in self.faults_at(gate_ns) if fault.kind != RADIO]
-        if not faults:
+        acting = self.faults_at(gate_ns)
+        if not acting:
             return 0
         senders = (self._sender(drone, message.source),)
-        faults = [fault for fault in faults if joins(fault, senders, WORLD)]
-        late_ns = total_delay_ns(faults, self.scenario.seed, WORLD, key, message)
+        faults = [fault for fault in acting if fault.kind != RADIO and joins(fault, senders, WORLD)]
+        late_ns = total_delay_ns(faults, self.scenario.seed, WORLD, keys.command(drone, kind), message)
         return NEVER if late_ns is None else -(-late_ns // self.gate_ns) * self.gate_ns
 
     def lost_by_radio(self, drone: str, command: QueuedCommand, gate_ns: int) -> bool:
         """Tell whether the radio loses a command that would take effect before a gate."""
         faults = self.faults_at(gate_ns)
-        targets = (WORLD, self._cluster_of.get(drone)) if faults else ()
+        if not faults:
+            return False
+        targets = (WORLD, self._cluster_of.get(drone))
         radios = [fault for fault in faults if fault.kind == RADIO and fault.target in targets]
         if not radios:
             return False
@@ -109,7 +111,7 @@ class CommandIntake:
             self.outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", refusal or "")
             return True
         gate_ns = message.t_ns if gating else self.clock.next_ns
-        late_ns = self._links.delay_ns(drone, keys.command(drone, kind), message, gate_ns)
+        late_ns = self._links.delay_ns(drone, kind, message, gate_ns)
         if late_ns is None:
             return True  # the link loses it; its sender has sent it all the same
         external, delay_ns = index in self.drivers, self.clock.delay_ns
@@ -160,18 +162,15 @@ class CommandIntake:
         drone = self.fleet.names[command.drone]
         if self._links.lost_by_radio(drone, command, gate_ns):
             return
-        refusal = self.queue.refusal(command) or self._apply(drone, command)
+        refusal = self.queue.refusal(command)
+        if refusal is None and command.kind == "mode":
+            refusal = self._apply_mode(drone, command)
+        elif refusal is None:
+            refusal = self._apply_setpoint(command)
+            if refusal is None and self.queue.claim(command.drone, command.source):
+                self.outbox.event("commander", drone, f"{command.source} flies {drone}", source=command.source)
         if refusal:
             self.outbox.refuse(command.source, keys.command(drone, command.kind), refusal)
-
-    def _apply(self, drone: str, command: QueuedCommand) -> str | None:
-        """Hand a command to the firmware; return why it is refused."""
-        if command.kind == "mode":
-            return self._apply_mode(drone, command)
-        refusal = self._apply_setpoint(command)
-        if refusal is None and self.queue.claim(command.drone, command.source):
-            self.outbox.event("commander", drone, f"{command.source} flies {drone}", source=command.source)
-        return refusal
 
     def _apply_setpoint(self, command: QueuedCommand) -> str | None:
         m, i, fleet = command.message, command.drone, self.fleet

@@ -42,10 +42,9 @@ class CommandAges:
     def command(self, t_ns: int, wall_ns: int) -> None:
         """Note when a command stamped t_ns arrived; its age is unknown where no gate of that stamp is remembered."""
         published_wall_ns = self._published.get(t_ns)
-        if published_wall_ns is not None:
-            self._keep(wall_ns - published_wall_ns)
-
-    def _keep(self, age_ns: int) -> None:
+        if published_wall_ns is None:
+            return
+        age_ns = wall_ns - published_wall_ns
         if len(self._ages_ns) < AGES_KEPT:
             self._ages_ns.append(age_ns)
         else:

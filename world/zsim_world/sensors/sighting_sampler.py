@@ -5,16 +5,15 @@ Each camera has a random stream. All that falls due in a gate is computed in one
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import UNSET
-from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
 from zsim.contract.camera_messages import Seen
 from zsim.contract.snapshot import State
-from zsim.math.compiled import kernel
+from zsim.math.compiled import Held, hold, kernel
 from zsim.math.random_streams import stream
 from zsim.math.rotation import Vector
 from zsim.scenario.obstacle import COLUMNS, row_of
@@ -114,8 +113,7 @@ class SightingSampler:
             np.array([drone.name not in hats.covered for drone in scenario.drones]),
             np.array([row_of(each) for each in env.obstacles], dtype=float).reshape(-1, COLUMNS),
         )
-        self._held: Any = List()  # numba takes a list as one thing, and each array apart
-        self._held.append(surroundings)
+        self._held = hold(surroundings)
         self._streams = np.array([words(rng) for rng in generators], dtype=np.uint64).reshape(-1, WORDS.size)
         self._counts = [0] * len(watching)
         self._due_ns = [0] * len(watching)  # the next picture of each
@@ -228,7 +226,7 @@ def look(
     former_ns: int,
     now: NDArray,
     now_ns: int,
-    held: List,
+    held: Held,
     streams: NDArray,
 ) -> NDArray:
     """Return what is seen in some pictures, (M, SEEN.size).
@@ -236,10 +234,10 @@ def look(
     Args:
         pictures: instant [ns] and camera of each, by instant, (P, 2).
         former, now: states of all drones at two gates, (N, STATE.size).
-        held: Surroundings, in a list of one.
+        held: Surroundings, by `hold`.
         streams: words of the cameras' random streams, (W, WORDS.size); moved on.
     """
-    scene = held[0]
+    scene = held.content
     hats = len(now) + len(scene.balls)
     view, out = np.empty((hats, VIEW.size)), np.empty((len(pictures) * (hats + 1), SEEN.size))
     poses, end = now, 0

@@ -181,6 +181,14 @@ class _Head(msgspec.Struct):
 _decode_head = msgspec.msgpack.Decoder(_Head).decode
 
 
+Handler = Callable[[ReceivedSample, int], None]
+"""Takes a message that came at a monotonic wall time [ns].
+
+Raises:
+    DecodeError: it is refused.
+"""
+
+
 @dataclass(eq=False)
 class MessageIntake:
     """Takes what others publish: checks it, keeps it, counts it for its sender, and hands the world what is for it."""
@@ -197,6 +205,7 @@ class MessageIntake:
     replaying: bool = False  # what another incarnation of the world has taken
     phase: str = ""  # of the cluster whose state was read last
     _states: Counter[str] = field(default_factory=Counter[str])
+    _handlers: dict[str, Handler] = field(default_factory=dict[str, "Handler"])
 
     def take(self, wall_ns: int, sample: ReceivedSample) -> None:
         """Take one message, or refuse it, and keep it in the journal."""
@@ -219,32 +228,43 @@ class MessageIntake:
         """Take one message, or refuse it, as another incarnation of the world has."""
         key = sample.key
         self.health.received += 1
-        kind = messages.type_of(key)
+        handle = self._handlers.get(key) or self._learn_handler(key)
         try:
-            if kind in RELAYED:
-                self.outputs.passed(sample)
-                self._relay(key, sample.payload)
-            elif kind in OF_CAMERAS and not keys.is_sensor(key):
-                self.outputs.passed(sample)
-                self._relay_of_camera(key, sample.payload)
-            elif self._is_of_driver(key):
-                self.outputs.passed(sample)
-                self._take_of_driver(key, sample.payload)
-            elif key.startswith(PROCESSES) or (key.startswith("drone/") and "/cmd/" in key):
-                self.outputs.passed(sample)
-                self._hand_over(key, sample.payload, wall_ns)
-            elif kind is None:
-                self.outputs.passed(sample)  # a key outside of the contract
-                self.history.add_foreign(key, sample.payload)
-            else:
-                raise DecodeError(f"{key}: only the world publishes here")
+            handle(sample, wall_ns)
         except DecodeError as error:
             self.history.add_foreign(key, sample.payload)
             self._refuse("somebody", key, error)
             self._count_refused(sample)
 
-    def _hand_over(self, key: str, payload: bytes, wall_ns: int) -> None:
+    def _learn_handler(self, key: str) -> Handler:
+        """Return what takes the messages of a key, and remember it: the same keys come at every gate."""
+        kind = messages.type_of(key)
+        if kind in RELAYED:
+            handler = self._relay
+        elif kind in OF_CAMERAS and not keys.is_sensor(key):
+            handler = self._relay_of_camera
+        elif self._is_of_driver(key):
+            handler = self._take_of_driver
+        elif key.startswith(PROCESSES) or (key.startswith("drone/") and "/cmd/" in key):
+            handler = self._hand_over
+        elif kind is None:
+            handler = self._keep_foreign
+        else:
+            handler = _refuse_key_of_world
+        if len(self._handlers) >= messages.KEYS_KEPT:
+            self._handlers.clear()
+        self._handlers[key] = handler
+        return handler
+
+    def _keep_foreign(self, sample: ReceivedSample, wall_ns: int) -> None:
+        """Keep a message on a key outside of the contract."""
+        self.outputs.passed(sample)
+        self.history.add_foreign(sample.key, sample.payload)
+
+    def _hand_over(self, sample: ReceivedSample, wall_ns: int) -> None:
         """Hand the world a message that it acts on."""
+        self.outputs.passed(sample)
+        key, payload = sample
         message = messages.decode(key, payload)
         self.history.add(key, payload, message.t_ns)
         if type(message) is run_messages.Done:
@@ -265,8 +285,10 @@ class MessageIntake:
             head = _head(sample.key, sample.payload)
             self.world.count_output(head.controller or head.source)
 
-    def _relay(self, key: str, payload: bytes) -> None:
+    def _relay(self, sample: ReceivedSample, wall_ns: int) -> None:
         """Keep an output that the world only relays, and count it for the done of who sent it."""
+        self.outputs.passed(sample)
+        key, payload = sample
         head = _head(key, payload)
         if head.t_ns > self.world.now_ns:
             raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self.world.now_ns}, the newest gate")
@@ -278,8 +300,10 @@ class MessageIntake:
         source = head.controller if kind is run_messages.ClusterRequest else head.source
         self.world.count_output(source or f"{role}.{keys.thing(key)}")
 
-    def _relay_of_camera(self, key: str, payload: bytes) -> None:
+    def _relay_of_camera(self, sample: ReceivedSample, wall_ns: int) -> None:
         """Keep what a camera or a detector says; who asks later how a camera sees gets nothing that is no answer."""
+        self.outputs.passed(sample)
+        key, payload = sample
         message = messages.decode(key, payload)
         if message.t_ns > self.world.now_ns:
             raise DecodeError(f"{key}: t_ns is {message.t_ns}; must be <= {self.world.now_ns}, the newest gate")
@@ -292,8 +316,10 @@ class MessageIntake:
         of_driver = what in OF_DRIVERS or what.startswith("sensor/")
         return of_driver and kind == "drone" and drone in self.world.external
 
-    def _take_of_driver(self, key: str, payload: bytes) -> None:
+    def _take_of_driver(self, sample: ReceivedSample, wall_ns: int) -> None:
         """Keep what a driver publishes of its drone, unless the world refuses it."""
+        self.outputs.passed(sample)
+        key, payload = sample
         drone = keys.thing(key)
         try:
             message = messages.decode(key, payload)
@@ -342,6 +368,10 @@ class MessageIntake:
         except DecodeError as error:
             self._refuse(participant.name, key, error)
             return []
+
+
+def _refuse_key_of_world(sample: ReceivedSample, wall_ns: int) -> None:
+    raise DecodeError(f"{sample.key}: only the world publishes here")
 
 
 def _head(key: str, payload: bytes) -> _Head:

@@ -3,9 +3,13 @@
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.stream_reader import StreamReader
+from msgspec.msgpack import decode, encode
 from msgspec.structs import replace
 from refused import has_terms
 
@@ -13,8 +17,9 @@ from zsim.contract import keys
 from zsim.contract.messages import DroneInfo, Imu, Info, Origin
 from zsim.contract.run_messages import Clock
 from zsim.record import Completeness, RecordReader, RecordWriter, completeness
-from zsim.record.completeness import GateGap
+from zsim.record.completeness import UNREAD, GateGap, sequence_numbers
 from zsim.record.mcap_layout import places
+from zsim.record.record_reader import MessageSpans
 
 GATE_NS = 20_000_000
 INFO = Info(
@@ -107,6 +112,42 @@ def test_numbers_of_a_key_that_are_missing(tmp_path: Path, imus: list[int], miss
     found = judged(tmp_path / "run.mcap", whole(3), imus)
     assert (found.complete, found.messages_missing, found.gaps) == (False, missing, ())
     assert has_terms(str(found), "incomplete", str(missing), "messages")
+
+
+@given(st.lists(st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 2**63 - 1), st.integers(0, 20)), min_size=1))
+def test_numbers_are_read_as_they_are_decoded(fields: list[tuple[int, int, int]]) -> None:
+    """Whatever the length of both integers, and of the map that they begin."""
+    payloads = [encode({"t_ns": t_ns, "seq": seq, **{f"f{k}": k for k in range(more)}}) for t_ns, seq, more in fields]
+    ends = np.cumsum([len(payload) for payload in payloads])
+    starts = ends - [len(payload) for payload in payloads]
+    spans = MessageSpans(b"".join(payloads), np.zeros(len(payloads), np.int64), starts, ends)
+    assert sequence_numbers(spans).tolist() == [decode(payload)["seq"] for payload in payloads]
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"",
+        b"\xc1",
+        encode({"seq": 1, "t_ns": 2}),
+        encode({"t_ns": 1, "seq": -1}),
+        encode({"t_ns": 1.5, "seq": 3}),
+        encode([1, 2]),
+        encode({"t_ns": 1, "seq": 300})[:-1],
+    ],
+)
+def test_what_is_written_otherwise_is_left_to_the_decoder(garbage: bytes) -> None:
+    spans = MessageSpans(garbage, np.zeros(1, np.int64), np.zeros(1, np.int64), np.array([len(garbage)]))
+    assert sequence_numbers(spans).tolist() == [UNREAD]
+
+
+def test_fields_in_another_order_are_numbered(tmp_path: Path) -> None:
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        writer.add_message(keys.INFO, INFO, 1)
+        for seq in (0, 1, 4):
+            writer.add(IMU, encode({"seq": seq, "t_ns": 0}), "", 0, 1)
+    with RecordReader(tmp_path / "run.mcap") as reader:
+        assert completeness(reader).messages_missing == 2
 
 
 def test_a_record_without_an_end(tmp_path: Path) -> None:
