@@ -32,8 +32,9 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
     with _refusals_of(scenario, cluster):
         space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
         rehearse(space, gains, law)
+        engagement = Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
         check_flyable(scenario, cluster, space, gains)
-        return Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
+        return engagement
 
 
 def check_plan(scenario: Scenario, cluster: Cluster) -> None:

@@ -31,6 +31,7 @@ SAMPLE_NS = 100_000_000  # of a reference that is compared with the plan's
 SAME = 1e-3  # m or rad within which the reference is the plan's: both are computed by the same formulas
 CONTROLLER, CONSOLE = "controller.", "console"  # how names begin: of who flies by the plan, and of operators' programs
 FATES = ("emergency", "flip", "impact", "battery", "landing")  # events of what befell a drone
+CRASHES = ("emergency", "flip", "impact")  # of them those that no drone flies on after
 LEADS = ("hold", "land", "target", "trajectory")  # requests by which a formation leaves its plan
 
 
