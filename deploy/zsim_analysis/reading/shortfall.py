@@ -323,9 +323,11 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
     if not on.any():
         text = f"nothing of the {of} of its trajectory was flown"
     else:
-        span_s = (float(at_s[on][0]), min(float(at_s[on][-1]) + SAMPLE_NS / 1e9, due_s))
-        parted = span_s[1] - span_s[0] - flown_s > LATE_MAX_S
-        length = f"for {seconds_text(round(flown_s, 1))} s, " if parted else ""
+        stretches = np.split(at_s[on], np.flatnonzero(np.diff(at_s[on]) > 2 * SAMPLE_NS / 1e9) + 1)
+        longest = max(stretches, key=len)
+        span_s = (float(longest[0]), min(float(longest[-1]) + SAMPLE_NS / 1e9, due_s))
+        parted = flown_s - (span_s[1] - span_s[0]) > LATE_MAX_S
+        length = f"for {seconds_text(round(flown_s, 1))} s in all, at the longest " if parted else ""
         text = f"its trajectory was flown {length}from {seconds_text(span_s[0])} to {seconds_text(span_s[1])} of {of}"
     if refusals:
         first_s, last_s, why = refusals
