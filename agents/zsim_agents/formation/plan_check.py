@@ -1,9 +1,9 @@
 """Whether a plan can be flown at all, judged before the flight from where the drones stand.
 
-In flight the guidance refuses what is beyond the limits, half a second by half a second, and the formation hovers
-meanwhile. What is certain to be refused to its end, or is over before any formation could begin it, is refused here, with
-the factor by which its time has to be stretched. Limits are a little wider than in flight, as the formation is never
-quite where it was set down: what is between the two is for the flight to judge.
+In flight the guidance refuses what is beyond the limits, asked again twice a second, and the formation hovers meanwhile.
+What is certain to be refused to its end, or is over before any formation could begin it, is refused here, with the
+factor by which its time has to be stretched. Limits are a little wider than in flight, as the formation is never quite
+where it was set down: what is between the two is for the flight to judge.
 """
 
 from __future__ import annotations
@@ -97,9 +97,10 @@ class _Rehearsal:
             climb_max_m_s=min(asked.climb_max_m_s, *(each.vertical_speed_m_s for each in own)),
             yaw_rate_max_rad_s=min(asked.yaw_rate_max_rad_s, *(math.radians(each.yaw_rate_deg_s) for each in own)),
         )
-        self._gains = dataclasses.replace(gains, separation_min_m=NEAR_ROOM * gains.separation_min_m)
         in_flight = limits.shape_in_flight
-        self._shape: ShapeLimits = dataclasses.replace(in_flight, height_min_m=NEAR_ROOM * in_flight.height_min_m)
+        wide = dataclasses.replace(gains, separation_min_m=NEAR_ROOM * gains.separation_min_m)
+        self._wide = wide, dataclasses.replace(in_flight, height_min_m=NEAR_ROOM * in_flight.height_min_m)
+        self._exact = gains, limits.shape
         self._planner = RampPlanner(space, gains, limits.shape)
 
     def check_target(self, start: Array, goal: Array, over_s: float | None) -> None:
@@ -118,8 +119,8 @@ class _Rehearsal:
         if peak > WAY_ROOM * LOAD_TOLERANCE * self._share:
             factor = peak / self._share
             raise PlanError(
-                f"plan.target_over_s is {over_s:g}; must be {factor:.2g} times as long, {factor * over_s:.1f} s or more, "
-                f"for a robot to stay within {self._share:g} of its limits"
+                f"plan.target_over_s is {over_s:g}; must be {factor:.2g} times as long, {factor * over_s:.1f} s or "
+                f"more, for a robot to stay within {self._share:g} of its limits"
             )
 
     def check_trajectory(self, start: Array, trajectory: Reference, start_s: float, ready_s: float) -> None:
@@ -145,7 +146,9 @@ class _Rehearsal:
         for t_s in _instants(from_s, to_s):
             if fault := self._fault_at(trajectory.value(t_s)[0]):
                 raise PlanError(f"plan.trajectory: {t_s:.1f} s after its start {fault}")
-        there_s = ready_s + self._planner.fastest((start, np.zeros_like(start)), Shifted(trajectory, start_s), ready_s).over_s
+        there_s = (
+            ready_s + self._planner.fastest((start, np.zeros_like(start)), Shifted(trajectory, start_s), ready_s).over_s
+        )
         if end_s < math.inf and there_s > ready_s + WAY_ROOM * (end_s - ready_s):
             reason = f"the way to it takes the formation until {there_s:.0f} s"
             raise PlanError(f"plan.trajectory is over at {end_s:g} s; must start later: {reason}")
@@ -153,20 +156,23 @@ class _Rehearsal:
     def _peak(self, reference: Reference, from_s: float, to_s: float) -> tuple[float, float]:
         """Return the greatest share of its limits at which a robot moves along a reference, and when [s]."""
         loads = [
-            (load(*robot_rates(self._space, *reference.value(t_s)), self._limits), t_s) for t_s in _instants(from_s, to_s)
+            (load(*robot_rates(self._space, *reference.value(t_s)), self._limits), t_s)
+            for t_s in _instants(from_s, to_s)
         ]
         return max(loads)
 
     def _fault_at(self, c: Array) -> str | None:
         space = self._space
-        fault = shape_fault(space, c, self._shape) or place_fault(space, c, self._gains, self._shape)
-        if fault:
-            return fault
+        if self._place_fault(c, *self._wide):
+            return self._place_fault(c, *self._exact)
         heights_m = space.inverse(c)[0][:, 2].tolist()
         for (name, limits), height_m in zip(self._drones, heights_m, strict=True):
             if height_m > limits.altitude_m:
                 return f"{name} is at z = {height_m:.1f} m; allowed: {limits.altitude_m:g} m, its limits.altitude_m"
         return None
+
+    def _place_fault(self, c: Array, gains: FormationGains, shape: ShapeLimits) -> str | None:
+        return shape_fault(self._space, c, shape) or place_fault(self._space, c, gains, shape)
 
 
 def _instants(from_s: float, to_s: float) -> list[float]:

@@ -220,9 +220,7 @@ class FlightReader:
 _Handler = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
 
 
-def _states(
-    name: str, drones: tuple[str, ...], states: list[_State], requests: list[ClusterRequest]
-) -> ClusterStates:
+def _states(name: str, drones: tuple[str, ...], states: list[_State], requests: list[ClusterRequest]) -> ClusterStates:
     """Return the states of a cluster that have as many variables as the last one, by time."""
     if not states:
         return ClusterStates(name, drones, requests=requests)

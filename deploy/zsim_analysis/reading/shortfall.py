@@ -1,4 +1,4 @@
-"""What a flight did not do of its plan, and what befell its drones: no report of it passes for one of a flight that did.
+"""What a flight did not do of its plan, and what befell its drones: so that no report hides it.
 
 Pure. Order of this file: what is judged; drones (falls, landings of their own, who else flew them); formations
 (engagement, holds, requests, the target and the trajectory of the plan, the window).
@@ -40,9 +40,9 @@ class Shortfall(Struct, frozen=True):
 
     Attributes:
         kind: of a drone: emergency, flip, impact, battery, landing (what befell it first), hand (others flew it);
-            of a cluster: plan (a step refused to the end, or flown in part), engagement (never), held (for long), request
-            (others led it), early (the run ended before it was due), window (it holds instants at which a cluster was
-            not engaged); collision; record (not all of it is there).
+            of a cluster: plan (a step refused to the end, or flown in part), engagement (never), held (for long),
+            request (others led it), early (the run ended before it was due), window (it holds instants at which a
+            cluster was not engaged); collision; record (not all of it is there).
         subject: the cluster, the drone, or "record".
         t_s: since when, simulated time.
         fails: the flight is no example of its plan; the command ends with code 1.
@@ -132,7 +132,9 @@ def _acting(drone: str, event: Event, flight: RecordedFlight) -> str:
         if each.kind == "fault" and each.data.get("target") in (drone, "world"):
             source = each.data.get("source") or "somebody"
             whose = "the scenario's" if source == "scenario" else f"{source}'s"
-            acting[each.data.get("id")] = f"{whose} fault {each.data.get('kind')} since {seconds_text(each.t_ns / 1e9)} s"
+            acting[each.data.get("id")] = (
+                f"{whose} fault {each.data.get('kind')} since {seconds_text(each.t_ns / 1e9)} s"
+            )
         elif each.kind in ("fault_end", "fault_clear"):
             acting.pop(each.data.get("id"), None)
     return f"; {', '.join(acting.values())}" if acting else ""
@@ -350,7 +352,9 @@ def _target_reached(states: ClusterStates, planned: PlannedReference, plan: Clus
             text = f"{name}: its reference was at the target {seconds_text(round(late_s, 1))} s after it was due{why}"
             yield Shortfall("plan", name, due_s, text, not led)
     elif states.phases[-1] in ("landing", "idle"):
-        yield Shortfall("plan", name, float(engaged_ns) / 1e9, f"{name}: it landed before it was at its target", not led)
+        yield Shortfall(
+            "plan", name, float(engaged_ns) / 1e9, f"{name}: it landed before it was at its target", not led
+        )
 
 
 def _sampled(states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -359,7 +363,7 @@ def _sampled(states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _waits(states: ClusterStates, op: str, from_s: float) -> tuple[float, float, str] | None:
-    """Return from when to when [s], and why at first, a step of the plan was refused after a time; None if it was not."""
+    """Return from when to when [s], and why at first, a step of the plan was refused after from_s; None if never."""
     rows = np.flatnonzero(states.t_ns / 1e9 >= from_s)
     found = [(row, step[1]) for row in rows.tolist() if (step := waiting_step(states.reasons[row])) and step[0] == op]
     found = [each for each in found if states.phases[each[0]] == "engaged"]

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv, stdtrit
 
 LEVEL = 0.95  # of all intervals of a report
-RUNS_MIN = 5  # chosen: Student's interval of two runs is nine times as wide as their distance; fewer are shown as they are
+RUNS_MIN = (
+    5  # chosen: Student's interval of two runs is nine times as wide as their distance; fewer are shown as they are
+)
 
 
 class ConfidenceInterval(Struct, frozen=True):

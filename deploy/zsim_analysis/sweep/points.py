@@ -17,7 +17,7 @@ from zsim_analysis.sweep.metrics import metric_columns, metrics_function
 from zsim_analysis.sweep.sweep_run import FIXED, Row, engaged_column
 from zsim_analysis.sweep.sweep_summary import Distribution, FormationParameter, GridPoint, SweepSummary
 
-PLANNED_ONLY = ("min_separation_m", "errors.", "clusters.")  # columns that what was not flown would make look better
+PLANNED_ONLY = ("min_separation_m", "errors.", "clusters.")  # columns, or their beginnings, of `flown`
 STATISTICS = ("est_std", "true_std", "true_rms", "true_mean")
 _FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # in a text, but not in a name such as drone1
 _COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # start of a column: its cluster's name, and its own
@@ -51,8 +51,10 @@ class SweepResults:
         return np.array([np.nan if cell is None else cell for cell in cells], np.float64)
 
     def flown(self, column: str, point: int | None = None) -> NDArray[np.float64]:
-        """Return `values` of the runs whose statistics count: of what a flight can only better by not being flown, those
-        that did what their plan says; NaN for the others."""
+        """Return `values`, of errors and separations NaN where a run did not do what its plan says.
+
+        A flight that was not flown, or fell early, would make their means look better.
+        """
         values = self.values(column, point)
         if not column.startswith(PLANNED_ONLY):
             return values

@@ -248,8 +248,8 @@ def _is_engaged_throughout(summary: RunSummary, cluster: str) -> bool:
 def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, float | None]:
     """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster.
 
-    Those of a cluster that was not engaged are None, and all of a flight that was not as planned: drones on the ground, or
-    that hover in place of a trajectory, hold no formation that was asked for, and one that fell early errs for less long.
+    Those of a cluster that was not engaged are None, and all of a flight that was not as planned: drones on the ground,
+    or that hover in place of a trajectory, hold no formation that was asked for, and one that fell errs for less long.
     """
     columns: dict[str, float | None] = {}
     for i, (name, cluster) in enumerate(summary.clusters.items()):

@@ -1,4 +1,4 @@
-"""What befalls drones: the firmware stops or lands one by itself, one turns over, hits something, or has no charge left.
+"""What befalls drones: the firmware stops or lands one by itself, one turns over, hits something, has no charge left.
 
 Found once a gate on the arrays of the fleet by one compiled pass, which reads and compares and changes nothing of the
 flight; what is found is put into words only then.
@@ -148,7 +148,7 @@ def find(
         bits, mode = 0, memory[i, MEMORY.mode]
         if mode != seen[i, SEEN.mode]:
             seen[i, SEEN.mode] = mode
-            if mode == EMERGENCY or mode == LANDING:
+            if mode in (EMERGENCY, LANDING):
                 bits |= MODE
         x, y = state[i, STATE.q_WB + 1], state[i, STATE.q_WB + 2]
         up = 1.0 - 2.0 * (x * x + y * y)

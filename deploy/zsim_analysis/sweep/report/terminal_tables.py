@@ -91,7 +91,8 @@ def overview(summary: SweepSummary) -> PointTable:
         _column(summary, "separation (m)", lambda point: _mean(point, "min_separation_m", 2)),
         _column(summary, "least (m)", _least),
     )
-    caption = f"separation: mean of the runs as planned, least of all; {100 * summary.level:g} % intervals are in the report\n"
+    intervals = f"{100 * summary.level:g} % intervals are in the report"
+    caption = f"separation: mean of the runs as planned, least of all; {intervals}\n"
     return PointTable(title, caption, columns)
 
 

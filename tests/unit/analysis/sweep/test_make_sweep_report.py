@@ -221,7 +221,9 @@ def beyond(axes: Axes) -> list[tuple[str, float]]:
 def test_a_mean_does_not_profit_from_runs_that_fell_or_were_not_flown(tmp_path: Path) -> None:
     """Four of ten runs fall in the same way, at other times: they err by less and keep farther apart."""
     of = plan("seed", runs=10)
-    rows = [{**well(of, run), "errors.x_c.true_rms": 0.2, "min_separation_m": 3.0, "as_planned": True} for run in range(6)]
+    rows = [
+        {**well(of, run), "errors.x_c.true_rms": 0.2, "min_separation_m": 3.0, "as_planned": True} for run in range(6)
+    ]
     fall = {"as_planned": False, "crashed": True, "errors.x_c.true_rms": 0.1, "min_separation_m": 9.0}
     cut = {"window_note": "The run ended at 60 s, before the window 120 to 320 s."}
     for run in range(6, 10):
@@ -240,7 +242,7 @@ def test_a_mean_does_not_profit_from_runs_that_fell_or_were_not_flown(tmp_path: 
     assert list(summary.not_as_planned.values()) == [4]  # in one line, whatever the time
     assert "26.5 s" in page
     assert summary.window_notes == {cut["window_note"]: 4}
-    assert "before the window 120 to 320 s" in page
+    assert cut["window_note"] in page
 
 
 @pytest.mark.usefixtures("unrendered")
