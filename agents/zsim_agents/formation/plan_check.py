@@ -1,6 +1,6 @@
 """Whether a plan can be flown at all, judged before the flight from where the drones stand.
 
-In flight the guidance refuses what is beyond the limits, asked again twice a second, and the formation hovers meanwhile.
+In flight the guidance refuses what is beyond the limits, twice a second anew, and the formation hovers meanwhile.
 What is certain to be refused to its end, or is over before any formation could begin it, is refused here, with the
 factor by which its time has to be stretched. Limits are a little wider than in flight, as the formation is never quite
 where it was set down: what is between the two is for the flight to judge.
