@@ -156,16 +156,22 @@ def _panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
 
 
 def _name(
-    figure: Figure, axes: Axes, results: SweepResults, axis: GridAxis | None, beyond: bool, paper: bool = False
+    figure: Figure,
+    axes: Axes,
+    results: SweepResults,
+    axis: GridAxis | None,
+    beyond: bool,
+    paper: bool = False,
+    means: bool = True,
 ) -> None:
     """Put the legend above a figure: what a dot, a mean, a box, a mark and a colour are."""
     mean = VERMILION if not axis or len(axis.series) == 1 else GREY
-    if axis:
+    if axis and means:
         axes.plot([], [], ".", color=BLUE if len(axis.series) == 1 else GREY, ms=7, alpha=0.6, label=ONE_RUN)
         if not axis.field:
             axes.plot([], [], "s", color="#0072b226", mec=BLUE, ms=8, label="quartiles and median")
         axes.errorbar([], [], yerr=[], fmt="o", ms=4, lw=1.4, capsize=3, color=mean, label=mean_label(results))
-    else:
+    elif means:
         axes.plot([], [], "s", color="#d55e0066", ms=8, label=mean_label(results))
     if beyond:
         axes.plot([], [], "^", color=mean, ms=7, mec="white", mew=0.6, label=BEYOND_AXIS)
@@ -190,7 +196,7 @@ def _safety(results: SweepResults) -> Figure:
     shares, *others = figure.subplots(1, 1 + len(panels), squeeze=False).ravel()
     _shares(shares, results, axis)
     beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(others, panels, strict=True)]
-    _name(figure, shares, results, axis, any(beyond))
+    _name(figure, shares, results, axis, any(beyond), means=bool(panels))
     return figure
 
 
