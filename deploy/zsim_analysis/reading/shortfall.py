@@ -84,7 +84,7 @@ def _fates(flight: RecordedFlight) -> Iterator[Shortfall]:
     """Yield a line for each drone that something befell, with all of it in the order of time."""
     by_drone: dict[str, list[Event]] = {}
     for event in flight.events:
-        if event.kind in FATES and (event.kind != "emergency" or event.data.get("in_air", True)):
+        if event.kind in FATES:
             by_drone.setdefault(event.subject, []).append(event)
     for drone, events in by_drone.items():
         first = {event.kind: event for event in reversed(events)}
@@ -92,12 +92,11 @@ def _fates(flight: RecordedFlight) -> Iterator[Shortfall]:
         text = f"{drone}: {', '.join(parts)}{_acting(drone, events[0], flight)}"
         fails = any(not _is_silence_of_others(event) for event in events)
         yield Shortfall(events[0].kind, drone, events[0].t_ns / 1e9, text, fails)
+    told = {*by_drone, *(event.subject for event in flight.events if event.data.get("mode") == "emergency")}
     for track in flight.tracks:  # a record of a version that has no such events
-        if track.name not in by_drone and track.states and track.states[-1] == "emergency":
-            asked = [each for each in flight.events if each.kind == "emergency" and each.subject == track.name]
-            if not asked:
-                t_s = float(track.status_t_ns[-1]) / 1e9
-                yield Shortfall("emergency", track.name, t_s, f"{track.name} ended in an emergency", True)
+        if track.name not in told and not track.external and track.states and track.states[-1] == "emergency":
+            t_s = float(track.status_t_ns[-1]) / 1e9
+            yield Shortfall("emergency", track.name, t_s, f"{track.name} ended in an emergency", True)
 
 
 def _fate(event: Event) -> str:

@@ -115,7 +115,7 @@ class FlightWatch:
         if self._memory[i, MEMORY.mode] == EMERGENCY:
             tilt_deg = math.degrees(math.acos(self._setting[i, SETTING.tilt_cut]))
             text = f"{name} stops its rotors: it finds itself tilted by more than {tilt_deg:.0f} deg"
-            return Mishap(i, "emergency", text, {"cause": "tilt", "in_air": True})
+            return Mishap(i, "emergency", text, {"cause": "tilt"})
         charge = 100.0 * float(self._bodies.energy[i] / self._bodies.vehicle[i, VEHICLE.capacity])
         if charge < self._setting[i, SETTING.low_battery]:
             data = {"cause": "battery", "charge_percent": round(charge, 2)}

@@ -193,9 +193,9 @@ class CommandIntake:
         refusal = self._hand_on(command) if command.drone in self.drivers else enter[mode](command.drone)
         if refusal is None:
             self.outbox.notice("mode", drone, f"{source} asks {drone} to {mode}", {"mode": mode}, source)
-        if refusal is None and mode == "emergency" != was:
+        if refusal is None and mode == "emergency" and was not in ("landed", "emergency"):
             text = f"{source} stops the rotors of {drone}, which is {was}"
-            self.outbox.notice("emergency", drone, text, {"cause": "command", "in_air": was != "landed"}, source)
+            self.outbox.notice("emergency", drone, text, {"cause": "command"}, source)
         return refusal
 
     def _hand_on(self, command: QueuedCommand) -> str | None:

@@ -160,9 +160,8 @@ class World(Coordinator):
     def take_of_driver(self, drone: str, message: Any) -> str | None:
         former, refusal = self.drivers.status(self.names.index(drone)), self.drivers.take(drone, message, self.now_ns)
         stopped = isinstance(message, Status) and message.state == "emergency"
-        if refusal is None and stopped and (former is None or former.state != "emergency"):
-            data = {"cause": "driver", "in_air": former is not None and former.state != "landed"}
-            self.outbox.notice("emergency", drone, f"the driver of {drone} reports an emergency", data)
+        if refusal is None and stopped and former and former.state not in ("landed", "emergency"):
+            self.outbox.notice("emergency", drone, f"the driver of {drone} reports an emergency", {"cause": "driver"})
         return refusal
 
     def release_drones(self, name: str) -> None:
