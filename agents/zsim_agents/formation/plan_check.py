@@ -23,7 +23,7 @@ from zsim_agents.formation.robot_limits import RobotLimits, load
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, robot_rates
 from zsim_agents.formation.trajectory import Hold, Reference, Shifted, ramp_onto
 
-READY_S = 4.0  # least from the order to take off to the engagement: AR.Drones take 4 to 12 s
+READY_S = 3.0  # least from the order to take off to the engagement: a take-off to the hover; AR.Drones take 4 to 12 s
 ROOM = 1.05  # chosen: of the limits of speed, as a drone's place in the formation differs by some centimetres
 WAY_ROOM = 1.25  # chosen: of a way from the start, whose length differs by what the drones drift in their climb
 NEAR_ROOM = 0.9  # chosen: of the least separation and height

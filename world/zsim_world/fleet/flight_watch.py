@@ -19,8 +19,7 @@ from zsim_world.state.fleet_arrays import STATE, VEHICLE, Bodies
 from zsim_world.vehicles.firmware import EMERGENCY, LANDING, MEMORY
 from zsim_world.vehicles.firmware_settings import SETTING
 
-IMPACT_M_S = 1.0  # chosen: thrice the speed at which the firmware sets a drone down
-IMPACT_G = 5.0  # chosen: twice what rotors and drag give a drone, which may change its velocity so over a gate
+IMPACT_G = 5.0  # chosen: twice what rotors and drag give a drone, on average over a gate; a fall from 0.4 m has it
 UPRIGHT_AGAIN = 0.5  # chosen: cosine of the tilt below which one that was upside down may turn over again
 QUIET_S = 1.0  # chosen: contacts that follow one sooner are its bounces
 MODE, FLIP, IMPACT, EMPTY = 1, 2, 4, 8  # bits of what befell a drone
@@ -71,7 +70,7 @@ class FlightWatch:
         self._seen = np.zeros((len(names), SEEN.size))
         self._seen[:, SEEN.led] = [i in external for i in range(len(names))]
         self._found = np.zeros(len(names), np.int64)
-        self._change_m_s = IMPACT_M_S + IMPACT_G * G_M_S2 * gate_s
+        self._change_m_s = IMPACT_G * G_M_S2 * gate_s
         self._quiet_gates = math.ceil(QUIET_S / gate_s)
         self.look()  # loads or compiles it
 

@@ -71,10 +71,10 @@ def test_an_expression_is_judged_over_its_time() -> None:
 
 
 def test_what_is_over_before_it_can_begin_is_refused_with_the_earliest_time() -> None:
-    assert has_terms(refusal(pair(way(1, 2, start_s=1))), "clusters[0].plan.trajectory", "5 s", "6 s")
+    assert has_terms(refusal(pair(way(1, 1, start_s=1))), "clusters[0].plan.trajectory", "3 s", "5 s")
     far = "{takeoff_s: 2, trajectory: {start_s: 10, waypoints: [{at_s: 0, values: {x_c: 90}}, {at_s: 9, values: {x_c: 92}}]}}"
     assert has_terms(text := refusal(pair(far)), "clusters[0].plan.trajectory", "19 s")
-    least_s = 6 + 15 / 8 * 90 / (0.8 * 1.5)
+    least_s = 5 + 15 / 8 * 90 / (0.8 * 1.5)
     assert least_s - 1 < float(re.findall(r"until (\d+) s", text)[0]) < 1.2 * least_s
     landing = "{takeoff_s: 2, land_s: 15, trajectory: {start_s: 20, expressions: {x_c: 0.1*t}}}"
     assert has_terms(refusal(pair(landing)), "clusters[0].plan.land_s", "15", "20 s")

@@ -1,6 +1,6 @@
 """What befalls drones becomes an event with its figures; a flight as usual, with a landing, has none."""
 
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -90,15 +90,21 @@ def test_the_watch_goes_on_from_its_snapshot():
     assert befallen(other, 1.0) == befallen(fleet, 1.0) != []
 
 
+def ask(world: World, drone: str, mode: Literal["takeoff", "emergency"]) -> None:
+    command = flight_messages.Mode(world.now_ns, world.now_ns, "console.1", mode)
+    world.handle(keys.command(drone, "mode"), command, 0)
+
+
 def test_an_operator_s_emergency_in_the_air_is_an_event_with_its_source():
     world = World(scenario(processes={"expect": []}))
     events: list[Event] = []
     for k in range(150):
         world.advance(0)
-        if k in (1, 100):  # on the ground first
-            for drone, mode in (("d1", "emergency"), ("d0", "takeoff" if k == 1 else "emergency")):
-                command = flight_messages.Mode(world.now_ns, k, "console.1", mode)
-                world.handle(keys.command(drone, "mode"), command, 0)
+        if k == 1:  # d1 still stands on the ground
+            ask(world, "d1", "emergency")
+            ask(world, "d0", "takeoff")
+        elif k == 100:
+            ask(world, "d0", "emergency")
         events += [m for _, m in world.outbox.take() if isinstance(m, Event) and m.kind == "emergency"]
     (event,) = events
     assert (event.subject, event.source, event.data) == ("d0", "console.1", {"cause": "command"})
