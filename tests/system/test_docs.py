@@ -586,8 +586,12 @@ def test_the_protocol_names_every_message_and_field(shape: str) -> None:
 
 
 def test_the_protocol_names_every_event() -> None:
-    code = "".join(path.read_text() for path in sorted((ROOT / "world/zsim_world").glob("*.py")))
-    kinds = set(re.findall(r"\bevent\(\s*\"(\w+)\"", code)) | {"join", "restart", "superseded"}
+    code = "".join(path.read_text() for path in sorted((ROOT / "world/zsim_world").rglob("*.py")))
+    kinds = set(re.findall(r"\b(?:event|notice|Mishap)\((?:i, )?\s*\"(\w+)\"", code)) | {
+        "join",
+        "restart",
+        "superseded",
+    }
     text = (ROOT / "docs/protocol.md").read_text()
     assert sorted(kind for kind in kinds if f"`{kind}`" not in text) == []
 

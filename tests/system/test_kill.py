@@ -28,7 +28,7 @@ IN_FLIGHT = r" [1-9][0-9]*\.[0-9] . 100000 s"  # a line of progress after the fi
 APART_M = 0.3  # of a run with deaths from one without, in realtime
 MOVING = PAIR.replace(
     "{takeoff_s: 0.5}",
-    "{takeoff_s: 0.5, trajectory: {start_s: 6, waypoints: [{at_s: 0, values: {x_c: 0}}, {at_s: 8, values: {x_c: 2}}]}}",
+    "{takeoff_s: 0.5, trajectory: {start_s: 9, waypoints: [{at_s: 0, values: {x_c: 0}}, {at_s: 8, values: {x_c: 2}}]}}",
 )
 STEP = (ROOT / "scenarios" / "step.yaml").read_text()
 UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes waits half a second or more in a recorder
@@ -335,7 +335,7 @@ def test_a_world_that_was_restarted_in_realtime_counts_only_its_own_time(federat
 @pytest.mark.parametrize(
     ("scenario", "kills_s", "end_s"),
     [
-        pytest.param(MOVING, (7.0, 9.0, 11.0), 14.0, id="two that move"),
+        pytest.param(MOVING, (10.0, 12.0, 14.0), 17.0, id="two that move"),
         pytest.param(STEP, (30.0, 40.0, 50.0), 70.0, id="Test 1", marks=pytest.mark.soak),
     ],
 )

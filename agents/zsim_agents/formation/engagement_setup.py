@@ -14,6 +14,7 @@ from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_check import all_near
 from zsim_agents.formation.flight_data import GateInput
 from zsim_agents.formation.flight_plan import FlightPlan, PlanError, plan_of
+from zsim_agents.formation.plan_check import check_flyable
 from zsim_agents.formation.robot_limits import guard, load
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, closest_pair, robot_rates
 from zsim_agents.formation.spaces.scenario_space import scenario_space
@@ -31,17 +32,21 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
     with _refusals_of(scenario, cluster):
         space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
         rehearse(space, gains, law)
-        return Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
+        engagement = Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
+        check_flyable(scenario, cluster, space, gains)
+        return engagement
 
 
 def check_plan(scenario: Scenario, cluster: Cluster) -> None:
-    """Refuse a plan that `engagement_of` refuses; nothing is rehearsed, so nothing has to be compiled.
+    """Refuse a plan that `engagement_of` refuses; no law is rehearsed.
 
     Raises:
         RunError: the plan can never be flown, with the reason.
     """
     with _refusals_of(scenario, cluster):
-        FlightPlan(scenario_space(scenario, cluster), plan_of(cluster))
+        space = scenario_space(scenario, cluster)
+        FlightPlan(space, plan_of(cluster))
+        check_flyable(scenario, cluster, space, gains_of(cluster.gains))
 
 
 @contextmanager

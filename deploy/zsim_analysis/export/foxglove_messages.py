@@ -63,9 +63,14 @@ LEVELS = {  # of events; the others are information
     "fingerprint": LogLevel.Warning,
     "outputs_missing": LogLevel.Warning,
     "fault": LogLevel.Warning,
+    "landing": LogLevel.Warning,
     "death": LogLevel.Error,
     "overdue": LogLevel.Error,
     "collision": LogLevel.Error,
+    "emergency": LogLevel.Error,
+    "flip": LogLevel.Error,
+    "impact": LogLevel.Error,
+    "battery": LogLevel.Error,
     "diverged": LogLevel.Error,
 }
 _POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 4)])

@@ -13,7 +13,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Quaternion
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Bye, Event, Join
+from zsim.contract.run_messages import Bye, ClusterRequest, Event, Join
 from zsim.record import Completeness, Recorded, RecordReader, completeness
 from zsim.schema.message import Vector3
 from zsim_analysis.reading.drone_answers import DroneAnswers, EstimateFields, VelocityFields
@@ -60,7 +60,7 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
     Args:
         path: of the record.
         answers: with the drones' estimates and velocity commands.
-        motion: with all of truth and status, not the last truth of each drone alone.
+        motion: with all of truth and status, not the last of each drone alone.
 
     Raises:
         RecordError: no such record.
@@ -69,7 +69,7 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
         flight = FlightReader(answers)
         wanted = [key for key in reader.topics() if flight.handler(key)]
         if not motion:
-            ends = [reader.last(key) for key in wanted if keys.leaf(key) == "truth"]
+            ends = [reader.last(key) for key in wanted if keys.leaf(key) in ("truth", "status")]
             wanted = [key for key in wanted if keys.parts(key)[0] != "drone"]
             for message in filter(None, ends):
                 flight.add(message)
@@ -92,6 +92,7 @@ class FlightReader:
         self._truth: dict[str, tuple[array[int], array[float]]] = {}
         self._status: dict[str, tuple[array[int], list[str], array[float]]] = {}
         self._states: dict[str, list[_State]] = {}
+        self._requests: dict[str, list[ClusterRequest]] = {}
         self._processes: dict[str, RecordedProcess] = {}
         self._first_wall_ns: int | None = None
         self._last_wall_ns = 0
@@ -110,6 +111,10 @@ class FlightReader:
                 "drone/truth": (_Truth, self._store_truth),
                 "drone/sensor/status": (_Status, self._store_status),
                 "cluster/state": (_State, lambda name, message: self._states.setdefault(name, []).append(message)),
+                "cluster/request": (
+                    ClusterRequest,
+                    lambda name, message: self._requests.setdefault(name, []).append(message),
+                ),
             }
             if answers := self._answers:
                 kinds["drone/estimate"] = (EstimateFields, answers.add_estimate)
@@ -182,7 +187,10 @@ class FlightReader:
             info=info,
             scenario=scenario_of(info),
             tracks=[self._track(name, name in external) for name in names],
-            clusters=[_states(name, drones, self._states.get(name, [])) for name, drones in members.items()],
+            clusters=[
+                _states(name, drones, self._states.get(name, []), self._requests.get(name, []))
+                for name, drones in members.items()
+            ],
             events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
             processes=list(self._processes.values()),
             messages=messages,
@@ -212,10 +220,10 @@ class FlightReader:
 _Handler = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
 
 
-def _states(name: str, drones: tuple[str, ...], states: list[_State]) -> ClusterStates:
+def _states(name: str, drones: tuple[str, ...], states: list[_State], requests: list[ClusterRequest]) -> ClusterStates:
     """Return the states of a cluster that have as many variables as the last one, by time."""
     if not states:
-        return ClusterStates(name, drones)
+        return ClusterStates(name, drones, requests=requests)
     names = states[-1].names
     fit = [s for s in states if len(s.names) == len(s.value) == len(s.desired) == len(names) > 0]
     by_time = {state.t_ns: state for state in sorted(fit, key=lambda state: state.t_ns)}
@@ -229,4 +237,5 @@ def _states(name: str, drones: tuple[str, ...], states: list[_State]) -> Cluster
         desired=np.array([state.desired for state in kept]).reshape(-1, len(names)),
         phases=[state.phase for state in kept],
         reasons=[state.reason for state in kept],
+        requests=requests,
     )

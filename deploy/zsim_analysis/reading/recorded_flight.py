@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Event
+from zsim.contract.run_messages import ClusterRequest, Event
 from zsim.record import Completeness
 from zsim.scenario.scenario import Scenario
 
@@ -95,7 +95,12 @@ class VelocityCommands:
 
 @dataclass
 class ClusterStates:
-    """What the controller of one cluster published: K instants, n names; `reasons` (K,) why it waits or is held."""
+    """What the controller of one cluster published: K instants, n names.
+
+    Attributes:
+        reasons: (K,) why it waits or is held.
+        requests: that it took, from others than its plan.
+    """
 
     name: str
     drones: tuple[str, ...]
@@ -105,6 +110,7 @@ class ClusterStates:
     desired: Array = field(default_factory=lambda: np.zeros((0, 0)))
     phases: list[str] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
+    requests: list[ClusterRequest] = field(default_factory=list)
 
 
 @dataclass

@@ -1,27 +1,48 @@
-"""What a flight did not do of its plan, so that no report of it can be mistaken for that of a flight that did. Pure."""
+"""What a flight did not do of its plan, and what befell its drones: so that no report hides it.
 
-from collections.abc import Iterator
+Pure. Order of this file: what is judged; drones (falls, landings of their own, who else flew them); formations
+(engagement, holds, requests, the target and the trajectory of the plan, the window).
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
-from zsim.scenario.scenario import ClusterPlan, Scenario
-from zsim_agents.formation.flight_plan import waiting_step
-from zsim_analysis.reading.recorded_flight import ClusterStates, RecordedFlight
-from zsim_analysis.reading.window_text import percent_text, seconds_text
+from zsim.contract.run_messages import Event
+from zsim.scenario.scenario import Cluster, ClusterPlan, Scenario
+from zsim_agents.formation.flight_data import HELD_ON_REQUEST
+from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, plan_of, waiting_step
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_agents.formation.trajectory import Hold, Reference
+from zsim_agents.formation.variable_values import variable_of
+from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight
+from zsim_analysis.reading.window_text import percent_text, seconds_text, span_text
 
 ENGAGES_S = 20.0  # chosen: a formation engages 4 to 12 s after its take-off; a run may end before
-
-
 MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second, and m or rad by which a reference at rest never moves
+HELD_MAX_S = 2.0  # chosen: four times what a formation waits after a fault; held for longer, it has left its plan
+LATE_MAX_S = 1.0  # chosen: two tries of a step of the plan; more of a reference is not left out unsaid
+SAMPLE_NS = 100_000_000  # of a reference that is compared with the plan's
+SAME = 1e-3  # m or rad within which the reference is the plan's: both are computed by the same formulas
+CONTROLLER, CONSOLE = "controller.", "console"  # how names begin: of who flies by the plan, and of operators' programs
+FATES = ("emergency", "flip", "impact", "battery", "landing")  # events of what befell a drone
+CRASHES = ("emergency", "flip", "impact")  # of them those that no drone flies on after
+LEADS = ("hold", "land", "target", "trajectory")  # requests by which a formation leaves its plan
 
 
 class Shortfall(Struct, frozen=True):
-    """One thing that a flight did not do.
+    """One thing that a flight did not do, or that happened to it.
 
     Attributes:
-        kind: plan (a step refused to the end), engagement (never), early (the run ended before it was due), window
-            (it holds instants at which a cluster was not engaged), collision, record (not all of it is there).
+        kind: of a drone: emergency, flip, impact, battery, landing (what befell it first), hand (others flew it);
+            of a cluster: plan (a step refused to the end, or flown in part), engagement (never), held (for long),
+            request (others led it), early (the run ended before it was due), window (it holds instants at which a
+            cluster was not engaged); collision; record (not all of it is there).
         subject: the cluster, the drone, or "record".
         t_s: since when, simulated time.
         fails: the flight is no example of its plan; the command ends with code 1.
@@ -36,8 +57,9 @@ class Shortfall(Struct, frozen=True):
 
 def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Shortfall]:
     """Return what a flight did not do, what matters most first; empty for one that flew its plan."""
-    lines = [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
-    lines += [*_collisions(flight), *_of_record(flight)]
+    lines = [*_fates(flight), *_collisions(flight)]
+    lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
+    lines += [*_hands(flight), *_of_record(flight)]
     return sorted(lines, key=lambda line: not line.fails)
 
 
@@ -55,12 +77,102 @@ def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
         yield Shortfall("collision", first.subject, t_s, f"{first.text} at {t_s:.2f} s{more}", True)
 
 
+# Drones
+
+
+def _fates(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield a line for each drone that something befell, with all of it in the order of time."""
+    by_drone: dict[str, list[Event]] = {}
+    for event in flight.events:
+        if event.kind in FATES:
+            by_drone.setdefault(event.subject, []).append(event)
+    for drone, events in by_drone.items():
+        first = {event.kind: event for event in reversed(events)}
+        parts = [_fate(event) for event in sorted(first.values(), key=lambda event: (event.t_ns, event.seq))]
+        text = f"{drone}: {', '.join(parts)}{_acting(drone, events[0], flight)}"
+        fails = any(not _is_silence_of_others(event) for event in events)
+        yield Shortfall(events[0].kind, drone, events[0].t_ns / 1e9, text, fails)
+    told = {*by_drone, *(event.subject for event in flight.events if event.data.get("mode") == "emergency")}
+    for track in flight.tracks:  # a record of a version that has no such events
+        if track.name not in told and not track.external and track.states and track.states[-1] == "emergency":
+            t_s = float(track.status_t_ns[-1]) / 1e9
+            yield Shortfall("emergency", track.name, t_s, f"{track.name} ended in an emergency", True)
+
+
+def _fate(event: Event) -> str:
+    at, data = f"at {seconds_text(event.t_ns / 1e9)} s", event.data
+    if event.kind == "emergency":
+        if data.get("cause") == "command":
+            whose = "operator's emergency" if event.source.startswith(CONSOLE) else "emergency"
+            return f"ended by: {whose} {at} ({event.source})"
+        return f"emergency {at} ({'its driver reported it' if data.get('cause') == 'driver' else 'tilted too far'})"
+    if event.kind == "impact":
+        return f"hit {data.get('other', 'something')} at {data.get('speed_m_s', 0.0):.1f} m/s {at}"
+    if event.kind == "landing":
+        charge = data.get("charge_percent")
+        why = f"{data.get('commander') or 'its commander'} fell silent"
+        return f"landed by itself {at} ({why if charge is None else f'{charge:.1f} % of charge left'})"
+    return f"upside down {at}" if event.kind == "flip" else f"no charge left {at}"
+
+
+def _is_silence_of_others(event: Event) -> bool:
+    """Return whether a drone landed since a program that is no controller let it be."""
+    commander = str(event.data.get("commander") or "")
+    silent = event.kind == "landing" and event.data.get("cause") == "silence"
+    return silent and not commander.startswith(CONTROLLER)
+
+
+def _acting(drone: str, event: Event, flight: RecordedFlight) -> str:
+    """Return which injected faults of a drone, or of all, had begun when something befell it, and had not ended."""
+    acting: dict[object, str] = {}
+    for each in flight.events:
+        if (each.t_ns, each.seq) > (event.t_ns, event.seq):
+            break
+        if each.kind == "fault" and each.data.get("target") in (drone, "world"):
+            source = each.data.get("source") or "somebody"
+            whose = "the scenario's" if source == "scenario" else f"{source}'s"
+            acting[each.data.get("id")] = (
+                f"{whose} fault {each.data.get('kind')} since {seconds_text(each.t_ns / 1e9)} s"
+            )
+        elif each.kind in ("fault_end", "fault_clear"):
+            acting.pop(each.data.get("id"), None)
+    return f"; {', '.join(acting.values())}" if acting else ""
+
+
+def _hands(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield for each drone of a cluster who beside its controller flew it, or had it land."""
+    members = {drone for states in flight.clusters for drone in states.drones if _plan(flight.scenario, states.name)}
+    for drone in sorted(members):
+        own = [event for event in flight.events if event.subject == drone]
+        parts: list[tuple[int, str]] = []
+        for place, event in enumerate(own):
+            if event.source.startswith(CONTROLLER):
+                continue
+            if event.kind == "commander":
+                ends = (each.t_ns for each in own[place + 1 :] if each.kind in ("commander", "release"))
+                span_s = (event.t_ns / 1e9, next(ends, flight.last_ns) / 1e9)
+                parts.append((event.t_ns, f"flown by {event.source} from {span_text(span_s)}"))
+            elif event.kind == "mode" and event.data.get("mode") == "land":
+                parts.append((event.t_ns, f"asked to land by {event.source} at {seconds_text(event.t_ns / 1e9)} s"))
+        if parts:
+            more = f" (and {len(parts) - 1} more)" if len(parts) > 1 else ""
+            yield Shortfall("hand", drone, parts[0][0] / 1e9, f"{drone}: {parts[0][1]}{more}", False)
+
+
+# Formations
+
+
 def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[float, float]) -> Iterator[Shortfall]:
     if not states.phases:
         return
-    yield from _refused(states)
+    refused = [*_refused(states)]
+    yield from refused
     if "engaged" in states.phases:
+        yield from _held(states)
+        yield from _requests(states, flight.scenario)
         yield from _not_begun(states, flight)
+        if not refused:
+            yield from _reference_flown(states, flight)
         yield from _outside(states, window_s)
     else:
         yield from _never_engaged(states, takeoff_s(flight.scenario, states.name), flight.last_ns / 1e9)
@@ -81,6 +193,30 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
         if engaged and (last or states.phases[place + 1] == "landing"):
             text = f"{states.name}: the {op} of the plan was refused to the end: {why}"
             yield Shortfall("plan", states.name, begun[1], text, True)
+
+
+def _held(states: ClusterStates) -> Iterator[Shortfall]:
+    """Yield for how long, in all, a fault held a formation that had been engaged."""
+    phases = np.array(states.phases)
+    rows = np.flatnonzero(phases == "held")
+    rows = rows[[HELD_ON_REQUEST not in states.reasons[row] for row in rows]] if len(rows) else rows
+    if not len(rows):
+        return
+    nexts = np.minimum(rows + 1, len(phases) - 1)
+    length_s = float((states.t_ns[nexts] - states.t_ns[rows]).sum()) / 1e9
+    span_s = (float(states.t_ns[rows[0]]) / 1e9, float(states.t_ns[nexts[-1]]) / 1e9)
+    text = f"{states.name}: held for {seconds_text(length_s)} s, from {span_text(span_s)}: {states.reasons[rows[0]]}"
+    yield Shortfall("held", states.name, span_s[0], text, length_s > HELD_MAX_S)
+
+
+def _requests(states: ClusterStates, scenario: Scenario | None) -> Iterator[Shortfall]:
+    """Yield what others than the plan asked of a formation that has one."""
+    plan = _plan(scenario, states.name)
+    asked = [each for each in states.requests if each.ok and each.op in LEADS]
+    if asked and plan and plan.takeoff_s is not None:
+        first = ", ".join(f"{each.op} at {seconds_text(each.t_ns / 1e9)} s ({each.source})" for each in asked[:3])
+        more = f" and {len(asked) - 3} more" if len(asked) > 3 else ""
+        yield Shortfall("request", states.name, asked[0].t_ns / 1e9, f"{states.name}: asked {first}{more}", False)
 
 
 def _not_begun(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
@@ -107,15 +243,151 @@ def _moves(states: ClusterStates) -> bool:
     return phases == {"engaged"} and not states.reasons[-1] and moved > MOVES_MIN
 
 
+class PlannedReference(NamedTuple):
+    """What the plan leads a formation along: a reference from start_s on, in the variables (entries of c) it names."""
+
+    space: ClusterSpace
+    reference: Reference
+    start_s: float
+    entries: NDArray[np.intp]
+
+    def flown(self, states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return at which of these rows of its states an engaged formation was led along it."""
+        t_s = (states.t_ns[rows] / 1e9 - self.start_s).tolist()
+        return np.array([self._is_on(states, row, t) for row, t in zip(rows.tolist(), t_s, strict=True)], bool)
+
+    def _is_on(self, states: ClusterStates, row: int, t_s: float) -> bool:
+        if states.phases[row] != "engaged":
+            return False
+        off = self.space.difference(states.desired[row], self.reference.value(t_s)[0])
+        return bool(np.abs(off[self.entries]).max(initial=0.0) <= SAME)
+
+
+def _planned(states: ClusterStates, scenario: Scenario | None) -> PlannedReference | None:
+    """Return the trajectory of a cluster's plan, else its target; None without one, or where it was refused."""
+    cluster = _cluster(scenario, states.name)
+    if scenario is None or cluster is None or cluster.plan.takeoff_s is None:
+        return None
+    steps = [each.request for each in plan_of(cluster) if isinstance(each.request, MoveTo | Follow)]
+    try:
+        space = scenario_space(scenario, cluster)
+        if space.names != states.names or not steps:
+            return None
+        base = states.desired[states.phases.index("engaged")].copy()  # a formation is engaged where it is
+        base[space.neutral] = 0.0
+        names, reference, start_s = dict[str, None](), None, cluster.plan.takeoff_s
+        for step in steps:
+            if isinstance(step, MoveTo):
+                base = step.goal(space, base)
+                names.update(dict.fromkeys(step.values))
+                reference = Hold(base)
+            else:
+                reference, start_s = step.trajectory(space, base), step.start_s or 0.0
+                named = [step.expressions, *(w["values"] for w in step.waypoints if isinstance(w["values"], Mapping))]
+                names.update(dict.fromkeys(str(name) for each in named for name in each))
+        entries = np.array(sorted({variable_of(space, name, "").entry for name in names}), np.intp)
+    except (*REFUSALS, ValueError):
+        return None
+    return PlannedReference(space, reference, start_s, entries) if reference else None
+
+
+def _reference_flown(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield what is missing of the trajectory, or of the way to the target, that the plan asks for."""
+    planned, plan = _planned(states, flight.scenario), _plan(flight.scenario, states.name)
+    if planned is None or plan is None:
+        return
+    if plan.trajectory is not None:
+        yield from _trajectory_flown(states, planned, plan)
+    else:
+        yield from _target_reached(states, planned, plan)
+
+
+def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: ClusterPlan) -> Iterator[Shortfall]:
+    t_s, whole_s = states.t_ns / 1e9 - planned.start_s, planned.reference.duration_s
+    run_s, land_s = float(t_s[-1]), np.inf if plan.land_s is None else plan.land_s - planned.start_s
+    due_s = min(np.inf if whole_s is None else whole_s, land_s, run_s)
+    if due_s <= 0.0:
+        return  # the run ended before it, which is said elsewhere, or its landing is planned before it
+    if whole_s is not None and run_s < min(whole_s, land_s):
+        text = f"{states.name}: the run ended at {seconds_text(run_s)} of {seconds_text(whole_s)} s of its trajectory"
+        yield Shortfall("early", states.name, run_s + planned.start_s, text, False)
+    rows = _sampled(states, np.flatnonzero((t_s >= 0.0) & (t_s <= due_s)))
+    at_s, on = t_s[rows], planned.flown(states, rows)
+    refusals = _waits(states, "trajectory", planned.start_s)
+    begin_s = 0.0
+    if whole_s is None and on.any() and not refusals:
+        begin_s = float(at_s[on][0])  # one without an end is joined in motion whenever the formation gets there
+    flown_s = float(np.diff(np.r_[at_s, due_s])[on].sum())
+    if due_s - begin_s - flown_s <= LATE_MAX_S:
+        return
+    of = f"{seconds_text(due_s)} s"
+    if not on.any():
+        text = f"nothing of the {of} of its trajectory was flown"
+    else:
+        stretches = np.split(at_s[on], np.flatnonzero(np.diff(at_s[on]) > 2 * SAMPLE_NS / 1e9) + 1)
+        longest = max(stretches, key=len)
+        span_s = (float(longest[0]), min(float(longest[-1]) + SAMPLE_NS / 1e9, due_s))
+        parted = flown_s - (span_s[1] - span_s[0]) > LATE_MAX_S
+        length = f"for {seconds_text(round(flown_s, 1))} s in all, at the longest " if parted else ""
+        text = f"its trajectory was flown {length}from {seconds_text(span_s[0])} to {seconds_text(span_s[1])} of {of}"
+    if refusals:
+        first_s, last_s, why = refusals
+        text += f"; it was refused from {span_text((first_s, last_s))}: {why}"
+    led = any(each.ok and each.op in LEADS and each.t_ns / 1e9 < planned.start_s + due_s for each in states.requests)
+    yield Shortfall("plan", states.name, planned.start_s, f"{states.name}: {text}", not led)
+
+
+def _target_reached(states: ClusterStates, planned: PlannedReference, plan: ClusterPlan) -> Iterator[Shortfall]:
+    engaged_ns = states.t_ns[states.phases.index("engaged")]
+    rows = np.flatnonzero(states.t_ns >= engaged_ns)
+    on = planned.flown(states, rows := _sampled(states, rows))
+    name, led = states.name, any(each.ok and each.op in LEADS for each in states.requests)
+    due_s = None if plan.target_over_s is None else float(engaged_ns) / 1e9 + plan.target_over_s
+    if on.any():
+        late_s = 0.0 if due_s is None else float(states.t_ns[rows[on]][0]) / 1e9 - due_s
+        if late_s > LATE_MAX_S and due_s is not None:
+            waits = _waits(states, "target", 0.0)
+            why = f"; it was refused from {span_text(waits[:2])}: {waits[2]}" if waits else ""
+            text = f"{name}: its reference was at the target {seconds_text(round(late_s, 1))} s after it was due{why}"
+            yield Shortfall("plan", name, due_s, text, not led)
+    elif states.phases[-1] in ("landing", "idle"):
+        yield Shortfall(
+            "plan", name, float(engaged_ns) / 1e9, f"{name}: it landed before it was at its target", not led
+        )
+
+
+def _sampled(states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return of these rows the first in every SAMPLE_NS."""
+    return rows[np.unique(states.t_ns[rows] // SAMPLE_NS, return_index=True)[1]]
+
+
+def _waits(states: ClusterStates, op: str, from_s: float) -> tuple[float, float, str] | None:
+    """Return from when to when [s], and why at first, a step of the plan was refused after from_s; None if never."""
+    rows = np.flatnonzero(states.t_ns / 1e9 >= from_s)
+    found = [(row, step[1]) for row in rows.tolist() if (step := waiting_step(states.reasons[row])) and step[0] == op]
+    found = [each for each in found if states.phases[each[0]] == "engaged"]
+    if not found:
+        return None
+    return float(states.t_ns[found[0][0]]) / 1e9, float(states.t_ns[found[-1][0]]) / 1e9, found[0][1]
+
+
 def _outside(states: ClusterStates, window_s: tuple[float, float]) -> Iterator[Shortfall]:
-    t_s = states.t_ns / 1e9
-    rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1]))
-    out = [row for row in rows if states.phases[row] != "engaged"]
-    if out:
-        share, phase = 1 - len(out) / len(rows), states.phases[out[0]]
-        part = f"engaged in {percent_text(share)} % of the window only ({phase} else)"
-        text = part if share else f"never engaged within the window, but {phase}"
-        yield Shortfall("window", states.name, float(t_s[out[0]]), f"{states.name}: {text}", False)
+    shares = phase_shares(states.t_ns / 1e9, states.phases, window_s)
+    others = {phase: share for phase, share in shares.items() if phase != "engaged"}
+    if others:
+        rest = ", ".join(f"{phase} {percent_text(share)} %" for phase, share in others.items())
+        part = f"engaged in {percent_text(shares.get('engaged', 0.0))} % of the window only ({rest})"
+        text = part if "engaged" in shares else f"never engaged within the window ({rest})"
+        t_s = states.t_ns / 1e9
+        rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1]))
+        first = next(row for row in rows.tolist() if states.phases[row] != "engaged")
+        yield Shortfall("window", states.name, float(t_s[first]), f"{states.name}: {text}", False)
+
+
+def phase_shares(t_s: Array, phases: list[str], window_s: tuple[float, float]) -> dict[str, float]:
+    """Return at which shares of a window's instants a formation was in each of its phases, the greatest first."""
+    rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1])).tolist()
+    return {phase: count / len(rows) for phase, count in Counter(phases[row] for row in rows).most_common()}
 
 
 def _never_engaged(states: ClusterStates, due_s: float | None, end_s: float) -> Iterator[Shortfall]:
@@ -141,5 +413,9 @@ def takeoff_s(scenario: Scenario | None, cluster: str) -> float | None:
 
 
 def _plan(scenario: Scenario | None, cluster: str) -> ClusterPlan | None:
-    clusters = scenario.clusters if scenario else ()
-    return next((each.plan for each in clusters if each.name == cluster), None)
+    found = _cluster(scenario, cluster)
+    return found.plan if found else None
+
+
+def _cluster(scenario: Scenario | None, name: str) -> Cluster | None:
+    return next((each for each in scenario.clusters if each.name == name), None) if scenario else None

@@ -3,7 +3,7 @@
 A page has everything in it, figures included; it loads nothing from the network.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -15,7 +15,7 @@ from zsim_analysis.reading.driver_links import link_text
 from zsim_analysis.reading.flight import read_flight
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.reading.window_text import span_text
+from zsim_analysis.reading.window_text import seconds_text, span_text
 from zsim_analysis.report.comparison import (
     ABSENT,
     UNPLANNED,
@@ -33,10 +33,11 @@ from zsim_analysis.report.figures.comparison_figures import comparison_figures
 from zsim_analysis.report.figures.report_figures import figures
 from zsim_analysis.report.pages import Picture, sources, template, write_page, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
-from zsim_analysis.report.summary import RunSummary, summarise
+from zsim_analysis.report.summary import EventLine, RunSummary, summarise
 from zsim_analysis.report.tables import PAPER_COLUMN, error_table
 
 STATISTICS = ("est. std", "true std", "true RMS", "true mean")
+FAULTS_MAX = 6  # at the head of a page
 NAMED, NAMES_MAX = 3, 100  # runs whose names the page's own name holds, and characters of them
 MARK, MARK_WITHIN = b": comparison</title>", 4_000  # of a page of ours, within its first bytes
 
@@ -104,6 +105,7 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Mode", summary.mode or "not known"),
         ("Ended", summary.ended),
         ("Flown as planned", _planned(summary)),
+        *(("Injected faults", text) for text in _faults(summary.events)),
         ("Record", summary.record.state),
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
         ("Deadlines missed", _misses(summary)),
@@ -116,8 +118,24 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def _planned(summary: RunSummary) -> str:
-    early = any(each.kind == "early" for each in summary.shortfalls)
-    return ("as far as the run went" if early else "yes") if summary.as_planned else "no"
+    if not summary.as_planned:
+        return "no"
+    kinds = {each.kind for each in summary.shortfalls}
+    parts = {
+        "as far as the run went": "early" in kinds,
+        "but for what others asked or flew": bool(kinds & {"hand", "request"}),
+        "but for a short hold": "held" in kinds,
+    }
+    return ", ".join(part for part, holds in parts.items() if holds) or "yes"
+
+
+def _faults(events: Sequence[EventLine]) -> Iterator[str]:
+    """Yield in one text which faults were injected, and when, if any were."""
+    begun = [event for event in events if event.kind == "fault"]
+    faults = [f"{event.text.removesuffix(' begins')} at {seconds_text(event.t_s)} s" for event in begun[:FAULTS_MAX]]
+    more = [f"{len(begun) - FAULTS_MAX} more"] if len(begun) > FAULTS_MAX else []
+    if faults:
+        yield ", ".join([*faults, *more])
 
 
 def _misses(summary: RunSummary) -> str:

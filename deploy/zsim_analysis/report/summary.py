@@ -13,7 +13,7 @@ from zsim_analysis.reading.driver_links import DriverLink, driver_links
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m
 from zsim_analysis.reading.recorded_flight import RecordedFlight, RecordedProcess
 from zsim_analysis.reading.recorded_run import command_age_ms
-from zsim_analysis.reading.shortfall import Shortfall, shortfalls
+from zsim_analysis.reading.shortfall import Shortfall, phase_shares, shortfalls
 from zsim_analysis.reading.verdict import window_of
 from zsim_analysis.reading.window_text import percent_text
 from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table_of
@@ -41,12 +41,14 @@ class ClusterErrors(Struct, frozen=True):
         errors: over the instants of the window at which it was engaged; None each where it never was.
         paper_std: Table I beside a flight of Test 1, else empty.
         engaged_share: of the window's instants, those at which it was engaged; None without any.
+        phases: shares of the window's instants by phase.
     """
 
     drones: tuple[str, ...]
     errors: dict[str, ParameterErrors]
     paper_std: dict[str, float] = {}
     engaged_share: float | None = None
+    phases: dict[str, float] = {}
 
     @property
     def part(self) -> str:
@@ -116,6 +118,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
             f.errors(window_s),
             dict(paper_table_of(flight, f, window_s) if as_planned else {}),
             f.engaged_share(window_s),
+            phase_shares(f.t_s, f.phases, window_s),
         )
         for f in formations
     }

@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv, stdtrit
 
 LEVEL = 0.95  # of all intervals of a report
+RUNS_MIN = (
+    5  # chosen: Student's interval of two runs is nine times as wide as their distance; fewer are shown as they are
+)
 
 
 class ConfidenceInterval(Struct, frozen=True):
-    """A value with the ends of its confidence interval; NaN ends where one sample shows no spread."""
+    """A value with the ends of its confidence interval; NaN ends where too few samples show no spread."""
 
     value: float
     low: float
@@ -19,13 +22,13 @@ class ConfidenceInterval(Struct, frozen=True):
 
 
 def mean_interval(samples: NDArray[np.float64], level: float = LEVEL) -> ConfidenceInterval:
-    """Return the mean of samples (n,) with Student's interval: mean ± t(n − 1) s / √n.
+    """Return the mean of samples (n,) with Student's interval: mean ± t(n − 1) s / √n; none below RUNS_MIN samples.
 
     It holds for normal samples, and for others by the central limit theorem as n grows.
     """
     n = len(samples)
     middle = float(np.mean(samples)) if n else math.nan
-    if n < 2:
+    if n < RUNS_MIN:
         return ConfidenceInterval(middle, math.nan, math.nan)
     half = float(stdtrit(n - 1, (1 + level) / 2) * np.std(samples, ddof=1) / math.sqrt(n))
     return ConfidenceInterval(middle, middle - half, middle + half)

@@ -12,12 +12,14 @@ from zsim.scenario.scenario import Scenario
 from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
 from zsim_analysis.sweep.axes import Draw, Seeds
 from zsim_analysis.sweep.design import SweepDesign
-from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
+from zsim_analysis.sweep.intervals import LEVEL, RUNS_MIN, mean_interval, share_interval
 from zsim_analysis.sweep.metrics import metric_columns, metrics_function
 from zsim_analysis.sweep.sweep_run import FIXED, Row, engaged_column
 from zsim_analysis.sweep.sweep_summary import Distribution, FormationParameter, GridPoint, SweepSummary
 
+PLANNED_ONLY = ("min_separation_m", "errors.", "clusters.")  # columns, or their beginnings, of `flown`
 STATISTICS = ("est_std", "true_std", "true_rms", "true_mean")
+_FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # in a text, but not in a name such as drone1
 _COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # start of a column: its cluster's name, and its own
 
 
@@ -48,6 +50,16 @@ class SweepResults:
         cells = [row.get(column) for row, is_chosen in zip(self.rows, chosen, strict=True) if is_chosen]
         return np.array([np.nan if cell is None else cell for cell in cells], np.float64)
 
+    def flown(self, column: str, point: int | None = None) -> NDArray[np.float64]:
+        """Return `values`, of errors and separations NaN where a run did not do what its plan says.
+
+        A flight that was not flown, or fell early, would make their means look better.
+        """
+        values = self.values(column, point)
+        if not column.startswith(PLANNED_ONLY):
+            return values
+        return np.where(self.values("as_planned", point) == 0, np.nan, values)
+
     def parameters(self) -> dict[str, FormationParameter]:
         """Return the formation parameters, by the beginning of their columns."""
         return parameters(self.errors, self.clusters)
@@ -58,9 +70,9 @@ class SweepResults:
         return int((at_point & self.well).sum()), int(at_point.sum())
 
     def without_collision(self, point: int) -> tuple[int, int]:
-        """Return how many of a point's runs that ended well had no collision, and how many there are."""
-        collisions = self.values("collisions", point)
-        return int((collisions == 0).sum()), len(collisions)
+        """Return in how many of a point's runs that ended well no drone collided or fell, and how many there are."""
+        collisions, crashed = self.values("collisions", point), self.values("crashed", point)
+        return int(((collisions == 0) & (crashed != 1)).sum()), len(collisions)
 
     def engaged(self, point: int | None = None) -> tuple[int, int]:
         """Return how many runs that ended well had every cluster engaged, and how many have a cluster."""
@@ -106,10 +118,9 @@ class SweepResults:
             finished=len(rows),
             failed=dict(Counter(row["failure"] for row in rows if row["failure"]).most_common()),
             not_engaged=of - engaged,
-            not_as_planned=dict(
-                Counter(row["shortfall"] for row in self._well() if row.get("shortfall")).most_common()
-            ),
+            not_as_planned=_counted(row["shortfall"] for row in self._well() if row.get("shortfall")),
             judged_unengaged=sum(row.get("engaged_throughout") is False for row in self._well()),
+            window_notes=_counted(row["window_note"] for row in self._well() if row.get("window_note")),
             windows_s=self.windows_s(),
             paper_std=dict(self.paper_std),
             level=LEVEL,
@@ -129,7 +140,8 @@ class SweepResults:
         well, runs = self.ended_well(point)
         engaged, of = self.engaged(point)
         columns = ("min_separation_m", *self.errors, *self.metrics)
-        spreads = {column: each for column in columns if (each := distribution(self.values(column, point)))}
+        spreads = {column: each for column in columns if (each := distribution(self.flown(column, point)))}
+        separations = self.values("min_separation_m", point)
         return GridPoint(
             label=self.label(point),
             values=self.design.at(point),
@@ -140,6 +152,7 @@ class SweepResults:
             engaged=engaged if of else None,
             as_planned=share_interval(*planned) if (planned := self.as_planned(point))[1] else None,
             spreads=spreads,
+            least_separation_m=float(np.nanmin(separations)) if np.isfinite(separations).any() else None,
         )
 
 
@@ -171,7 +184,16 @@ def distribution(samples: NDArray[np.float64]) -> Distribution | None:
         return None
     p5, median, p95 = (float(value) for value in np.percentile(known, [5, 50, 95]))
     std = float(np.std(known, ddof=1)) if len(known) > 1 else float("nan")
-    return Distribution(len(known), mean_interval(known), std, p5, median, p95, float(known.min()), float(known.max()))
+    few = tuple(known.tolist()) if len(known) < RUNS_MIN else ()
+    ends = float(known.min()), float(known.max())
+    return Distribution(len(known), mean_interval(known), std, p5, median, p95, *ends, few)
+
+
+def _counted(texts: Iterable[str]) -> dict[str, int]:
+    """Return how often each text occurs, most often first; those that differ in figures only count as the first one."""
+    first: dict[str, str] = {}
+    counts = Counter(first.setdefault(_FIGURE.sub("#", text), text) for text in texts)
+    return dict(counts.most_common())
 
 
 def _error_columns(rows: Sequence[Row]) -> list[str]:

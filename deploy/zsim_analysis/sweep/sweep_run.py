@@ -23,6 +23,7 @@ from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.shortfall import CRASHES
 from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.metrics import NO_METRICS, metrics_of
 
@@ -56,13 +57,15 @@ class RunResult(Struct, frozen=True, kw_only=True):
         failure: why it did not end well, None if it did.
         ended: the reason that the world gave.
         wall_s: wall time of the flight.
-        collisions: contacts between drones.
+        collisions: contacts between drones, and with obstacles.
+        crashed: whether a drone was stopped in the air, turned over, or hit something hard.
         engaged: whether every cluster was engaged at some instant of the judged window, None without a cluster.
         engaged_throughout: whether every cluster was engaged at every instant of it, None without a cluster.
         as_planned: whether the flight did what its plan says.
         shortfall: the first thing that it did not do.
         metrics_failure: why it has no figures of the user's own, None if it has, or none are asked for.
         window_from_s, window_to_s: the judged window.
+        window_note: why it is not that of the scenario, empty where it is.
         host: where it was flown.
         fingerprint: numeric; equal ones promise equal bits.
     """
@@ -78,6 +81,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
     real_time_factor: float | None = None
     min_separation_m: float | None = None
     collisions: int | None = None
+    crashed: bool | None = None
     engaged: bool | None = None
     engaged_throughout: bool | None = None
     as_planned: bool | None = None
@@ -85,6 +89,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
     metrics_failure: str | None = None
     window_from_s: float | None = None
     window_to_s: float | None = None
+    window_note: str | None = None
     host: str = ""
     fingerprint: str = ""
 
@@ -218,6 +223,7 @@ def _row(
         real_time_factor=summary.real_time_factor,
         min_separation_m=summary.min_separation_m,
         collisions=sum(event.kind == "collision" for event in flight.events),
+        crashed=any(each.kind in CRASHES for each in summary.shortfalls),
         engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
         engaged_throughout=all(_is_engaged_throughout(summary, name) for name in clusters) if clusters else None,
         as_planned=summary.as_planned,
@@ -225,6 +231,7 @@ def _row(
         metrics_failure=metrics.failure,
         window_from_s=summary.window_s[0],
         window_to_s=summary.window_s[1],
+        window_note=summary.window_note,
         **where,
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
@@ -241,16 +248,15 @@ def _is_engaged_throughout(summary: RunSummary, cluster: str) -> bool:
 def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, float | None]:
     """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster.
 
-    Those of a cluster that was not engaged are None, and those of one whose plan was refused: drones on the ground, and
-    drones that hover in place of a trajectory, hold no formation that was asked for.
+    Those of a cluster that was not engaged are None, and all of a flight that was not as planned: drones on the ground,
+    or that hover in place of a trajectory, hold no formation that was asked for, and one that fell errs for less long.
     """
     columns: dict[str, float | None] = {}
-    refused = {each.subject for each in summary.shortfalls if each.kind == "plan"}
     for i, (name, cluster) in enumerate(summary.clusters.items()):
         prefix = "errors" if i == 0 else f"clusters.{name}.errors"
         for parameter, errors in cluster.errors.items():
             for statistic, value in msgspec.structs.asdict(errors).items():
                 columns[f"{prefix}.{parameter}.{statistic}"] = (
-                    None if engaged[name] is None or name in refused else value
+                    value if engaged[name] is not None and summary.as_planned else None
                 )
     return columns

@@ -35,7 +35,11 @@ class FormationParameter(Struct, frozen=True):
 
 
 class Distribution(Struct, frozen=True):
-    """How a quantity is distributed over the runs of a point that ended well."""
+    """How a quantity is distributed over runs of a point.
+
+    Attributes:
+        samples: all of them where they are too few for an interval, else empty.
+    """
 
     runs: int
     mean: ConfidenceInterval
@@ -45,6 +49,7 @@ class Distribution(Struct, frozen=True):
     p95: float
     least: float
     greatest: float
+    samples: tuple[float, ...] = ()
 
 
 class GridPoint(Struct, frozen=True):
@@ -55,11 +60,13 @@ class GridPoint(Struct, frozen=True):
         names: the values in short, no two of a field alike.
         runs: finished ones.
         ended_well: share of them; None without a run.
-        without_collision: share of those that ended well.
+        without_collision: share of those that ended well in which no drone ran into another or an obstacle, or fell.
         engaged: runs that ended well and had every cluster engaged at some instant of the judged window; None where
             no run has a cluster.
         as_planned: share of those that ended well that did what their plan says.
-        spreads: by column of the table, of those that ended well.
+        spreads: by column of the table, of those that ended well; of the separation and the errors, of those among them
+            that did what their plan says.
+        least_separation_m: of all that ended well, None where no run has any.
     """
 
     label: str
@@ -71,6 +78,7 @@ class GridPoint(Struct, frozen=True):
     engaged: int | None
     as_planned: ConfidenceInterval | None
     spreads: dict[str, Distribution]
+    least_separation_m: float | None = None
 
     @property
     def well(self) -> int:
@@ -88,8 +96,10 @@ class SweepSummary(Struct, frozen=True):
 
     Attributes:
         not_engaged: runs that ended well, but a cluster was never engaged within the judged window.
-        not_as_planned: by what they did not do, how many runs ended well and did not do what their plan says.
+        not_as_planned: by what the first of them did not do, how many runs ended well and did not do what their plan
+            says; texts that differ in figures only are one.
         judged_unengaged: runs that ended well whose window holds instants at which a cluster was not engaged.
+        window_notes: by why their window is not that of the scenario, how many runs ended well.
         windows_s: the judged windows, least start and greatest end of all runs; None where no run has one.
         paper_std: Table I by parameter, empty for any flight but Test 1.
         parameters: of the formations, by the beginning of their columns.
@@ -117,6 +127,7 @@ class SweepSummary(Struct, frozen=True):
     metrics: tuple[str, ...]
     unmeasured: dict[str, int]
     points: list[GridPoint]
+    window_notes: dict[str, int] = {}
 
     def json(self) -> bytes:
         """Return the text of summary.json; what is not known is null."""

@@ -187,9 +187,14 @@ class CommandIntake:
     def _apply_mode(self, drone: str, command: QueuedCommand) -> str | None:
         fleet, source, mode = self.fleet, command.source, command.message.mode
         enter = {"takeoff": fleet.takeoff, "land": fleet.land, "emergency": fleet.emergency, "reset": fleet.reset}
+        reported = self.drivers.status(command.drone)
+        was = reported.state if reported else fleet.status(command.drone)[0]
         refusal = self._hand_on(command) if command.drone in self.drivers else enter[mode](command.drone)
         if refusal is None:
             self.outbox.notice("mode", drone, f"{source} asks {drone} to {mode}", {"mode": mode}, source)
+        if refusal is None and mode == "emergency" and was not in ("landed", "emergency"):
+            text = f"{source} stops the rotors of {drone}, which is {was}"
+            self.outbox.notice("emergency", drone, text, {"cause": "command"}, source)
         return refusal
 
     def _hand_on(self, command: QueuedCommand) -> str | None:

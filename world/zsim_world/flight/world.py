@@ -11,6 +11,7 @@ from msgspec import UNSET
 from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import TruthHash, fingerprint
+from zsim.contract.flight_messages import Status
 from zsim.contract.snapshot import State
 from zsim.contract.views import DroneView, ViewDrones
 from zsim.runtime.agent import Output
@@ -157,7 +158,11 @@ class World(Coordinator):
         return self._intake.accept(drone, kind, message)
 
     def take_of_driver(self, drone: str, message: Any) -> str | None:
-        return self.drivers.take(drone, message, self.now_ns)
+        former, refusal = self.drivers.status(self.names.index(drone)), self.drivers.take(drone, message, self.now_ns)
+        stopped = isinstance(message, Status) and message.state == "emergency"
+        if refusal is None and stopped and former and former.state not in ("landed", "emergency"):
+            self.outbox.notice("emergency", drone, f"the driver of {drone} reports an emergency", {"cause": "driver"})
+        return refusal
 
     def release_drones(self, name: str) -> None:
         self._intake.release_all(name)
@@ -195,6 +200,7 @@ class World(Coordinator):
         self.clock.advance(self.fleet.t_ns)
         self.statistics.separation(self.fleet.closest_m())
         self._publish_collisions()
+        self._publish_mishaps()
         return True
 
     def _paced(self) -> list[Participant]:
@@ -208,6 +214,11 @@ class World(Coordinator):
         for i, m in self.fleet.bumps():
             name, other = self.names[i], self.scenario.environment.obstacles[m].name
             self.outbox.notice("collision", name, f"{name} runs into {other}", {"other": other})
+
+    def _publish_mishaps(self) -> None:
+        for each in self.fleet.mishaps():
+            data = {**each.data, "commander": self.queue.commanders()[each.drone]}
+            self.outbox.notice(each.kind, self.names[each.drone], each.text, data)
 
     def _publish_gate(self, wall_ns: int) -> None:
         state = self.fleet.bodies.state

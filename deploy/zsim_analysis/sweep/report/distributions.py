@@ -44,21 +44,21 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: Gri
     if axis is None:
         dress(axes)
         axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=PAPER_PT)
-        samples = known(results.values(panel.column))
+        samples = known(results.flown(panel.column))
         count = count_text(len(samples), results.ended_well(0)[0])
         axes.text(0.98, 0.9, count, transform=axes.transAxes, ha="right", fontsize=PAPER_PT - 1, zorder=6)
         return _histogram(axes, samples, panel.printed)
     dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
     drawn = []
     for point, place in axis.places.items():
-        if len(samples := known(results.values(panel.column, point))):
+        if len(samples := known(results.flown(panel.column, point))):
             drawn.append(_draw_point(axes, samples, place, axis))
             _count_beside(axes, drawn[-1][1], count_text(len(samples), results.ended_well(point)[0]))
     if axis.field:
         _join_means(axes, drawn, axis)
     axis.dress(axes)
     axis.mark(axes, results.never_as_planned())
-    scale_to_samples(axes, known(results.values(panel.column)))
+    scale_to_samples(axes, known(results.flown(panel.column)))
     if panel.printed is not None:
         _mark_printed(axes, panel.printed, upright=False)
     return mark_beyond(axes, [interval for _, interval in drawn])

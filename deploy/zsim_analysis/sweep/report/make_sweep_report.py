@@ -10,7 +10,7 @@ from zsim.errors import ReportError
 from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
-from zsim_analysis.sweep.intervals import ConfidenceInterval
+from zsim_analysis.sweep.intervals import RUNS_MIN, ConfidenceInterval
 from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.field_names import FieldName, field_name
 from zsim_analysis.sweep.report.sweep_figures import figures
@@ -37,6 +37,7 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
         summary=summary,
         facts=facts(summary),
         notes=notes(summary),
+        runs_min=RUNS_MIN,
         overview=[*map(str, axes), *OVERVIEW],
         points=[(*values_of(point), *overview(point)) for point in points],
         parameters=list(names),
@@ -109,7 +110,7 @@ def marks_of(summary: SweepSummary) -> list[str]:
             f"{summary.judged_unengaged} {runs} were judged while a cluster was not engaged "
             f"(window {windows_of(summary)}); give a window after the engagement, report.window_s"
         )
-    return lines
+    return lines + [f"{count} {runs}: {text}" for text, count in summary.window_notes.items()]
 
 
 def notes(summary: SweepSummary) -> list[str]:
@@ -150,7 +151,7 @@ def _missing(what: str, columns: Mapping[str, str], known: Container[str]) -> st
 def overview(point: GridPoint) -> list[str]:
     """Return one row of the table of all points, without its label."""
     separation = point.spreads.get("min_separation_m")
-    least = "–" if separation is None else f"{separation.least:.2f}"
+    least = "–" if point.least_separation_m is None else f"{point.least_separation_m:.2f}"
     engaged = "–" if point.engaged is None else str(point.engaged)
     well, planned, apart = map(_share, (point.ended_well, point.as_planned, point.without_collision))
     mean = _noted(_spread(separation), point.count("min_separation_m"))
@@ -166,7 +167,7 @@ def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: d
         printed = paper_std.get(parameter.name)
         paper = ["" if printed is None else f"{printed:g}"] if paper_std else []
         rms = point.spreads.get(f"{prefix}.true_rms")
-        span = "–" if rms is None else f"{rms.p5:.4f} to {rms.p95:.4f}"
+        span = "–" if rms is None or rms.samples else f"{rms.p5:.4f} to {rms.p95:.4f}"
         means = [_mean(point, f"{prefix}.{each}") for each in ("est_std", "true_std", "true_rms", "true_mean")]
         rows.append([parameter.titled, *paper, *means, span])
     return rows
@@ -181,9 +182,11 @@ def _noted(text: str, count: str) -> str:
 
 
 def _spread(samples: Distribution | None, digits: int = 2) -> str:
-    """Return a mean with half the width of its interval."""
+    """Return a mean with half the width of its interval, and the runs themselves where they are too few for one."""
     if samples is None:
         return "–"
+    if samples.samples:
+        return ", ".join(f"{each:.{digits}f}" for each in samples.samples)
     half = samples.mean.high - samples.mean.value
     return f"{samples.mean.value:.{digits}f}" + (f" ± {half:.{digits}f}" if np.isfinite(half) else "")
 

@@ -23,7 +23,7 @@ from zsim_analysis.report.pages import (
     legend_above,
     new_figure,
 )
-from zsim_analysis.sweep.intervals import LEVEL, mean_interval, share_interval
+from zsim_analysis.sweep.intervals import LEVEL, RUNS_MIN, mean_interval, share_interval
 from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.distributions import PAPER, Panel, Samples, draw_distribution, known
 from zsim_analysis.sweep.report.field_names import field_name
@@ -46,7 +46,7 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
     """Yield the figures that the runs have data for, with a panel for each quantity that they have."""
     parameters = dict(list(results.parameters().items())[:PANELS_MAX])
     rms, std, own = (
-        [panel for panel in panels if len(known(results.values(panel.column)))]
+        [panel for panel in panels if len(known(results.flown(panel.column)))]
         for panels in (rms_panels(parameters), std_panels(parameters, results.paper_std), metric_panels(results))
     )
     if rms:
@@ -135,7 +135,8 @@ def mean_label(results: SweepResults) -> str:
     counts = {results.ended_well(point)[0] for point in range(results.design.points)} - {0}
     many = " to ".join(f"{count}" for count in sorted({min(counts), max(counts)})) if counts else "no"
     what = "runs" if results.drawn or not results.has_seeds else "seeds"
-    return f"mean and {100 * LEVEL:g} % interval of {many} {what[:-1] if counts == {1} else what}"
+    shown = f"mean and {100 * LEVEL:g} % interval" if max(counts, default=0) >= RUNS_MIN else "mean"
+    return f"{shown} of {many} {what[:-1] if counts == {1} else what}"
 
 
 def _panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
@@ -155,16 +156,22 @@ def _panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
 
 
 def _name(
-    figure: Figure, axes: Axes, results: SweepResults, axis: GridAxis | None, beyond: bool, paper: bool = False
+    figure: Figure,
+    axes: Axes,
+    results: SweepResults,
+    axis: GridAxis | None,
+    beyond: bool,
+    paper: bool = False,
+    means: bool = True,
 ) -> None:
     """Put the legend above a figure: what a dot, a mean, a box, a mark and a colour are."""
     mean = VERMILION if not axis or len(axis.series) == 1 else GREY
-    if axis:
+    if axis and means:
         axes.plot([], [], ".", color=BLUE if len(axis.series) == 1 else GREY, ms=7, alpha=0.6, label=ONE_RUN)
         if not axis.field:
             axes.plot([], [], "s", color="#0072b226", mec=BLUE, ms=8, label="quartiles and median")
         axes.errorbar([], [], yerr=[], fmt="o", ms=4, lw=1.4, capsize=3, color=mean, label=mean_label(results))
-    else:
+    elif means:
         axes.plot([], [], "s", color="#d55e0066", ms=8, label=mean_label(results))
     if beyond:
         axes.plot([], [], "^", color=mean, ms=7, mec="white", mew=0.6, label=BEYOND_AXIS)
@@ -184,12 +191,12 @@ def _name(
 def _safety(results: SweepResults) -> Figure:
     axis = GridAxis(results.design) if results.design.points > 1 else None
     panel = Panel("min_separation_m", "least separation (m)")
-    panels = [panel] if len(known(results.values(panel.column))) else []
+    panels = [panel] if len(known(results.flown(panel.column))) else []
     figure = new_figure(PAGE_IN if panels else COLUMN_IN, 3.0)
     shares, *others = figure.subplots(1, 1 + len(panels), squeeze=False).ravel()
     _shares(shares, results, axis)
     beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(others, panels, strict=True)]
-    _name(figure, shares, results, axis, any(beyond))
+    _name(figure, shares, results, axis, any(beyond), means=bool(panels))
     return figure
 
 
@@ -230,7 +237,7 @@ def _scatter(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figur
     for axes, panel in zip(grid, panels, strict=False):
         dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
         axes.set_xlabel(wrapped(str(field_name(path)), LEVEL_LETTERS), fontsize=PAPER_PT)
-        y = results.values(panel.column)
+        y = results.flown(panel.column)
         axes.plot(x, y, ".", color=BLUE, ms=4, alpha=0.45, mew=0, zorder=2)
         intervals = [DrawnInterval(middle, mean_interval(samples)) for middle, samples in slices(x, y)]
         for each in intervals:

@@ -91,7 +91,8 @@ def overview(summary: SweepSummary) -> PointTable:
         _column(summary, "separation (m)", lambda point: _mean(point, "min_separation_m", 2)),
         _column(summary, "least (m)", _least),
     )
-    caption = f"separation: mean of the runs; {100 * summary.level:g} % intervals are in the report\n"
+    intervals = f"{100 * summary.level:g} % intervals are in the report"
+    caption = f"separation: mean of the runs as planned, least of all; {intervals}\n"
     return PointTable(title, caption, columns)
 
 
@@ -151,8 +152,7 @@ def _count(point: GridPoint, column: str) -> str:
 
 
 def _least(point: GridPoint) -> str:
-    separation = point.spreads.get("min_separation_m")
-    return "–" if separation is None else f"{separation.least:.2f}"
+    return "–" if point.least_separation_m is None else f"{point.least_separation_m:.2f}"
 
 
 def _axis_columns(summary: SweepSummary) -> list[TerminalColumn]:

@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 import synthetic_record
 import typer
+from refused import has_terms
 from rich.console import Console
 from synthetic_record import Flown
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState
-from zsim.contract.run_messages import Clock, Event
+from zsim.contract.run_messages import Clock, ClusterRequest, Event
 from zsim.record import RecordWriter
+from zsim_agents.formation.flight_data import HELD_ON_REQUEST
 from zsim_agents.formation.flight_plan import WAITS, waiting_step
+from zsim_agents.formation.spaces.scenario_space import cluster_space
+from zsim_agents.formation.trajectory import WaypointTrajectory
 from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
@@ -186,6 +190,176 @@ def test_a_collision_is_one() -> None:
     assert (line.kind, line.t_s, line.fails) == ("collision", 7.0, True)
 
 
+def event(t_s: float, what: str, subject: str, by: str = "world", /, **data: Any) -> Event:
+    return Event(round(t_s * 1e9), round(1000 * t_s), what, by, subject, what, data)
+
+
+def numbered(*events: Event) -> tuple[Event, ...]:
+    """Return events as a record has them that lacks none."""
+    return tuple(msgspec.structs.replace(each, seq=seq) for seq, each in enumerate(events))
+
+
+FALL = numbered(
+    event(10.0, "fault", "drone1", id=1, kind="rotor_efficiency", target="drone1", source="scenario"),
+    event(10.3, "emergency", "drone1", cause="tilt", commander="controller.main"),
+    event(10.36, "flip", "drone1", commander="controller.main"),
+    event(11.86, "impact", "drone1", speed_m_s=10.547, other="the ground", commander="controller.main"),
+)
+
+
+def test_a_fall_is_one_line_with_the_drone_the_times_and_the_fault() -> None:
+    (line,) = found(lambda t_s: {"phase": "engaged"}, events=FALL)
+    assert (line.kind, line.subject, line.t_s, line.fails) == ("emergency", "drone1", 10.3, True)
+    assert has_terms(line.text, "10.3 s", "10.36 s", "10.5 m/s", "11.86 s", "scenario's", "rotor_efficiency since 10 s")
+
+
+def test_a_fault_that_is_over_is_not_blamed() -> None:
+    over = event(10.2, "fault_end", "drone1", id=1, kind="rotor_efficiency", target="drone1")
+    (line,) = found(lambda t_s: {"phase": "engaged"}, events=(FALL[0], over, *FALL[1:]))
+    assert "rotor_efficiency" not in line.text
+
+
+def test_an_operator_s_emergency_is_told_as_such_and_is_no_flight_as_planned(tmp_path: Path) -> None:
+    stop = event(21.0, "emergency", "drone2", "console.1", cause="command")
+    write(tmp_path / "run.mcap", lambda t_s: {"phase": "engaged"}, numbered(stop))
+    summary = judge(tmp_path / "run.mcap")[-1]
+    (line,) = summary.shortfalls
+    assert (line.kind, line.subject, line.fails) == ("emergency", "drone2", True)
+    assert has_terms(line.text, "drone2", "operator's", "emergency", "21 s", "console.1")
+    assert dict(facts(summary))["Flown as planned"] == "no"
+
+
+@pytest.mark.parametrize(
+    ("commander", "cause", "fails"),
+    [("controller.main", "silence", True), ("console.1", "silence", False), ("console.1", "battery", True)],
+)
+def test_a_landing_that_nobody_asked_for_fails_unless_its_pilot_let_it_be(
+    commander: str, cause: str, fails: bool
+) -> None:
+    landing = event(12.0, "landing", "drone3", cause=cause, commander=commander)
+    (line,) = found(lambda t_s: {"phase": "engaged"}, events=(landing,))
+    assert (line.kind, line.subject, line.t_s, line.fails) == ("landing", "drone3", 12.0, fails)
+
+
+def test_who_flew_a_drone_by_hand_is_told_and_does_not_fail() -> None:
+    hand = (event(8, "commander", "drone2", "console.1"), event(9.5, "release", "drone2", "console.1"))
+    (line,) = found(lambda t_s: {"phase": "engaged"}, events=hand)
+    assert (line.kind, line.subject, line.fails) == ("hand", "drone2", False)
+    assert has_terms(line.text, "console.1", "8 to 9.5 s")
+
+
+@pytest.mark.parametrize(("length_s", "fails"), [(1.0, False), (6.0, True)])
+def test_a_formation_that_a_fault_held_is_told_and_fails_if_it_was_for_long(length_s: float, fails: bool) -> None:
+    def held(t_s: float) -> dict[str, Any]:
+        return {"phase": "held", "reason": "drone2 is late"} if 9.99 < t_s < 9.99 + length_s else {"phase": "engaged"}
+
+    line = next(line for line in found(held) if line.kind == "held")
+    assert (line.subject, line.t_s, line.fails) == ("main", pytest.approx(10.0), fails)
+    assert has_terms(line.text, f"for {length_s:g} s", "drone2 is late")
+
+
+def test_what_others_asked_of_a_formation_is_told_and_a_hold_on_request_is_no_fault() -> None:
+    def state(t_s: float) -> dict[str, Any]:
+        return {"phase": "held", "reason": HELD_ON_REQUEST} if t_s > 20 else {"phase": "engaged"}
+
+    asked = ClusterRequest(20_000_000_000, 0, "hold", {}, "console.1", True)
+    refused_one = msgspec.structs.replace(asked, op="land", ok=False)
+    flight = flight_of(state)
+    flight.clusters[0].requests += [asked, refused_one]
+    kinds = {line.kind: line for line in shortfalls(flight, (4.0, 30.0))}
+    assert kinds.keys() == {"request", "window"}
+    assert has_terms(kinds["request"].text, "hold at 20 s", "console.1")
+    assert not any(line.fails for line in kinds.values())
+
+
+WAY = [{"at_s": 0, "values": {"x_c": 5}}, {"at_s": 5, "values": {"x_c": 8}}, {"at_s": 10, "values": {"x_c": 5}}]
+TRAJECTORY = (
+    *SOON,
+    f"clusters.main.plan.trajectory={{start_s: 10, waypoints: {msgspec.json.encode(WAY).decode()}}}",
+)
+
+
+def test_a_trajectory_that_was_interrupted_is_told_with_all_that_was_flown() -> None:
+    led = along(10.0)
+
+    def broken(t_s: float) -> dict[str, Any]:
+        return {**led(t_s), **({"phase": "held"} if 13 < t_s < 16 else {})}
+
+    line = next(line for line in found(broken, overrides=TRAJECTORY) if line.kind == "plan")
+    assert has_terms(line.text, "for 7.1 s in all", "from 6 to 10 of 10 s")
+
+
+def along(from_s: float, to_s: float = 30.0) -> State:
+    """Return the states of a formation that is led along `WAY` in this time, and is refused that before."""
+    space = cluster_space(3)
+    at_target = np.array([5, -5, 15, 0, 0, np.pi / 2, 0, 0, 0, 4, 4, np.pi / 4])
+    way = WaypointTrajectory(space, WAY, at_target)
+
+    def state(t_s: float) -> dict[str, Any]:
+        led = from_s <= t_s <= to_s
+        reason = "" if led or t_s < 10 or t_s > to_s else f"trajectory{WAITS}a robot moves at 2.88 of its limits"
+        return {"phase": "engaged", "desired": tuple(way.value(t_s - 10.0)[0] if led else at_target), "reason": reason}
+
+    return state
+
+
+def test_a_trajectory_of_which_only_the_end_was_flown_is_one() -> None:
+    (line,) = found(along(19.5), overrides=TRAJECTORY)
+    assert (line.kind, line.subject, line.t_s, line.fails) == ("plan", "main", 10.0, True)
+    assert has_terms(line.text, "from 9.5 to 10 of 10 s", "refused from 10 to 19.48 s", "2.88")
+
+
+def test_a_trajectory_that_was_flown_and_one_that_was_joined_at_once_are_none() -> None:
+    assert found(along(10.0), overrides=TRAJECTORY) == []
+    assert found(along(10.5), overrides=TRAJECTORY) == []
+
+
+def test_a_trajectory_that_was_left_is_one_unless_others_asked_for_it() -> None:
+    flight = flight_of(along(10.0, 14.0), overrides=TRAJECTORY)
+    (line,) = shortfalls(flight, (4.0, 30.0))
+    assert (line.kind, line.fails) == ("plan", True)
+    assert has_terms(line.text, "from 0 to 4.1 of 10 s")
+    flight.clusters[0].requests.append(ClusterRequest(14_000_000_000, 0, "hold", {}, "console.1", True))
+    assert {line.kind: line.fails for line in shortfalls(flight, (4.0, 30.0))} == {"plan": False, "request": False}
+
+
+def test_a_run_that_ends_within_its_trajectory_is_told() -> None:
+    (line,) = found(along(10.0), overrides=TRAJECTORY, duration_s=14.0)
+    assert (line.kind, line.fails) == ("early", False)
+    assert "4 of 10 s" in line.text
+
+
+def test_a_target_that_was_due_earlier_is_one() -> None:
+    overrides = (*SOON, "clusters.main.plan.target_over_s=4")
+
+    def late(t_s: float) -> dict[str, Any]:
+        return {"phase": "engaged", "reason": f"target{WAITS}over_s is 4 s" if t_s < 9 else ""}
+
+    assert found(late, overrides=overrides, climb_s=3.9) == []
+    (line,) = found(late, overrides=overrides, climb_s=20.0)
+    assert (line.kind, line.t_s, line.fails) == ("plan", 4.0, True)
+    assert has_terms(line.text, "16 s after", "over_s is 4 s")
+
+
+def test_the_phases_outside_the_engagement_have_their_shares() -> None:
+    phases = ((6.6, "taking_off"), (9.2, "assembling"), (17.0, "engaged"), (30.0, "held"))
+    line = next(
+        line
+        for line in found(lambda t_s: {"phase": next(phase for end, phase in phases if t_s <= end)})
+        if line.kind == "window"
+    )
+    assert has_terms(line.text, "engaged in 30 %", "held 50 %", "taking_off 10.1 %", "assembling 9.99 %")
+
+
+def test_a_record_without_events_of_falls_shows_that_a_drone_ended_in_an_emergency() -> None:
+    flight = flight_of(lambda t_s: {"phase": "engaged"})
+    flight.tracks[1].states[-1] = "emergency"
+    (line,) = shortfalls(flight, (4.0, 30.0))
+    assert (line.kind, line.subject, line.fails) == ("emergency", "drone2", True)
+    flight.events.append(event(29.0, "mode", "drone2", "console.1", mode="emergency"))
+    assert shortfalls(flight, (4.0, 30.0)) == []  # stopped on the ground: in the air there would be an event of it
+
+
 def test_the_step_is_read_from_the_reason() -> None:
     assert waiting_step(f"trajectory{WAITS}a: b; c") == ("trajectory", "a: b; c")
     held = f"held on request; target{WAITS}no"
@@ -220,6 +394,7 @@ CASES: dict[str, tuple[State, tuple[Event, ...], int]] = {
         (Event(7 * 10**9, 0, "collision", "world", "drone1", "drone1 and drone2 collide"),),
         1,
     ),
+    "a fall": (lambda t_s: {"phase": "engaged"}, FALL, 1),
     "judged while not engaged": (lambda t_s: {"phase": "engaged" if t_s > 9 else "assembling"}, (), 0),
     "as planned": (lambda t_s: {"phase": "engaged"}, (), 0),
 }

@@ -217,15 +217,54 @@ def beyond(axes: Axes) -> list[tuple[str, float]]:
     return [(str(line.get_marker()), float(np.asarray(line.get_ydata())[0])) for line in marks]
 
 
+@pytest.mark.usefixtures("unrendered")
+def test_a_mean_does_not_profit_from_runs_that_fell_or_were_not_flown(tmp_path: Path) -> None:
+    """Four of ten runs fall in the same way, at other times: they err by less and keep farther apart."""
+    of = plan("seed", runs=10)
+    rows = [
+        {**well(of, run), "errors.x_c.true_rms": 0.2, "min_separation_m": 3.0, "as_planned": True} for run in range(6)
+    ]
+    fall = {"as_planned": False, "crashed": True, "errors.x_c.true_rms": 0.1, "min_separation_m": 9.0}
+    cut = {"window_note": "The run ended at 60 s, before the window 120 to 320 s."}
+    for run in range(6, 10):
+        text = f"drone1: emergency at {20 + run}.5 s (tilted too far)"
+        rows.append({**well(of, run), **fall, **cut, "shortfall": text})
+    rows[6]["min_separation_m"] = 1.0
+    page = report_of(tmp_path, of, rows)
+    summary = SweepResults(SweepDesign(of), rows).summary()
+    (point,) = summary.points
+    assert point.spreads["errors.x_c.true_rms"].mean.value == pytest.approx(0.2)
+    assert point.spreads["min_separation_m"].mean.value == pytest.approx(3.0)
+    assert point.count("errors.x_c.true_rms") == "n = 6"
+    assert point.least_separation_m == 1.0
+    assert point.without_collision is not None
+    assert point.without_collision.value == pytest.approx(0.6)
+    assert list(summary.not_as_planned.values()) == [4]  # in one line, whatever the time
+    assert "26.5 s" in page
+    assert summary.window_notes == {cut["window_note"]: 4}
+    assert cut["window_note"] in page
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_two_runs_are_shown_as_they_are(tmp_path: Path) -> None:
+    of = plan("seed", runs=2)
+    rows = [{**well(of, run), "errors.x_c.true_rms": value} for run, value in enumerate((0.044, 0.19))]
+    page = report_of(tmp_path, of, rows)
+    assert "0.0440, 0.1900" in page
+    assert "± 0.9" not in page
+
+
 def test_numbers_stand_at_their_value_under_their_full_name() -> None:
-    figure = drawn(plan("seed", "sensors.gps.position_m.noise=0,1,4", runs=6), "true_rms.png")
+    figure = drawn(plan("seed", "sensors.gps.position_m.noise=0,1,4", runs=15), "true_rms.png")
     axes = figure.axes[0]
     assert axes.get_xlabel() == "GPS position noise (m)"
     assert has_terms(axes.get_ylabel().replace("\n", " "), "RMS", "$x_c$", "truth", "m")
     assert axes.get_xticks().tolist() == [0.0, 1.0, 4.0]
     low, high = axes.get_xlim()
     assert low < 0 < 4 < high < 5
-    assert any(has_terms(text, "mean", "95 %", "2 seeds") for text in named(figure))
+    assert any(has_terms(text, "mean", "95 %", "5 seeds") for text in named(figure))
+    few = named(drawn(plan("seed", "sensors.gps.position_m.noise=0,1,4", runs=6), "true_rms.png"))
+    assert any(has_terms(text, "mean", "2 seeds") and "95 %" not in text for text in few)
 
 
 def test_values_over_decades_have_a_logarithmic_axis() -> None:
@@ -244,8 +283,10 @@ def test_combinations_of_other_fields_have_a_colour_each_and_words_stand_side_by
 
 
 def test_an_interval_that_leaves_its_axis_is_marked_there_and_named() -> None:
-    """Two runs give an interval some ten times as wide as their spread."""
-    figure = drawn(plan("seed", "duration_s=1,2", runs=4), "true_rms.png")
+    """Five runs, all but one of them alike, give an interval that is wider than their spread."""
+    of = plan("seed", "duration_s=1,2", runs=10)
+    rows = [{**well(of, run), "errors.x_c.true_rms": 0.2 if run > 7 else 0.1} for run in range(of.runs)]
+    figure = next(each.drawing for each in figures(SweepResults(SweepDesign(of), rows)) if each.name == "true_rms.png")
     axes = figure.axes[0]
     low, high = axes.get_ylim()
     ends = {"v": low, "^": high}
@@ -323,7 +364,8 @@ def test_points_without_a_flight_as_planned_are_marked_and_their_share_is_drawn(
 def test_figures_of_a_sweep_without_a_flight_as_planned_say_so() -> None:
     one = plan("seed", runs=4)
     assert drawn(one, "safety.png", as_planned=False).get_suptitle() == NEVER_AS_PLANNED
-    assert drawn(one, "true_rms.png", as_planned=False).get_suptitle() == NEVER_AS_PLANNED
+    rows = [{**well(one, run), "as_planned": False} for run in range(one.runs)]
+    assert [each.name for each in figures(SweepResults(SweepDesign(one), rows))] == ["safety.png"]  # no errors count
     assert drawn(one, "safety.png", as_planned=True).get_suptitle() == ""
     assert drawn(one, "safety.png").get_suptitle() == ""  # nothing to judge
 

@@ -9,12 +9,12 @@ from sweep_rows import made, plan, well
 
 from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign
-from zsim_analysis.sweep.intervals import mean_interval, share_interval
+from zsim_analysis.sweep.intervals import RUNS_MIN, mean_interval, share_interval
 from zsim_analysis.sweep.points import SweepResults, distribution, parameters
 from zsim_analysis.sweep.sweep_summary import FormationParameter
 
 
-@pytest.mark.parametrize("n", [2, 3, 10, 200])
+@pytest.mark.parametrize("n", [RUNS_MIN, 10, 200])
 @pytest.mark.parametrize("level", [0.9, 0.95, 0.99])
 def test_the_interval_of_a_mean_is_student_s(n: int, level: float) -> None:
     samples = stream(n, "samples").normal(3.0, 2.0, n)
@@ -24,8 +24,10 @@ def test_the_interval_of_a_mean_is_student_s(n: int, level: float) -> None:
     assert found.value == samples.mean()
 
 
-def test_one_sample_has_a_mean_and_no_interval() -> None:
-    found = mean_interval(np.array([4.0]))
+@pytest.mark.parametrize("n", range(1, RUNS_MIN))
+def test_few_samples_have_a_mean_and_no_interval(n: int) -> None:
+    """Two runs, 0.044 and 0.190 m, would give 0.117 ± 0.935 m."""
+    found = mean_interval(np.full(n, 4.0))
     assert found.value == 4.0
     assert math.isnan(found.low)
     assert math.isnan(found.high)
@@ -56,6 +58,10 @@ def test_a_spread() -> None:
     assert found is not None
     assert (found.runs, found.median, found.least, found.greatest) == (4, 2.5, 1.0, 4.0)
     assert found.std == pytest.approx(math.sqrt(5 / 3))
+    assert found.samples == (1.0, 2.0, 3.0, 4.0)
+    many = distribution(np.arange(RUNS_MIN, dtype=float))
+    assert many is not None
+    assert many.samples == ()
     assert distribution(np.array([np.nan])) is None
 
 

@@ -82,6 +82,23 @@ def test_a_cluster_that_was_never_engaged_has_no_errors() -> None:
     assert set(grounded.values()) == {None}
 
 
+def test_a_run_in_which_a_drone_falls_is_not_as_planned_and_has_no_errors() -> None:
+    """A rotor is lost in formation: the drone turns over, its firmware stops it, and it hits the ground."""
+    fault = "faults: [{kind: rotor_efficiency, target: drone1, at_s: 8, rotor: front_left, value: 0}]\n"
+    row = fly(task(PAIR.replace("duration_s: 6", "duration_s: 13") + fault))
+    assert (row["failure"], row["collisions"], row["crashed"], row["as_planned"]) == (None, 0, True, False)
+    assert has_terms(row["shortfall"], "drone1", "emergency", "8…", "upside", "ground", "rotor_efficiency since 8 s")
+    assert {value for name, value in row.items() if name.startswith("errors.")} == {None}
+
+
+def test_a_run_whose_plan_nobody_can_fly_is_a_row_with_the_factor_that_fits() -> None:
+    way = "[{at_s: 0, values: {x_c: 0}}, {at_s: 10, values: {x_c: 30}}, {at_s: 20, values: {x_c: 0}}]"
+    plan = f"{{takeoff_s: 0.2, trajectory: {{start_s: 9, waypoints: {way}}}}}"
+    row = fly(task(PAIR.replace("{takeoff_s: 0.2}", plan)))
+    assert has_terms(row["failure"], "clusters[0].plan.trajectory", "3.00", "0.8", "3.75")
+    assert row["as_planned"] is None
+
+
 def test_a_run_without_a_cluster_has_none_engaged() -> None:
     row = fly(task())
     assert (row["failure"], row["engaged"]) == (None, None)

@@ -222,3 +222,10 @@ def test_its_estimator_may_wait_for_the_driver_as_long_as_it_takes(world: World)
         world.handle(keys.process(name, "join"), Join(0, 0, "run1", 1, "estimator", "h", 1, GATE_NS), 0)
     waits = {name: world.must_wait_for(p) for name, p in world.barrier.participants.items()}
     assert (waits["estimator.d1"], waits["estimator.d2"]) == (False, True)
+
+
+def test_an_emergency_that_a_driver_reports_in_flight_is_an_event_once(world: World):
+    for state in ("emergency", "emergency", "landed", "emergency"):
+        assert world.take_of_driver("d2", status(world.now_ns, state)) is None
+    (event,) = [m for _, m in world.take_outbox() if isinstance(m, Event) and m.kind == "emergency"]
+    assert (event.subject, event.data) == ("d2", {"cause": "driver"})

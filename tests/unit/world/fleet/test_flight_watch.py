@@ -1,0 +1,110 @@
+"""What befalls drones becomes an event with its figures; a flight as usual, with a landing, has none."""
+
+from typing import Any, Literal
+
+import pytest
+
+from zsim.contract import flight_messages, keys
+from zsim.contract.run_messages import Event
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.flight.world import World
+from zsim_world.state.fleet_arrays import STATE
+
+
+def scenario(count: int = 2, drone: Any = None, **top: Any):
+    drones = [{"name": f"d{k}", "position_m": [3.0 * k, 0, 0], **(drone or {})} for k in range(count)]
+    return resolve({"name": "t", "duration_s": 60, "drones": drones, "sensors": {"preset": "paper"}, **top})
+
+
+def befallen(fleet: Fleet, seconds: float) -> list[tuple[str, int, dict[str, Any]]]:
+    """Advance; return kind, drone and data of all that befell drones."""
+    found = []
+    for _ in range(round(seconds * 50)):
+        fleet.advance()
+        found += [(each.kind, each.drone, each.data) for each in fleet.mishaps()]
+    return found
+
+
+def airborne(drone: Any = None) -> Fleet:
+    """Return two drones that hover."""
+    fleet = Fleet(scenario(drone=drone))
+    for i in range(fleet.count):
+        assert fleet.takeoff(i) is None
+    assert befallen(fleet, 6.0) == []
+    return fleet
+
+
+def test_a_flight_with_a_landing_that_was_asked_for_has_none():
+    fleet = airborne()
+    for i in range(fleet.count):
+        assert fleet.land(i) is None
+    assert befallen(fleet, 8.0) == []
+    assert fleet.status(0)[0] == "landed"
+
+
+def test_a_fall_is_an_impact_at_the_speed_before_it_and_its_bounces_are_none():
+    fleet = airborne()
+    fleet.emergency(1)
+    fastest, found = 0.0, []
+    for _ in range(50):
+        fastest = max(fastest, float(-fleet.truth().velocity_m_s[1, 2]))
+        fleet.advance()
+        found += [(each.kind, each.drone, each.data) for each in fleet.mishaps()]
+    ((kind, drone, data),) = found
+    assert (kind, drone, data["other"]) == ("impact", 1, "the ground")
+    assert data["speed_m_s"] == pytest.approx(fastest, rel=0.1)
+
+
+def test_a_drone_that_is_turned_over_flips_once_and_its_firmware_stops_it():
+    fleet = airborne()
+    fleet.bodies.state[0, STATE.w_WB_B] = 20.0  # rad/s, about its x axis
+    found = befallen(fleet, 0.5)
+    assert {"flip", "emergency"} <= {kind for kind, _, _ in found}
+    assert {drone for _, drone, _ in found} == {0}
+    (emergency,) = [data for kind, _, data in found if kind == "emergency"]
+    assert emergency["cause"] == "tilt"
+
+
+def test_an_empty_battery_and_the_landing_before_it_are_told():
+    fleet = airborne()
+    fleet.bodies.energy[0] = 1.0  # J, which lasts for a few gates
+    found = befallen(fleet, 0.2)
+    assert ("landing", 0) in [(kind, drone) for kind, drone, _ in found]
+    (data,) = [data for kind, _, data in found if kind == "landing"]
+    assert data["cause"] == "battery"
+    assert [(kind, drone) for kind, drone, _ in found if kind == "battery"] == [("battery", 0)]
+
+
+def test_a_drone_whose_commander_falls_silent_lands_and_says_why():
+    fleet = airborne()
+    fleet.set_velocity(1, (0.0, 0.0, 0.0))
+    ((kind, drone, data),) = befallen(fleet, 3.0)
+    assert (kind, drone, data["cause"]) == ("landing", 1, "silence")
+
+
+def test_the_watch_goes_on_from_its_snapshot():
+    fleet, other = airborne(), Fleet(scenario())
+    fleet.emergency(0)
+    other.restore(fleet.snapshot())
+    assert befallen(other, 1.0) == befallen(fleet, 1.0) != []
+
+
+def ask(world: World, drone: str, mode: Literal["takeoff", "emergency"]) -> None:
+    command = flight_messages.Mode(world.now_ns, world.now_ns, "console.1", mode)
+    world.handle(keys.command(drone, "mode"), command, 0)
+
+
+def test_an_operator_s_emergency_in_the_air_is_an_event_with_its_source():
+    world = World(scenario(processes={"expect": []}))
+    events: list[Event] = []
+    for k in range(150):
+        world.advance(0)
+        if k == 1:  # d1 still stands on the ground
+            ask(world, "d1", "emergency")
+            ask(world, "d0", "takeoff")
+        elif k == 100:
+            ask(world, "d0", "emergency")
+        events += [m for _, m in world.outbox.take() if isinstance(m, Event) and m.kind == "emergency"]
+    (event,) = events
+    assert (event.subject, event.source, event.data) == ("d0", "console.1", {"cause": "command"})
