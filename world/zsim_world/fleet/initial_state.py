@@ -11,8 +11,8 @@ from zsim.scenario.scenario import Drone, Scenario
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics import rigid_body
 from zsim_world.physics.air import WIND
-from zsim_world.physics.contacts import obstacle_rows
 from zsim_world.physics.ground import contact_points
+from zsim_world.physics.obstacle_contact import BALLS, SLOTS_MAX, obstacle_rows
 from zsim_world.physics.simd import body_blocks
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
@@ -56,7 +56,7 @@ def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensor
 
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:
     drones, n, obstacles = scenario.drones, len(scenario.drones), obstacle_rows(scenario.environment)
-    each = rotors.shape[1] // ROTOR.size
+    each, slots = rotors.shape[1] // ROTOR.size, min(len(obstacles), SLOTS_MAX)
     state = np.array([_standing(drone, own, each) for drone, own in zip(drones, row, strict=True)])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
     half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
@@ -77,6 +77,10 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         obstacle=obstacles,
         bumping=np.zeros((n, len(obstacles)), dtype=np.int8),
         bumped=np.zeros((n, len(obstacles)), dtype=np.int8),
+        solid=np.full((n, slots), -1, dtype=np.int32),
+        held=np.zeros((n, slots, BALLS, 3)),
+        braced=np.zeros(n, dtype=np.int8),
+        twist=np.zeros((n, 3)),
         lanes=body_blocks(row, rotors, np.array([[half_decay(lag, dt)] for lag in row[:, VEHICLE.rotor_lag]])),
         external=external,
         pose=state[external],

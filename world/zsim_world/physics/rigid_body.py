@@ -8,6 +8,7 @@ from zsim.math import rotation as rot
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, add, axpy
 from zsim_world.physics.ground import contact
+from zsim_world.physics.obstacle_contact import Touch, touched
 from zsim_world.physics.rotors import lagged, wrench
 from zsim_world.state.fleet_arrays import STATE, VEHICLE, PerRotor, Row, of, put_of
 
@@ -59,6 +60,7 @@ def accelerations(
     decay: float | None,
     air_W: Vector,
     push_W: Vector,
+    touch: Touch | None = None,
 ) -> tuple[Vector, Vector]:
     """Return a_WB in W [m/s^2] and the angular acceleration in B [rad/s^2].
 
@@ -71,10 +73,14 @@ def accelerations(
         row, rotors: parameters; anchor: of its contact points (ground.py).
         p_WB, v_WB, q_WB, w_WB_B: state; speeds, commands, decay: of the rotors, as for `rotors.wrench`.
         air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
+        touch: what it touches besides, None: nothing.
     """
     ground = NOTHING, NOTHING
     if grounded:
         ground = contact(row, anchor, p_WB, v_WB, q_WB, w_WB_B)
+    if touch is not None:
+        others = touched(row, touch, p_WB, v_WB, q_WB, w_WB_B)
+        ground = add(ground[0], others[0]), add(ground[1], others[1])
     ix, iy, iz = vector(row, VEHICLE.inertia)
     thrust, moment = wrench(row, rotors, q_WB, p_WB[2], w_WB_B, speeds, commands, decay)
     moment = add(moment, ground[1])
@@ -118,6 +124,7 @@ def step(
     air_W: Vector,
     push_W: Vector,
     dt: float,
+    touch: Touch | None = None,
 ) -> None:
     """Advance one drone's state (STATE.size + R,) by dt [s] in place, under a command (R,) [rad/s] to its rotors.
 
@@ -126,7 +133,7 @@ def step(
     decay = half_decay(row[VEHICLE.rotor_lag], dt)
     speeds, commands = PerRotor(state, STATE.size, 1, rotors.each), PerRotor(command, 0, 1, rotors.each)
     p, v, q, w = pose(state)
-    p, v, q, w, _ = stepped(True, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air_W, push_W, dt)
+    p, v, q, w, _ = stepped(True, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air_W, push_W, dt, touch)
     put(state, STATE.p_WB, p)
     put(state, STATE.v_WB, v)
     put_four(state, STATE.q_WB, q)
@@ -163,26 +170,27 @@ def stepped(
     air_W: Vector,
     push_W: Vector,
     dt: float,
+    touch: Touch | None = None,
 ) -> tuple[Vector, Vector, Quaternion, Vector, bool]:
     """Return p_WB, v_WB, q_WB, w_WB_B after dt [s], and whether the ground was out of reach; speeds stay.
 
     Args:
-        grounded, row, rotors, anchor, air_W, push_W: as for `accelerations`.
+        grounded, row, rotors, anchor, air_W, push_W, touch: as for `accelerations`.
         p, v, q, w: state; speeds, commands: of the rotors at the start; decay: of their lag, see `half_decay`.
     """
     h, reach = 0.5 * dt, row[VEHICLE.contact_reach]
 
-    a1, b1 = accelerations(grounded, row, rotors, anchor, p, v, q, w, speeds, commands, None, air_W, push_W)
+    a1, b1 = accelerations(grounded, row, rotors, anchor, p, v, q, w, speeds, commands, None, air_W, push_W, touch)
     d1 = rot.rate(q, w)
     p2, v2, w2, q2 = axpy(p, h, v), axpy(v, h, a1), axpy(w, h, b1), _turned(q, h, d1)
-    a2, b2 = accelerations(grounded, row, rotors, anchor, p2, v2, q2, w2, speeds, commands, decay, air_W, push_W)
+    a2, b2 = accelerations(grounded, row, rotors, anchor, p2, v2, q2, w2, speeds, commands, decay, air_W, push_W, touch)
     d2 = rot.rate(q2, w2)
     p3, v3, w3, q3 = axpy(p, h, v2), axpy(v, h, a2), axpy(w, h, b2), _turned(q, h, d2)
-    a3, b3 = accelerations(grounded, row, rotors, anchor, p3, v3, q3, w3, speeds, commands, decay, air_W, push_W)
+    a3, b3 = accelerations(grounded, row, rotors, anchor, p3, v3, q3, w3, speeds, commands, decay, air_W, push_W, touch)
     d3 = rot.rate(q3, w3)
     p4, v4, w4, q4 = axpy(p, dt, v3), axpy(v, dt, a3), axpy(w, dt, b3), _turned(q, dt, d3)
     a4, b4 = accelerations(
-        grounded, row, rotors, anchor, p4, v4, q4, w4, speeds, commands, decay * decay, air_W, push_W
+        grounded, row, rotors, anchor, p4, v4, q4, w4, speeds, commands, decay * decay, air_W, push_W, touch
     )
     d4 = rot.rate(q4, w4)
 

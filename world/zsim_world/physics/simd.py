@@ -8,7 +8,7 @@ its columns are constants, so that neither a check of overlaps nor a rest is nee
 drone in their order, so that the results are the same to the last bit, whatever the block.
 
 Equations that branch, as those of contact with the ground, are done for each drone by itself: a block is stepped as
-in free air, and drones that had the ground in reach take their step again with it.
+in free air, and drones that had the ground or an obstacle in reach, or touch another, take their step again with it.
 """
 
 from collections.abc import Iterable
@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import apart, inlined
 from zsim.math.rotation import Quaternion, Vector
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.ground import drag_anchors
+from zsim_world.physics.obstacle_contact import Touch
 from zsim_world.physics.rigid_body import four, put, vector
 from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, Bodies, PerRotor, Row
 
@@ -139,7 +140,9 @@ def accelerate(bodies: Bodies) -> None:
         if _load(bodies, lanes, first):
             _accelerate_block(lanes, bodies.each, bodies.anchor[0])
         for i in range(first, min(first + LANES, count)):
-            if _in_reach(bodies, i):
+            if bodies.braced[i] != 0:
+                _accelerate_braced(bodies, i)
+            elif _in_reach(bodies, i):
                 _accelerate_low(bodies, i)
             else:
                 for c in range(6):
@@ -245,10 +248,36 @@ def _accelerate_low(bodies: Bodies, i: int) -> None:
 
 
 @inlined
-def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> None:
-    """Take over what became of drone i in lane k; where the ground was in reach, let it take its step again with it."""
+def _touch(bodies: Bodies, i: int) -> Touch:
+    return Touch(bodies.obstacle, bodies.solid[i], bodies.held[i], vector(bodies.twist[i], 0))
+
+
+@apart
+def _accelerate_braced(bodies: Bodies, i: int) -> None:
+    """Do as `_accelerate_low`, with all that the drone touches."""
+    each, row, anchor, touch = bodies.each, bodies.vehicle[i], bodies.anchor[i], _touch(bodies, i)
+    p, v, q, w = body.pose(bodies.state[i])
+    rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
+    commands, air, push = PerRotor(bodies.command[i], 0, 1, each), vector(bodies.air[i], 0), vector(bodies.push[i], 0)
+    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, touch)
+    put(bodies.accel[i], 0, a)
+    put(bodies.accel[i], 3, alpha)
+
+
+@apart
+def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
+    """Let a drone take its step with all that it touches."""
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
-    if lanes[LANES * BODY_LANES.clear + k] > 0.0:
+    air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
+    rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
+    body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt, _touch(bodies, i))
+
+
+@inlined
+def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> None:
+    """Take over what became of drone i in lane k; where it was not in free air, let it take its step again."""
+    row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
+    if lanes[LANES * BODY_LANES.clear + k] > 0.0 and bodies.braced[i] == 0:
         for c in range(STATE.size):
             state[c] = lanes[LANES * (BODY_LANES.state + c) + k]
         for r in range(len(bodies.each)):
@@ -256,9 +285,12 @@ def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> Non
     else:
         if not _in_reach(bodies, i):  # the anchors were not moved while it was high
             drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))
-        rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
-        air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-        body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt)
+        if bodies.braced[i] != 0:
+            _step_braced(bodies, i, dt)
+        else:
+            rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
+            air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
+            body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt)
         _put_state(lanes, k, state, bodies.each)
     if _in_reach(bodies, i):
         drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))

@@ -120,8 +120,12 @@ class Bodies(NamedTuple):
     touched: NDArray  # int8 (N, N), contacts that began in this gate
     near: NearPairs
     obstacle: NDArray  # (M, obstacle.COLUMNS)
-    bumping: NDArray  # int8 (N, M), whose hull touches which obstacle
+    bumping: NDArray  # int8 (N, M), who touches which obstacle with more than its feet
     bumped: NDArray  # int8 (N, M), contacts that began in this gate
+    solid: NDArray  # int32 (N, K), the obstacles in reach of each, see physics/obstacle_contact.py
+    held: NDArray  # (N, K, BALLS, 3), m, anchors on them
+    braced: NDArray  # int8 (N,), 1 where an obstacle is in reach or a hull touches another
+    twist: NDArray  # (N, 3), N m in W, of other drones' hulls; of those that are braced
     lanes: NDArray  # (blocks, columns of a block), see physics/simd.py
     external: NDArray  # int64 (E,), the drones that are not integrated
     pose: NDArray  # (E, STATE.size + R), where they are: moved on with their velocities in every tick
