@@ -30,6 +30,7 @@ from zsim_world.state.fleet_arrays import (
     NearPairs,
     NoiseRows,
     Senses,
+    aero_row,
     rotor_row,
     rotor_slots,
     vehicle_row,
@@ -58,6 +59,7 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
     drones, n, obstacles = scenario.drones, len(scenario.drones), obstacle_rows(scenario.environment)
     each, slots = rotors.shape[1] // ROTOR.size, min(len(obstacles), SLOTS_MAX)
     state = np.array([_standing(drone, own, each) for drone, own in zip(drones, row, strict=True)])
+    aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
     half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
     return Bodies(
@@ -81,7 +83,9 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         held=np.zeros((n, slots, BALLS, 3)),
         braced=np.zeros(n, dtype=np.int8),
         twist=np.zeros((n, 3)),
-        lanes=body_blocks(row, rotors, np.array([[half_decay(lag, dt)] for lag in row[:, VEHICLE.rotor_lag]])),
+        aero_parts=(0, 1) if aero.any() else (0,),
+        aero=aero,
+        lanes=body_blocks(row, rotors, np.array([[half_decay(lag, dt)] for lag in row[:, VEHICLE.rotor_lag]]), aero),
         external=external,
         pose=state[external],
     )

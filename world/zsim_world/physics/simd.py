@@ -23,7 +23,7 @@ from zsim_world.physics import rigid_body as body
 from zsim_world.physics.ground import drag_anchors
 from zsim_world.physics.obstacle_contact import Touch
 from zsim_world.physics.rigid_body import four, put, vector
-from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, Bodies, PerRotor, Row
+from zsim_world.state.fleet_arrays import AERO, ROTOR, STATE, VEHICLE, Aero, Bodies, PerRotor, Row
 
 LANES = 8  # doubles in a register of 512 bit, or in two of 256
 
@@ -37,6 +37,7 @@ BODY_LANES = columns(
         Field("air", "m/s", 3),
         Field("push", "N", 3),
         Field("accel", "m/s^2, rad/s^2", 6),  # in W; angular, in B
+        Field("aero", "AERO", AERO.size),
         Field("clear", "1"),  # 1 if the ground was out of reach in the whole step, so that its result holds
     ),
 )
@@ -62,11 +63,11 @@ def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDAr
     return made.reshape(number, -1)
 
 
-def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray) -> NDArray[np.float64]:
-    """Return the blocks of N bodies: parameters, those of their rotors, and the lag of these in half a tick (N, 1)."""
+def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray, aero: NDArray) -> NDArray[np.float64]:
+    """Return the blocks of N bodies: parameters, of their rotors, the lag of these in half a tick (N, 1), aerodynamics."""
     each = rotors.shape[1] // ROTOR.size
     known = BODY_LANES.size + BODY_ROTORS.known * each
-    parts = ((BODY_LANES.vehicle, row), (BODY_LANES.decay, decay), (known, rotors))
+    parts = ((BODY_LANES.vehicle, row), (BODY_LANES.decay, decay), (BODY_LANES.aero, aero), (known, rotors))
     return blocks(BODY_LANES.size + BODY_ROTORS.size * each, parts)
 
 
@@ -76,6 +77,13 @@ def lane_row(block: NDArray, k: int) -> Row:
     a, b, c, d = lane_four(block, 0, k), lane_four(block, 4, k), lane_four(block, 8, k), lane_four(block, 12, k)
     e, f, g, h = lane_four(block, 16, k), lane_four(block, 20, k), lane_four(block, 24, k), lane_four(block, 28, k)
     return a + b + c + d + e + f + g + h
+
+
+@inlined
+def _lane_aero(block: NDArray, k: int, parts: tuple[int, ...]) -> Aero:
+    """Return the aerodynamics of the drone in lane k of a block of bodies."""
+    a, b = lane_four(block, BODY_LANES.aero, k), lane_four(block, BODY_LANES.aero + 4, k)
+    return Aero(parts, a + b + (block[LANES * (BODY_LANES.aero + 8) + k],))
 
 
 @inlined
@@ -123,7 +131,7 @@ def move(bodies: Bodies, dt: float) -> None:
     for first in range(0, count, LANES):
         lanes = bodies.lanes[first // LANES]
         if _load(bodies, lanes, first):
-            _step_block(lanes, bodies.each, bodies.anchor[0], dt)
+            _step_block(lanes, bodies.each, bodies.aero_parts, bodies.anchor[0], dt)
         else:
             for k in range(LANES):
                 lanes[LANES * BODY_LANES.clear + k] = 0.0
@@ -138,7 +146,7 @@ def accelerate(bodies: Bodies) -> None:
     for first in range(0, count, LANES):
         lanes = bodies.lanes[first // LANES]
         if _load(bodies, lanes, first):
-            _accelerate_block(lanes, bodies.each, bodies.anchor[0])
+            _accelerate_block(lanes, bodies.each, bodies.aero_parts, bodies.anchor[0])
         for i in range(first, min(first + LANES, count)):
             if bodies.braced[i] != 0:
                 _accelerate_braced(bodies, i)
@@ -202,7 +210,7 @@ def _pose(lanes: NDArray, k: int) -> tuple[Vector, Vector, Quaternion, Vector]:
 
 
 @inlined
-def _step_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray, dt: float) -> None:
+def _step_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, ...], anchor: NDArray, dt: float) -> None:
     """Take a step of dt [s] with all drones of the block, as in free air."""
     for k in range(LANES):
         p, v, q, w = _pose(lanes, k)
@@ -211,7 +219,10 @@ def _step_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray, dt: floa
         commands = lane_rotors(lanes, _group(BODY_ROTORS.command, each), k, each)
         air, push = lane_vector(lanes, BODY_LANES.air, k), lane_vector(lanes, BODY_LANES.push, k)
         decay, row = lanes[LANES * BODY_LANES.decay + k], lane_row(lanes, k)
-        p, v, q, w, clear = body.stepped(False, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air, push, dt)
+        aero = _lane_aero(lanes, k, parts)
+        p, v, q, w, clear = body.stepped(
+            False, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air, push, dt, None, aero
+        )
         put_lane_vector(lanes, BODY_LANES.state + STATE.p_WB, k, p)
         put_lane_vector(lanes, BODY_LANES.state + STATE.v_WB, k, v)
         put_lane_four(lanes, BODY_LANES.state + STATE.q_WB, k, q)
@@ -221,7 +232,7 @@ def _step_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray, dt: floa
 
 
 @inlined
-def _accelerate_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray) -> None:
+def _accelerate_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, ...], anchor: NDArray) -> None:
     """Find the accelerations of all drones of the block, as in free air."""
     for k in range(LANES):
         p, v, q, w = _pose(lanes, k)
@@ -229,8 +240,10 @@ def _accelerate_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray) ->
         speeds = lane_rotors(lanes, _group(BODY_ROTORS.speed, each), k, each)
         commands = lane_rotors(lanes, _group(BODY_ROTORS.command, each), k, each)
         air, push = lane_vector(lanes, BODY_LANES.air, k), lane_vector(lanes, BODY_LANES.push, k)
-        row = lane_row(lanes, k)
-        a, alpha = body.accelerations(False, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push)
+        row, aero = lane_row(lanes, k), _lane_aero(lanes, k, parts)
+        a, alpha = body.accelerations(
+            False, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, None, aero
+        )
         put_lane_vector(lanes, BODY_LANES.accel, k, a)
         put_lane_vector(lanes, BODY_LANES.accel + 3, k, alpha)
 
@@ -242,7 +255,8 @@ def _accelerate_low(bodies: Bodies, i: int) -> None:
     p, v, q, w = body.pose(bodies.state[i])
     rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
     commands, air, push = PerRotor(bodies.command[i], 0, 1, each), vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push)
+    aero = Aero(bodies.aero_parts, bodies.aero[i])
+    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, None, aero)
     put(bodies.accel[i], 0, a)
     put(bodies.accel[i], 3, alpha)
 
@@ -259,7 +273,8 @@ def _accelerate_braced(bodies: Bodies, i: int) -> None:
     p, v, q, w = body.pose(bodies.state[i])
     rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
     commands, air, push = PerRotor(bodies.command[i], 0, 1, each), vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, touch)
+    aero = Aero(bodies.aero_parts, bodies.aero[i])
+    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, touch, aero)
     put(bodies.accel[i], 0, a)
     put(bodies.accel[i], 3, alpha)
 
@@ -270,7 +285,8 @@ def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
     air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
     rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
-    body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt, _touch(bodies, i))
+    aero = Aero(bodies.aero_parts, bodies.aero[i])
+    body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt, _touch(bodies, i), aero)
 
 
 @inlined
@@ -290,7 +306,8 @@ def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> Non
         else:
             rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
             air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-            body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt)
+            aero = Aero(bodies.aero_parts, bodies.aero[i])
+            body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt, None, aero)
         _put_state(lanes, k, state, bodies.each)
     if _in_reach(bodies, i):
         drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))
