@@ -33,7 +33,9 @@ def advance(fleet: Fleet, seconds: float, steer: Any = None) -> None:
         fleet.advance()
 
 
-def thrown(fleet: Fleet, v: Any, q: Any = (1.0, 0.0, 0.0, 0.0), rotor: float = 0.0, seconds: float = 0.02) -> np.ndarray:
+def thrown(
+    fleet: Fleet, v: Any, q: Any = (1.0, 0.0, 0.0, 0.0), rotor: float = 0.0, seconds: float = 0.02
+) -> np.ndarray:
     """Let a drone with its rotors at a speed go through still air high up, and return the state after some gates."""
     state = fleet.bodies.state[0]
     state[:] = 0.0
@@ -110,7 +112,6 @@ def test_thrust_depends_on_the_flow_past_the_rotors(coefficients: Any, v: Any, f
         state = fleet.bodies.state[0]
         state[:] = 0.0
         state[2], state[3:6], state[6], state[13:] = 1e4, v, 1.0, rotor
-        fleet.bodies.vehicle[0, VEHICLE.rotor_lag] = 1.0
         fleet._integrate(0)  # the accelerations of the present state
         accel.append(fleet.bodies.accel[0, :3].copy())
     np.testing.assert_allclose(0.429 * (accel[1] - accel[0]), force, rtol=1e-9, atol=1e-12)

@@ -28,7 +28,9 @@ TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
 TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
 WORLD, WORLD_DEATHS = "world", ("restart", "end")
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
-THRUST_SHARE_MIN = 0.005  # of what the rotors lift, in a hover, chosen: racers that lift fifteen times themselves have .07
+THRUST_SHARE_MIN = (
+    0.005  # of what the rotors lift, in a hover, chosen: racers that lift fifteen times themselves have .07
+)
 TILT_FREE_DEG = 30.0  # deg, allowed to whatever is light enough to fly
 # Chosen, a decade or more beyond what flies: 60 to 400 W/kg from racers' hover to large rotors; 3 min to 2 h
 HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power

@@ -42,6 +42,9 @@ def upon(fields: dict[str, Any], drone: Any) -> Any:
     """Return a drone's entry with the shared fields that it does not give; those of sections are taken one by one."""
     if not isinstance(drone, dict):
         return drone
-    pairs = {name: (fields.get(name), drone.get(name)) for name in ("limits", "aerodynamics")}
-    both = {k: {**of_all, **own} for k, (of_all, own) in pairs.items() if isinstance(of_all, dict) and isinstance(own, dict)}
-    return {**fields, **drone, **both}
+    both = {**fields, **drone}
+    for name in ("limits", "aerodynamics"):
+        of_all, own = fields.get(name), drone.get(name)
+        if isinstance(of_all, dict) and isinstance(own, dict):
+            both[name] = {**of_all, **own}
+    return both

@@ -43,7 +43,7 @@ PerAxis = tuple[NonNegative, NonNegative, NonNegative]
 
 
 class Aerodynamics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the air does to it besides `drag_n_s_m`, with u the velocity of the body, or of a rotor, against the air in B.
+    """What the air does to it besides `drag_n_s_m`; u is the velocity of the body, or of a rotor, against the air in B.
 
     Body: -linear u - quadratic |u| u, by axis, at the centre of mass. Each rotor at speed w, where it is:
     -k_d w (u_x, u_y) across, (k_h (u_x^2 + u_y^2) - k_z w u_z) along its thrust. Svacha, Mohta and Kumar, Improving

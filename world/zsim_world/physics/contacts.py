@@ -63,7 +63,10 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
     # slip is damped at the rate of the approach: a push across a hull turns it, and finds less inertia than one along d
     straight = 1.0 / one[VEHICLE.mass] + 1.0 / other[VEHICLE.mass]
     turning = dot(arms[0], arms[0]) / _least_inertia(one) + dot(arms[1], arms[1]) / _least_inertia(other)
-    viscous, limit = damping * straight / (straight + turning), min(one[VEHICLE.friction], other[VEHICLE.friction]) * normal
+    viscous, limit = (
+        damping * straight / (straight + turning),
+        min(one[VEHICLE.friction], other[VEHICLE.friction]) * normal,
+    )
     speed = norm(slip)
     across = viscous if viscous * speed <= limit else limit / speed
     f_W = axpy(scaled(n, normal), -across, slip)

@@ -87,10 +87,9 @@ def accelerations(
     moment = add(moment, ground[1])
     force = add(add(ground[0], push_W), rot.rotate(q_WB, (0.0, 0.0, thrust)))
     force = axpy(force, -row[VEHICLE.drag], axpy(v_WB, -1.0, air_W))
-    if aero is not None:
-        if len(aero.parts) > 1:
-            more = _flow(row, rotors, aero.numbers, axpy(v_WB, -1.0, air_W), q_WB, w_WB_B, speeds, commands, decay)
-            force, moment = add(force, more[0]), add(moment, more[1])
+    if aero is not None and len(aero.parts) > 1:
+        more = _flow(row, rotors, aero.numbers, axpy(v_WB, -1.0, air_W), q_WB, w_WB_B, speeds, commands, decay)
+        force, moment = add(force, more[0]), add(moment, more[1])
     inv = 1.0 / row[VEHICLE.mass]
     wx, wy, wz = w_WB_B
     return (
@@ -163,7 +162,9 @@ def step(
     decay = half_decay(row[VEHICLE.rotor_lag], dt)
     speeds, commands = PerRotor(state, STATE.size, 1, rotors.each), PerRotor(command, 0, 1, rotors.each)
     p, v, q, w = pose(state)
-    p, v, q, w, _ = stepped(True, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air_W, push_W, dt, touch, aero)
+    p, v, q, w, _ = stepped(
+        True, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air_W, push_W, dt, touch, aero
+    )
     put(state, STATE.p_WB, p)
     put(state, STATE.v_WB, v)
     put_four(state, STATE.q_WB, q)
@@ -211,13 +212,19 @@ def stepped(
     """
     h, reach = 0.5 * dt, row[VEHICLE.contact_reach]
 
-    a1, b1 = accelerations(grounded, row, rotors, anchor, p, v, q, w, speeds, commands, None, air_W, push_W, touch, aero)
+    a1, b1 = accelerations(
+        grounded, row, rotors, anchor, p, v, q, w, speeds, commands, None, air_W, push_W, touch, aero
+    )
     d1 = rot.rate(q, w)
     p2, v2, w2, q2 = axpy(p, h, v), axpy(v, h, a1), axpy(w, h, b1), _turned(q, h, d1)
-    a2, b2 = accelerations(grounded, row, rotors, anchor, p2, v2, q2, w2, speeds, commands, decay, air_W, push_W, touch, aero)
+    a2, b2 = accelerations(
+        grounded, row, rotors, anchor, p2, v2, q2, w2, speeds, commands, decay, air_W, push_W, touch, aero
+    )
     d2 = rot.rate(q2, w2)
     p3, v3, w3, q3 = axpy(p, h, v2), axpy(v, h, a2), axpy(w, h, b2), _turned(q, h, d2)
-    a3, b3 = accelerations(grounded, row, rotors, anchor, p3, v3, q3, w3, speeds, commands, decay, air_W, push_W, touch, aero)
+    a3, b3 = accelerations(
+        grounded, row, rotors, anchor, p3, v3, q3, w3, speeds, commands, decay, air_W, push_W, touch, aero
+    )
     d3 = rot.rate(q3, w3)
     p4, v4, w4, q4 = axpy(p, dt, v3), axpy(v, dt, a3), axpy(w, dt, b3), _turned(q, dt, d3)
     a4, b4 = accelerations(

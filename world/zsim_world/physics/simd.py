@@ -64,7 +64,7 @@ def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDAr
 
 
 def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray, aero: NDArray) -> NDArray[np.float64]:
-    """Return the blocks of N bodies: parameters, of their rotors, the lag of these in half a tick (N, 1), aerodynamics."""
+    """Return the blocks of N bodies: parameters, rotors, the lag of these in half a tick (N, 1), aerodynamics."""
     each = rotors.shape[1] // ROTOR.size
     known = BODY_LANES.size + BODY_ROTORS.known * each
     parts = ((BODY_LANES.vehicle, row), (BODY_LANES.decay, decay), (BODY_LANES.aero, aero), (known, rotors))

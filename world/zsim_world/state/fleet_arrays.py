@@ -214,7 +214,7 @@ class PerRotor(NamedTuple):
 
 
 class Aero(NamedTuple):
-    """Aerodynamics of one drone; `parts` as `Bodies.aero_parts`: compiled code knows how many, and leaves out the rest."""
+    """Aerodynamics of one drone; compiled code knows how many `parts` (Bodies.aero_parts), and leaves out the rest."""
 
     parts: tuple[int, ...]
     numbers: Row  # (AERO.size,)

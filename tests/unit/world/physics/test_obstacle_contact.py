@@ -157,12 +157,11 @@ def test_a_force_beside_the_centre_turns() -> None:
     w = 0.4
     turn = np.array([[math.cos(w), -math.sin(w), 0], [math.sin(w), math.cos(w), 0], [0, 0, 1]])
     corner = turn @ r_B
-    p = (3.0 - corner[0] - 0.03, 3.0 - corner[1] - 0.03, ROOF_M - corner[2] - 0.001)  # but one foot is over the edge
-    p = (-3.0 - corner[0] + 0.01, -3.0 - corner[1] + 0.01, p[2])
+    p = (-3.01 + 0.02 - corner[0], -3.01 + 0.02 - corner[1], ROOF_M - corner[2] - 0.001)  # the others are over the edge
     held = np.zeros((1, *fleet.bodies.held.shape[2:]))
     held[0, 0] = np.array(p) + corner
     touch = Touch(fleet.bodies.obstacle, np.zeros(1, dtype=np.int32), held, (0.0, 0.0, 0.0))
-    force, moment = touched(row, touch, p, (0.0, 0.0, 0.0), tuple(map(float, q)), (0.0, 0.0, 0.0))
+    force, moment = touched(row, touch, p, (0.0, 0.0, 0.0), (q[0], q[1], q[2], q[3]), (0.0, 0.0, 0.0))
     normal = row[VEHICLE.foot_stiffness] * 0.001
     np.testing.assert_allclose(force, (0.0, 0.0, normal), atol=1e-9)
     np.testing.assert_allclose(moment, np.cross(r_B, (0.0, 0.0, normal)), atol=1e-9)
