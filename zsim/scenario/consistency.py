@@ -28,12 +28,13 @@ TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
 TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
 WORLD, WORLD_DEATHS = "world", ("restart", "end")
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
+UPON_COSINE, UPON_DEPTH_M = 0.999, 0.001  # of a roof's normal to the vertical; how deep a drone on it may be
 THRUST_SHARE_MIN = (
     0.005  # of what the rotors lift, in a hover, chosen: racers that lift fifteen times themselves have .07
 )
 TILT_FREE_DEG = 30.0  # deg, allowed to whatever is light enough to fly
 # Chosen, a decade or more beyond what flies: 60 to 400 W/kg from racers' hover to large rotors; 3 min to 2 h
-HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power
+HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power for the rotors
 HOVER_S = (10.0, 86_400.0)  # s on a full battery
 
 
@@ -152,11 +153,18 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
 
 
 def _buried_faults(obstacle: Any, starts: list[tuple[int, Any, float]]) -> Iterator[Fault]:
-    """Yield the drones that start in an obstacle or too near; `starts` has index, place and clearance of each."""
+    """Yield the drones that start in an obstacle or beside it too near, not those upon it.
+
+    `starts` has index, place and clearance of each.
+    """
     row = row_of(obstacle)
     x, reach = row[CENTRE], sum(row[HALF:])  # no point of it is farther from its centre, whatever its yaw
     for index, p_W, least in starts:
-        if abs(p_W[0] - x) < reach + least and (distance := nearest(row, *p_W)[0]) < least:
+        if abs(p_W[0] - x) >= reach + least:
+            continue
+        distance, _, _, up = nearest(row, *p_W)
+        is_upon = up > UPON_COSINE and distance > -UPON_DEPTH_M
+        if distance < least and not is_upon:
             place = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
             yield f"drones[{index}].position_m", f"{place}; must be >= {least:g} m"
 
@@ -204,14 +212,14 @@ def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fa
     if low is not None and speeds.min() <= low < high:
         yield "rotor_min_rad_s", f"is {low:g}; must be < {speeds.min():.1f}, the speed of a rotor in a hover"
     battery = vehicle.battery
-    shaft = float(torque * thin * (speeds**3).sum())
-    power = shaft / battery.efficiency + battery.electronics_w
+    power = float(torque * thin * (speeds**3).sum()) / battery.efficiency
     least, greatest = (each * drone.mass_kg for each in HOVER_W_KG)
     if not least <= power <= greatest:
         takes = f"so that a hover takes {power:.3g} W"
         units = "check its unit, N m s^2: of a torque per thrust in m, this times thrust_n_s2"
         yield "torque_nm_s2", f"is {torque:g}, {takes}; sane: {least:.3g} to {greatest:.3g} W for its mass; {units}"
     elif drone.battery_mah is not None:
+        power += battery.electronics_w
         endurance = drone.battery_mah * COULOMB_PER_MAH * battery.voltage_v / power
         if not HOVER_S[0] <= endurance <= HOVER_S[1]:
             lasts = f"which lasts {endurance:.3g} s in a hover at {power:.3g} W"

