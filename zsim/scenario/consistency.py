@@ -3,6 +3,7 @@
 Works on what is sound of a document (`checker.sound`): a check whose fields are missing or faulty is left out.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any
@@ -17,15 +18,24 @@ from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, space_name
 from zsim.scenario.sighting_check import sighting_faults
 from zsim.schema.checker import Fault, show
+from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
 from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.sensors.sensor_catalogue import DECLARED, MODULE, declarations, own_sections
-from zsim.vehicles.vehicle import Vehicle
+from zsim.vehicles.vehicle import Vehicle, lift_shares
 
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
 TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
 TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
 WORLD, WORLD_DEATHS = "world", ("restart", "end")
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
+UPON_COSINE, UPON_DEPTH_M = 0.999, 0.001  # of a roof's normal to the vertical; how deep a drone on it may be
+THRUST_SHARE_MIN = (
+    0.005  # of what the rotors lift, in a hover, chosen: racers that lift fifteen times themselves have .07
+)
+TILT_FREE_DEG = 30.0  # deg, allowed to whatever is light enough to fly
+# Chosen, a decade or more beyond what flies: 60 to 400 W/kg from racers' hover to large rotors; 3 min to 2 h
+HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power for the rotors
+HOVER_S = (10.0, 86_400.0)  # s on a full battery
 
 
 def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
@@ -143,11 +153,18 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
 
 
 def _buried_faults(obstacle: Any, starts: list[tuple[int, Any, float]]) -> Iterator[Fault]:
-    """Yield the drones that start in an obstacle or too near; `starts` has index, place and clearance of each."""
+    """Yield the drones that start in an obstacle or beside it too near, not those upon it.
+
+    `starts` has index, place and clearance of each.
+    """
     row = row_of(obstacle)
     x, reach = row[CENTRE], sum(row[HALF:])  # no point of it is farther from its centre, whatever its yaw
     for index, p_W, least in starts:
-        if abs(p_W[0] - x) < reach + least and (distance := nearest(row, *p_W)[0]) < least:
+        if abs(p_W[0] - x) >= reach + least:
+            continue
+        distance, _, _, up = nearest(row, *p_W)
+        is_upon = up > UPON_COSINE and distance > -UPON_DEPTH_M
+        if distance < least and not is_upon:
             place = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
             yield f"drones[{index}].position_m", f"{place}; must be >= {least:g} m"
 
@@ -159,15 +176,55 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
     gravity = scenario.environment and scenario.environment.gravity_m_s2
     vehicle = vehicles.get(drone.model) if drone.model else None
     if vehicle and _known(drone.mass_kg, drone.thrust_n_s2, high, gravity):
-        most = LIFT_SHARE_MAX * len(vehicle.rotors) * drone.thrust_n_s2 * high**2 / gravity
-        if drone.mass_kg >= most:
-            yield (
-                "mass_kg",
-                f"is {drone.mass_kg:g}; must be < {most:.3f}, nine tenths of what its rotors lift",
-            )
+        yield from _hover_faults(drone, vehicle, scenario.environment)
     yield from _height_faults(drone, scenario.environment and scenario.environment.height_m)
     if drone.sensors is not None:
         yield from ((f"sensors.{path}", text) for path, text in _sensor_faults(drone.sensors))
+
+
+def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fault]:
+    """Yield what a hover shows of mass, rotors and battery: numbers in a wrong unit are far from all that flies."""
+    count, shares = len(vehicle.rotors), lift_shares(vehicle)
+    thrust, torque = drone.thrust_n_s2, drone.torque_nm_s2
+    low, high = drone.rotor_min_rad_s, drone.rotor_max_rad_s
+    weight = drone.mass_kg * environment.gravity_m_s2
+    lift = count * thrust * high**2 / shares.max()
+    most = LIFT_SHARE_MAX * lift / environment.gravity_m_s2
+    if drone.mass_kg >= most:
+        yield "mass_kg", f"is {drone.mass_kg:g}; must be < {most:.3f}, nine tenths of what its rotors lift"
+        return
+    if weight < THRUST_SHARE_MIN * lift:
+        flown = f"so that it hovers at {100 * weight / lift:.2g} % of what its rotors lift ({lift:.3g} N)"
+        units = "check their units, N s^2, rad/s and kg (thrust = thrust_n_s2 times speed^2)"
+        yield "thrust_n_s2", f"is {thrust:g}, {flown}; sane: {100 * THRUST_SHARE_MIN:g} to 90 %; {units}"
+        return
+    tilt, lean = drone.limits and drone.limits.tilt_deg, math.degrees(math.acos(weight / (LIFT_SHARE_MAX * lift)))
+    cut = math.degrees(math.acos(vehicle.firmware.tilt_cut_cosine))
+    if tilt is not None and tilt > max(lean, TILT_FREE_DEG):
+        yield "limits.tilt_deg", f"is {tilt:g}; must be <= {lean:.1f}, at which its rotors still carry its weight"
+    if tilt is not None and tilt >= cut:
+        yield "limits.tilt_deg", f"is {tilt:g}; must be < {cut:.1f}, at which its firmware cuts the rotors"
+    density = environment.air_density_kg_m3
+    if not _known(torque, density):
+        return
+    thin = density / SEA_LEVEL_KG_M3  # by which the coefficients are less
+    speeds = np.sqrt(weight * shares / (count * thrust * thin))
+    if low is not None and speeds.min() <= low < high:
+        yield "rotor_min_rad_s", f"is {low:g}; must be < {speeds.min():.1f}, the speed of a rotor in a hover"
+    battery = vehicle.battery
+    power = float(torque * thin * (speeds**3).sum()) / battery.efficiency
+    least, greatest = (each * drone.mass_kg for each in HOVER_W_KG)
+    if not least <= power <= greatest:
+        takes = f"so that a hover takes {power:.3g} W"
+        units = "check its unit, N m s^2: of a torque per thrust in m, this times thrust_n_s2"
+        yield "torque_nm_s2", f"is {torque:g}, {takes}; sane: {least:.3g} to {greatest:.3g} W for its mass; {units}"
+    elif drone.battery_mah is not None:
+        power += battery.electronics_w
+        endurance = drone.battery_mah * COULOMB_PER_MAH * battery.voltage_v / power
+        if not HOVER_S[0] <= endurance <= HOVER_S[1]:
+            lasts = f"which lasts {endurance:.3g} s in a hover at {power:.3g} W"
+            sane = f"sane: {HOVER_S[0]:g} to {HOVER_S[1]:g} s"
+            yield "battery_mah", f"is {drone.battery_mah:g}, {lasts}; {sane}; check its unit, mAh"
 
 
 def _height_faults(drone: Any, origin_m: float | None) -> Iterator[Fault]:

@@ -14,7 +14,7 @@ from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegativ
 from zsim.sensors.camera import Hats
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
-from zsim.vehicles.vehicle import Arm, Limits, Mass, RotorLag, TakeoffHeight
+from zsim.vehicles.vehicle import Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight
 
 TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
@@ -62,6 +62,8 @@ class Drone(Spec, frozen=True, kw_only=True):
     battery_percent: Annotated[float, Meta(ge=0, le=100)] = 100.0
     takeoff_height_m: TakeoffHeight = ARDRONE2.takeoff_height_m
     limits: Limits = ARDRONE2.limits
+    aerodynamics: Aerodynamics | UnsetType = UNSET
+    """Unset: none but `drag_n_s_m`, and left out of the resolved text."""
     sensors: Sensors
 
     @property

@@ -18,7 +18,7 @@ from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, sound
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
 from zsim.vehicles import vehicle_catalogue
-from zsim.vehicles.vehicle import DEFAULTS, Vehicle
+from zsim.vehicles.vehicle import DEFAULTS, Aerodynamics, Vehicle
 
 EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
 
@@ -170,10 +170,12 @@ def _expand_drone(drone: Any, shared: dict[str, Any], vehicles: dict[str, Vehicl
     vehicle = vehicle or vehicles[vehicle_catalogue.DEFAULT]
     own = drone.get("sensors")
     own_sensors = _merge(shared, own) if isinstance(own, dict) else shared if own is None else own
-    limits = _merge(msgspec.to_builtins(vehicle.limits), drone["limits"]) if _has_map(drone, "limits") else None
-    defaults = {name: getattr(vehicle, name) for name in DEFAULTS} | {"limits": msgspec.to_builtins(vehicle.limits)}
-    expanded = {**defaults, **drone, "sensors": _expanded(own_sensors, vehicle.sensor_preset)}
-    return expanded if limits is None else {**expanded, "limits": limits}
+    sections = {"limits": msgspec.to_builtins(vehicle.limits)}
+    if vehicle.aerodynamics != Aerodynamics():
+        sections["aerodynamics"] = msgspec.to_builtins(vehicle.aerodynamics)
+    defaults = {name: getattr(vehicle, name) for name in DEFAULTS} | sections
+    merged = {name: _merge(sections[name], drone[name]) for name in sections if _has_map(drone, name)}
+    return {**defaults, **drone, "sensors": _expanded(own_sensors, vehicle.sensor_preset), **merged}
 
 
 def _has_map(section: dict[str, Any], name: str) -> bool:

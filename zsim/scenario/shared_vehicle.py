@@ -6,7 +6,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 
 from zsim.schema.checker import faults
 from zsim.schema.quantities import NonNegative, Positive
-from zsim.vehicles.vehicle import Arm, Limits, Mass, RotorLag, TakeoffHeight
+from zsim.vehicles.vehicle import Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight
 
 
 class SharedVehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -26,6 +26,7 @@ class SharedVehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     battery_percent: Annotated[float, Meta(ge=0, le=100)] | UnsetType = UNSET
     takeoff_height_m: TakeoffHeight | UnsetType = UNSET
     limits: Limits | UnsetType = UNSET
+    aerodynamics: Aerodynamics | UnsetType = UNSET
 
 
 def shared(document: dict[str, Any]) -> dict[str, Any]:
@@ -38,9 +39,12 @@ def shared(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def upon(fields: dict[str, Any], drone: Any) -> Any:
-    """Return a drone's entry with the shared fields that it does not give; `limits` are put together one by one."""
+    """Return a drone's entry with the shared fields that it does not give; those of sections are taken one by one."""
     if not isinstance(drone, dict):
         return drone
-    limits, own = fields.get("limits"), drone.get("limits")
-    both = {"limits": {**limits, **own}} if isinstance(limits, dict) and isinstance(own, dict) else {}
-    return {**fields, **drone, **both}
+    both = {**fields, **drone}
+    for name in ("limits", "aerodynamics"):
+        of_all, own = fields.get(name), drone.get(name)
+        if isinstance(of_all, dict) and isinstance(own, dict):
+            both[name] = {**of_all, **own}
+    return both

@@ -17,6 +17,7 @@ from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
 ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a hover at every heading; more do not go into a message
 ARM_MISS_MAX = 0.01  # of the arm, chosen: what rounding of a drawing leaves
 BALANCE_MAX = 1e-6  # of the arm, by which the centre of the rotors may miss that of mass
+LIFT_MIN = 0.2  # of the mean thrust, chosen: a rotor that bears less in hover has nothing left to steer with
 RANK_MIN = 1e-3  # least share that one of roll, pitch and yaw may have of the strongest
 
 Mass = Annotated[float, Meta(gt=0, le=100)]
@@ -26,13 +27,40 @@ TakeoffHeight = Annotated[float, Meta(ge=0.3, le=5)]
 
 
 class Limits(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the firmware allows a commander; defaults and ranges of the AR.Drone SDK's outdoor set where it has them."""
+    """What the firmware allows a commander; defaults of the AR.Drone SDK's outdoor set where it has them.
 
-    tilt_deg: Annotated[float, Meta(gt=0, le=30)] = 20.0  # outdoor_euler_angle_max, 0.349 rad
-    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=10)] = 5.0  # chosen, the SDK has none; 20 deg hold 6 m/s
-    vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=2)] = 1.0  # outdoor_control_vz_max
+    How far they go is chosen: what larger and racing aircraft fly, and the loops still hold.
+    """
+
+    tilt_deg: Annotated[float, Meta(gt=0, le=60)] = 20.0  # outdoor_euler_angle_max, 0.349 rad
+    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=30)] = 5.0  # chosen, the SDK has none; 20 deg hold 6 m/s
+    vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=10)] = 1.0  # outdoor_control_vz_max
     yaw_rate_deg_s: Annotated[float, Meta(gt=0, le=350)] = 200.0  # outdoor_control_yaw, 3.49 rad/s
     altitude_m: Positive = 100.0  # altitude_max: what it takes for no limit
+
+
+PerAxis = tuple[NonNegative, NonNegative, NonNegative]
+
+
+class Aerodynamics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the air does to it besides `drag_n_s_m`; u is the velocity of the body, or of a rotor, against the air in B.
+
+    Body: -linear u - quadratic |u| u, by axis, at the centre of mass. Each rotor at speed w, where it is:
+    -k_d w (u_x, u_y) across, (k_h (u_x^2 + u_y^2) - k_z w u_z) along its thrust. Svacha, Mohta and Kumar, Improving
+    quadrotor trajectory tracking by compensating for aerodynamic effects, ICUAS 2017, as RotorPy (Folk et al. 2023)
+    has it; the linear part by axis is the rotor drag of Faessler, Franchi and Scaramuzza, RA-L 3 (2018) 620-626.
+    The firmware knows `drag_n_s_m` alone: to it the rest is a disturbance.
+    """
+
+    linear_drag_n_s_m: PerAxis = (0.0, 0.0, 0.0)
+    quadratic_drag_n_s2_m2: PerAxis = (0.0, 0.0, 0.0)
+    """c_D of RotorPy: 1/2 rho c A."""
+    rotor_drag_n_s2_m: NonNegative = 0.0
+    """k_d, of each rotor."""
+    rotor_inflow_n_s2_m: NonNegative = 0.0
+    """k_z, of each rotor: thrust that a climb costs and a descent brings."""
+    rotor_lift_n_s2_m2: NonNegative = 0.0
+    """k_h, of each rotor: translational lift."""
 
 
 class Rotor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -162,6 +190,7 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     battery_mah: Positive
     takeoff_height_m: TakeoffHeight
     limits: Limits = Limits()
+    aerodynamics: Aerodynamics = Aerodynamics()
     sensor_preset: str = "ardrone2"
 
     rotors: tuple[Rotor, ...]
@@ -186,15 +215,15 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         if not math.isclose(self.arm_m, farthest, rel_tol=ARM_MISS_MAX):
             what = f"arm_m is {self.arm_m:g}, but the farthest of rotors is {farthest:.4g} m from the centre"
             raise ValueError(f"{what}; must be the same: give both, and airframe and rotor_radius_m that fit")
-        layout = allocation(self)
-        off = np.abs(layout.sum(axis=1)).max()
-        if not off <= BALANCE_MAX * count:
-            raise ValueError(f"rotors pull off the centre by {off:.3g} arms; positions and turns must sum to zero")
-        strengths = np.linalg.svd(layout, compute_uv=False)
+        strengths = np.linalg.svd(np.vstack([np.ones(count), allocation(self)]), compute_uv=False)
         if strengths[-1] < RANK_MIN * strengths[0]:
             raise ValueError(
-                "rotors cannot give roll, pitch and yaw apart from each other; place them about the centre"
+                "rotors cannot give thrust, roll, pitch and yaw apart from each other; place them about the centre"
             )
+        shares = lift_shares(self)
+        if shares.min() < LIFT_MIN:
+            weakest = f"{names[int(shares.argmin())]} of rotors bears {shares.min():.2f} of the mean thrust in a hover"
+            raise ValueError(f"{weakest}; must be >= {LIFT_MIN:g}: place them about the centre of mass, turns balanced")
 
 
 DEFAULTS = (
@@ -232,9 +261,31 @@ def allocation(vehicle: Vehicle) -> np.ndarray:
     return np.array([y, -x, [float(rotor.turn) for rotor in vehicle.rotors]])
 
 
-def mixing(vehicle: Vehicle) -> np.ndarray:
-    """Return the thrust of each rotor for a unit of roll, pitch and yaw, (R, 3): the pseudo-inverse of `allocation`.
+def is_balanced(vehicle: Vehicle) -> bool:
+    """Return whether rotors that turn alike give no moment."""
+    return bool(np.abs(allocation(vehicle).sum(axis=1)).max() <= BALANCE_MAX * len(vehicle.rotors))
 
-    Rounded to twelve digits, so that the numbers do not depend on the library of linear algebra.
+
+def mixing(vehicle: Vehicle) -> np.ndarray:
+    """Return the thrust of each rotor for a unit of roll, pitch and yaw, (R, 3), without any thrust in all.
+
+    The pseudo-inverse of `allocation`, of an unbalanced vehicle of it below a row of thrust. Rounded to twelve digits,
+    so that the numbers do not depend on the library of linear algebra.
     """
-    return np.array([[float(f"{x:.12g}") for x in row] for row in np.linalg.pinv(allocation(vehicle))])
+    layout = allocation(vehicle)
+    if is_balanced(vehicle):
+        return _rounded(np.linalg.pinv(layout))
+    return _rounded(np.linalg.pinv(np.vstack([np.ones(layout.shape[1]), layout]))[:, 1:])
+
+
+def lift_shares(vehicle: Vehicle) -> np.ndarray:
+    """Return the thrust of each rotor over the mean, (R,), that gives no moment: 1 where they are balanced."""
+    layout = allocation(vehicle)
+    if is_balanced(vehicle):
+        return np.ones(layout.shape[1])
+    count = layout.shape[1]
+    return count * _rounded(np.linalg.pinv(np.vstack([np.ones(count), layout]))[:, :1])[:, 0]
+
+
+def _rounded(matrix: np.ndarray) -> np.ndarray:
+    return np.array([[float(f"{x:.12g}") for x in row] for row in matrix])

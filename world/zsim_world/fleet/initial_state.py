@@ -7,12 +7,13 @@ from typing import Any, cast
 import numpy as np
 
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
+from zsim.scenario import obstacle
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics import rigid_body
 from zsim_world.physics.air import WIND
-from zsim_world.physics.contacts import obstacle_rows
 from zsim_world.physics.ground import contact_points
+from zsim_world.physics.obstacle_contact import BALLS, SLOTS_MAX, obstacle_rows
 from zsim_world.physics.simd import body_blocks
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
@@ -30,6 +31,7 @@ from zsim_world.state.fleet_arrays import (
     NearPairs,
     NoiseRows,
     Senses,
+    aero_row,
     rotor_row,
     rotor_slots,
     vehicle_row,
@@ -37,6 +39,8 @@ from zsim_world.state.fleet_arrays import (
 from zsim_world.vehicles import firmware, firmware_settings, observer, observer_gains
 from zsim_world.vehicles.observer import BELIEF, CALIBRATION, DEVICE
 from zsim_world.vehicles.simd_firmware import board_blocks, sound_actuators
+
+ON_ROOF_M = 0.01  # m, chosen: so near to an obstacle a drone starts upon it
 
 
 def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable) -> Arrays:
@@ -56,8 +60,9 @@ def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensor
 
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:
     drones, n, obstacles = scenario.drones, len(scenario.drones), obstacle_rows(scenario.environment)
-    each = rotors.shape[1] // ROTOR.size
+    each, slots = rotors.shape[1] // ROTOR.size, min(len(obstacles), SLOTS_MAX)
     state = np.array([_standing(drone, own, each) for drone, own in zip(drones, row, strict=True)])
+    aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
     half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
     return Bodies(
@@ -77,7 +82,13 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         obstacle=obstacles,
         bumping=np.zeros((n, len(obstacles)), dtype=np.int8),
         bumped=np.zeros((n, len(obstacles)), dtype=np.int8),
-        lanes=body_blocks(row, rotors, np.array([[half_decay(lag, dt)] for lag in row[:, VEHICLE.rotor_lag]])),
+        solid=np.full((n, slots), -1, dtype=np.int32),
+        held=np.zeros((n, slots, BALLS, 3)),
+        braced=np.zeros(n, dtype=np.int8),
+        twist=np.zeros((n, 3)),
+        aero_parts=(0, 1) if aero.any() else (0,),
+        aero=aero,
+        lanes=body_blocks(row, rotors, np.array([[half_decay(lag, dt)] for lag in row[:, VEHICLE.rotor_lag]]), aero),
         external=external,
         pose=state[external],
     )
@@ -94,6 +105,7 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
     both = list(zip(vehicles, drones, strict=True))
     setting = np.array([firmware_settings.settings(vehicle, drone) for vehicle, drone in both])
     calibration = np.array([_calibration(drone, scenario) for drone in drones])
+    obstacles = obstacle_rows(scenario.environment)
     mounts = calibration[:, CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4]
     return Boards(
         setting=setting,
@@ -102,7 +114,7 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
         setpoint=np.zeros((n, firmware.SETPOINT.size)),
         set_tick=np.zeros(n, dtype=np.int64),
         memory=np.zeros((n, firmware.MEMORY.size)),
-        belief=np.array([_first_belief(height, each) for height in row[:, VEHICLE.stand_height]]),
+        belief=np.array([_first_belief(drone, own, obstacles, each) for drone, own in zip(drones, row, strict=True)]),
         actuator=sound_actuators(n, each),
         device=np.zeros((n, DEVICE.size)),
         lanes=board_blocks(row, rotors, setting, mounts),
@@ -143,11 +155,18 @@ def _anchors(drone: Drone, row: np.ndarray) -> np.ndarray:
     return np.array(drone.position_m[:2]) + contact_points(row)[:, :2] @ turn.T
 
 
-def _first_belief(height: float, rotors: int) -> np.ndarray:
-    """Return the belief at power-up: level, heading unknown until the first magnetometer sample."""
+def _first_belief(drone: Drone, row: np.ndarray, obstacles: np.ndarray, rotors: int) -> np.ndarray:
+    """Return the belief at power-up: level, heading unknown until the first magnetometer sample.
+
+    One that starts on a roof knows of its height, as one that has landed there.
+    """
     belief = np.zeros(BELIEF.size + rotors)
     belief[BELIEF.q_WB] = 1.0
-    belief[BELIEF.height] = height
+    belief[BELIEF.height] = row[VEHICLE.stand_height]
+    roof_m = drone.position_m[2]
+    is_on_roof = any(abs(obstacle.nearest(solid, *drone.position_m)[0]) < ON_ROOF_M for solid in obstacles)
+    if is_on_roof and roof_m > observer.FLOOR_MIN_M:
+        belief[BELIEF.height] = belief[BELIEF.stand_height] = roof_m + row[VEHICLE.stand_height]
     belief[BELIEF.still_steps] = observer.STILL_STEPS_MIN
     return belief
 

@@ -13,7 +13,8 @@ from zsim.math.compiled import Held, apart, inlined, kernel
 from zsim.math.rotation import norm
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.air import WIND, blow
-from zsim_world.physics.contacts import meet_drones, meet_obstacles
+from zsim_world.physics.contacts import meet_drones
+from zsim_world.physics.obstacle_contact import meet_obstacles
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import drained
 from zsim_world.physics.simd import accelerate, lead, line_up, move
@@ -77,6 +78,7 @@ def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: NoiseRows) -> No
 def _meet(wind: NDArray, gust: NDArray, bodies: Bodies) -> float:
     """Set air and pushes for the next tick; return the least distance of two drones [m]."""
     for i in range(gust.shape[0]):
+        bodies.braced[i] = 0
         for k in range(3):
             bodies.air[i, k] = wind[WIND.steady + k] + gust[i, k]
             bodies.push[i, k] = 0.0

@@ -1,17 +1,14 @@
-"""Hulls that touch, of drones and of obstacles, and the downwash on drones that fly below others."""
+"""Hulls of drones that touch each other, spheres to them, and the downwash on drones that fly below others."""
 
 import math
-from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.compiled import apart, inlined
-from zsim.math.rotation import Vector, z_axis
-from zsim.scenario import obstacle
-from zsim.scenario.scenario import Environment
+from zsim.math.rotation import Vector, add, axpy, cross, dot, norm, rotate, scaled, subtract, z_axis
 from zsim_world.physics.air import downwash, jet_reach
-from zsim_world.physics.rigid_body import four
+from zsim_world.physics.obstacle_contact import brace
+from zsim_world.physics.rigid_body import four, vector
 from zsim_world.physics.rotors import free_thrust
 from zsim_world.state.fleet_arrays import STATE, VEHICLE, Bodies, NearPairs, PerRotor
 
@@ -19,9 +16,6 @@ DISTANCE_MIN_M = 1e-9  # m, so that two drones in one place have a direction
 CLOSE = 1.0 + 1e-9  # of the square of a distance: more than rounding can make of it
 STRAY_M = 0.25  # m, by which each drone may move before near pairs are found anew: 0.4 s at 0.6 m/s
 APPROACH_M = 0.501  # m, by which a pair's distance may have changed by then: twice as much, and room for rounding
-
-
-nearest: Any = inlined(obstacle.nearest)
 
 
 @inlined
@@ -49,20 +43,52 @@ def _blow(bodies: Bodies, above: int, below: int, aside: float, drop: float) -> 
     bodies.air[below, 2] -= downwash(thrust, row[VEHICLE.air_density], row[VEHICLE.jet_start], drop, aside)
 
 
-@inlined
+@apart
 def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
-    """Push drones i and j apart along d = p_j - p_i."""
-    vehicle, state, closing = bodies.vehicle, bodies.state, 0.0
-    for k in range(3):
-        closing -= (state[j, STATE.v_WB + k] - state[i, STATE.v_WB + k]) * d[k] / distance
+    """Part the hulls of drones i and j, d = p_j - p_i: along it by spring and damper, across it by dry friction.
+
+    Both forces act at one point, a = (R_i - dent) n from i, so that linear and angular momentum are kept.
+    """
+    n = scaled(d, 1.0 / distance)
+    one, other = bodies.vehicle[i], bodies.vehicle[j]
+    share = distance / (one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius])
+    arms = scaled(n, share * one[VEHICLE.hull_radius]), scaled(n, -share * other[VEHICLE.hull_radius])
+    v = subtract(_velocity_at(bodies.state[j], arms[1]), _velocity_at(bodies.state[i], arms[0]))
     # the softer of the two, so that a light drone stays within what its step can follow
-    stiffness = min(vehicle[i, VEHICLE.hull_stiffness], vehicle[j, VEHICLE.hull_stiffness])
-    damping = min(vehicle[i, VEHICLE.hull_damping], vehicle[j, VEHICLE.hull_damping])
-    depth = vehicle[i, VEHICLE.hull_radius] + vehicle[j, VEHICLE.hull_radius] - distance
-    force = hull_force(stiffness, damping, depth, closing) / distance
+    stiffness = min(one[VEHICLE.hull_stiffness], other[VEHICLE.hull_stiffness])
+    damping = min(one[VEHICLE.hull_damping], other[VEHICLE.hull_damping])
+    depth = one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius] - distance
+    normal = hull_force(stiffness, damping, depth, -dot(v, n))
+    slip = axpy(v, -dot(v, n), n)
+    # slip is damped at the rate of the approach: a push across a hull turns it, and finds less inertia than one along d
+    straight = 1.0 / one[VEHICLE.mass] + 1.0 / other[VEHICLE.mass]
+    turning = dot(arms[0], arms[0]) / _least_inertia(one) + dot(arms[1], arms[1]) / _least_inertia(other)
+    viscous, limit = (
+        damping * straight / (straight + turning),
+        min(one[VEHICLE.friction], other[VEHICLE.friction]) * normal,
+    )
+    speed = norm(slip)
+    across = viscous if viscous * speed <= limit else limit / speed
+    f_W = axpy(scaled(n, normal), -across, slip)
+    brace(bodies, i)
+    brace(bodies, j)
+    twists = cross(arms[0], f_W), cross(arms[1], f_W)
     for k in range(3):
-        bodies.push[i, k] -= force * d[k]
-        bodies.push[j, k] += force * d[k]
+        bodies.push[i, k] -= f_W[k]
+        bodies.push[j, k] += f_W[k]
+        bodies.twist[i, k] -= twists[0][k]
+        bodies.twist[j, k] += twists[1][k]
+
+
+@inlined
+def _velocity_at(state: NDArray, r_W: Vector) -> Vector:
+    """Return the velocity in W [m/s] of a drone's point r_W from its centre."""
+    return add(vector(state, STATE.v_WB), cross(rotate(four(state, STATE.q_WB), vector(state, STATE.w_WB_B)), r_W))
+
+
+@inlined
+def _least_inertia(row: NDArray) -> float:
+    return min(row[VEHICLE.inertia], row[VEHICLE.inertia + 1], row[VEHICLE.inertia + 2])
 
 
 @inlined
@@ -139,37 +165,3 @@ def meet_drones(bodies: Bodies) -> float:
     for n in range(near.number[0]):
         least = min(least, _meet(bodies, near.pair[n, 0], near.pair[n, 1]))
     return max(math.sqrt(least), DISTANCE_MIN_M)
-
-
-def obstacle_rows(environment: Environment) -> NDArray[np.float64]:
-    """Return the obstacles of a scenario, (M, obstacle.COLUMNS)."""
-    return np.array([obstacle.row_of(each) for each in environment.obstacles]).reshape(-1, obstacle.COLUMNS)
-
-
-@apart
-def meet_obstacles(bodies: Bodies) -> None:
-    """Add to `push` what obstacles push drones with, and note who touches which; a hull is a sphere.
-
-    `bumping[i, m]` is 1 where they are in contact now; `bumped` is set to 1 where contact begins.
-    """
-    for i in range(bodies.state.shape[0]):
-        for m in range(bodies.obstacle.shape[0]):
-            depth = _push_off(bodies.vehicle[i], bodies.state[i], bodies.push[i], bodies.obstacle[m])
-            if depth > 0.0 and bodies.bumping[i, m] == 0:
-                bodies.bumped[i, m] = 1
-            bodies.bumping[i, m] = 1 if depth > 0.0 else 0
-
-
-@inlined
-def _push_off(vehicle: NDArray, state: NDArray, push: NDArray, solid: NDArray) -> float:
-    """Push one drone off one obstacle; return by how much its hull is dented [m], below 0 where they do not touch."""
-    p, v = STATE.p_WB, STATE.v_WB
-    distance, nx, ny, nz = nearest(solid, state[p], state[p + 1], state[p + 2])
-    depth = vehicle[VEHICLE.hull_radius] - distance
-    if depth > 0.0:
-        closing = -(state[v] * nx + state[v + 1] * ny + state[v + 2] * nz)
-        force = hull_force(vehicle[VEHICLE.hull_stiffness], vehicle[VEHICLE.hull_damping], depth, closing)
-        push[0] += force * nx
-        push[1] += force * ny
-        push[2] += force * nz
-    return depth

@@ -21,7 +21,7 @@ POINTS = 8  # under which there may be ground: four feet, four corners of the hu
 
 
 @inlined
-def _point(row: Row, k: int) -> Vector:
+def contact_point(row: Row, k: int) -> Vector:
     """Return contact point k in B [m]: front left, front right, rear right, rear left; first the feet."""
     foot, x, y = k < 4, 1.0 if k % 4 < 2 else -1.0, 1.0 if k % 4 in (0, 3) else -1.0
     xy = row[VEHICLE.foot_xy] if foot else row[VEHICLE.rim_xy]
@@ -30,7 +30,7 @@ def _point(row: Row, k: int) -> Vector:
 
 def contact_points(row: NDArray) -> np.ndarray:
     """Return all contact points in B [m], (POINTS, 3)."""
-    return np.array([[float(x) for x in cast(Any, _point).py_func(row, k)] for k in range(POINTS)])
+    return np.array([[float(x) for x in cast(Any, contact_point).py_func(row, k)] for k in range(POINTS)])
 
 
 @inlined
@@ -60,7 +60,7 @@ def contact(
     if p_WB[2] > row[VEHICLE.contact_reach]:
         return force, moment
     for k in range(POINTS):
-        r_B = _point(row, k)
+        r_B = contact_point(row, k)
         r_W = rotate(q_WB, r_B)
         depth = -(p_WB[2] + r_W[2])
         if depth > 0.0:
@@ -78,7 +78,7 @@ def contact(
 def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) -> None:
     """Move the anchors after a step: to the point itself in the air, along with it where it slides."""
     for k in range(POINTS):
-        r_W = rotate(q_WB, _point(row, k))
+        r_W = rotate(q_WB, contact_point(row, k))
         x, y = p_WB[0] + r_W[0], p_WB[1] + r_W[1]
         depth = -(p_WB[2] + r_W[2])
         gx, gy = x - anchor[k, 0], y - anchor[k, 1]

@@ -8,8 +8,9 @@ from zsim.math import rotation as rot
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, add, axpy
 from zsim_world.physics.ground import contact
-from zsim_world.physics.rotors import lagged, wrench
-from zsim_world.state.fleet_arrays import STATE, VEHICLE, PerRotor, Row, of, put_of
+from zsim_world.physics.obstacle_contact import Touch, touched
+from zsim_world.physics.rotors import in_flow, lagged, wrench
+from zsim_world.state.fleet_arrays import AERO, STATE, VEHICLE, Aero, PerRotor, Row, of, put_of
 
 NOTHING = (0.0, 0.0, 0.0)  # N or N m
 
@@ -59,6 +60,8 @@ def accelerations(
     decay: float | None,
     air_W: Vector,
     push_W: Vector,
+    touch: Touch | None = None,
+    aero: Aero | None = None,
 ) -> tuple[Vector, Vector]:
     """Return a_WB in W [m/s^2] and the angular acceleration in B [rad/s^2].
 
@@ -71,15 +74,22 @@ def accelerations(
         row, rotors: parameters; anchor: of its contact points (ground.py).
         p_WB, v_WB, q_WB, w_WB_B: state; speeds, commands, decay: of the rotors, as for `rotors.wrench`.
         air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
+        touch: what it touches besides, None: nothing; aero: its aerodynamics, None: none but `drag`.
     """
     ground = NOTHING, NOTHING
     if grounded:
         ground = contact(row, anchor, p_WB, v_WB, q_WB, w_WB_B)
+    if touch is not None:
+        others = touched(row, touch, p_WB, v_WB, q_WB, w_WB_B)
+        ground = add(ground[0], others[0]), add(ground[1], others[1])
     ix, iy, iz = vector(row, VEHICLE.inertia)
     thrust, moment = wrench(row, rotors, q_WB, p_WB[2], w_WB_B, speeds, commands, decay)
     moment = add(moment, ground[1])
     force = add(add(ground[0], push_W), rot.rotate(q_WB, (0.0, 0.0, thrust)))
     force = axpy(force, -row[VEHICLE.drag], axpy(v_WB, -1.0, air_W))
+    if aero is not None and len(aero.parts) > 1:
+        more = _flow(row, rotors, aero.numbers, axpy(v_WB, -1.0, air_W), q_WB, w_WB_B, speeds, commands, decay)
+        force, moment = add(force, more[0]), add(moment, more[1])
     inv = 1.0 / row[VEHICLE.mass]
     wx, wy, wz = w_WB_B
     return (
@@ -90,6 +100,30 @@ def accelerations(
             (moment[2] - (iy - ix) * wx * wy) / iz,
         ),
     )
+
+
+@inlined
+def _flow(
+    row: Row,
+    rotors: PerRotor,
+    aero: Row,
+    u_W: Vector,
+    q_WB: Quaternion,
+    w_WB_B: Vector,
+    speeds: PerRotor,
+    commands: PerRotor,
+    decay: float | None,
+) -> tuple[Vector, Vector]:
+    """Return the force in W [N] and the moment in B [N m] of the aerodynamics, u_W being the velocity in the air."""
+    u = rot.rotate_back(q_WB, u_W)
+    force, moment = in_flow(row, rotors, aero, u, w_WB_B, speeds, commands, decay)
+    size, linear, quadratic = rot.norm(u), AERO.linear, AERO.quadratic
+    drag = (
+        -(aero[linear] + size * aero[quadratic]) * u[0],
+        -(aero[linear + 1] + size * aero[quadratic + 1]) * u[1],
+        -(aero[linear + 2] + size * aero[quadratic + 2]) * u[2],
+    )
+    return rot.rotate(q_WB, add(force, drag)), moment
 
 
 @inlined
@@ -118,6 +152,8 @@ def step(
     air_W: Vector,
     push_W: Vector,
     dt: float,
+    touch: Touch | None = None,
+    aero: Aero | None = None,
 ) -> None:
     """Advance one drone's state (STATE.size + R,) by dt [s] in place, under a command (R,) [rad/s] to its rotors.
 
@@ -126,7 +162,9 @@ def step(
     decay = half_decay(row[VEHICLE.rotor_lag], dt)
     speeds, commands = PerRotor(state, STATE.size, 1, rotors.each), PerRotor(command, 0, 1, rotors.each)
     p, v, q, w = pose(state)
-    p, v, q, w, _ = stepped(True, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air_W, push_W, dt)
+    p, v, q, w, _ = stepped(
+        True, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air_W, push_W, dt, touch, aero
+    )
     put(state, STATE.p_WB, p)
     put(state, STATE.v_WB, v)
     put_four(state, STATE.q_WB, q)
@@ -163,26 +201,34 @@ def stepped(
     air_W: Vector,
     push_W: Vector,
     dt: float,
+    touch: Touch | None = None,
+    aero: Aero | None = None,
 ) -> tuple[Vector, Vector, Quaternion, Vector, bool]:
     """Return p_WB, v_WB, q_WB, w_WB_B after dt [s], and whether the ground was out of reach; speeds stay.
 
     Args:
-        grounded, row, rotors, anchor, air_W, push_W: as for `accelerations`.
+        grounded, row, rotors, anchor, air_W, push_W, touch, aero: as for `accelerations`.
         p, v, q, w: state; speeds, commands: of the rotors at the start; decay: of their lag, see `half_decay`.
     """
     h, reach = 0.5 * dt, row[VEHICLE.contact_reach]
 
-    a1, b1 = accelerations(grounded, row, rotors, anchor, p, v, q, w, speeds, commands, None, air_W, push_W)
+    a1, b1 = accelerations(
+        grounded, row, rotors, anchor, p, v, q, w, speeds, commands, None, air_W, push_W, touch, aero
+    )
     d1 = rot.rate(q, w)
     p2, v2, w2, q2 = axpy(p, h, v), axpy(v, h, a1), axpy(w, h, b1), _turned(q, h, d1)
-    a2, b2 = accelerations(grounded, row, rotors, anchor, p2, v2, q2, w2, speeds, commands, decay, air_W, push_W)
+    a2, b2 = accelerations(
+        grounded, row, rotors, anchor, p2, v2, q2, w2, speeds, commands, decay, air_W, push_W, touch, aero
+    )
     d2 = rot.rate(q2, w2)
     p3, v3, w3, q3 = axpy(p, h, v2), axpy(v, h, a2), axpy(w, h, b2), _turned(q, h, d2)
-    a3, b3 = accelerations(grounded, row, rotors, anchor, p3, v3, q3, w3, speeds, commands, decay, air_W, push_W)
+    a3, b3 = accelerations(
+        grounded, row, rotors, anchor, p3, v3, q3, w3, speeds, commands, decay, air_W, push_W, touch, aero
+    )
     d3 = rot.rate(q3, w3)
     p4, v4, w4, q4 = axpy(p, dt, v3), axpy(v, dt, a3), axpy(w, dt, b3), _turned(q, dt, d3)
     a4, b4 = accelerations(
-        grounded, row, rotors, anchor, p4, v4, q4, w4, speeds, commands, decay * decay, air_W, push_W
+        grounded, row, rotors, anchor, p4, v4, q4, w4, speeds, commands, decay * decay, air_W, push_W, touch, aero
     )
     d4 = rot.rate(q4, w4)
 

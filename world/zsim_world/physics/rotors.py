@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, rotate
-from zsim_world.state.fleet_arrays import VEHICLE, PerRotor, Row, mixed, of, place, put_of
+from zsim_world.state.fleet_arrays import AERO, ROTOR, VEHICLE, PerRotor, Row, lift_share, mixed, of, place, put_of
 
+LOW_SQUARE_MIN = 1e-12  # (rad/s)^2, of rotors that may stand still
 GROUND_CLEARANCE_MIN = 0.5  # radii, the formula below is not meant for less
 
 
@@ -75,6 +76,42 @@ def wrench(
 
 
 @inlined
+def in_flow(
+    row: Row,
+    rotors: PerRotor,
+    aero: Row,
+    u_B: Vector,
+    w_WB_B: Vector,
+    speeds: PerRotor,
+    commands: PerRotor,
+    decay: float | None,
+) -> tuple[Vector, Vector]:
+    """Return force [N] and moment [N m] in B that a flow past the rotors adds (zsim.vehicles.vehicle.Aerodynamics).
+
+    Translational lift, stated for rotors that fly, goes with the square of a speed below the least one commanded.
+
+    Args:
+        aero: (AERO.size,); u_B: velocity of the centre of mass against the air, in B [m/s].
+        row, rotors, w_WB_B, speeds, commands, decay: as for `wrench`.
+    """
+    unit, (wx, wy, wz) = row[VEHICLE.rotor_unit], w_WB_B
+    fx, fy, fz, mx, my, mz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for r in range(len(rotors.each)):
+        x, y, _ = place(rotors, r)
+        x, y = x * unit, y * unit
+        speed, low = of(speeds, 0, r), of(rotors, ROTOR.low, r)
+        if decay is not None:
+            speed = lagged(speed, of(commands, 0, r), decay)
+        ux, uy, uz = u_B[0] - wz * y, u_B[1] + wz * x, u_B[2] + wx * y - wy * x
+        across = -aero[AERO.rotor_drag] * speed
+        flying = min(speed * speed / max(low * low, LOW_SQUARE_MIN), 1.0)
+        lift = aero[AERO.rotor_lift] * (ux * ux + uy * uy) * flying - aero[AERO.rotor_inflow] * speed * uz
+        fx, fy, fz = fx + across * ux, fy + across * uy, fz + lift
+        mx, my, mz = mx + y * lift, my - x * lift, mz + x * across * uy - y * across * ux
+    return (fx, fy, fz), (mx, my, mz)
+
+
+@inlined
 def free_thrust(row: Row, speeds: PerRotor) -> float:
     """Return the thrust [N] far from the ground."""
     squares = 0.0
@@ -93,23 +130,26 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
     low = thrust * row[VEHICLE.rotor_min] * row[VEHICLE.rotor_min]
     high = thrust * row[VEHICLE.rotor_max] * row[VEHICLE.rotor_max]
     roll, pitch = moment[0] / row[VEHICLE.rotor_unit], moment[1] / row[VEHICLE.rotor_unit]
-    reach = 0.0
+    reach, least, most_lift = 0.0, lift_share(rotors, 0), lift_share(rotors, 0)
     for r in range(len(rotors.each)):
         by_roll, by_pitch, _, _ = mixed(rotors, r)
         reach = max(reach, abs(by_roll * roll + by_pitch * pitch))
-    scale = (high - low) / (2.0 * reach) if 2.0 * reach > high - low else 1.0
+        least, most_lift = min(least, lift_share(rotors, r)), max(most_lift, lift_share(rotors, r))
+    # a mean with (low + reach) / least <= mean <= (high - reach) / most_lift, and the tilt that leaves one
+    room = (high * least - low * most_lift) * (2.0 / (least + most_lift))
+    scale = room / (2.0 * reach) if 2.0 * reach > room else 1.0
     roll, pitch, reach = roll * scale, pitch * scale, reach * scale
-    mean = min(max(row[VEHICLE.rotor_share] * thrust_n, low + reach), high - reach)
+    mean = min(max(row[VEHICLE.rotor_share] * thrust_n, (low + reach) / least), (high - reach) / most_lift)
     yaw = moment[2] * thrust / row[VEHICLE.torque]
     sign, most = (1.0 if yaw >= 0.0 else -1.0), abs(yaw)
     for r in range(len(rotors.each)):
         by_roll, by_pitch, by_yaw, inverse = mixed(rotors, r)
-        force, share = mean + by_roll * roll + by_pitch * pitch, sign * by_yaw
+        force, share = mean * lift_share(rotors, r) + by_roll * roll + by_pitch * pitch, sign * by_yaw
         room = (high - force if share > 0.0 else low - force) * (sign * inverse)
         most = min(most, room if share != 0.0 else most)
     for r in range(len(rotors.each)):
         by_roll, by_pitch, by_yaw, _ = mixed(rotors, r)
-        force = mean + by_roll * roll + by_pitch * pitch
+        force = mean * lift_share(rotors, r) + by_roll * roll + by_pitch * pitch
         put_of(speeds, r, math.sqrt(max(force + sign * by_yaw * most, low) / thrust))
 
 

@@ -8,7 +8,7 @@ its columns are constants, so that neither a check of overlaps nor a rest is nee
 drone in their order, so that the results are the same to the last bit, whatever the block.
 
 Equations that branch, as those of contact with the ground, are done for each drone by itself: a block is stepped as
-in free air, and drones that had the ground in reach take their step again with it.
+in free air, and drones that had the ground or an obstacle in reach, or touch another, take their step again with it.
 """
 
 from collections.abc import Iterable
@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import apart, inlined
 from zsim.math.rotation import Quaternion, Vector
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.ground import drag_anchors
+from zsim_world.physics.obstacle_contact import Touch
 from zsim_world.physics.rigid_body import four, put, vector
-from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, Bodies, PerRotor, Row
+from zsim_world.state.fleet_arrays import AERO, ROTOR, STATE, VEHICLE, Aero, Bodies, PerRotor, Row
 
 LANES = 8  # doubles in a register of 512 bit, or in two of 256
 
@@ -36,6 +37,7 @@ BODY_LANES = columns(
         Field("air", "m/s", 3),
         Field("push", "N", 3),
         Field("accel", "m/s^2, rad/s^2", 6),  # in W; angular, in B
+        Field("aero", "AERO", AERO.size),
         Field("clear", "1"),  # 1 if the ground was out of reach in the whole step, so that its result holds
     ),
 )
@@ -61,11 +63,11 @@ def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDAr
     return made.reshape(number, -1)
 
 
-def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray) -> NDArray[np.float64]:
-    """Return the blocks of N bodies: parameters, those of their rotors, and the lag of these in half a tick (N, 1)."""
+def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray, aero: NDArray) -> NDArray[np.float64]:
+    """Return the blocks of N bodies: parameters, rotors, the lag of these in half a tick (N, 1), aerodynamics."""
     each = rotors.shape[1] // ROTOR.size
     known = BODY_LANES.size + BODY_ROTORS.known * each
-    parts = ((BODY_LANES.vehicle, row), (BODY_LANES.decay, decay), (known, rotors))
+    parts = ((BODY_LANES.vehicle, row), (BODY_LANES.decay, decay), (BODY_LANES.aero, aero), (known, rotors))
     return blocks(BODY_LANES.size + BODY_ROTORS.size * each, parts)
 
 
@@ -75,6 +77,13 @@ def lane_row(block: NDArray, k: int) -> Row:
     a, b, c, d = lane_four(block, 0, k), lane_four(block, 4, k), lane_four(block, 8, k), lane_four(block, 12, k)
     e, f, g, h = lane_four(block, 16, k), lane_four(block, 20, k), lane_four(block, 24, k), lane_four(block, 28, k)
     return a + b + c + d + e + f + g + h
+
+
+@inlined
+def _lane_aero(block: NDArray, k: int, parts: tuple[int, ...]) -> Aero:
+    """Return the aerodynamics of the drone in lane k of a block of bodies."""
+    a, b = lane_four(block, BODY_LANES.aero, k), lane_four(block, BODY_LANES.aero + 4, k)
+    return Aero(parts, a + b + (block[LANES * (BODY_LANES.aero + 8) + k],))
 
 
 @inlined
@@ -122,7 +131,7 @@ def move(bodies: Bodies, dt: float) -> None:
     for first in range(0, count, LANES):
         lanes = bodies.lanes[first // LANES]
         if _load(bodies, lanes, first):
-            _step_block(lanes, bodies.each, bodies.anchor[0], dt)
+            _step_block(lanes, bodies.each, bodies.aero_parts, bodies.anchor[0], dt)
         else:
             for k in range(LANES):
                 lanes[LANES * BODY_LANES.clear + k] = 0.0
@@ -137,9 +146,11 @@ def accelerate(bodies: Bodies) -> None:
     for first in range(0, count, LANES):
         lanes = bodies.lanes[first // LANES]
         if _load(bodies, lanes, first):
-            _accelerate_block(lanes, bodies.each, bodies.anchor[0])
+            _accelerate_block(lanes, bodies.each, bodies.aero_parts, bodies.anchor[0])
         for i in range(first, min(first + LANES, count)):
-            if _in_reach(bodies, i):
+            if bodies.braced[i] != 0:
+                _accelerate_braced(bodies, i)
+            elif _in_reach(bodies, i):
                 _accelerate_low(bodies, i)
             else:
                 for c in range(6):
@@ -199,7 +210,7 @@ def _pose(lanes: NDArray, k: int) -> tuple[Vector, Vector, Quaternion, Vector]:
 
 
 @inlined
-def _step_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray, dt: float) -> None:
+def _step_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, ...], anchor: NDArray, dt: float) -> None:
     """Take a step of dt [s] with all drones of the block, as in free air."""
     for k in range(LANES):
         p, v, q, w = _pose(lanes, k)
@@ -208,7 +219,10 @@ def _step_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray, dt: floa
         commands = lane_rotors(lanes, _group(BODY_ROTORS.command, each), k, each)
         air, push = lane_vector(lanes, BODY_LANES.air, k), lane_vector(lanes, BODY_LANES.push, k)
         decay, row = lanes[LANES * BODY_LANES.decay + k], lane_row(lanes, k)
-        p, v, q, w, clear = body.stepped(False, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air, push, dt)
+        aero = _lane_aero(lanes, k, parts)
+        p, v, q, w, clear = body.stepped(
+            False, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air, push, dt, None, aero
+        )
         put_lane_vector(lanes, BODY_LANES.state + STATE.p_WB, k, p)
         put_lane_vector(lanes, BODY_LANES.state + STATE.v_WB, k, v)
         put_lane_four(lanes, BODY_LANES.state + STATE.q_WB, k, q)
@@ -218,7 +232,7 @@ def _step_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray, dt: floa
 
 
 @inlined
-def _accelerate_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray) -> None:
+def _accelerate_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, ...], anchor: NDArray) -> None:
     """Find the accelerations of all drones of the block, as in free air."""
     for k in range(LANES):
         p, v, q, w = _pose(lanes, k)
@@ -226,8 +240,10 @@ def _accelerate_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray) ->
         speeds = lane_rotors(lanes, _group(BODY_ROTORS.speed, each), k, each)
         commands = lane_rotors(lanes, _group(BODY_ROTORS.command, each), k, each)
         air, push = lane_vector(lanes, BODY_LANES.air, k), lane_vector(lanes, BODY_LANES.push, k)
-        row = lane_row(lanes, k)
-        a, alpha = body.accelerations(False, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push)
+        row, aero = lane_row(lanes, k), _lane_aero(lanes, k, parts)
+        a, alpha = body.accelerations(
+            False, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, None, aero
+        )
         put_lane_vector(lanes, BODY_LANES.accel, k, a)
         put_lane_vector(lanes, BODY_LANES.accel + 3, k, alpha)
 
@@ -239,16 +255,45 @@ def _accelerate_low(bodies: Bodies, i: int) -> None:
     p, v, q, w = body.pose(bodies.state[i])
     rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
     commands, air, push = PerRotor(bodies.command[i], 0, 1, each), vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push)
+    aero = Aero(bodies.aero_parts, bodies.aero[i])
+    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, None, aero)
     put(bodies.accel[i], 0, a)
     put(bodies.accel[i], 3, alpha)
 
 
 @inlined
-def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> None:
-    """Take over what became of drone i in lane k; where the ground was in reach, let it take its step again with it."""
+def _touch(bodies: Bodies, i: int) -> Touch:
+    return Touch(bodies.obstacle, bodies.solid[i], bodies.held[i], vector(bodies.twist[i], 0))
+
+
+@apart
+def _accelerate_braced(bodies: Bodies, i: int) -> None:
+    """Do as `_accelerate_low`, with all that the drone touches."""
+    each, row, anchor, touch = bodies.each, bodies.vehicle[i], bodies.anchor[i], _touch(bodies, i)
+    p, v, q, w = body.pose(bodies.state[i])
+    rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
+    commands, air, push = PerRotor(bodies.command[i], 0, 1, each), vector(bodies.air[i], 0), vector(bodies.push[i], 0)
+    aero = Aero(bodies.aero_parts, bodies.aero[i])
+    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, touch, aero)
+    put(bodies.accel[i], 0, a)
+    put(bodies.accel[i], 3, alpha)
+
+
+@apart
+def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
+    """Let a drone take its step with all that it touches."""
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
-    if lanes[LANES * BODY_LANES.clear + k] > 0.0:
+    air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
+    rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
+    aero = Aero(bodies.aero_parts, bodies.aero[i])
+    body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt, _touch(bodies, i), aero)
+
+
+@inlined
+def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> None:
+    """Take over what became of drone i in lane k; where it was not in free air, let it take its step again."""
+    row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
+    if lanes[LANES * BODY_LANES.clear + k] > 0.0 and bodies.braced[i] == 0:
         for c in range(STATE.size):
             state[c] = lanes[LANES * (BODY_LANES.state + c) + k]
         for r in range(len(bodies.each)):
@@ -256,9 +301,13 @@ def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> Non
     else:
         if not _in_reach(bodies, i):  # the anchors were not moved while it was high
             drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))
-        rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
-        air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-        body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt)
+        if bodies.braced[i] != 0:
+            _step_braced(bodies, i, dt)
+        else:
+            rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
+            air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
+            aero = Aero(bodies.aero_parts, bodies.aero[i])
+            body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt, None, aero)
         _put_state(lanes, k, state, bodies.each)
     if _in_reach(bodies, i):
         drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))

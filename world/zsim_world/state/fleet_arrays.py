@@ -12,16 +12,16 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.scenario.scenario import Drone, Environment
-from zsim.schema.quantities import SEA_LEVEL_KG_M3
-from zsim.vehicles.vehicle import Vehicle, allocation, mixing
+from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
+from zsim.vehicles.vehicle import Aerodynamics, Vehicle, allocation, lift_shares, mixing
 
 REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # thrust, torque and drag of a vehicle hold there
-COULOMB_PER_MAH = 3.6  # C per mAh: 3600 s to the hour
 
 VEHICLE = columns(
     "VehicleColumns",
@@ -70,6 +70,17 @@ ROTOR = columns(  # groups of what is known of each rotor
         Field("pitch", "1"),
         Field("yaw", "1"),  # thrust per moment over torque per thrust
         Field("yaw_inverse", "1"),  # 0 where yaw is
+        Field("lift", "1"),  # thrust over the mean of all, so that it gives no moment; 1 of balanced rotors
+    ),
+)
+AERO = columns(  # zsim.vehicles.vehicle.Aerodynamics, at the field's air density
+    "AeroColumns",
+    (
+        Field("linear", "N s/m", 3),
+        Field("quadratic", "N s^2/m^2", 3),
+        Field("rotor_drag", "N s^2/m"),
+        Field("rotor_inflow", "N s^2/m"),
+        Field("rotor_lift", "N s^2/m^2"),
     ),
 )
 STATE = columns(  # and R speeds [rad/s]
@@ -120,9 +131,15 @@ class Bodies(NamedTuple):
     touched: NDArray  # int8 (N, N), contacts that began in this gate
     near: NearPairs
     obstacle: NDArray  # (M, obstacle.COLUMNS)
-    bumping: NDArray  # int8 (N, M), whose hull touches which obstacle
+    bumping: NDArray  # int8 (N, M), who touches which obstacle with more than its feet
     bumped: NDArray  # int8 (N, M), contacts that began in this gate
+    solid: NDArray  # int32 (N, K), the obstacles in reach of each, see physics/obstacle_contact.py
+    held: NDArray  # (N, K, BALLS, 3), m, anchors on them
+    braced: NDArray  # int8 (N,), 1 where an obstacle is in reach or a hull touches another
+    twist: NDArray  # (N, 3), N m in W, of other drones' hulls; of those that are braced
     lanes: NDArray  # (blocks, columns of a block), see physics/simd.py
+    aero_parts: tuple[int, ...]  # one number; two where any drone has aerodynamics, which are left out else
+    aero: NDArray  # (N, AERO.size)
     external: NDArray  # int64 (E,), the drones that are not integrated
     pose: NDArray  # (E, STATE.size + R), where they are: moved on with their velocities in every tick
 
@@ -196,6 +213,13 @@ class PerRotor(NamedTuple):
     each: tuple[int, ...]
 
 
+class Aero(NamedTuple):
+    """Aerodynamics of one drone; compiled code knows how many `parts` (Bodies.aero_parts), and leaves out the rest."""
+
+    parts: tuple[int, ...]
+    numbers: Row  # (AERO.size,)
+
+
 @inlined
 def of(rotors: PerRotor, group: int, r: int) -> float:
     """Return the number of rotor r in a group of groups."""
@@ -217,6 +241,14 @@ def mixed(rotors: PerRotor, r: int) -> tuple[float, float, float, float]:
         return _ROLL[r], _PITCH[r], _YAW[r], 1.0 / _YAW[r]
     inverse = of(rotors, ROTOR.yaw_inverse, r)
     return of(rotors, ROTOR.roll, r), of(rotors, ROTOR.pitch, r), of(rotors, ROTOR.yaw, r), inverse
+
+
+@inlined
+def lift_share(rotors: PerRotor, r: int) -> float:
+    """Return the thrust of rotor r over the mean, `rotors` being its parameters."""
+    if len(rotors.each) == CROSS_ROTORS:
+        return 1.0
+    return of(rotors, ROTOR.lift, r)
 
 
 @inlined
@@ -268,6 +300,16 @@ def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDA
     return row
 
 
+def aero_row(drone: Drone, environment: Environment) -> NDArray[np.float64]:
+    """Return the aerodynamics of one drone, (AERO.size,)."""
+    row, aero = np.empty(AERO.size), Aerodynamics() if drone.aerodynamics is UNSET else drone.aerodynamics
+    row[AERO.linear : AERO.linear + 3] = aero.linear_drag_n_s_m
+    row[AERO.quadratic : AERO.quadratic + 3] = aero.quadratic_drag_n_s2_m2
+    row[AERO.rotor_drag], row[AERO.rotor_inflow] = aero.rotor_drag_n_s2_m, aero.rotor_inflow_n_s2_m
+    row[AERO.rotor_lift] = aero.rotor_lift_n_s2_m2
+    return row * (environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3)
+
+
 def rotor_row(vehicle: Vehicle, drone: Drone, rotors: int) -> NDArray[np.float64]:
     """Return what is known of each rotor of one drone, (ROTOR.size * rotors,)."""
     groups, count = np.zeros((ROTOR.size, rotors)), len(vehicle.rotors)
@@ -275,6 +317,7 @@ def rotor_row(vehicle: Vehicle, drone: Drone, rotors: int) -> NDArray[np.float64
     groups[ROTOR.x, :count], groups[ROTOR.y, :count], groups[ROTOR.turn, :count] = -minus_pitch, roll, turn
     groups[ROTOR.low, :count], groups[ROTOR.high, :count] = drone.rotor_min_rad_s, drone.rotor_max_rad_s
     groups[ROTOR.roll : ROTOR.yaw + 1, :count] = mixing(vehicle).T
+    groups[ROTOR.lift], groups[ROTOR.lift, :count] = 1.0, lift_shares(vehicle)
     yaw = groups[ROTOR.yaw]
     groups[ROTOR.yaw_inverse] = np.divide(1.0, yaw, out=np.zeros(rotors), where=yaw != 0.0)
     return groups.ravel()

@@ -25,7 +25,7 @@ from zsim_world.physics.rigid_body import four, vector
 from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor, of, put_of
 from zsim_world.vehicles.attitude_control import DRIVE, clipped
 from zsim_world.vehicles.firmware_settings import SETTING
-from zsim_world.vehicles.observer import BELIEF, STEP_S, STILL_STEPS_MIN, lift
+from zsim_world.vehicles.observer import BELIEF, FLOOR_MIN_M, STEP_S, STILL_STEPS_MIN, lift, standing_height
 
 LANDED, TAKING_OFF, HOVERING, FLYING, LANDING, EMERGENCY = range(6)
 MODES: tuple[DroneState, ...] = ("landed", "taking_off", "hovering", "flying", "landing", "emergency")
@@ -112,6 +112,8 @@ def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
     memory[MEMORY.holds_xy], memory[MEMORY.holds_z] = 0.0, 0.0
     if mode == LANDED:
         belief[BELIEF.still_steps] = STILL_STEPS_MIN
+        height = belief[BELIEF.height]
+        belief[BELIEF.stand_height] = height if height > FLOOR_MIN_M else 0.0
 
 
 @inlined
@@ -282,7 +284,7 @@ def _climb(
     if mode == LANDING:
         return -_descent(memory, belief, row, setting, each)
     if mode == TAKING_OFF:
-        return _ascent(memory, row, setting, height)
+        return _ascent(memory, belief, row, setting)
     if asked != 0.0:
         memory[MEMORY.holds_z] = 0.0
         return min(asked, setting[SETTING.k_height] * (setting[SETTING.altitude] - height))
@@ -293,16 +295,18 @@ def _climb(
 
 
 @inlined
-def _ascent(memory: NDArray, row: NDArray, setting: NDArray, height: float) -> float:
+def _ascent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
     """Return the vertical velocity of a take-off [m/s]: along a height that rises evenly."""
+    height, standing = belief[BELIEF.height], standing_height(belief, row)
+    final = min(setting[SETTING.takeoff_height] + (standing - row[VEHICLE.stand_height]), setting[SETTING.altitude])
     if memory[MEMORY.holds_z] == 0.0:
-        memory[MEMORY.hold_z], memory[MEMORY.holds_z] = row[VEHICLE.stand_height], RISING
+        memory[MEMORY.hold_z], memory[MEMORY.holds_z] = standing, RISING
     rising = 0.0
     if memory[MEMORY.holds_z] == RISING:
         rising = setting[SETTING.ascent]
         memory[MEMORY.hold_z] += rising * STEP_S
-        if memory[MEMORY.hold_z] >= setting[SETTING.takeoff_height]:
-            memory[MEMORY.hold_z], memory[MEMORY.holds_z] = setting[SETTING.takeoff_height], HOLDING
+        if memory[MEMORY.hold_z] >= final:
+            memory[MEMORY.hold_z], memory[MEMORY.holds_z] = final, HOLDING
     return rising + _clip(setting[SETTING.k_height] * (memory[MEMORY.hold_z] - height), setting[SETTING.climb])
 
 

@@ -37,6 +37,7 @@ BELIEF = columns(  # and R rotor speeds, modelled [rad/s]
         Field("sonar_age", "1"),  # steps since the last good echo
         Field("lift_bias", "m/s^2"),  # of the accelerometer along the vertical
         Field("heading", "rad"),  # of q_WB
+        Field("stand_height", "m"),  # at which it has landed on what is not the ground; 0 on the ground
     ),
 )
 DEVICE = columns(  # the newest sample of each sensor, and whether it is new
@@ -70,6 +71,7 @@ STILL_STEPS_MIN = 50.0  # what knowing a floor to be level to 0.05 rad is worth,
 STILL_STEPS_SWAY = 400.0  # the gyro's bias is averaged slower: in a wind a standing drone sways on its feet
 STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks on, so older samples have less weight
 FLOW_QUALITY_MIN = 0.3  # below, the picture shows more horizon than ground
+FLOOR_MIN_M = 0.3  # m, chosen: a landing believed to be higher is on a roof; sonars measure from 0.25 m on or less
 SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barometer
 MAG_MIN_UT = 1.0  # uT, a horizontal field that still gives a heading
 
@@ -171,8 +173,14 @@ def _stand(belief: NDArray, row: NDArray, own: Quaternion, f_B: Vector, w: Vecto
     put(belief, BELIEF.v_H, (0.0, 0.0, 0.0))
     put(belief, BELIEF.disturbance, (0.0, 0.0, 0.0))
     belief[BELIEF.lift_bias] += (f_H[2] - row[VEHICLE.gravity] - belief[BELIEF.lift_bias]) / n
-    belief[BELIEF.height] = row[VEHICLE.stand_height]
+    belief[BELIEF.height] = standing_height(belief, row)
     return own
+
+
+@inlined
+def standing_height(belief: NDArray, row: NDArray) -> float:
+    """Return the believed height [m] of a drone that stands, on the ground or on what it has landed on."""
+    return max(row[VEHICLE.stand_height], belief[BELIEF.stand_height])
 
 
 @inlined

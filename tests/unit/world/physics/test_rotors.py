@@ -8,10 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vehicle_rows import one_drone, per_rotor
 
+from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
+from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.physics import rotors
 from zsim_world.physics.rotors import ground_effect, lagged
-from zsim_world.state.fleet_arrays import VEHICLE
+from zsim_world.state.fleet_arrays import VEHICLE, PerRotor, rotor_row, rotor_slots, vehicle_row
 
 LEVEL, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 HIGH = 1000.0  # m, out of ground effect
@@ -104,3 +106,29 @@ def test_ground_effect_values(height, factor):
 def test_lag_is_exponential():
     assert lagged(100.0, 200.0, math.exp(-1.0)) == pytest.approx(200 - 100 / math.e)
     assert lagged(300.0, 300.0, math.exp(-1.0)) == 300.0
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.floats(-20.0, 40.0),
+    st.tuples(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0), st.floats(-0.5, 0.5)),
+)
+def test_off_the_centre_the_mixer_keeps_the_limits_and_the_direction_of_the_tilt(thrust, asked):
+    """The Iris, whose rear rotors bear more: thrust alone turns nothing, and what is asked within reach is given."""
+    drones = [{"name": "a", "model": "iris", "position_m": [0, 0, 0]}]
+    scenario = resolve({"name": "t", "duration_s": 1, "drones": drones})
+    vehicle, drone = vehicle_of("iris"), scenario.drones[0]
+    slots = rotor_slots([vehicle])
+    row = vehicle_row(vehicle, drone, scenario.environment)
+    known = PerRotor(rotor_row(vehicle, drone, slots), 0, 1, tuple(range(slots)))
+    speeds = per_rotor([0.0] * slots)
+    rotors.mix(row, known, thrust, asked, speeds)
+    low, high = row[VEHICLE.rotor_min], row[VEHICLE.rotor_max]
+    flown = speeds.numbers[:4]
+    speeds.numbers[4:] = 0.0  # a slot without a rotor, whose command is clipped to nothing
+    assert all(low - 1e-9 <= speed <= high + 1e-9 for speed in flown)
+    total, moment = rotors.wrench(row, known, LEVEL, HIGH, STILL, speeds, speeds, None)
+    assert abs(moment[0] * asked[1] - moment[1] * asked[0]) < 1e-4  # its direction kept
+    if 8.0 < thrust < 16.0 and max(map(abs, asked)) < 0.1:
+        assert math.isclose(total, thrust, rel_tol=1e-4)
+        np.testing.assert_allclose(moment[:2], asked[:2], atol=1e-4)

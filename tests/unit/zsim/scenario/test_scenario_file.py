@@ -571,6 +571,28 @@ def test_a_fault_that_all_drones_share_is_told_once():
             ("drones[0].rotor_min_rad_s", "600", "<", "rotor_max_rad_s", "503"),
         ),
         (
+            {"drones": [drone("a", rotor_min_rad_s=400)]},
+            ("drones[0].rotor_min_rad_s", "400", "<", "361.5", "hover"),
+        ),
+        (  # metres of torque per thrust, as RotorS has it
+            {"drones": [drone("a", torque_nm_s2=0.016)]},
+            ("drones[0].torque_nm_s2", "0.016", "3.36e+06 W", "1.29", "4.29e+03 W", "thrust_n_s2"),
+        ),
+        ({"drones": [drone("a", torque_nm_s2=1e-15)]}, ("drones[0].torque_nm_s2", "1e-15", "W", "N m s^2")),
+        (  # per (rev/s)^2 instead of (rad/s)^2, and more
+            {"drones": [drone("a", thrust_n_s2=0.01)]},
+            ("drones[0].thrust_n_s2", "0.01", "0.042 %", "0.5", "90 %", "N s^2"),
+        ),
+        (  # ampere-hours
+            {"drones": [drone("a", battery_mah=1)]},
+            ("drones[0].battery_mah", "0.72 s", "10", "86400 s", "mAh"),
+        ),
+        ({"drones": [drone("a", battery_mah=1e6)]}, ("drones[0].battery_mah", "7.2e+05 s", "86400 s")),
+        (
+            {"drones": [drone("a", limits={"tilt_deg": 58})]},
+            ("drones[0].limits.tilt_deg", "58", "<=", "55.0", "weight"),
+        ),
+        (
             {"sensors": {"imu": {"rate_hz": 500}}, "drones": [drone("a")]},
             ("drones[0].sensors.imu.rate_hz", "500", "<=", "200"),
         ),
@@ -853,6 +875,17 @@ def test_a_drone_s_own_field_wins_over_the_shared_vehicle_s():
     a, b = scenario_file.resolve(document(drones=drones, vehicle=vehicle)).drones
     assert [(each.mass_kg, each.battery_mah) for each in (a, b)] == [(0.5, 1500), (0.48, 1500)]
     assert [(each.limits.tilt_deg, each.limits.altitude_m) for each in (a, b)] == [(12, 30), (9, 30)]
+
+
+def test_aerodynamics_are_taken_one_by_one_and_left_out_where_there_are_none():
+    vehicle = {"aerodynamics": {"rotor_drag_n_s2_m": 1e-4, "rotor_lift_n_s2_m2": 1e-3}}
+    drones = [drone("a"), drone("b", 2.0, aerodynamics={"rotor_drag_n_s2_m": 2e-4}), drone("c", 4.0, model="iris")]
+    a, b, c = scenario_file.resolve(document(drones=drones, vehicle=vehicle)).drones
+    coefficients = [(x.aerodynamics.rotor_drag_n_s2_m, x.aerodynamics.rotor_lift_n_s2_m2) for x in (a, b, c)]  # type: ignore[union-attr]
+    assert coefficients == [(1e-4, 1e-3), (2e-4, 1e-3), (1e-4, 1e-3)]
+    (iris,) = scenario_file.resolve(document(drones=[drone("c", model="iris")])).drones
+    assert iris.aerodynamics.rotor_drag_n_s2_m == 8.06428e-5  # type: ignore[union-attr]
+    assert "aerodynamics" not in scenario_file.to_text(scenario_file.resolve(document(drones=[drone("a")])))
 
 
 @pytest.mark.parametrize(

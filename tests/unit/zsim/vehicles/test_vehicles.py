@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from zsim.errors import DocumentError, ScenarioError
 from zsim.scenario import scenario_file
 from zsim.vehicles import ardrone2, vehicle_catalogue
-from zsim.vehicles.vehicle import DEFAULTS, Rotor, Vehicle, allocation, cross_layout, mixing
+from zsim.vehicles.vehicle import DEFAULTS, Rotor, Vehicle, allocation, cross_layout, lift_shares, mixing
 
 
 def document(**drone: Any) -> dict[str, Any]:
@@ -128,6 +128,21 @@ def test_rotors_that_cannot_hold_it_level_are_refused(rotors: tuple[Rotor, ...])
 
 
 def test_mixing_inverts_the_allocation_and_adds_no_thrust():
-    for vehicle in (*vehicle_catalogue.STOCK.values(), vehicle_catalogue.vehicle_of("hexacopter")):
+    own = [vehicle_catalogue.vehicle_of(name) for name in ("hexacopter", "iris")]
+    for vehicle in (*vehicle_catalogue.STOCK.values(), *own):
         np.testing.assert_allclose(allocation(vehicle) @ mixing(vehicle), np.eye(3), atol=1e-9)
         np.testing.assert_allclose(mixing(vehicle).sum(axis=0), 0.0, atol=1e-9)
+
+
+def test_the_lift_is_shared_so_that_nothing_turns():
+    """Two arms of one length and two of half of it: the near ones bear twice as much, 4/3 of the mean."""
+    rotors = [replace(each, x_m=each.x_m * (1.0 if each.x_m > 0 else 0.5)) for each in cross_layout(0.2)]
+    vehicle = with_rotors(*rotors)
+    np.testing.assert_allclose(lift_shares(vehicle), [2 / 3, 2 / 3, 4 / 3, 4 / 3], rtol=1e-9)
+    np.testing.assert_array_equal(lift_shares(ardrone2.VEHICLE), 1.0)
+
+
+def test_a_centre_of_mass_almost_under_the_front_rotors_is_refused():
+    rotors = [replace(each, x_m=each.x_m * (0.1 if each.x_m > 0 else 1.0)) for each in cross_layout(0.2)]
+    with pytest.raises(ValueError, match=r"rear_right\b.* 0\.18 .*>= 0\.2"):
+        with_rotors(*rotors)

@@ -1,0 +1,78 @@
+"""A pair that lands on the roof of a box 8 m away, rests there and takes off again; and one over whose edge it tips."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from operated_flight import OperatedFlight
+
+from zsim.scenario.scenario_file import resolve
+from zsim.vehicles.ardrone2 import VEHICLE
+
+ROOF_M, LAND_S = 1.0, 60.0
+STAND_M = VEHICLE.airframe.foot_depth_m - VEHICLE.airframe.foot_sag_m
+
+
+def pair(west_m: float, east_m: float) -> OperatedFlight:
+    """Return the flight to a box between these two x."""
+    size, place = [east_m - west_m, 6, ROOF_M], [0.5 * (west_m + east_m), 0, 0]
+    plan = {"takeoff_s": 5, "target": {"x_c": 8, "y_c": 0, "z_c": 4, "p": 4}, "land_s": LAND_S}
+    drones = [{"name": "drone1", "position_m": [2, 0, 0]}, {"name": "drone2", "position_m": [-2, 0, 0]}]
+    document: dict[str, Any] = {
+        "name": "roof",
+        "duration_s": 200,
+        "sensors": {"preset": "paper"},
+        "environment": {"obstacles": [{"name": "box", "shape": "box", "position_m": place, "size_m": size}]},
+        "drones": drones,
+        "clusters": [{"name": "main", "drones": ["drone1", "drone2"], "plan": plan}],
+    }
+    return OperatedFlight(resolve(document))
+
+
+def tilts_deg(flight: OperatedFlight) -> Any:
+    q = flight.world.fleet.truth().orientation_wxyz
+    return np.degrees(np.arccos(np.clip(1.0 - 2.0 * (q[:, 1] ** 2 + q[:, 2] ** 2), -1.0, 1.0)))
+
+
+def rest(flight: OperatedFlight) -> None:
+    """Expect both drones to rest on the roof."""
+    truth = flight.world.fleet.truth()
+    assert np.degrees(np.linalg.norm(truth.angular_velocity_rad_s, axis=1)).max() < 1.0
+    assert np.linalg.norm(truth.velocity_m_s, axis=1).max() < 1e-3
+    assert tilts_deg(flight).max() < 1.0
+    np.testing.assert_allclose(truth.position_m[:, 2], ROOF_M + STAND_M, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_pair_lands_on_a_roof_rests_and_takes_off_again() -> None:
+    """Expected: no collision is told, as on the ground; the second take-off ends at its height over the roof."""
+    flight = pair(5.0, 11.0)
+    flight.until(lambda: flight.t_s > LAND_S and set(flight.states.values()) == {"landed"})
+    flight.fly(2.0)
+    rest(flight)
+    for name in ("drone1", "drone2"):
+        flight.mode(name, "takeoff")
+    heights = [flight.places_m[name][2] for name in ("drone1", "drone2")]
+    np.testing.assert_allclose(heights, ROOF_M + VEHICLE.takeoff_height_m, atol=0.2)
+    for name in ("drone1", "drone2"):
+        flight.mode(name, "land")
+    flight.fly(2.0)
+    rest(flight)
+    assert flight.collisions == []
+
+
+@pytest.mark.slow
+def test_a_drone_that_lands_half_over_the_edge_tips_over() -> None:
+    """The edge is 3 cm inside of where drone1 comes down, found by the flight to the whole roof."""
+    whole = pair(5.0, 11.0)
+    whole.until(lambda: whole.t_s > LAND_S and set(whole.states.values()) == {"landed"})
+    x_m = whole.places_m["drone1"][0]
+    flight, tilt = pair(5.0, x_m - 0.03), 0.0
+    flight.until(lambda: flight.t_s > LAND_S)
+    for _ in range(120):
+        flight.fly(0.1)
+        tilt = max(tilt, float(tilts_deg(flight)[0]))
+    assert tilt > 30.0
+    assert flight.places_m["drone1"][2] < 0.3
+    assert math.isclose(flight.places_m["drone2"][2], ROOF_M + STAND_M, abs_tol=1e-3)
