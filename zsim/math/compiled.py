@@ -138,6 +138,7 @@ class Held:
         self.content = content
 
 
+_make_held: Any = Held
 if njit is not None:
     from numba import types
     from numba.experimental import structref
@@ -151,8 +152,7 @@ if njit is not None:
         """A Held of compiled code."""
 
     structref.define_proxy(_CompiledHeld, _HeldType, ["content"])
-
-_make_held: Any = Held if njit is None else _CompiledHeld
+    _make_held = _CompiledHeld
 
 
 @portable
