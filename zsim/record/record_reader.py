@@ -252,7 +252,14 @@ class RecordReader:
             if content is None:
                 self._damaged.add(chunk.place)
                 continue
-            yield from _recorded(content, wanted)
+            if chunk.channels <= wanted.keys():
+                yield from _recorded(content, wanted)
+                continue
+            channel, places = self._indexed(chunk, content)
+            for at in np.sort(places[np.isin(channel, list(wanted))]).tolist():
+                _, length, number, _, t_ns, wall_ns = MESSAGE.unpack_from(content, at)
+                payload = content[at + MESSAGE.size : at + HEAD.size + length]
+                yield Recorded(wanted[number], payload, t_ns, wall_ns)
 
     def _by_time(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         """Yield by time, holding no more chunks in memory than overlap in time, and stragglers."""
