@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SCENARIO ?= scenarios/step.yaml
 PARTS ?=
+AGAINST ?=
 WORKERS ?= 4
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
 
@@ -33,9 +34,9 @@ soak: $(VENV)/.dev ## repetitions and long runs
 	$(COMPILED)
 	$(BIN)/pytest -n 0 -m soak
 
-bench: $(VENV)/.dev ## measure against others, all or PARTS='a b'; see docs/performance.md
+bench: $(VENV)/.dev ## measure, all or PARTS='a b'; PARTS=c AGAINST=REV: beside a commit; see docs/performance.md
 	$(COMPILED)
-	$(BIN)/python -m benchmarks $(PARTS)
+	$(BIN)/python -m benchmarks $(PARTS) $(if $(AGAINST),--against $(AGAINST))
 
 clean:           ## remove the environment and what tools leave behind
 	rm -rf $(VENV) .venv-bench .pytest_cache .ruff_cache .hypothesis .import_linter_cache
