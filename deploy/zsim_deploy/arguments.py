@@ -105,7 +105,9 @@ From = Annotated[
 To = Annotated[float | None, typer.Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
 
 
-Force = Annotated[bool, typer.Option("--force", help="Fly into a folder that holds other files, too.")]
+Force = Annotated[
+    bool, typer.Option("--force", help="Replace an earlier run in the folder; other files there stay as they are.")
+]
 
 
 def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":

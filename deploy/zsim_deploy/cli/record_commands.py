@@ -13,7 +13,7 @@ from zsim.errors import ZsimError, printable
 from zsim_analysis.export import Format
 from zsim_analysis.report import FORMATS
 from zsim_deploy import INTERRUPTED
-from zsim_deploy.arguments import RUN, Duration, Force, From, Keys, ScenarioPath, Seed, Set, To, check_range, require
+from zsim_deploy.arguments import RUN, Duration, From, Keys, ScenarioPath, Seed, Set, To, check_range, require
 from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ def sweep(
     dask: Annotated[str | None, typer.Option(help="Scheduler of a Dask cluster that flies the runs instead.")] = None,
     keep_records: Annotated[bool, typer.Option("--keep-records", help="Keep the record of every run.")] = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
-    force: Force = False,
+    force: Annotated[bool, typer.Option("--force", help="Sweep into a folder that holds other files, too.")] = False,
 ) -> None:
     """Fly a scenario many times, with other seeds and values of its fields: one table, one report."""
     if dask is not None and (keep_records or workers is not None):
