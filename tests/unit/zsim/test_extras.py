@@ -30,4 +30,4 @@ def test_what_the_pages_install_is_an_extra() -> None:
 
 
 def test_the_command_names_each_extra_once() -> None:
-    assert install_command(["world", "agents", "world"]).startswith("pip install '.[agents,world]' ")
+    assert "[agents,world]'" in install_command(["world", "agents", "world"])
