@@ -9,6 +9,7 @@ WORKERS ?= 4
 FLIGHT := agents,world,record,report
 PIP := $(BIN)/pip install --disable-pip-version-check --no-compile
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
+export PYTHONDONTWRITEBYTECODE = # many processes import the same files, and pip has not compiled them
 
 .PHONY: run test setup lint soak bench clean help
 
@@ -19,7 +20,6 @@ run: $(VENV)/.run ## fly Test 1 of the paper as real processes and report it; in
 	$(COMPILED)
 	$(BIN)/zsim run $(SCENARIO)
 
-test soak: export PYTHONDONTWRITEBYTECODE = # hundreds of processes import the same files
 test: $(VENV)/.dev ## run the tests
 	$(COMPILED)
 	$(BIN)/pytest -n $(WORKERS) --dist loadgroup -m "not soak"
