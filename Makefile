@@ -4,23 +4,27 @@ VENV := .venv
 BIN := $(VENV)/bin
 SCENARIO ?= scenarios/step.yaml
 PARTS ?=
+AGAINST ?=
 WORKERS ?= 4
+FLIGHT := agents,world,record,report
+PIP := $(BIN)/pip install --disable-pip-version-check --no-compile
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
+export PYTHONDONTWRITEBYTECODE = # many processes import the same files, and pip has not compiled them
 
 .PHONY: run test setup lint soak bench clean help
 
 help:            ## list the commands
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
-run: setup       ## fly Test 1 of the paper as real processes and report it
+run: $(VENV)/.run ## fly Test 1 of the paper as real processes and report it; installs what a flight needs
+	$(COMPILED)
 	$(BIN)/zsim run $(SCENARIO)
 
-test soak: export PYTHONDONTWRITEBYTECODE = # hundreds of processes import the same files
 test: $(VENV)/.dev ## run the tests
 	$(COMPILED)
 	$(BIN)/pytest -n $(WORKERS) --dist loadgroup -m "not soak"
 
-setup: $(VENV)/.run ## make the environment in .venv
+setup: $(VENV)/.all ## install every extra into .venv: console, cameras, exports, sweeps, hosts, ROS
 	$(COMPILED)
 
 lint: $(VENV)/.dev ## style, types, and who may import whom
@@ -33,9 +37,9 @@ soak: $(VENV)/.dev ## repetitions and long runs
 	$(COMPILED)
 	$(BIN)/pytest -n 0 -m soak
 
-bench: $(VENV)/.dev ## measure against others, all or PARTS='a b'; see docs/performance.md
+bench: $(VENV)/.dev ## measure, all or PARTS='a b'; PARTS=c AGAINST=REV: beside a commit; see docs/performance.md
 	$(COMPILED)
-	$(BIN)/python -m benchmarks $(PARTS)
+	$(BIN)/python -m benchmarks $(PARTS) $(if $(AGAINST),--against $(AGAINST))
 
 clean:           ## remove the environment and what tools leave behind
 	rm -rf $(VENV) .venv-bench .pytest_cache .ruff_cache .hypothesis .import_linter_cache
@@ -45,20 +49,29 @@ $(VENV)/bin/python:
 		{ echo "zsim needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1). Say PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || \
 		{ echo "Python's venv module is missing; on Debian: apt-get install python3-venv"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@echo "making the environment $(VENV) with $$($(PYTHON) --version)"
+	@$(PYTHON) -m venv $(VENV)
 
+# pip's own output is shown: on a slow line or disk this takes minutes
 $(VENV)/.run: pyproject.toml | $(VENV)/bin/python
-	$(BIN)/pip install --disable-pip-version-check -q -e '.[all]'
+	@echo "installing what a flight needs (extras $(FLIGHT); about 550 MB; \`make setup\` installs all extras)"
+	@$(PIP) -e '.[$(FLIGHT)]'
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
-	$(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
+$(VENV)/.all: pyproject.toml | $(VENV)/bin/python
+	@echo "installing all extras (about 1.2 GB)"
+	@$(PIP) -e '.[all]'
 	@touch $@ $(VENV)/.run
 
-# of its own, so that it can go on beside what needs no kernel
+$(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
+	@echo "installing all extras and what the tests need (about 3 GB)"
+	@$(PIP) -e '.[dev]'
+	@touch $@ $(VENV)/.all $(VENV)/.run
+
+# of its own, so that it can go on beside what needs no kernel; in two processes, of which the second one to come to a
+# function finds it compiled
 $(VENV)/.compiled: pyproject.toml
-	@$(BIN)/python -m compileall -q zsim agents world deploy
-	@echo "compiling what flies (once on this machine, about a minute)"
-	@folder=$$(mktemp -d) && $(BIN)/zsim run scenarios/step.yaml --in-process --duration 0.1 --no-report \
-		--out $$folder/run >/dev/null 2>&1 && rm -r $$folder
+	@echo "compiling what flies, once on this machine: about a minute"
+	@$(BIN)/python -m zsim_deploy.roles.warm_up agents & agents=$$!; \
+		$(BIN)/python -m zsim_deploy.roles.warm_up world && wait $$agents
 	@touch $@

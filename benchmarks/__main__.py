@@ -2,6 +2,7 @@
 
 make bench                                        everything; makes the peers' environment first
 .venv/bin/python -m benchmarks a b --repeats 7    some parts
+.venv/bin/python -m benchmarks c --against REV    this working tree beside another commit
 .venv/bin/python -m benchmarks a --page           write the page from results/a.json again, measuring nothing
 """
 
@@ -10,10 +11,12 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks import (
+    against,
     command_age,
     console,
     gateway,
@@ -27,6 +30,7 @@ from benchmarks import (
     recorder,
     runs_per_hour,
 )
+from benchmarks.child import RefusedError
 from benchmarks.sheet import Sheet, read
 
 RESULTS = Path(__file__).parent / "results"
@@ -60,27 +64,41 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
     parser.add_argument("--page", action="store_true", help="measure nothing; write the page from the JSON files")
     parser.add_argument("--no-page", action="store_true", help="leave benchmarks/README.md and its pictures alone")
+    parser.add_argument("--against", metavar="REV", help="with part c alone: fly this tree beside a commit, in turn")
+    parser.add_argument(
+        "--of", nargs="+", choices=against.FLIGHTS, default=list(against.FLIGHTS), help="with --against: what is flown"
+    )
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # so that contenders are ended
     if unknown := set(given.parts) - set(PARTS):
         parser.error(f"part is {', '.join(sorted(unknown))}; must be of {' '.join(PARTS)}")
-    chosen = given.parts or list(PARTS)
+    chosen = {name: PARTS[name] for name in given.parts or PARTS}
+    if given.against is not None:
+        if list(chosen) != ["c"]:
+            parser.error(f"--against: part is {', '.join(chosen)}; must be c alone: say c --against {given.against}")
+        chosen = {"c-against": Part(partial(against.measure, revision=given.against, names=given.of), against.page)}
     if not given.page and BESIDE & set(chosen):
         peers.ensure(_say)
-    for part in chosen:
-        path = given.results / f"{part}.json"
-        sheet = read(path) if given.page else _measured(part, given.repeats, path)
+    for name, part in chosen.items():
+        path = given.results / f"{name}.json"
+        try:
+            sheet = read(path) if given.page else _measured(name, part, given.repeats, path)
+        except RefusedError as error:
+            parser.error(str(error))
+        told = f"{_where(sheet)}\n\n{part.page(sheet)}"
+        if given.against is not None:
+            print(told)
         if not given.no_page:
-            page.update(part, f"{_where(sheet)}\n\n{PARTS[part].page(sheet)}")
+            page.update(name, told)
 
 
-def _measured(part: str, repeats: int, path: Path) -> Sheet:
+def _measured(name: str, part: Part, repeats: int, path: Path) -> Sheet:
     start_s, described = time.monotonic(), machine.describe()
-    sheet = PARTS[part].measure(repeats)
-    sheet.machine = {**described, "peers": peers.versions() if part in BESIDE else {}, "repeats": repeats}
+    sheet = part.measure(repeats)
+    sheet.machine = {**described, "peers": peers.versions() if name in BESIDE else {}, "repeats": repeats}
     sheet.machine["minutes"] = round((time.monotonic() - start_s) / 60.0, 1)
     sheet.write(path)
-    _say(f"{part}: {sheet.machine['minutes']} min, written to {path}")
+    _say(f"{name}: {sheet.machine['minutes']} min, written to {path}")
     return sheet
 
 

@@ -1,10 +1,15 @@
 """One run of `zsim run`: what the world measured of it, and what its processes spent."""
 
+import contextlib
+import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import psutil
@@ -14,7 +19,8 @@ from zsim.contract import run_messages
 from zsim.record import RecordReader
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
-TIMEOUT_S = 300.0
+TIMEOUT_S = 600.0
+WAIT_S = 0.05  # wall time between two looks whether a command has ended
 LOOK_S = 0.5  # wall time between two looks at what processes have spent; a look takes milliseconds
 
 
@@ -40,10 +46,47 @@ def fly(scenario: Path, seconds: float, *options: str) -> tuple[dict[str, float]
             _, said = process.communicate()
         if process.returncode:
             raise RefusedError(f"zsim run: exit code {process.returncode}: {said.strip()[-160:]}")
-        return _end_event(out), cpu
+        return end_event(out), cpu
 
 
-def _end_event(folder: Path) -> dict[str, float]:
+class Spent(NamedTuple):
+    """What a command and its descendants spent: CPU seconds, and the greatest resident memory of a process [MB]."""
+
+    cpu_s: float
+    peak_mb: float
+
+
+def spent(command: Sequence[str], folder: Path) -> Spent:
+    """Run a command in a folder and return what it spent.
+
+    Raises:
+        RefusedError: it failed, or was not through in time.
+    """
+    with tempfile.TemporaryFile("w+") as said:
+        process = subprocess.Popen(
+            command, cwd=folder, stdin=subprocess.DEVNULL, stdout=said, stderr=said, start_new_session=True
+        )
+        until_s = time.monotonic() + TIMEOUT_S
+        ended, status, usage = 0, 0, None
+        try:
+            while not ended:
+                time.sleep(WAIT_S)
+                ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+                if not ended and time.monotonic() > until_s:
+                    raise RefusedError(f"not through after {TIMEOUT_S:g} s")
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.returncode = os.waitstatus_to_exitcode(status) if ended else process.wait()
+        if process.returncode:
+            said.seek(0)
+            raise RefusedError(f"zsim run: exit code {process.returncode}: {said.read().strip()[-160:]}")
+    assert usage is not None
+    return Spent(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e3)  # ru_maxrss: kilobytes (getrusage(2))
+
+
+def end_event(folder: Path) -> dict[str, float]:
+    """Return the world's figures of a run: the data of its event `end`."""
     records = RecordReader(folder / "run.mcap").messages(keys=["world/event"])
     events = [msgspec.msgpack.decode(record.payload, type=run_messages.Event) for record in records]
     return next(event.data for event in events if event.kind == "end")

@@ -4,5 +4,46 @@ Rooms from the ground: errors, math and schema, contract, then record, scenario 
 other, and runtime; a room imports those below it. Nothing here imports another package of the product.
 """
 
-__version__ = "0.1.0"
+from contextlib import suppress
+from pathlib import Path
+
+RELEASE = "0.1.0"  # as in pyproject.toml
 CONTRACT = 1
+COMMIT_FILE = "commit.txt"  # of an archive that git has made, of an sdist and of a wheel
+DIGITS = 8  # of a commit in a version: none of two in a repository of this size are alike
+
+
+def commit(package: Path = Path(__file__).parent) -> str:
+    """Return the commit of a package `zsim` in hex digits, as git's files or the build have it; empty if neither does.
+
+    No program is started for it: it is read at every start of every process.
+    """
+    with suppress(OSError):
+        if found := _checked_out(package.parent / ".git"):
+            return found
+    with suppress(OSError):
+        found = (package / COMMIT_FILE).read_text().strip()
+        return "" if "$" in found else found  # a checkout has the placeholder that `git archive` fills
+    return ""
+
+
+def _checked_out(git: Path) -> str:
+    """Return the commit of a checkout, whose `.git` is a folder, or a file in a worktree (gitrepository-layout(5))."""
+    if git.is_file():
+        git = git.parent / git.read_text().removeprefix("gitdir:").strip()
+    head = (git / "HEAD").read_text().strip()
+    if not head.startswith("ref: "):
+        return head
+    reference = head.removeprefix("ref: ")
+    shared = git / "commondir"
+    common = git / shared.read_text().strip() if shared.exists() else git
+    with suppress(FileNotFoundError):
+        return (common / reference).read_text().strip()
+    with suppress(FileNotFoundError):
+        for line in (common / "packed-refs").read_text().splitlines():
+            if line.endswith(f" {reference}"):
+                return line.partition(" ")[0]
+    return ""
+
+
+__version__ = f"{RELEASE}+g{found[:DIGITS]}" if (found := commit()) else RELEASE

@@ -20,6 +20,8 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONNECT_VARIABLE = "ZSIM_CONNECT"  # of the environment: the endpoint where --connect is not given
 RUN_ID = "{run}"  # in the folder of a record: a recorder that is started again finds the one that it had begun
 CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}  # modules by extra
+FLIGHT_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy", "filterpy")}
+REPORT_NEEDS = {"report": ("matplotlib", "jinja2", "mcap", "zstandard")}
 CONSOLE_PORT = 8080  # of its page
 RUN, HOSTS = "Run", "On several machines"  # panels of the help
 REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
@@ -59,7 +61,8 @@ def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
     """
     missing = {module: extra for extra, modules in needs.items() for module in modules if find_spec(module) is None}
     if missing:
-        raise RunError(f"{command}: {' and '.join(missing)} is not installed; {install_command(missing.values())}")
+        lacking = f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not installed"
+        raise RunError(f"{command}: {lacking}; {install_command(missing.values())}")
 
 
 def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[str, str]) -> str:
@@ -105,7 +108,9 @@ From = Annotated[
 To = Annotated[float | None, typer.Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
 
 
-Force = Annotated[bool, typer.Option("--force", help="Fly into a folder that holds other files, too.")]
+Force = Annotated[
+    bool, typer.Option("--force", help="Replace an earlier run in the folder; other files there stay as they are.")
+]
 
 
 def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":

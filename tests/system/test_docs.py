@@ -76,7 +76,7 @@ KINDS = (
     "text",
     "json",
 )
-ELSEWHERE = ("apt-get install ", "git clone ", "cd ", "python3 -m venv ", ".venv/bin/pip install ", "ssh ", "scp ",
+ELSEWHERE = ("apt-get install ", "git clone ", "cd ", "python3 -m venv ", ".venv/bin/pip install ", ".venv/bin/jupyter ", "ssh ", "scp ",
              "rsync ", "sudo ", "zenohd ", "ufw ", "chrt ", "kill ", "docker ", "kubectl ", "sh ",
              ".venv/bin/pip wheel ", "export ", "make bench", ".venv/bin/python -m benchmarks")  # fmt: skip
 

@@ -243,12 +243,12 @@ def content_of(source: Source, place: RecordSpan) -> bytes | None:
             content = _decompressor().decompress(content, max_output_size=head.size)
         except (zstandard.ZstdError, MemoryError, OverflowError):  # the latter two of a damaged size
             return None
-    unchecked = head.crc == 0 and not _is_ours(source)  # MCAP has 0 where a tool computes none
+    unchecked = head.crc == 0 and not is_ours(source)  # MCAP has 0 where a tool computes none
     return content if unchecked or head.crc == zlib.crc32(content) else None
 
 
-def _is_ours(source: Source) -> bool:
-    """Tell whether zsim has written a file, which gives every chunk a check sum."""
+def is_ours(source: Source) -> bool:
+    """Tell whether zsim has written a record, of which the first bytes are given; it gives every chunk a check sum."""
     return source[LIBRARY : LIBRARY + len(OURS)] == OURS
 
 

@@ -272,6 +272,20 @@ def _opened(path: Path, mode: str) -> FileIO:
     return file
 
 
+def is_being_written(path: Path) -> bool:
+    """Tell whether a process is writing the record at a path; there may be none."""
+    if fcntl is None or not path.exists():
+        return False
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:  # of a file system without locks
+            return False
+    return False
+
+
 def _message_encoding(media: str) -> str:
     """Return MCAP's name for a Zenoh media type."""
     known = {"": "msgpack", "application/msgpack": "msgpack", "application/json": "json", "text/json": "json"}

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from zsim import extras
 from zsim.errors import DocumentError
 from zsim.schema.checker import show
 
@@ -97,6 +98,8 @@ def _imported(name: str, what: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and (lacking := extras.missing(error)):
+            raise DocumentError([f"{what}, which cannot be imported: {lacking}"]) from error
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"]) from error
 

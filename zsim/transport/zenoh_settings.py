@@ -48,6 +48,7 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
         "scouting/gossip/enabled": "false",
         "connect/retry": f"{{period_init_ms: {CONNECT_RETRY_MS}, period_max_ms: {2 * CONNECT_RETRY_MS}}}",
         "transport/link/tx/lease": str(lease),
+        "transport/shared_memory/enabled": "false",  # on by default; needs /dev/shm, and leaves its segments there
         _CLOSE_AFTER: str(CLOSE_AFTER_US),
     }
 

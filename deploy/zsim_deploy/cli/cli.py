@@ -11,12 +11,14 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.main import get_command
 
-from zsim import __version__
+from zsim import __version__, extras
 from zsim.errors import BehindError, SupersededError, ZsimError, printable
 from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import (
     CONSOLE_NEEDS,
+    FLIGHT_NEEDS,
     HOSTS,
+    REPORT_NEEDS,
     RUN,
     FlightOptions,
     Force,
@@ -87,6 +89,7 @@ def run(
     order: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
+    require("run", FLIGHT_NEEDS | (REPORT_NEEDS if report else {}))
     from zsim_agents.hosting import check_plans
     from zsim_deploy.launch.camera_children import with_cameras
     from zsim_deploy.launch.console_process import RunConsole
@@ -250,6 +253,11 @@ def _run() -> NoReturn:
     except UsageError as error:
         _show_usage(error)
         sys.exit(2)
+    except ModuleNotFoundError as error:
+        if (lacking := extras.missing(error)) is None:
+            raise
+        print(printable(f"{' '.join(sys.argv[1:2])}: {lacking}"), file=sys.stderr)
+        sys.exit(USER_FAULT)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     if code == INTERRUPTED:

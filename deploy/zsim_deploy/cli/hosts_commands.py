@@ -12,11 +12,12 @@ from typing import Annotated, Any
 import typer
 
 from zsim.errors import printable
-from zsim_deploy.arguments import HOSTS, FlightOptions, Force, Insecure, flight_options
+from zsim_deploy.arguments import HOSTS, REPORT_NEEDS, FlightOptions, Force, Insecure, flight_options, require
 from zsim_deploy.hosts.row_choice import RowChoice, RowOrder
 
 app = typer.Typer()
 
+UP_NEEDS = {"hosts": ("asyncssh", "cryptography"), "record": ("mcap", "zstandard")}  # modules by extra
 FOLLOW_S = 0.2  # between two looks at a log that is followed
 
 Hosts = Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
@@ -44,6 +45,7 @@ def up(
 
     --only and --sort are of the table that is shown; every role is started whatever they are.
     """
+    require("up", UP_NEEDS | (REPORT_NEEDS if report else {}))
     from zsim.scenario.rights import ROUTER
     from zsim.transport.open_files import host_launcher_files, require_files
     from zsim_deploy.cli.record_commands import conclude

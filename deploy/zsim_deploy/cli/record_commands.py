@@ -13,7 +13,20 @@ from zsim.errors import ZsimError, printable
 from zsim_analysis.export import Format
 from zsim_analysis.report import FORMATS
 from zsim_deploy import INTERRUPTED
-from zsim_deploy.arguments import RUN, Duration, Force, From, Keys, ScenarioPath, Seed, Set, To, check_range, require
+from zsim_deploy.arguments import (
+    FLIGHT_NEEDS,
+    REPORT_NEEDS,
+    RUN,
+    Duration,
+    From,
+    Keys,
+    ScenarioPath,
+    Seed,
+    Set,
+    To,
+    check_range,
+    require,
+)
 from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:
@@ -21,8 +34,6 @@ if TYPE_CHECKING:
     from zsim_analysis.reading.shortfall import Shortfall
     from zsim_analysis.sweep.design import SweepPlan
 
-RERUN_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy", "filterpy")}
-REPORT_NEEDS = {"report": ("matplotlib", "jinja2", "mcap", "zstandard")}
 SWEEP_NEEDS = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "jinja2")}
 DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
 WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy", Format.FOXGLOVE: "foxglove"}
@@ -100,6 +111,7 @@ def report(
     ] = None,
 ) -> None:
     """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
+    require("report", REPORT_NEEDS)
     from zsim.record.record_reader import record_in
     from zsim_analysis.sweep.design import is_sweep
 
@@ -130,7 +142,6 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
         folder: of the run or the sweep.
         formats: of figures, beside PNG.
     """
-    require("report", REPORT_NEEDS)
     from rich.console import Console
 
     from zsim.runtime.progress import PipedConsole, cell
@@ -189,7 +200,7 @@ def sweep(
     dask: Annotated[str | None, typer.Option(help="Scheduler of a Dask cluster that flies the runs instead.")] = None,
     keep_records: Annotated[bool, typer.Option("--keep-records", help="Keep the record of every run.")] = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
-    force: Force = False,
+    force: Annotated[bool, typer.Option("--force", help="Sweep into a folder that holds other files, too.")] = False,
 ) -> None:
     """Fly a scenario many times, with other seeds and values of its fields: one table, one report."""
     if dask is not None and (keep_records or workers is not None):
@@ -270,6 +281,7 @@ def export(
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier export.")] = False,
 ) -> None:
     """Write the record of a run as tables, for MATLAB, or for Foxglove and Rerun."""
+    require("export", {"export": ("mcap", "zstandard", WRITERS[form])})
     from rich.console import Console
     from rich.progress import Progress
 
@@ -277,7 +289,6 @@ def export(
 
     check_range(from_, to)
     record_at(run)
-    require("export", {"export": ("mcap", "zstandard", WRITERS[form])})
     from zsim_analysis.export.make_export import export as write
     from zsim_analysis.export.selection import MessageSelection
 
@@ -311,7 +322,7 @@ def rerun(
     ] = False,
 ) -> None:
     """Fly the run of a record again, from its own inputs, and print whether truth is the same; exit code 0 or 1."""
-    require("rerun", RERUN_NEEDS)
+    require("rerun", FLIGHT_NEEDS)
     from zsim_analysis.rerun import rerun_record
 
     def show(text: str) -> None:

@@ -102,7 +102,7 @@ class Wheelhouse:
         """Return the wheel of this project: of the checkout, or of what is installed."""
         checkout = _checkout()
         source = str(checkout) if checkout else requirement(importlib.metadata.distribution(PROJECT))
-        folder = self._folder / PROJECT / _key(_sources(checkout) if checkout else source)
+        folder = self._folder / PROJECT / _key([zsim.__version__, _sources(checkout)] if checkout else source)
         if not folder.is_dir():
             self._progress(f"building the wheel of {PROJECT}")
             with tempfile.TemporaryDirectory(dir=self._folder) as made:

@@ -6,7 +6,7 @@ Zenoh's endpoints and the certificates name the hosts of the inventory, so conta
 from collections.abc import Sequence
 from typing import Any
 
-from zsim import __version__
+from zsim import RELEASE
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
@@ -85,7 +85,7 @@ def _project(scenario: Scenario, here: Sequence[PlannedProcess]) -> dict[str, An
 
 def _service(scenario: Scenario, process: PlannedProcess) -> dict[str, Any]:
     return {
-        "image": f"zsim:{__version__}-{process.host}",
+        "image": f"zsim:{RELEASE}-{process.host}",
         "build": ".",
         "command": _words(scenario, process),
         "environment": dict(ENVIRONMENT),

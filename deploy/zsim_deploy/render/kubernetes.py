@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from zsim import __version__
+from zsim import RELEASE
 from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
@@ -43,7 +43,7 @@ from zsim_deploy.render.rendered_files import (
     unused,
 )
 
-IMAGE = f"zsim:{__version__}"
+IMAGE = f"zsim:{RELEASE}"
 CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
 RECORD_GIB = 10  # 186 runs of 330 s with three drones, 58 MB each
 

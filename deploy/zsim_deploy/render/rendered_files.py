@@ -12,13 +12,13 @@ from typing import Any
 
 import yaml
 
-from zsim import __version__
+from zsim import RELEASE
 from zsim.errors import RunError
 from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
 
 BASE = "python:3.11-slim"  # the oldest Python that zsim runs on
-WHEEL = f"zsim-{__version__}-py3-none-any.whl"
+WHEEL = f"zsim-{RELEASE}-py3-none-any.whl"
 USER = 1000  # first ordinary user of Debian
 CACHE = "/var/cache/zsim"
 CERTIFICATES, ACCESS, SCENARIO, RUNS = "/certs", "/access/access.json", "/scenario/scenario.yaml", "/runs"

@@ -2,7 +2,8 @@
 
 python -m zsim_deploy.roles.warm_up EXTRA...    what the roles run that need these extras; `zsim push` runs it on a host
 
-Where numba is missing nothing is compiled, and there is nothing to do.
+Where numba is missing nothing is compiled, and there is nothing to do. As a program it prints the name of
+each function before it compiles it: nothing where all is compiled already.
 """
 
 import importlib.util
@@ -96,5 +97,28 @@ def _place(i: int, row: int) -> list[float]:
     return [APART_M * math.cos(i), APART_M * math.sin(i) + 4 * APART_M * row, 0.0]
 
 
+def _show_compilation() -> None:
+    """Print a line whenever a function called from Python is about to be compiled, not when it is loaded from disk."""
+    from numba.core import event
+
+    class Shown(event.Listener):
+        """Prints the outermost compilation: those inside it are of the functions that it calls."""
+
+        depth = 0
+
+        def on_start(self, event: Any) -> None:
+            if not self.depth:
+                function = event.data["dispatcher"].py_func
+                print(f"compiling {function.__module__}.{function.__name__}", flush=True)
+            self.depth += 1
+
+        def on_end(self, event: Any) -> None:
+            self.depth -= 1
+
+    event.register("numba:compile", Shown())
+
+
 if __name__ == "__main__":
+    if importlib.util.find_spec("numba") is not None:
+        _show_compilation()
     main(sys.argv[1:])

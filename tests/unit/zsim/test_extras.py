@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[3]
 WRITTEN = ("README.md", "docs/**/*.md", "deploy/**/*.py", "agents/**/*.py", "world/**/*.py", "zsim/**/*.py")
 WRITTEN += ("examples/**/*", "clients/**/*", "scenarios/*", "benchmarks/**/*.py", "tests/**/*.py")
 OF_AN_INDEX = re.compile(r"zsim\[[a-z{]")  # zsim[gateway], zsim[{extra}]
-OF_A_CHECKOUT = re.compile(r"pip install '\.\[([a-z0-9,]+)\]'")
+OF_A_CHECKOUT = re.compile(r"pip install (?:-e )?'\.\[([a-z0-9,]+)\]'")
 
 
 def texts() -> dict[str, str]:
@@ -25,9 +25,9 @@ def test_nothing_is_to_be_installed_from_an_index() -> None:
 def test_what_the_pages_install_is_an_extra() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = [name for text in texts().values() for names in OF_A_CHECKOUT.findall(text) for name in names.split(",")]
-    assert "gateway" in named
+    assert "notebook" in named
     assert set(named) <= set(extras)
 
 
 def test_the_command_names_each_extra_once() -> None:
-    assert install_command(["world", "agents", "world"]).startswith("pip install '.[agents,world]' ")
+    assert "[agents,world]'" in install_command(["world", "agents", "world"])

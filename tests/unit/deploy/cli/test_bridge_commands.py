@@ -10,6 +10,7 @@ from refused import has_terms, refused
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import RunError
+from zsim.extras import install_command
 from zsim_bridges.ros2.ros_types import MESSAGES, RosTypes
 from zsim_deploy.cli.bridge_commands import console, gateway, ros1, ros2
 
@@ -52,5 +53,5 @@ def test_a_bridge_without_its_extra_is_a_line(
     monkeypatch: pytest.MonkeyPatch, command: Callable[[], None], module: str, extra: str
 ) -> None:
     monkeypatch.setattr("zsim_deploy.arguments.find_spec", lambda name: None if name == module else find_spec(name))
-    with refused(RunError, extra, module, f"pip install '.[{extra}]'"):
+    with refused(RunError, extra, module, install_command([extra])):
         command()

@@ -1,12 +1,14 @@
 """Into which folders a run flies."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
-from refused import has_terms, refused
+from refused import refused
 from synthetic_record import SCENARIOS
 
 from zsim.errors import RunError
+from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
 from zsim_deploy.launch.run_folder import make_directory
 
@@ -30,14 +32,65 @@ def test_what_a_run_leaves_that_never_flew_is_in_nobodys_way(tmp_path: Path) -> 
     assert make_directory(tmp_path, STEP) == tmp_path
 
 
+OF_A_RUN = (
+    *("scenario.yaml", "run.log", "summary.json", "report.html", "logs/world.log", "logs/recorder.log"),
+    *("figures/errors.png", "figures/errors.pdf", "journal/0.entries", "journal/launch.json", "journal/truth"),
+)
+OF_OTHERS = ("thesis.tex", "logs/notes.txt", "figures/mine.tikz", "csv/truth.csv", "journal.md")
+
+
+def flown(folder: Path, names: Iterable[str]) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("x")
+
+
+def files(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
 @pytest.mark.parametrize("name", ["run.mcap", "logs/world.log"])
-@pytest.mark.parametrize("force", [False, True])
-def test_a_run_is_never_flown_over(tmp_path: Path, name: str, force: bool) -> None:
-    (tmp_path / "logs").mkdir()
-    (tmp_path / name).write_text("x")
-    with pytest.raises(RunError) as caught:
-        make_directory(tmp_path, STEP, force)
-    assert has_terms(str(caught.value), str(tmp_path), "--out")
+def test_a_run_is_replaced_only_if_forced(tmp_path: Path, name: str) -> None:
+    flown(tmp_path, [name])
+    with refused(RunError, str(tmp_path), "--force", "--out"):
+        make_directory(tmp_path, STEP)
+    assert files(tmp_path) == {name}
+
+
+def test_force_removes_the_files_of_a_run_and_nothing_else(tmp_path: Path) -> None:
+    RecordWriter(tmp_path / "run.mcap").close()
+    flown(tmp_path, (*OF_A_RUN, *OF_OTHERS))
+    assert make_directory(tmp_path, STEP, force=True) == tmp_path
+    assert files(tmp_path) == set(OF_OTHERS)
+
+
+@pytest.mark.parametrize("left", [("scenario.yaml", "logs/world.log"), ("journal/launch.json", "journal/0.entries")])
+def test_force_removes_a_run_that_left_no_record(tmp_path: Path, left: tuple[str, ...]) -> None:
+    flown(tmp_path, left)
+    make_directory(tmp_path, STEP, force=True)
+    assert files(tmp_path) == set()
+
+
+def test_force_removes_nothing_of_a_folder_that_is_no_run(tmp_path: Path) -> None:
+    mine = {"scenario.yaml", "logs/training.log", "figures/plot.png", "journal/monday", "summary.json"}
+    flown(tmp_path, mine)
+    make_directory(tmp_path, STEP, force=True)
+    assert files(tmp_path) == mine
+
+
+def test_force_removes_no_record_of_another_tool(tmp_path: Path) -> None:
+    flown(tmp_path, ["run.mcap", "logs/world.log", "scenario.yaml"])
+    with refused(RunError, str(tmp_path / "run.mcap"), "--out"):
+        make_directory(tmp_path, STEP, force=True)
+    assert files(tmp_path) == {"run.mcap", "logs/world.log", "scenario.yaml"}
+
+
+def test_force_does_not_touch_a_run_under_way(tmp_path: Path) -> None:
+    with RecordWriter(tmp_path / "run.mcap"):
+        flown(tmp_path, ["scenario.yaml", "logs/world.log"])
+        with refused(RunError, str(tmp_path), "--out"):
+            make_directory(tmp_path, STEP, force=True)
+        assert files(tmp_path) == {"run.mcap", "scenario.yaml", "logs/world.log"}
 
 
 def test_a_folder_that_is_not_there_is_made(tmp_path: Path) -> None:

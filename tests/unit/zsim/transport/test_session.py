@@ -1,5 +1,8 @@
-"""The end of a session."""
+"""The start and the end of a session."""
 
+import shutil
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -7,6 +10,31 @@ import zenoh
 
 from zsim.transport.session import open_session
 from zsim.transport.tls import Identity
+
+ALONE = ("unshare", "--map-root-user", "--mount")  # Linux: mounts that nobody else sees
+WITH_SHM = "mount -t tmpfs -o {options} tmpfs /dev/shm && exec {python} -c '{code}'"
+OPENS = """
+import os
+from zsim.transport import zenoh_settings
+from zsim.transport.session import open_session
+from zsim.transport.tls import Identity
+
+who = Identity("here")
+settings = zenoh_settings.common("router", "lockstep") | zenoh_settings.listening(["tcp/127.0.0.1:0"], who)
+with open_session(settings, "zsim", who, str):
+    print(os.listdir("/dev/shm"))
+"""
+
+
+@pytest.mark.skipif(
+    not shutil.which("unshare") or subprocess.run([*ALONE, "true"], capture_output=True).returncode != 0,
+    reason="needs mount namespaces (Linux, unshare)",
+)
+@pytest.mark.parametrize("options", ["size=64k", "ro", "size=1g"])
+def test_a_session_needs_no_shared_memory_and_leaves_nothing_in_it(options: str) -> None:
+    code = WITH_SHM.format(options=options, python=sys.executable, code=OPENS)
+    done = subprocess.run([*ALONE, "sh", "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
 
 
 def test_a_far_end_that_takes_nothing_does_not_fail_who_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
