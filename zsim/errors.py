@@ -10,7 +10,9 @@ ZsimError
 │   └── NoWorldError   the session is open, but no world answers
 ├── RunError           a run that could not start or did not end well
 │   ├── SupersededError   another process of the same name has taken over
-│   └── BehindError       a participant that cannot catch up any more
+│   ├── BehindError       a participant that cannot catch up any more
+│   └── RunFailedError    a run that a failure ended before its time
+│       └── UserCodeError    a class of a user's own raised, or returned what cannot be used
 ├── HostsError         a host that cannot be reached, or lacks what it needs; a line per host
 ├── RecordError        a record that cannot be written or read: disk full, no MCAP file
 └── ReportError        a report that cannot be made or written
@@ -83,6 +85,27 @@ class SupersededError(RunError):
 
 class BehindError(RunError):
     """A participant lacks what nobody keeps any more; a new incarnation of it can go on."""
+
+
+class RunFailedError(RunError):
+    """A failure ended the run before its time."""
+
+
+class UserCodeError(RunFailedError):
+    """A class of a user's own raised, or returned what cannot be used.
+
+    Args:
+        text: class and method, and the line in the user's file or the value.
+        where: which process, at which simulated time; empty until that is known.
+    """
+
+    def __init__(self, text: str, where: str = "") -> None:
+        super().__init__(f"{where}: {text}" if where else text)
+        self.text = text
+        self.where = where
+
+    def __reduce__(self) -> tuple[type["UserCodeError"], tuple[str, str]]:
+        return type(self), (self.text, self.where)
 
 
 class HostsError(ZsimError):

@@ -125,9 +125,15 @@ def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
 def made(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> list[Agent]:
     """Return the agents of one role for drones or clusters, as many as it takes."""
     agent = agent_class(role)
-    if AGENTS[role].joint:
-        return [agent(info, scenario, names)]
-    return [agent(info, scenario, name) for name in names]
+    try:
+        if AGENTS[role].joint:
+            return [agent(info, scenario, names)]
+        return [agent(info, scenario, name) for name in names]
+    except Exception as error:
+        failure = plugin.user_code_error(error, f"{role} of {', '.join(names)}, before the start")
+        if failure is None:
+            raise
+        raise failure from error
 
 
 def agent_class(role: str) -> Callable[..., Agent]:

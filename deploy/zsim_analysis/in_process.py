@@ -10,12 +10,12 @@ from msgspec import Struct
 
 from zsim.contract import flight_messages, keys, run_messages
 from zsim.contract.framing import GateMessages
-from zsim.errors import RunError
+from zsim.errors import RunError, UserCodeError
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
 from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
-from zsim.scenario.role_table import agent_names
+from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World
@@ -60,10 +60,13 @@ class InProcessFlight:
                 "fly it as processes, or with --set processes.gating=[]"
             )
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id)
+        for name in set(scenario.expected()) - set(agent_names(scenario)):
+            if lets_drop(scenario.processes.on_overdue or {}, name):
+                self.world.losses.expired(name)  # nobody else can come here
         self._agents = agents(self.world)
 
     def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:
-        """Fly to the end; `world.ended` and `world.diverged` then have the reason.
+        """Fly to the end; `world.ended` and `world.failure` then have the reason.
 
         Args:
             observers: receive every message.
@@ -95,6 +98,9 @@ class InProcessFlight:
                 if reason := stop_reason():
                     self.world.clock.stop(reason)
             bus.end()
+        except UserCodeError:
+            if self.world.failure:  # else the scenario lets the run go on without who has failed
+                raise
         finally:
             gc.set_threshold(*thresholds)
             gc.unfreeze()
@@ -117,7 +123,8 @@ def fly(
         run_id: set only by tests that compare records.
 
     Raises:
-        DivergedError: the state of a drone was no longer finite; the record is complete to its end.
+        RunError: a failure has ended the run, of a user's class, or since the state of a drone was no longer finite;
+            the record is complete to its end.
     """
     progress = _Progress(scenario, screen) if screen else None
     writer = None
@@ -129,8 +136,8 @@ def fly(
         for each in (progress, writer):
             if each:
                 each.close()
-    if flight.world.diverged:
-        raise flight.world.diverged
+    if flight.world.failure:
+        raise flight.world.failure
     return flight.world.ended or "ended"
 
 

@@ -20,7 +20,7 @@ from zsim.runtime.group import AgentGroup
 from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
-from zsim_analysis.reading.recorded_run import OUTPUTS, GateInputs, RecordedAgents, decode_or_none
+from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, decode_or_none
 from zsim_world.flight.coordinator import FLIGHT_REQUESTS
 from zsim_world.flight.world import World
 
@@ -209,7 +209,7 @@ class RerunBus(Bus):
             raise RunError(f"flown again, the run ends at {self._world.now_ns / 1e9:.2f} s: {reason}")
 
     def _compare_output(self, key: str, message: Any) -> None:
-        if isinstance(message, (*OUTPUTS, flight_messages.Command)):
+        if isinstance(message, (*messages.RELAYED, flight_messages.Command)):
             self.outputs.add(key, message)
 
     def _keep_truth(self, gate: GateMessages) -> None:
@@ -225,7 +225,7 @@ class RerunBus(Bus):
             return
         if key == keys.EVENT:
             self._feed_event(message)
-        elif isinstance(message, OUTPUTS):
+        elif isinstance(message, messages.RELAYED):
             self._feed_output(key, message)
         elif isinstance(message, Sightings):  # no detector is run again: it would need the pictures
             self._hand_over(key, message, message.source)

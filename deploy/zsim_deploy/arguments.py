@@ -2,7 +2,7 @@
 
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
@@ -127,12 +127,16 @@ def load_scenario(
     seed: int | None = None,
     duration: float | None = None,
     elsewhere: bool = False,
+    modules: Iterable[Path] = (),
 ) -> Any:
-    """Return the scenario of a file with the overrides of the command line; `elsewhere`: it flies on other hosts."""
+    """Return the scenario of a file with the overrides of the command line; `elsewhere`: it flies on other hosts.
+
+    `modules`: folders in which modules that it names may stand, beside its own.
+    """
     from zsim.scenario import scenario_file
     from zsim_agents.hosting import check_classes
 
-    scenario = scenario_file.load(path, overrides or (), seed=seed, duration_s=duration)
+    scenario = scenario_file.load(path, overrides or (), modules, seed=seed, duration_s=duration)
     check_classes(scenario, path.name, elsewhere)
     return scenario
 

@@ -166,6 +166,11 @@ def access(process_name: str) -> str:
     return f"{ACCESS}/{process_name}"
 
 
+def is_command(key: str) -> bool:
+    """Tell whether a key is that of commands to a drone."""
+    return key.startswith("drone/") and "/cmd/" in key
+
+
 def is_sensor(expression: str) -> bool:
     """Tell whether a key, or an expression, is about a drone's sensors."""
     parts = expression.split("/")

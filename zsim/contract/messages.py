@@ -86,8 +86,9 @@ class Info(Message, frozen=True):
 
     `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
     run_id of the run that is played back; empty for a flight. `user_sensors` is left out where all sensors are the
-    contract's, `sightings` where the world computes none. Wherever an Info is made or decoded, the messages of its
-    sensors can be encoded and decoded.
+    contract's, `sightings` where the world computes none. `module_folders` are those in which the world has looked for
+    modules that the scenario names, for who reads the record later; left out where it names none. Wherever an Info is
+    made or decoded, the messages of its sensors can be encoded and decoded.
     """
 
     contract: Count
@@ -109,6 +110,7 @@ class Info(Message, frozen=True):
     replay_of: str = ""
     user_sensors: tuple[SensorInfo, ...] | UnsetType = UNSET
     sightings: bool | UnsetType = UNSET
+    module_folders: tuple[str, ...] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         register_sensors(self.own_sensors)
@@ -159,8 +161,21 @@ _OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest I
 _VIEWS: dict[str, type[Struct]] = {"view/cluster/": views.ViewCluster, "view/estimates/": views.ViewEstimates}
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
 
-encode: Callable[[Struct], bytes] = msgspec.msgpack.Encoder().encode
-"""Return the payload of a message."""
+RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
+"""What agents publish for each other; the world counts it, as it does commands."""
+OUTPUTS = (*RELAYED, camera_messages.Sightings, camera_messages.CameraInfo)
+
+
+def _plain(value: Any) -> Any:
+    """Return a number or array of numpy's as numbers of Python's, which msgspec has a form for."""
+    to_plain = getattr(value, "tolist", None)
+    if to_plain is None:
+        raise TypeError(f"a value is of type {type(value).__name__}; must be a number, text, list or map")
+    return to_plain()
+
+
+encode: Callable[[Struct], bytes] = msgspec.msgpack.Encoder(enc_hook=_plain).encode
+"""Return the payload of a message; numbers and arrays of numpy's are taken."""
 
 
 @lru_cache(maxsize=KEYS_KEPT)
@@ -191,6 +206,28 @@ def types_by_shape() -> dict[str, type[Struct]]:
     """Return the contract's message types by the shape of their key, for documentation and for tests."""
     shapes = {f"{kind}/*/{rest}": message for (kind, rest), message in _BY_SHAPE.items()}
     return {**_FIXED, **shapes, **{f"{start}*": message for start, message in _VIEWS.items()}}
+
+
+@lru_cache(maxsize=KEYS_KEPT)
+def is_output(key: str) -> bool:
+    """Tell whether the world counts the messages of a key for the done of the process that publishes them."""
+    kind = type_of(key)
+    return kind is not None and (keys.is_command(key) or (kind in OUTPUTS and not keys.is_sensor(key)))
+
+
+def output_type(key: str) -> type[Struct]:
+    """Return the message that an agent may return on a key from a step.
+
+    Raises:
+        DecodeError: none; one line.
+    """
+    kind = type_of(key)
+    if kind is None:
+        raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
+    if not is_output(key):
+        todo = "return it from `views`" if key.startswith("view/") else "only who this is about writes there"
+        raise DecodeError(f"{key:.80}: is no key of an agent's outputs (commands, estimates, states); {todo}")
+    return kind
 
 
 def fields(kind: type[Struct]) -> Iterable[str]:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, Literal
 
-from msgspec import Struct, field
+from msgspec import UNSET, Struct, UnsetType, field
 
 from zsim.schema.message import Count, Message, Number, Whole
 
@@ -90,9 +90,10 @@ class Snapshot(Message, frozen=True):
 
 
 class Bye(Message, frozen=True):
-    """A process leaves of its own will."""
+    """A process leaves of its own will; `failed`: since it cannot go on, and would fail again if it were restarted."""
 
     reason: str
+    failed: bool | UnsetType = UNSET
 
 
 RUN_ENDED = "the run ended"  # reason of whoever leaves because the run is over

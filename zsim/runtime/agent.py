@@ -17,13 +17,17 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from msgspec import Struct
+from msgspec.structs import replace
 
+from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import ControlAnswer, ControlRequest, Faults
+from zsim.contract.run_messages import ClusterRequest, ControlAnswer, ControlRequest, Faults
 from zsim.contract.snapshot import State
+from zsim.errors import DecodeError, UserCodeError
 from zsim.runtime.link_faults import LinkFaults
 from zsim.runtime.routing import GateRouter, Input, RoutingTable, one_by_one
+from zsim.schema import plugin
 
 
 class Output(NamedTuple):
@@ -74,6 +78,11 @@ class Agent(ABC):
         """Name of the process that publishes its outputs: its own, unless it shares one."""
         return self._process or self.name
 
+    @property
+    def overhears(self) -> bool:
+        """Tell whether it may read outputs of others that close none of its gates."""
+        return any(not keys.is_sensor(key) and key not in self.gate_keys for key in self.reads)
+
     def share_process(self, process: str) -> None:
         """Publish as a process of this name, in a group, which takes gates apart for those who do not `takes_gates`."""
         self._process = process
@@ -88,6 +97,58 @@ class Agent(ABC):
     def _link_faults(self, info: Info) -> LinkFaults:
         names, clusters = (self.name, *self.serves), {cluster.name: cluster.drones for cluster in info.clusters}
         return LinkFaults(names, info.seed, info.gate_ns, clusters)
+
+    def answer(self, t_ns: int, inputs: Sequence[Input]) -> Sequence[Output] | None:
+        """Take the inputs of a gate; return its outputs, None at a gate at which it does not step.
+
+        The outputs of a user's class are as others get them over Zenoh: of the contract, finite, of Python's types.
+
+        Raises:
+            UserCodeError: a user's class raised, or returned what cannot be used.
+        """
+        try:
+            self.deliver(t_ns, inputs)
+            if t_ns % self.period_ns:
+                return None
+            outputs = self.step(t_ns)
+            return [self._checked(output) for output in outputs] if self._is_own else outputs
+        except Exception as error:
+            failure = self.failure(error, t_ns)
+            if failure is None:
+                raise
+            raise failure from error
+
+    def failure(self, error: Exception, t_ns: int) -> UserCodeError | None:
+        """Return what a user's code raised in this agent with the agent's name and the gate; None for other errors."""
+        return plugin.user_code_error(error, f"{self.name} at {t_ns / 1e9:.2f} s")
+
+    @cached_property
+    def _is_own(self) -> bool:
+        return plugin.is_own(type(self))
+
+    def _checked(self, output: Output) -> Output:
+        """Return an output of a user's class as it would be received."""
+        key, message = output
+        try:
+            kind = messages.output_type(key)
+            if type(message) is not kind:
+                raise DecodeError(f"{key}: message is a {type(message).__name__}; must be a {kind.__name__}")
+            sent = messages.decode(key, messages.encode(message))
+            return Output(key, self._signed(key, sent))
+        except (DecodeError, *messages.REFUSALS) as error:
+            raise UserCodeError(f"{plugin.full_name(type(self))}.step returns {error}") from error
+
+    def _signed(self, key: str, message: Any) -> Struct:
+        """Return a message with this process as its sender, by which the world counts it.
+
+        Raises:
+            DecodeError: it names another one.
+        """
+        field = "controller" if isinstance(message, ClusterRequest) else "source"
+        sender = getattr(message, field)
+        if sender not in ("", self.source):
+            raise DecodeError(f"{key}: {field} is {sender!r}; must be {self.source!r}, the agent's own name, or empty")
+        return replace(message, **{field: self.source})
 
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
         """Take the inputs of a gate in canonical order, as far as faults of the links bring them."""

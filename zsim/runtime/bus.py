@@ -12,9 +12,9 @@ from msgspec import Struct
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages
-from zsim.errors import RunError
+from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.inbox import Inbox
+from zsim.runtime.inbox import NEVER_NS, Inbox
 from zsim.runtime.routing import RoutingTable
 from zsim.scenario.fault_kinds import PROCESS_KILL
 
@@ -66,14 +66,14 @@ class SteppedWorld(Protocol):
 
 Sink = Callable[[str, Any], None]
 GateSink = Callable[[GateMessages], None]
-OUTPUTS = ("/estimate", "/state", "/request")  # ends of the keys of what agents publish for others than the world
 
 
 class _Route(NamedTuple):
-    """Where the messages of a key go: who reads them, and whether they are for others than the world."""
+    """Where the messages of a key go: who reads them, whether the world counts them, and whether it acts on them."""
 
     inboxes: tuple[Inbox, ...]
-    is_output: bool
+    is_counted: bool
+    is_relayed: bool
 
 
 class Bus:
@@ -106,6 +106,7 @@ class Bus:
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
         self._info: messages.Info | None = None
+        self._failures: dict[str, UserCodeError] = {}  # by the agent that cannot go on, the first one first
 
     def join(self) -> None:
         """Let every agent make ready and join the run."""
@@ -114,6 +115,10 @@ class Bus:
             seq, host, run_id = agent.next_seq("join"), socket.gethostname(), self._coordinator.run_id
             join = join_of(agent.name, host, run_id, 0, seq, period_ns=agent.period_ns, serves=agent.serves)
             self._to_world(keys.process(agent.name, "join"), join)
+        if any(agent.overhears for agent, _ in self._agents):
+            info = self._coordinator.info()
+            for _, inbox in self._agents:
+                inbox.hold_ns = info.command_delay_ns + info.gate_ns
 
     def turn(self) -> bool:
         """Let the world go as far as it may, and every agent answer; return whether the run goes on.
@@ -149,16 +154,32 @@ class Bus:
             for t_ns, outputs in steps:
                 self._publish(agent, t_ns, outputs)
             stepped = stepped or bool(steps)
+            if agent.name in self._failures and inbox.taken_ns != NEVER_NS:
+                self._leave_failed(agent, inbox)
         return stepped
 
+    def _leave_failed(self, agent: Agent, inbox: Inbox) -> None:
+        """Let an agent leave that cannot go on; it is handed nothing any more."""
+        inbox.start_after(NEVER_NS)
+        reason, seq = str(self._failures[agent.name]), agent.next_seq("bye")
+        self._to_world(keys.process(agent.name, "bye"), run_messages.Bye(self._t_ns, seq, reason, failed=True))
+
     def end(self) -> None:
-        """Let every agent leave, and publish the world's last messages."""
+        """Let every agent leave, and publish the world's last messages.
+
+        Raises:
+            UserCodeError: a user's class could not go on before the end; all has been published nevertheless.
+        """
         self._coordinator.publish_end()
         self._spread()
         for agent, _ in self._agents:
+            if agent.name in self._failures:
+                continue
             bye = run_messages.Bye(self._t_ns, agent.next_seq("bye"), run_messages.RUN_ENDED)
             self._to_world(keys.process(agent.name, "bye"), bye)
         self._spread()
+        for failure in self._failures.values():
+            raise failure
 
     def _spread(self) -> None:
         for key, message in self._coordinator.take_outbox():
@@ -194,19 +215,23 @@ class Bus:
         t_ns = inbox.next_gate_ns()
         while t_ns is not None and inbox.missing(t_ns) is None:
             self._t_ns = t_ns
-            agent.deliver(t_ns, inbox.take(t_ns))
-            if t_ns % agent.period_ns == 0:
-                yield t_ns, agent.step(t_ns)
+            try:
+                outputs = agent.answer(t_ns, inbox.take(t_ns))
+            except UserCodeError as failure:
+                self._failures[agent.name] = failure
+                return
+            if outputs is not None:
+                yield t_ns, outputs
             t_ns = inbox.next_gate_ns()
 
     def _publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
         sent = 0
         for key, message in outputs:
-            inboxes, is_output = self._route(key)
-            sent += 1
+            inboxes, is_counted, is_relayed = self._route(key)
+            sent += is_counted
             for inbox in inboxes:
                 inbox.put(key, message)
-            if is_output:
+            if is_relayed:
                 self._sink(key, message)
                 self._coordinator.count_output(agent.name)
             else:
@@ -222,7 +247,8 @@ class Bus:
         route = self._routes.get(key)
         if route is None:
             inboxes = tuple(self._agents[reader][1] for reader in self._readers.readers(key))
-            route = self._routes[key] = _Route(inboxes, key.endswith(OUTPUTS))
+            is_counted = messages.is_output(key)
+            route = self._routes[key] = _Route(inboxes, is_counted, is_counted and not keys.is_command(key))
         return route
 
     def _gate_readers(self, table: Sequence[str]) -> tuple[Inbox, ...]:

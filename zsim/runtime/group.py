@@ -71,8 +71,7 @@ class AgentGroup(Agent):
     def step(self, t_ns: int) -> list[Output]:
         outputs: list[Output] = []
         for place, member in enumerate(self._members):
-            member.deliver(t_ns, self._take(place))
-            own = member.step(t_ns)
+            own = member.answer(t_ns, self._take(place)) or ()
             for output in own:
                 for reader in self._routes.readers(output.key):
                     self._waiting[reader].append(output)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
-from zsim.contract import keys
+from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages
 
 GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
@@ -30,6 +30,8 @@ class Inbox:
             is better than none.
         uncounted: keys of which everything that comes late is handed out with the next gate in any case: it belongs to
             no gate, as what a detector finds in a picture.
+        hold_ns: after which an agent's output on a key that closes no gate is handed out, as if stamped so much later:
+            command delay and a gate, when it has come wherever the world may be, so that no order of arrival counts.
         sparse: closing keys whose publishers may skip gates, as the driver of an external drone: one is waited for only
             as long as it comes at every gate.
 
@@ -46,6 +48,7 @@ class Inbox:
         keep_late: bool = False,
         uncounted: Sequence[str] = (),
         sparse: Sequence[str] = (),
+        hold_ns: int = 0,
     ) -> None:
         self._closing = dict.fromkeys(gate_keys)
         self._sparse = dict.fromkeys(sparse, (UNHEARD_NS, UNHEARD_NS))  # with the stamps of its last two messages
@@ -64,6 +67,8 @@ class Inbox:
         self.taken_ns = self._former_ns = -1  # the gates that were taken last
         self._keep_late = keep_late
         self._uncounted = frozenset(uncounted)
+        self.hold_ns = hold_ns
+        self._hold_of: dict[str, int] = {}
         self._belated: dict[tuple[str, int], tuple[str, Any]] = {}
         self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
         self.duplicates = 0
@@ -80,6 +85,8 @@ class Inbox:
         if key in self._sparse:
             _, newest_ns = last = self._sparse[key]
             self._sparse[key] = (newest_ns, t_ns) if t_ns > newest_ns else last
+        hold_ns = self._hold_of.get(key)
+        t_ns += self._find_hold(key) if hold_ns is None else hold_ns
         if t_ns <= self.taken_ns:
             self.late += 1
             return self._put_late(key, message)
@@ -108,6 +115,11 @@ class Inbox:
             return False
         self._belated[key, message.seq] = (key, message)
         return True
+
+    def _find_hold(self, key: str) -> int:
+        is_held = key not in self._closing and key not in self._uncounted and messages.is_output(key)
+        self._hold_of[key] = hold_ns = self.hold_ns if is_held else 0
+        return hold_ns
 
     def _find_came(self, key: str) -> list[int] | None:
         """Return the list of what has come of the counted drone that a sensor key belongs to."""

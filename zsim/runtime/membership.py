@@ -9,6 +9,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
+from msgspec import UNSET
+
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import Pairs
@@ -174,11 +176,12 @@ class Membership:
     def publish(self, t_ns: int, outputs: Sequence[Output]) -> None:
         """Encode the outputs of a gate and the done that counts them, for `send`."""
         self._kept.append((t_ns, outputs))
+        counted = _counted(outputs)
         if t_ns <= self.published_ns:
-            self._done(t_ns, len(outputs))
+            self._done(t_ns, counted)
             return
         encoded = [(key, messages.encode(message)) for key, message in outputs]
-        encoded.append((self._done_key, messages.encode(self._done(t_ns, len(outputs)))))
+        encoded.append((self._done_key, messages.encode(self._done(t_ns, counted))))
         self._unsent += encoded
 
     def publish_snapshot(self, t_ns: int) -> None:
@@ -205,9 +208,9 @@ class Membership:
         """Return [key, payload] of the outputs of the last gates, for a world that lost them with a link."""
         return [[key, messages.encode(message)] for _, outputs in self._kept for key, message in outputs]
 
-    def leave(self, reason: str) -> None:
-        """Publish bye."""
-        bye = run_messages.Bye(max(0, self.done_ns), self._agent.next_seq("bye"), reason)
+    def leave(self, reason: str, failed: bool = False) -> None:
+        """Publish bye; `failed` of one that cannot go on."""
+        bye = run_messages.Bye(max(0, self.done_ns), self._agent.next_seq("bye"), reason, failed or UNSET)
         self._link.put(keys.process(self._agent.name, "bye"), bye)
 
     def _join(self) -> None:
@@ -324,7 +327,7 @@ class Membership:
         for t_ns, outputs in self._kept:
             for key, message in outputs:
                 self._link.put(key, message)
-            self._link.put(self._done_key, self._done(t_ns, len(outputs)))
+            self._link.put(self._done_key, self._done(t_ns, _counted(outputs)))
         self._missed_since_ns = self.done_ns
 
     def ask_faults(self) -> None:
@@ -336,9 +339,15 @@ class Membership:
         self.ask_faults()
         try:
             wanted = (*self._agent.reads, *self._agent.repeats, keys.FAULTS)
-            for key, payload in replay(self._link, self._agent.name, since_ns, wanted, REPLAY_S):
+            held_ns = self._info.command_delay_ns + self._info.gate_ns if self._agent.overhears else 0  # by an inbox
+            for key, payload in replay(self._link, self._agent.name, max(-1, since_ns - held_ns), wanted, REPLAY_S):
                 self._take_in(ReceivedSample(key, payload))
         except NoWorldError:
             return
         self._missed_since_ns = None
         self._asked += 1
+
+
+def _counted(outputs: Sequence[Output]) -> int:
+    """Return how many outputs the world counts."""
+    return sum(messages.is_output(key) for key, _ in outputs)

@@ -81,6 +81,7 @@ class Runner:
             SupersededError: another process of the same name has taken over.
             RunError: the world has begun another run.
             BehindError: it lacks what the world does not keep any more.
+            UserCodeError: a user's class raised, or returned what cannot be used; the world has been told.
         """
         self._agent.rehearse()
         self._inputs.subscribe()
@@ -96,6 +97,13 @@ class Runner:
         try:
             while self._leave is None:
                 self._turn()
+        except Exception as error:
+            failure = self._agent.failure(error, max(0, self._inbox.taken_ns))
+            if failure is None:
+                raise
+            self._member.send()
+            self._member.leave(str(failure), failed=True)
+            raise failure from error
         finally:
             self._over.set()
             ticker.join()
@@ -173,10 +181,9 @@ class Runner:
         self._update_faults(t_ns)
         for key, request in self._inputs.repeated(t_ns):
             self._agent.repeat(key, request)
-        self._agent.deliver(t_ns, self._inbox.take(t_ns))
-        if t_ns % self._agent.period_ns:
+        outputs = self._agent.answer(t_ns, self._inbox.take(t_ns))
+        if outputs is None:
             return
-        outputs = self._agent.step(t_ns)
         self._member.publish(t_ns, outputs)
         self._take_snapshot(t_ns)
         self._show(t_ns)

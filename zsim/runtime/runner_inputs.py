@@ -45,7 +45,8 @@ class RunnerInputs:
         self._blocking: Subscription | None = None  # where `wait` waits
         self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         of_drivers = [key for key in agent.gate_keys if keys.parts(key)[1] in self._external]
-        self.inbox = Inbox(agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers)
+        hold_ns = 0 if self._is_realtime else info.command_delay_ns + info.gate_ns
+        self.inbox = Inbox(agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers, hold_ns)
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}

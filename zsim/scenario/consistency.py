@@ -355,11 +355,6 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
 
 def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
     yield from _death_faults(processes and processes.on_death)
-    if processes and processes.on_overdue and processes.return_s is None:
-        yield (
-            "processes.on_overdue",
-            "is given without return_s; must come with it, as it holds after that time",
-        )
     first: dict[str, int] = {}
     things = {role: (each.about, drones if each.about == "drone" else clusters) for role, each in AGENTS.items()}
     for index, name in _entries(processes and processes.expect):

@@ -86,6 +86,16 @@ def on_overdue(
     return actions.get(name) or actions.get(role) or default
 
 
+def lets_drop(actions: Mapping[str, str], name: str) -> bool:
+    """Tell whether a scenario says itself that a run goes on without a process: that is no failure then.
+
+    Args:
+        actions: `on_death` or `on_overdue` of the scenario, by process name or role.
+        name: of the process.
+    """
+    return (actions.get(name) or actions.get(name.partition(".")[0])) == "drop"
+
+
 def is_needed(name: str) -> bool:
     """Tell whether a run cannot go on without a process, by its role, unless the scenario says so."""
     role = ROLES.get(name.partition(".")[0])

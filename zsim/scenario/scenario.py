@@ -234,6 +234,8 @@ class Processes(Spec, frozen=True, kw_only=True):
 
     expect: Annotated[list[Name], Meta(max_length=PROCESSES_MAX)] | None = None
     on_death: Annotated[dict[str, OnDeath], Meta(max_length=PROCESSES_MAX)] = {}
+    start_timeout_s: Positive | UnsetType = UNSET
+    """Wall time after which one that is expected and has not joined is overdue; unset: see docs/scenario.md."""
     return_s: Positive | None = None  # wall; how long one that is to come back may stay away
     on_overdue: Annotated[dict[str, OnOverdue], Meta(max_length=PROCESSES_MAX)] | UnsetType = UNSET  # then; unset: end
     snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s for who goes on
@@ -287,6 +289,12 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def cluster(self, name: str) -> Cluster:
         """Return the cluster of that name; KeyError if there is none."""
         return {cluster.name: cluster for cluster in self.clusters}[name]
+
+    def names_own_code(self) -> bool:
+        """Tell whether it names a user's class, function or sensor, whose module a reader of its record needs."""
+        spaces = [part.space for cluster in self.clusters for part in (cluster, *cluster.groups)]
+        names = [*spaces, *(cluster.law for cluster in self.clusters), self.estimation.chosen(), self.report.metrics]
+        return any(isinstance(name, str) and ":" in name for name in names) or any(d.sensors.own for d in self.drones)
 
     def external(self) -> list[str]:
         """Return the names of the drones whose bodies are external."""

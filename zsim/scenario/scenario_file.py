@@ -23,19 +23,20 @@ from zsim.vehicles.vehicle import DEFAULTS, Aerodynamics, Vehicle
 EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
 
 
-def load(path: str | Path, overrides: Iterable[str] = (), **values: Any) -> Scenario:
+def load(path: str | Path, overrides: Iterable[str] = (), modules: Iterable[Path] = (), **values: Any) -> Scenario:
     """Return the resolved scenario of a YAML file; classes that it names may stand in modules beside it.
 
     Args:
         path: the file.
         overrides: texts `a.b.c=value` as given to `--set`, applied in order.
+        modules: further folders in which the modules may stand.
         values: top-level fields that replace the file's, None being ignored (`seed=3`).
 
     Raises:
         ScenarioError: with every fault found, a line each.
     """
     path = Path(path)
-    plugin.search(path.parent)
+    plugin.search(path.parent, *modules)
     document = yaml_file.read(path, EXAMPLE, ScenarioError)
     document.update({key: value for key, value in values.items() if value is not None})
     applied = [override.apply(document, text, yaml_file.value) for text in overrides]

@@ -288,4 +288,6 @@ def _as_json(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_as_json, value)) + "]"
     names = {None: "null", True: "true", False: "false"}
-    return names[value] if value is None or isinstance(value, bool) else repr(value)
+    if value is None or isinstance(value, bool):
+        return names[value]
+    return repr(value) if isinstance(value, int | float | str) else " ".join(repr(value).split())

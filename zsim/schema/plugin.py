@@ -10,29 +10,43 @@ Importing a module runs it: fly scenarios of others only if you trust what they 
 import importlib
 import os
 import sys
+import sysconfig
 from collections.abc import Callable
 from inspect import isfunction
 from pathlib import Path
-from types import ModuleType
+from traceback import walk_tb
+from types import FrameType, ModuleType
 from typing import Any
 
 from zsim import extras
-from zsim.errors import DocumentError
+from zsim.errors import DocumentError, UserCodeError
 from zsim.schema.checker import show
 
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that processes started from here search there too
 WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
 
+PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_deploy"})
+"""Of zsim: none of these is a user's."""
+LIBRARIES = tuple(f"{sysconfig.get_path(part)}{os.sep}" for part in ("stdlib", "purelib", "platlib"))
+
 MODULE_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\Z"
 CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
-def search(folder: Path) -> None:
+def search(*places: Path) -> None:
     """Let modules be found in the folder of the document that is read now, here and in processes started from here.
 
-    It takes the place of the folder before: a program that reads many documents does not fill its environment.
+    It takes the place of the folders before: a program that reads many documents does not fill its environment.
+
+    Args:
+        places: folders, that of the document first; those that are not there are left out.
     """
-    os.environ[FOLDERS] = str(folder.resolve())
+    os.environ[FOLDERS] = os.pathsep.join(dict.fromkeys(str(place.resolve()) for place in places if place.is_dir()))
+
+
+def folders() -> tuple[Path, ...]:
+    """Return the folders in which modules are looked for beside where Python finds them."""
+    return tuple(map(Path, filter(None, os.environ.get(FOLDERS, "").split(os.pathsep))))
 
 
 def load(name: str, where: str, kind: type) -> Callable[..., Any]:
@@ -91,8 +105,55 @@ def load_module(name: str, where: str) -> ModuleType:
     return _imported(name, f"{where} is {show(name)}")
 
 
+def is_own(kind: type) -> bool:
+    """Tell whether a class is a user's own, and none of zsim's."""
+    return kind.__module__.partition(".")[0] not in PACKAGES
+
+
+def full_name(kind: type) -> str:
+    """Return the name of a class as a scenario has it: `package.module:Class`."""
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def user_code_error(error: Exception, where: str) -> UserCodeError | None:
+    """Return what a user's code raised as an error that names class, method, file and line; None for other errors.
+
+    Args:
+        error: caught by code of zsim, so that its traceback begins there.
+        where: which process, at which simulated time.
+    """
+    if isinstance(error, UserCodeError):
+        return error if error.where else UserCodeError(error.text, where)
+    frames = [(frame, line) for frame, line in walk_tb(error.__traceback__) if _is_user_frame(frame)]
+    if not frames:
+        return None
+    (called, _), (deepest, line) = frames[0], frames[-1]
+    method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
+    raised = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    return UserCodeError(f"{method} raised {raised} ({_shown_path(deepest.f_code.co_filename)}:{line})", where)
+
+
+def _is_user_frame(frame: FrameType) -> bool:
+    """Tell whether a frame is of a user's file, or of an installed package that a document names."""
+    package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename
+    if package in PACKAGES or path.startswith("<"):
+        return False
+    is_library = path.startswith(LIBRARIES) or "site-packages" in path or "dist-packages" in path
+    return not is_library or package in _LOADED
+
+
+def _shown_path(path: str) -> str:
+    """Return a path from the working folder on, where the file is in it."""
+    folder = f"{os.getcwd()}{os.sep}"
+    return path.removeprefix(folder)
+
+
+_LOADED: set[str] = set()  # packages that documents have named
+
+
 def _imported(name: str, what: str) -> ModuleType:
-    for folder in filter(None, os.environ.get(FOLDERS, "").split(os.pathsep)):
+    _LOADED.add(name.partition(".")[0])
+    for folder in map(str, folders()):
         if folder not in sys.path:
             sys.path.append(folder)
     try:

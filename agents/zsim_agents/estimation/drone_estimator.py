@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.snapshot import State
-from zsim.errors import RunError
+from zsim.errors import UserCodeError
 from zsim.scenario.scenario import ESTIMATORS, Drone, Environment, Estimation
 from zsim.schema import plugin
 from zsim.schema.checker import show
@@ -107,7 +107,10 @@ class EstimatorSet:
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
         """Hand a message over to the estimator of drone i."""
-        self._estimators[i].receive(sensor, message)
+        try:
+            self._estimators[i].receive(sensor, message)
+        except Exception as error:
+            raise self._failure(error, i) from error
 
     def receive_gate(self, gate: Any) -> bool:
         """Refuse it: its messages are to be handed over one by one."""
@@ -117,10 +120,21 @@ class EstimatorSet:
         """Return the estimates for `t_s`, as plain numbers.
 
         Raises:
-            RunError: one of them is not what an estimate consists of.
+            UserCodeError: one of them is not what an estimate consists of.
         """
-        pairs = zip(self._drones, self._estimators, strict=True)
-        return [_plain(each.estimate(t_s), f"estimator.{drone}, at {t_s:g} s") for drone, each in pairs]
+        return [self._estimate(i, t_s) for i in range(len(self._estimators))]
+
+    def _estimate(self, i: int, t_s: float) -> StateEstimate:
+        try:
+            estimate = self._estimators[i].estimate(t_s)
+        except Exception as error:
+            raise self._failure(error, i) from error
+        return _plain(estimate, self._estimators[i], self._drones[i])
+
+    def _failure(self, error: Exception, i: int) -> Exception:
+        """Return what a user's class raised with its drone; any other error as it is."""
+        failure = plugin.user_code_error(error, "")
+        return UserCodeError(f"{failure.text}, for {self._drones[i]}") if failure else error
 
     def snapshot(self) -> State | None:
         """Return the states of all of them, None if their class has no `snapshot`."""
@@ -140,19 +154,26 @@ class EstimatorSet:
             warm_start(last)
 
 
-def _plain(estimate: StateEstimate, where: str) -> StateEstimate:
+def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> StateEstimate:
     """Return an estimate as a message has it."""
-    values = {field: _floats(getattr(estimate, field)) for field in SIZES}
-    values |= {field: _floats([getattr(estimate, field)]) for field in ("yaw_rad", "yaw_sigma_rad")}
-    for field, numbers in values.items():
-        size = SIZES.get(field, 1)
+    what = f"{plugin.full_name(type(estimator))}.estimate returns for {drone}"
+    values = {}
+    for field in (*SIZES, "yaw_rad", "yaw_sigma_rad"):
+        size, given = SIZES.get(field, 1), getattr(estimate, field, None)
+        try:
+            numbers = np.asarray(given, dtype=float).ravel().tolist()
+        except (TypeError, ValueError):
+            numbers = []
         if len(numbers) != size or not all(map(math.isfinite, numbers)):
-            raise RunError(f"{where}: {field} is {show(numbers)}; must be {size} finite numbers")
+            found = f"{field} = {show(given)}" if hasattr(estimate, field) else f"{show(estimate)} without {field}"
+            raise UserCodeError(
+                f"{what} {found}; must be {f'{size} finite numbers' if size > 1 else 'a finite number'}"
+            )
+        values[field] = tuple(numbers)
     yaw, yaw_sigma = values.pop("yaw_rad"), values.pop("yaw_sigma_rad")
-    sensors = {name: (int(used), int(refused)) for name, (used, refused) in estimate.sensors.items()}
+    try:
+        sensors = {name: (int(used), int(refused)) for name, (used, refused) in estimate.sensors.items()}
+    except (AttributeError, TypeError, ValueError) as error:
+        found = f"sensors = {show(getattr(estimate, 'sensors', None))}"
+        raise UserCodeError(f"{what} {found}; must be a map of (used, refused) by sensor") from error
     return StateEstimate(**values, yaw_rad=yaw[0], yaw_sigma_rad=yaw_sigma[0], sensors=sensors)
-
-
-def _floats(values: Any) -> tuple[float, ...]:
-    """Return the numbers of a sequence or of an array of any shape."""
-    return tuple(float(value) for value in getattr(values, "flat", values))

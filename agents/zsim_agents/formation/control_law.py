@@ -7,16 +7,23 @@ stock law.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from msgspec import Struct
 
 from zsim.contract.snapshot import State
+from zsim.errors import UserCodeError
 from zsim.math.compiled import portable
+from zsim.schema import plugin
+from zsim.schema.checker import show
 from zsim_agents.formation.robot_limits import Pairs, RobotLimits, limited, pairs_of
 from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace
+
+RATES = ("vx", "vy", "vz", "yaw rate")  # of a robot, in the order of r_dot
 
 
 @dataclass(frozen=True)
@@ -75,12 +82,17 @@ class ControlLaw(ABC):
     Args:
         space: cluster space of n robots.
         gains: of the scenario; a law takes those that it knows.
+
+    Attributes:
+        robots: what they are called in messages, in their order.
     """
 
     def __init__(self, space: ClusterSpace, gains: FormationGains | None = None) -> None:
         self.space = space
         self.gains = gains or FormationGains()
+        self.robots: Sequence[str] = [f"robot {i + 1}" for i in range(space.n)]
         self._order = np.empty((space.n, space.n), np.int64)
+        self._is_own = plugin.is_own(type(self))
 
     @abstractmethod
     def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
@@ -113,18 +125,34 @@ class ControlLaw(ABC):
         """Return the command of this gate; arguments as in `rates`, dt_s the time since the last command.
 
         Raises:
-            ValueError: `rates` returned another number of rates.
+            UserCodeError: `rates` of a user's law returned another number of rates, or one that is not finite.
         """
         n, order = self.space.n, self._order
-        r_dot = np.asarray(self.rates(c, p_W, v_W, c_des, c_dot_des), dtype=float)
-        if r_dot.shape != c.shape:  # compiled code would read beyond its end
-            raise ValueError(f"law: rates are of shape {r_dot.shape}; must be {c.shape}, four for each robot")
+        r_dot = self.rates(c, p_W, v_W, c_des, c_dot_des)
+        if self._is_own:  # compiled code would read beyond the end of a shorter one
+            r_dot = self._checked(r_dot)
         v_cmd_W, yaw_rate = np.empty((n, 3)), np.empty(n)
         factor, guards, alarms = limited(r_dot, p_W, v_W, v_cmd_W, yaw_rate, order, *self.gains.limits)
         if factor == 1.0 and not guards:
             self.followed(dt_s)
         guarded, alarmed = pairs_of(guards, alarms, order) if guards or alarms else ((), ())
         return FormationCommand(v_cmd_W, yaw_rate, factor, guarded, alarmed)
+
+    def _checked(self, r_dot: Any) -> Array:
+        """Return what `rates` of a user's law returned as an array (4n,) of finite numbers."""
+        what = f"{plugin.full_name(type(self))}.rates returns"
+        size = self.space.size
+        try:
+            rates = np.asarray(r_dot, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise UserCodeError(f"{what} {show(r_dot)}; must be an array of {size} rates") from error
+        if rates.shape != (size,):
+            raise UserCodeError(f"{what} an array of shape {rates.shape}; must be ({size},), four for each robot")
+        wrong = np.flatnonzero(~np.isfinite(rates))
+        if wrong.size:
+            robot, k = divmod(int(wrong[0]), len(RATES))
+            raise UserCodeError(f"{what} {rates[wrong[0]]} as {RATES[k]} of {self.robots[robot]}; must be finite")
+        return rates
 
 
 class ProportionalLaw(ControlLaw):

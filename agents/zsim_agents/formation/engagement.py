@@ -82,6 +82,7 @@ class Engagement:
         self.gains = gains or FormationGains()
         self.limits = limits or EngagementLimits()
         self.law = law(space, self.gains)
+        self.law.robots = self.drones
         self.guidance = Guidance(space, self.gains, self.limits.shape)
         self.plan = FlightPlan(space, plan)
         self._held_limits = self.gains.limits._replace(separation_min_m=self.gains.separation_min_m + HOLD_APART_M)

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from zsim.errors import DocumentError, RunError
+from zsim.errors import DocumentError, RunError, UserCodeError
 from zsim.scenario.scenario import Cluster, Gains, Scenario
 from zsim.schema import plugin
 from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, ProportionalLaw
@@ -54,10 +54,17 @@ def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
     """Raise what is wrong with a cluster as a RunError that names it, in its plan with the path in the scenario."""
     try:
         yield
+    except UserCodeError as error:
+        raise UserCodeError(error.text, f"cluster {cluster.name!r}, in a gate of its rehearsal") from error
     except PlanError as error:
         raise RunError(f"clusters[{scenario.clusters.index(cluster)}].{error} (cluster {cluster.name!r})") from error
     except (ValueError, DocumentError) as error:
         raise RunError(f"cluster {cluster.name!r}: {error}") from error
+    except Exception as error:
+        failure = plugin.user_code_error(error, f"cluster {cluster.name!r}, in a gate of its rehearsal")
+        if failure is None:
+            raise
+        raise failure from error
 
 
 def law_of(cluster: Cluster) -> Callable[[ClusterSpace, FormationGains], ControlLaw]:
@@ -80,7 +87,7 @@ def rehearse(
     p_W, yaw = space.inverse(c)
     c = space.forward(p_W, yaw)
     none = np.zeros((space.n, 3))
-    rehearsal = Engagement(space, [str(i) for i in range(space.n)], gains, law=law)
+    rehearsal = Engagement(space, [f"robot {i + 1}" for i in range(space.n)], gains, law=law)
     rehearsal.warm_start("engaged", c)
     rehearsal.step(GateInput(0.0, p_W, yaw, none, none, np.zeros(space.n), ("flying",) * space.n))
     ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)

@@ -30,6 +30,7 @@ EVENT_COLOURS = {
     "accepted": BLUE,
     "done": GREEN,
     "death": RED,
+    "failure": RED,
     "overdue": RED,
     "silent": RED,
     "no_show": RED,

@@ -12,7 +12,7 @@ from msgspec import UNSET
 
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
-from zsim.errors import RunError
+from zsim.errors import DocumentError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Hats
@@ -53,7 +53,7 @@ def _spaces(scenario: Scenario) -> dict[str, ClusterSpace]:
     """
     try:
         return {cluster.name: scenario_space(scenario, cluster) for cluster in scenario.clusters}
-    except ValueError as error:
+    except (ValueError, DocumentError) as error:
         raise RunError(f"console: {error}") from error
 
 

@@ -27,7 +27,7 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_analysis.export.foxglove_scene import Instant, RotorDisc, instants, is_drawn
 from zsim_analysis.export.foxglove_topics import DRONES, ESTIMATES, FORMATIONS, GROUND, LOG, TRAILS, FoxgloveFile
 from zsim_analysis.export.selection import DecodedMessages, MessageSelection, subject
-from zsim_analysis.reading.recorded_run import decode_or_none, scenario_of
+from zsim_analysis.reading.recorded_run import decode_or_none, scenario_of, search_modules
 
 LATEST_NS = 2**32 * 10**9  # Foxglove counts seconds in 32 bits
 ARM_M = 0.1785  # m, the AR.Drone's, where the scenario is not known
@@ -70,6 +70,7 @@ def convert(
     total = sum(reader.topics()[key] for key in wanted)
     recorded = reader.last(keys.INFO)
     info = decode_or_none(recorded) if recorded else None
+    search_modules(reader.path, info)
     scenario = scenario_of(info)
     drones = [subject(key) for key in wanted if key.startswith("drone/")]
     decoded = DecodedMessages(selection.messages(reader, wanted), _decode, lambda done: progress(done, total))

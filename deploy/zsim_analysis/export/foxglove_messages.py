@@ -65,6 +65,7 @@ LEVELS = {  # of events; the others are information
     "fault": LogLevel.Warning,
     "landing": LogLevel.Warning,
     "death": LogLevel.Error,
+    "failure": LogLevel.Error,
     "overdue": LogLevel.Error,
     "collision": LogLevel.Error,
     "emergency": LogLevel.Error,

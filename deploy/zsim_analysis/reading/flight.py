@@ -24,7 +24,7 @@ from zsim_analysis.reading.recorded_flight import (
     RecordedProcess,
     Track,
 )
-from zsim_analysis.reading.recorded_run import scenario_of
+from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 
 
 class _Truth(Struct):
@@ -75,7 +75,9 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
                 flight.add(message)
         for message in reader.messages(wanted, by_time=False):
             flight.add(message)
-        return flight.flight(sum(reader.topics().values()), completeness(reader))
+        recorded = flight.flight(sum(reader.topics().values()), completeness(reader))
+        search_modules(path, recorded.info)
+        return recorded
 
 
 class FlightReader:

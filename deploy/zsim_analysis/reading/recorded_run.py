@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import UNSET
 
-from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract import keys, messages, run_messages
 from zsim.errors import DecodeError, RecordError, ZsimError
 from zsim.record import Recorded, RecordReader
 from zsim.record.record_reader import record_at
@@ -19,12 +20,12 @@ from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import PROCESS_KILL
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
 from zsim_agents.hosting import agents_of
 
 # events of a process that did not take part all the time
-ABSENCES = ("death", "restart", "superseded", "doubled", "drop", "leave")
+ABSENCES = ("death", "failure", "restart", "superseded", "doubled", "drop", "leave")
 PROCESS_MESSAGES = ("join", "done", "bye")  # from processes to the world
-OUTPUTS = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
 
 
 class RecordedRun(NamedTuple):
@@ -46,6 +47,7 @@ def open_run(place: Path) -> Iterator[RecordedRun]:
     """
     with RecordReader(record_at(place)) as reader:
         info = _info(reader)
+        search_modules(reader.path, info)
         yield RecordedRun(reader, info, scenario_file.from_text(info.scenario))
 
 
@@ -57,6 +59,12 @@ def _info(reader: RecordReader) -> messages.Info:
         return messages.decode(keys.INFO, recorded.payload)
     except DecodeError as error:
         raise RecordError(f"{reader.path}: {error}; the record is of another version") from error
+
+
+def search_modules(record: Path, info: messages.Info | None) -> None:
+    """Let modules that a run's scenario names be found where the run found them, beside its record, or where we are."""
+    recorded = info.module_folders if info and info.module_folders is not UNSET else ()
+    plugin.search(*map(Path, recorded), record.parent, Path.cwd())
 
 
 def scenario_of(info: messages.Info | None) -> Scenario | None:
@@ -231,4 +239,4 @@ def _is_input(key: str) -> bool:
         return what in PROCESS_MESSAGES
     if kind == "drone" and what == keys.SIGHTINGS:  # of a detector
         return True
-    return key == keys.EVENT or (kind == "drone" and what.startswith("cmd/")) or messages.type_of(key) in OUTPUTS
+    return key == keys.EVENT or keys.is_command(key) or messages.type_of(key) in messages.RELAYED

@@ -13,7 +13,9 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.contract.run_messages import Event
-from zsim.scenario.scenario import Cluster, ClusterPlan, Scenario
+from zsim.scenario.rights import WORLD
+from zsim.scenario.role_table import agent_names, lets_drop
+from zsim.scenario.scenario import Cluster, ClusterPlan, Processes, Scenario
 from zsim_agents.formation.flight_data import HELD_ON_REQUEST
 from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, plan_of, waiting_step
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
@@ -42,8 +44,9 @@ class Shortfall(Struct, frozen=True):
         kind: of a drone: emergency, flip, impact, battery, landing (what befell it first), hand (others flew it);
             of a cluster: plan (a step refused to the end, or flown in part), engagement (never), held (for long),
             request (others led it), early (the run ended before it was due), window (it holds instants at which a
-            cluster was not engaged); collision; record (not all of it is there).
-        subject: the cluster, the drone, or "record".
+            cluster was not engaged); collision; process (one that was expected died, failed, or never came); record
+            (not all of it is there).
+        subject: the cluster, the drone, the process, or "record".
         t_s: since when, simulated time.
         fails: the flight is no example of its plan; the command ends with code 1.
     """
@@ -59,13 +62,34 @@ def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Sh
     """Return what a flight did not do, what matters most first; empty for one that flew its plan."""
     lines = [*_fates(flight), *_collisions(flight)]
     lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
-    lines += [*_hands(flight), *_of_record(flight)]
+    lines += [*_hands(flight), *_of_processes(flight), *_of_record(flight)]
     return sorted(lines, key=lambda line: not line.fails)
 
 
 def _of_record(flight: RecordedFlight) -> Iterator[Shortfall]:
     if not flight.completeness.complete:
         yield Shortfall("record", "record", flight.last_ns / 1e9, f"the record is {flight.completeness}", True)
+
+
+def _of_processes(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield the expected processes without which the run went on, or which ended it, unless the scenario says drop."""
+    scenario = flight.scenario
+    expected = {*scenario.expected(), *agent_names(scenario), WORLD} if scenario else set()
+    actions = scenario.processes if scenario else Processes()
+    dropped = {event.subject for event in flight.events if event.kind == "drop"}  # and nobody else does their work
+    for event in flight.events:
+        if event.kind == "end":
+            return  # who dies after it has taken part
+        if event.subject not in expected:
+            continue
+        is_death = event.kind == "death" and (event.data.get("on_death") == "end" or event.subject in dropped)
+        allowed = actions.on_overdue or {} if event.kind == "overdue" else actions.on_death
+        t_s = event.t_ns / 1e9
+        if event.kind == "leave":
+            yield Shortfall("process", event.subject, t_s, f"{event.text}, at {t_s:.2f} s", False)
+        elif (is_death or event.kind in ("failure", "overdue")) and not lets_drop(allowed, event.subject):
+            text = event.text if event.kind == "failure" else f"{event.text}, at {t_s:.2f} s"
+            yield Shortfall("process", event.subject, t_s, text, True)
 
 
 def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:

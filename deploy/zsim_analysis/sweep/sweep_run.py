@@ -144,7 +144,7 @@ def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tupl
     """
     flight, reader = InProcessFlight(scenario), FlightReader()
     flight.run([reader, writer] if writer else [reader])
-    return reader.flight(), flight.world.diverged
+    return reader.flight(), flight.world.failure
 
 
 @contextmanager

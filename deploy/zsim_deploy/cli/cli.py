@@ -12,8 +12,8 @@ import typer
 from typer.main import get_command
 
 from zsim import __version__, extras
-from zsim.errors import BehindError, SupersededError, ZsimError, printable
-from zsim_deploy import INTERRUPTED
+from zsim.errors import BehindError, RunFailedError, SupersededError, UserCodeError, ZsimError, printable
+from zsim_deploy import INTERRUPTED, USER_FAULT
 from zsim_deploy.arguments import (
     CONSOLE_NEEDS,
     FLIGHT_NEEDS,
@@ -56,8 +56,7 @@ app = typer.Typer(
 
 UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
 UNREAD = 128 + 13  # exit code of a command whose output nobody reads any more: that of SIGPIPE
-USER_FAULT = 2  # exit code of whatever a person has to put right
-EXIT_CODES = {SupersededError: 3, BehindError: 1}  # of the faults after which somebody else goes on; see supervisor.py
+EXIT_CODES = {SupersededError: 3, BehindError: 1, RunFailedError: 1, UserCodeError: 1}  # of what is no wrong input
 
 
 @app.command(rich_help_panel=RUN)
@@ -127,7 +126,8 @@ def run(
     if not continue_:
         options.out = make_directory(out, options.scenario, force)
     with shown or nullcontext(), interruptible():
-        outcome = fly(options, in_process)
+        with hosts_commands.seen_by_ps(options.scenario.federation, options.status):
+            outcome = fly(options, in_process)
         if shown:
             shown.outcome = outcome
         record_commands.conclude(outcome, options.out, report)

@@ -46,8 +46,11 @@ def keys(
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
-        for key, kind, count in inspection.list_keys(link, expression):
+        found = inspection.list_keys(link, expression)
+        for key, kind, count in found:
             print(printable(f"{key:<36} {kind:<14} {count:>6}"))
+        if not found:
+            raise _failed(f"no key in use matches {expression}{inspection.keys_like(link, expression)}")
 
 
 @app.command(rich_help_panel=PANEL)
@@ -57,15 +60,18 @@ def echo(
     key: Annotated[str, typer.Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")],
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="Payload as hexadecimal digits.")] = False,
+    timeout: Annotated[float | None, typer.Option(callback=positive, help="Stop after so many seconds.")] = None,
 ) -> None:
-    """Print the messages on a key as JSON lines."""
+    """Print the messages on a key as JSON lines; exit code 1 where --timeout is over and they have not come."""
     from zsim_deploy.cli import inspection
 
     def emit(name: str, message: Any) -> None:
         print(json.dumps({"key": name, "message": message}), flush=True)
 
     with connected(reach) as (link, _):
-        inspection.echo(link, key, count, emit, raw)
+        came = inspection.echo(link, key, count, emit, raw, timeout or math.inf, _note)
+    if came < (count or 1):
+        raise _failed(f"{came or 'no'} messages on {key} within {timeout:g} s")
 
 
 @app.command(rich_help_panel=PANEL)
@@ -80,7 +86,9 @@ def hz(
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
-        inspection.hz(link, key, window, seconds or math.inf, lambda line: print(printable(line), flush=True))
+        came = inspection.hz(link, key, window, seconds or math.inf, lambda line: print(printable(line), flush=True))
+    if not came:
+        raise _failed(f"no message on {key} within {seconds:g} s")
 
 
 @app.command(rich_help_panel=PANEL)
@@ -92,12 +100,16 @@ def pub(
     count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many times.")] = 1,
     rate_hz: Annotated[float, typer.Option(callback=positive, max=1000, help="How often per wall second.")] = 10.0,
 ) -> None:
-    """Send a command to a drone; t_ns, seq and source are filled in."""
+    """Send a command to a drone; t_ns, seq and source are filled in. Exit code 1 where the world refuses it."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, info):
         sent = inspection.publish(link, info, key, message, count, rate_hz)
-    print(printable(f"published {sent} on {key}"))
+    print(printable(f"published {sent.sent} on {key}"))
+    if sent.note:
+        _note(sent.note)
+    if sent.refused:
+        raise _failed(f"refused {sent.refused} of {sent.sent}: {sent.reason}")
 
 
 @app.command(rich_help_panel=PANEL)
@@ -114,6 +126,16 @@ def ask(
     with connected(reach) as (link, _):
         result = inspection.ask(link, key, op, args)
     print("ok" if result is None else json.dumps(result))
+
+
+def _note(text: str) -> None:
+    print(printable(text), file=sys.stderr, flush=True)
+
+
+def _failed(text: str) -> typer.Exit:
+    """Print why a command ends with exit code 1; return the exception to raise."""
+    _note(text)
+    return typer.Exit(1)
 
 
 @contextmanager

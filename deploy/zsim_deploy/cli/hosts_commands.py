@@ -18,6 +18,7 @@ from zsim_deploy.hosts.row_choice import RowChoice, RowOrder
 app = typer.Typer()
 
 UP_NEEDS = {"hosts": ("asyncssh", "cryptography"), "record": ("mcap", "zstandard")}  # modules by extra
+EVERY = ""  # federation
 FOLLOW_S = 0.2  # between two looks at a log that is followed
 
 Hosts = Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
@@ -98,25 +99,54 @@ def ps(
     ] = None,
     only: Only = None,
     sort: Sort = None,
-    federation: Federation = "zsim",
+    federation: Annotated[str, typer.Option(help="Only runs of this federation.")] = EVERY,
     as_json: Annotated[bool, typer.Option("--json", help="As a JSON line.")] = False,
 ) -> None:
-    """Show the processes of the run that is up: role, host, pid, state, lag, age, messages/s, round trip, restarts.
+    """Show the processes of the runs on this machine: role, host, pid, state, lag, age, messages/s, restarts.
 
-    A narrow terminal shows fewer columns, --json all of them.
+    A narrow terminal shows fewer columns, --json all of them, in a line for each run.
     """
+    from zsim.errors import RunError
     from zsim.terminal.fitted_table import print_table
     from zsim_deploy.hosts import control_socket
     from zsim_deploy.hosts.status_table import table
 
-    status = control_socket.ask(federation, "ps")
+    runs = []
+    for name in control_socket.launchers():
+        if name == federation or name.startswith(f"{federation}@") or federation == EVERY:
+            with contextlib.suppress(RunError):  # its launcher was killed, or ends
+                runs.append(control_socket.ask(name, "ps"))
+    if not runs:
+        whose = "" if federation == EVERY else f" of federation {federation!r}"
+        raise RunError(f"no run{whose} that `zsim run` or `zsim up` has started goes on on this machine")
     choice = RowChoice([*(roles or ()), *(only or ())], sort)
-    choice.check(status["rows"])
-    status["rows"] = choice.of(status["rows"])
-    if as_json:
-        print(json.dumps(status))
-    else:
-        print_table(table(status["rows"]))
+    choice.check([row for status in runs for row in status["rows"]])
+    for status in runs:
+        status["rows"] = choice.of(status["rows"])
+        if as_json:
+            print(json.dumps(status))
+        elif status["rows"]:
+            print(printable(_run_line(status)))
+            print_table(table(status["rows"]))
+
+
+def _run_line(status: dict[str, Any]) -> str:
+    clock = status["clock"]
+    return f"{status['out']}: {clock['t_s']:.1f} s, {clock['state']}" if clock else f"{status['out']}"
+
+
+@contextlib.contextmanager
+def seen_by_ps(federation: str, status: Callable[[], dict[str, Any]]) -> Iterator[None]:
+    """Let `zsim ps` see a run of this process while it lasts; a machine without a place to listen goes without."""
+    from zsim.errors import RunError
+
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(RunError, ImportError):  # no such sockets on Windows
+            from zsim_deploy.hosts import control_socket
+
+            name = control_socket.of_run(federation)
+            stack.enter_context(control_socket.ControlSocket(name, {"ps": status}))
+        yield
 
 
 def logs(

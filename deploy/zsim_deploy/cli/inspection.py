@@ -6,11 +6,12 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any
+from difflib import get_close_matches
+from typing import Any, NamedTuple
 
 import msgspec
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.framing import pairs_of
 from zsim.errors import DecodeError, RunError
 from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription, check_expression
@@ -19,6 +20,10 @@ LISTEN_S = 1.0  # wall time that `keys` listens: every live key of the contract 
 PACKET_S = 0.05  # wait between two looks into an empty subscription
 LINE_S = 1.0  # between two lines of `hz`
 SILENCE_S = 1.0  # after which a key with messages is reported as silent; later where its own gaps are longer
+UNHEARD_S = 3.0  # after which it is said that a key has no publisher; whatever comes at all comes once a second
+NAMED_MAX = 5  # keys that are named in place of one that nobody publishes
+OUTCOME_S = 3.0  # wall; how long the world may take to say what becomes of a command; a standing one does not say it
+UNKNOWN_SENDER = "somebody"  # source of the event of a message that could not be decoded
 PUB, ASK = "zsim.pub", "zsim.ask"
 COMMANDS = "drone/*/cmd/*"
 
@@ -39,13 +44,49 @@ def list_keys(link: Session, expression: str, listen_s: float = LISTEN_S) -> lis
     return [(key, _kind(key), count) for key, count in sorted(counts.items())]
 
 
-def echo(link: Session, expression: str, count: int | None, emit: Callable[[str, Any], None], raw: bool) -> None:
-    """Hand every message on an expression to `emit` until `count` have come."""
+def echo(
+    link: Session,
+    expression: str,
+    count: int | None,
+    emit: Callable[[str, Any], None],
+    raw: bool,
+    timeout_s: float = math.inf,
+    note: Callable[[str], None] = lambda text: None,
+) -> int:
+    """Hand every message on an expression to `emit` until `count` have come, or the time is over.
+
+    Args:
+        link: an open session.
+        expression: the keys.
+        count: after which it returns, None for none.
+        emit: takes key and message.
+        raw: payloads in hexadecimal digits.
+        timeout_s: wall time after which it returns.
+        note: takes a line for people, as that nobody publishes there.
+
+    Returns:
+        how many came.
+    """
     subscription = link.subscribe(expression)
-    for number, sample in enumerate(_samples(subscription, math.inf), start=1):
-        emit(sample.key, sample.payload.hex() if raw else readable(sample))
-        if number == count:
-            return
+    until_s, number = time.monotonic() + timeout_s, 0
+    unheard_s = time.monotonic() + min(UNHEARD_S, timeout_s)
+    while True:
+        for sample in _samples(subscription, until_s if number else unheard_s):
+            number += 1
+            emit(sample.key, sample.payload.hex() if raw else readable(sample))
+            if number == count:
+                return number
+        if time.monotonic() >= until_s:
+            return number
+        note(f"nobody has published on {expression} for {UNHEARD_S:g} s{keys_like(link, expression)}")
+        unheard_s = until_s
+
+
+def keys_like(link: Session, expression: str) -> str:
+    """Return, as the end of a line, which keys in use are most like one that nobody publishes."""
+    in_use = [key for key, _, _ in list_keys(link, "**")]
+    named = ", ".join(get_close_matches(expression, in_use, NAMED_MAX))
+    return f"; keys in use like it: {named}" if named else "; `zsim keys` lists the keys in use"
 
 
 def readable(sample: ReceivedSample) -> Any:
@@ -97,8 +138,8 @@ class MessageRate:
         return f"{text}, {self.total} messages"
 
 
-def hz(link: Session, expression: str, window: int, seconds: float, emit: Callable[[str], None]) -> None:
-    """Show once a second, and at the end, how often messages come on an expression.
+def hz(link: Session, expression: str, window: int, seconds: float, emit: Callable[[str], None]) -> int:
+    """Show once a second, and at the end, how often messages come on an expression; return how many came.
 
     Raises:
         SessionError: it is no key expression.
@@ -112,14 +153,17 @@ def hz(link: Session, expression: str, window: int, seconds: float, emit: Callab
 
     link.declare_subscriber(expression, arrive)
     rate, head = MessageRate(window), msgspec.msgpack.Decoder(_Stamp)
-    until_s = time.monotonic() + seconds
+    until_s, unheard_s = time.monotonic() + seconds, time.monotonic() + min(UNHEARD_S, seconds)
+    nothing = f"no message on {expression} yet"
     while (now_s := time.monotonic()) < until_s:
         time.sleep(min(LINE_S, until_s - now_s))
         for _ in range(len(arrived)):
             wall_s, payload = arrived.popleft()
             rate.add(wall_s, _stamp(head, payload))
-        nothing = f"no message on {expression} yet; `zsim keys` lists the keys in use"
+        if not rate.total and time.monotonic() >= unheard_s:
+            nothing, unheard_s = f"no message on {expression} yet{keys_like(link, expression)}", math.inf
         emit(rate.line(time.monotonic()) if rate.total else nothing)
+    return rate.total
 
 
 class _Stamp(msgspec.Struct):
@@ -151,8 +195,26 @@ def _samples(subscription: Subscription, until_s: float) -> Iterator[ReceivedSam
             time.sleep(min(PACKET_S, max(0.0, until_s - time.monotonic())))
 
 
-def publish(link: Session, info: messages.Info, key: str, text: str, count: int, rate_hz: float) -> int:
-    """Publish a JSON text as the command of its key, `count` times; t_ns, seq and source are filled in.
+class Published(NamedTuple):
+    """What became of commands that were sent by hand.
+
+    Attributes:
+        sent: how many.
+        refused: how many of them the world refused, as far as its events say.
+        reason: of the first refusal.
+        note: why nothing is known of them, empty if it is.
+    """
+
+    sent: int
+    refused: int = 0
+    reason: str = ""
+    note: str = ""
+
+
+def publish(link: Session, info: messages.Info, key: str, text: str, count: int, rate_hz: float) -> Published:
+    """Publish a JSON text as the command of its key, `count` times, and wait for what becomes of it.
+
+    t_ns, seq and source are filled in.
 
     Args:
         link: an open session.
@@ -166,11 +228,46 @@ def publish(link: Session, info: messages.Info, key: str, text: str, count: int,
         RunError: no JSON, not the message of that key, or a key on which nobody sends by hand.
     """
     fields = _fields(_command_key(key, info), text)
-    clock, start_s = _Now(link), time.monotonic()
+    events, clock, start_s = link.subscribe(keys.EVENT), _Now(link), time.monotonic()
     for seq in range(count):
         time.sleep(max(0.0, start_s + seq / rate_hz - time.monotonic()))
         link.put_raw(key, _payload(key, {"t_ns": clock.t_ns(), "seq": seq, **fields}))
-    return count
+    return _outcome(events, clock, info.gate_ns, (key, str(fields.get("source", PUB))), count)
+
+
+def _outcome(events: Subscription, clock: "_Now", gate_ns: int, ours: tuple[str, str], sent: int) -> Published:
+    """Return what the world's events say of commands, once the last has taken effect or was refused.
+
+    Args:
+        events: of the world.
+        clock: of the run.
+        gate_ns: between two gates.
+        ours: key and source of the commands.
+        sent: how many.
+    """
+    key, source = ours
+    accepted, refused, last_ns, reason = 0, 0, 0, ""
+    until_s = time.monotonic() + OUTCOME_S
+    while True:
+        now_ns = clock.t_ns()  # before the events: what is refused at a gate is said before its clock
+        for sample in events.drain():
+            with suppress(DecodeError):
+                event: run_messages.Event = messages.decode(keys.EVENT, sample.payload)
+                if event.kind == "refused" and event.subject == key and event.source in (source, UNKNOWN_SENDER):
+                    refused, reason = refused + 1, reason or event.text
+                elif (
+                    event.kind == "command"
+                    and event.source == source
+                    and key == keys.command(event.subject, str(event.data.get("command")))
+                ):
+                    accepted += 1
+                    last_ns = max(last_ns, int(event.data.get("apply_t_ns", 0)) + gate_ns)
+        if refused >= sent or (accepted + refused >= sent and now_ns >= last_ns):
+            return Published(sent, min(refused, sent), reason)
+        if time.monotonic() >= until_s:
+            note = f"the world is {clock.state()}; whether it carries them out is known when time goes on"
+            return Published(sent, min(refused, sent), reason, note)
+        time.sleep(PACKET_S)
 
 
 class _Now:
@@ -182,9 +279,18 @@ class _Now:
 
     def t_ns(self) -> int:
         """Return the time of the newest clock, 0 where no world answers."""
+        clock = self._clock()
+        return clock.t_ns if clock else 0
+
+    def state(self) -> str:
+        """Return whether time goes on: waiting, running, paused or stopped."""
+        clock = self._clock()
+        return clock.state if clock else "unknown"
+
+    def _clock(self) -> run_messages.Clock | None:
         for sample in self._subscription.drain():
             self._newest = sample
-        return messages.decode(keys.CLOCK, self._newest.payload).t_ns if self._newest else 0
+        return messages.decode(keys.CLOCK, self._newest.payload) if self._newest else None
 
 
 def _command_key(key: str, info: messages.Info) -> str:

@@ -253,7 +253,7 @@ def _plan(
 
 
 def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
-    """Print what did not end well, make the report, and fail if no run ended well and flew its plan."""
+    """Print what did not end well, make the report, and fail if a run did not end well, or none flew its plan."""
     for failure in sorted(set(failures), key=failures.count, reverse=True)[:5]:
         print(printable(f"{failures.count(failure)} of {runs} runs failed: {failure}"), file=sys.stderr)
     if report:
@@ -261,6 +261,8 @@ def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short:
     print(printable(f"table: {folder / 'sweep.parquet'}"))
     if len(failures) == runs:
         raise _failed(f"none of {runs} runs ended well: {failures[0]}")
+    if failures:
+        raise _failed(f"{len(failures)} of {runs} runs failed: {failures[0]}")
     if len(failures) + len(short) == runs:
         raise _failed(f"none of {runs} runs was flown as planned: {short[0]}")
 

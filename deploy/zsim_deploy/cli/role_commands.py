@@ -61,10 +61,13 @@ def world(
 ) -> None:
     """Run the world: integrates all drones and owns simulated time."""
     from zsim.scenario import scenario_file
+    from zsim.schema import plugin
     from zsim_deploy.roles import world_role
 
     path, overrides = flight.path, flight.overrides or ()
-    loaded = scenario_file.load(path, overrides, seed=flight.seed, duration_s=flight.duration)  # needs no agent's class
+    # its launcher has written what is flown into the run's folder, and has read it where the modules are
+    modules = plugin.folders() if launched else ()
+    loaded = scenario_file.load(path, overrides, modules, seed=flight.seed, duration_s=flight.duration)
     mode, pace = flight.mode_and_rate()
     who = identity(host, tls, insecure, access)
     world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who, journal, all_died)

@@ -107,12 +107,40 @@ class ControlSocket:
         self._path.unlink(missing_ok=True)
         self._thread.join(1.0)
         os.close(self._lock)
+        if "@" in self._path.stem:  # of one run: nobody waits for its lock
+            self._path.with_suffix(".lock").unlink(missing_ok=True)
 
     def __enter__(self) -> "ControlSocket":
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def of_run(federation: str) -> str:
+    """Return under which name a `zsim run` of this process listens: there may be several of a federation."""
+    return f"{federation}@{os.getpid()}"
+
+
+def launchers() -> list[str]:
+    """Return the names under which launchers of this user listen on this machine; what killed ones left is removed."""
+    found = []
+    for path in sorted(place("").parent.glob("*.sock")):
+        _, is_of_run, pid = path.stem.partition("@")
+        if is_of_run and not _lives(pid):
+            path.unlink(missing_ok=True)
+            path.with_suffix(".lock").unlink(missing_ok=True)
+        else:
+            found.append(path.stem)
+    return found
+
+
+def _lives(pid: str) -> bool:
+    try:
+        os.kill(int(pid), 0)
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _make_folder(folder: Path) -> None:

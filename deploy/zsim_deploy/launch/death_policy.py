@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 from zsim.scenario.role_table import OnDeath, is_needed, on_death, on_overdue
 from zsim.scenario.scenario import Processes
+from zsim_deploy import USER_FAULT
 
 RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
 RESTART_WINDOW_S = 20.0
-USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run at all
 SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
 
 

@@ -15,7 +15,7 @@ LAUNCH = "launch.json"
 
 
 class Launch(msgspec.Struct, frozen=True):
-    """How a run was launched."""
+    """How a run was launched; `modules`: folders in which those that its scenario names were looked for."""
 
     run_id: str
     mode: str = "lockstep"
@@ -24,6 +24,7 @@ class Launch(msgspec.Struct, frozen=True):
     hosted: bool = False
     insecure: bool = False
     listen: str | None = None
+    modules: tuple[str, ...] = ()
 
 
 def keep(folder: Path, launch: Launch) -> None:

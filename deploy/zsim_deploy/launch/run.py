@@ -1,19 +1,23 @@
 """A whole run: every process of a scenario started, watched, recorded, ended, and reported."""
 
 import contextlib
+import os
 import re
 import signal
+import socket
 import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from zsim.errors import RecordError, RunError, SessionError
+from zsim.errors import RecordError, RunError, RunFailedError, SessionError
 from zsim.record import repair
 from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.external_bodies import driver_lines
 from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
 from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
@@ -44,6 +48,7 @@ class RunOptions:
         order: names of processes in the order in which they are started.
         console: owns the console that is started; None for a run without.
         continued: whether it goes on where an earlier launch of it was interrupted.
+        supervisor: over its processes, once they are started.
     """
 
     scenario: Scenario
@@ -59,6 +64,21 @@ class RunOptions:
     detect: bool = False
     run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
     continued: bool = False
+    supervisor: Supervisor | None = None
+
+    def status(self) -> dict[str, Any]:
+        """Return what `zsim ps` shows of the run; callable from any thread."""
+        here = {
+            "role": "in-process",
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "state": "running",
+            "restarts": 0,
+        }
+        alone = {**here, "lag_ms": None, "messages_per_s": None, "round_trip_ms": None}
+        rows = self.supervisor.rows() if self.supervisor else [alone]
+        clock = self.supervisor.clock if self.supervisor else None
+        return {"rows": rows, "clock": clock, "out": str(self.out.absolute()), "roles": [row["role"] for row in rows]}
 
     def camera_children(self) -> list[CameraChild]:
         """Return the cameras and detectors that are started."""
@@ -140,7 +160,7 @@ def options_of(folder: Path) -> tuple[RunOptions, bool]:
         (folder / RECORD).unlink(missing_ok=True)
     else:
         interrupted_run.reopen_record(folder)
-    scenario = load_scenario(folder / "scenario.yaml", None)
+    scenario = load_scenario(folder / "scenario.yaml", None, modules=map(Path, launch.modules))
     pace = (launch.mode, launch.rate)
     where = (launch.listen, launch.insecure, launch.hosted)
     return RunOptions(scenario, folder, *pace, *where, run_id=launch.run_id, continued=True), launch.in_process
@@ -202,6 +222,7 @@ def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLa
         screen.say(line)
     supervisor = Supervisor(options.scenario.processes, screen)
     supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
+    options.supervisor = supervisor
     supervisor.lasting = options.console.process if options.console else None
 
     def end_with_output() -> None:
@@ -235,7 +256,8 @@ def _write_scenario(options: RunOptions, in_process: bool) -> None:
         RunError: it cannot be written.
     """
     pace = (options.mode, options.rate)
-    launch = Launch(options.run_id, *pace, in_process, options.hosted, options.insecure, options.listen)
+    modules = tuple(map(str, plugin.folders()))
+    launch = Launch(options.run_id, *pace, in_process, options.hosted, options.insecure, options.listen, modules)
     try:
         if not in_process:
             (options.out / "logs").mkdir(exist_ok=True)
@@ -262,7 +284,7 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
 
         try:
             ended = fly(options.scenario, options.out / "run.mcap", reason, screen)
-        except DivergedError as error:
+        except (DivergedError, RunFailedError) as error:
             return Outcome(str(error), failed=True)
         finally:
             stop.restore_signals()

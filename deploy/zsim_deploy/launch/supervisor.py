@@ -4,6 +4,7 @@ Where a process runs, on this machine (`ChildProcess`) or on another one (`Remot
 """
 
 import json
+import socket
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,7 +16,8 @@ from typing import Any, Protocol
 from zsim.errors import RunError
 from zsim.runtime.progress import ProgressSink
 from zsim.scenario.scenario import Processes
-from zsim_deploy.launch.death_policy import SUPERSEDED, USER_FAULT, DeathPolicy
+from zsim_deploy import USER_FAULT
+from zsim_deploy.launch.death_policy import SUPERSEDED, DeathPolicy
 from zsim_deploy.launch.world_watch import WorldWatch
 from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
@@ -83,6 +85,7 @@ class Supervisor:
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
         self._gone: list[RunProcess] = []  # nobody waits for them any more
         self._world_watch = WorldWatch()
+        self.clock: dict[str, Any] | None = None  # the world's last
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
     def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
@@ -130,6 +133,7 @@ class Supervisor:
         self._world_watch.received(time.monotonic())
         if "clock" in line:
             self._flies = self._flies or line["clock"].get("state") == "running"
+            self.clock = line["clock"]
             self._world_watch.clock(line["clock"])
             self._show.clock(line["clock"])
         elif "event" in line:
@@ -145,6 +149,8 @@ class Supervisor:
             self._reason = self._reason or event["text"]
         elif event["kind"] == "overdue":
             self._on_overdue(event)
+        elif event["kind"] == "failure" and event["data"].get("on_death") == "end":
+            self._fail(event["text"])
         elif event["kind"] == "death" and event["data"].get("on_death") == "end":
             self._fail(f"{event['subject']} died")
         elif event["kind"] == "death" and event["data"].get("on_death") == "restart":
@@ -162,6 +168,23 @@ class Supervisor:
             if child.name == name:
                 self._dead.add(name)
                 child.kill()
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return name, process number, state and restarts of each process, for `zsim ps`; callable from any thread."""
+        host = socket.gethostname()
+        return [
+            {
+                "role": child.name,
+                "host": host,
+                "pid": child.pid or None,
+                "state": "running" if child.code is None else f"ended ({child.outcome()})" if child.code else "ended",
+                "lag_ms": None,
+                "messages_per_s": None,
+                "round_trip_ms": None,
+                "restarts": child.restarts,
+            }
+            for child in self.members
+        ]
 
     # Watching
 

@@ -13,6 +13,7 @@ from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
+from zsim_deploy import USER_FAULT
 from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.inventory.processes import (
     PlannedProcess,
@@ -23,7 +24,7 @@ from zsim_deploy.inventory.processes import (
     processes,
     used_hosts,
 )
-from zsim_deploy.launch.death_policy import RESTARTS_MAX, SUPERSEDED, USER_FAULT
+from zsim_deploy.launch.death_policy import RESTARTS_MAX, SUPERSEDED
 from zsim_deploy.render.kubernetes_pod import (
     RECORDS,
     label,

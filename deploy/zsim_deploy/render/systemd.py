@@ -12,6 +12,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
+from zsim_deploy import USER_FAULT
 from zsim_deploy.arguments import RUN_ID
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Host, InventoryFile
@@ -27,7 +28,7 @@ from zsim_deploy.inventory.processes import (
     processes,
     used_hosts,
 )
-from zsim_deploy.launch.death_policy import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_FAULT
+from zsim_deploy.launch.death_policy import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
 
 TARGET = "zsim.target"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import NoWorldError, SessionError, SupersededError, ZsimError, printable
+from zsim.errors import NoWorldError, SessionError, SupersededError, UserCodeError, ZsimError, printable
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
 from zsim.runtime.runner import Runner
@@ -29,6 +29,7 @@ from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_agents.hosting import agent_class, chosen, hosted, made
 from zsim_bridges.observer_process import ObserverProcess
+from zsim_deploy import USER_FAULT
 from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.process_identity import check_certificate
 from zsim_deploy.roles.record_folder import RECORD, make, record_folder
@@ -57,7 +58,20 @@ def agent(build: Callable[[messages.Info, Scenario], Agent], reach: WorldAccess,
         build: makes it.
         reach: of the world.
         name: of the process, where that is known before the world is.
+
+    Raises:
+        UserCodeError: a user's class raised, or returned what cannot be used.
     """
+    try:
+        _agent(build, reach, name)
+    except UserCodeError as error:
+        if not reach.launched:
+            raise
+        print(printable(str(error)), file=sys.stderr)
+        sys.exit(USER_FAULT)  # its launcher is not to start it again
+
+
+def _agent(build: Callable[[messages.Info, Scenario], Agent], reach: WorldAccess, name: str) -> None:
     launched, who = reach.launched, reach.who._replace(process=name)
     stop = StopChannel(launched, who)
     say = log_printer(launched)

@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 SLOW_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
 SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
 HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more
-VITAL = frozenset({"death", "doubled", "overdue", "end"})  # why a run ends, and what is wrong with who takes part
+VITAL = frozenset(
+    {"death", "doubled", "failure", "overdue", "end"}
+)  # why a run ends, and what is wrong with who takes part
 
 
 def world(
@@ -66,6 +68,7 @@ def world(
     with _slow_start_notice(JsonProgress() if launched else None):
         run_id = launched or (journaled_run(journal) if journal else None)
         run_world = World(scenario, mode, rate, time.monotonic_ns, run_id)
+    run_world.is_launched = launched is not None
     for name in expect or ():
         run_world.barrier.expect(name)
     gc.collect()
@@ -144,7 +147,7 @@ def _clock_line(clock: run_messages.Clock, phase: str) -> dict[str, Any]:
 
 
 def _event_line(event: run_messages.Event) -> dict[str, Any]:
-    data = event.data if event.kind in ("end", "death", "overdue") else {}
+    data = event.data if event.kind in ("end", "death", "failure", "overdue") else {}
     return {
         "t_s": event.t_ns / 1e9,
         "kind": event.kind,

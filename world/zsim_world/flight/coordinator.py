@@ -14,7 +14,7 @@ import msgspec
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import fingerprint
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
-from zsim.errors import RunError
+from zsim.errors import RunError, RunFailedError
 from zsim.runtime.agent import Output
 from zsim.scenario.rights import WORLD
 from zsim.scenario.role_table import OnDeath, agent_names, on_death
@@ -53,12 +53,14 @@ class Coordinator(ABC):
         requests: on `world/control`, all of them counted.
         statistics: of the run so far.
         refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
+        is_launched: whether a launcher has started it and its processes, and not people one after the other.
         external: names of the drones of which drivers publish sensors, truth and status.
         unpaced: names of the processes that step when a driver publishes, and not at every gate.
-        diverged: what is to be raised once the end is published, None for a run that ended well.
+        failure: what is to be raised once the end is published, None for a run that ended well.
     """
 
     refused_queries: tuple[str, ...] = ()
+    is_launched: bool = False
     external: frozenset[str] = frozenset()
     unpaced: frozenset[str] = frozenset()
 
@@ -80,11 +82,11 @@ class Coordinator(ABC):
         self.requests = 0
         self.barrier = Barrier(self.run_id, self.clock.gate_ns, expected)
         self.statistics = RunStatistics()
-        self.diverged: RunError | None = None
+        self.failure: RunError | None = None
         self._expected = expected
         self._own_names = {"recorder", *expected, *agent_names(scenario)}
         self._data_flow = DataFlow(scenario)
-        self._start_wall_ns = wall_ns()
+        self.start_wall_ns = wall_ns()
         self._operations: dict[str, Operation] = self.clock.operations()
         self.losses = ProcessLosses(self)
 
@@ -123,6 +125,12 @@ class Coordinator(ABC):
         """Return the newest gate; 0 before the start too."""
         return self.clock.now_ns
 
+    def fail(self, reason: str) -> None:
+        """End the run before its time."""
+        if self.ended is None:
+            self.failure = RunFailedError(reason)
+        self.clock.stop(reason)
+
     @property
     def ended(self) -> str | None:
         """Return why the run is over, None while it goes on."""
@@ -142,7 +150,7 @@ class Coordinator(ABC):
         elif kind == "process" and what == "join":
             self._handle_join(name, message, wall_ns)
         elif kind == "process" and what == "bye":
-            self._handle_bye(name, message)
+            self._handle_bye(name, message, wall_ns)
 
     def count_output(self, source: str) -> None:
         """Count an output (estimate, cluster state) of a participant."""
@@ -209,7 +217,10 @@ class Coordinator(ABC):
             text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
             self.outbox.event("doubled", name, text, {"other": other})
 
-    def _handle_bye(self, name: str, message: run_messages.Bye) -> None:
+    def _handle_bye(self, name: str, message: run_messages.Bye, wall_ns: int) -> None:
+        if message.failed is True and self.ended is None:
+            self.losses.failed(name, message.reason, wall_ns)
+            return
         participant = self.barrier.remove(name)
         if participant is None:
             return
@@ -309,7 +320,7 @@ class Coordinator(ABC):
         """Return whom the world waits for now."""
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
             return self.missed(wall_ns)
-        return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self._start_wall_ns, self._data_flow.feeds)
+        return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self.start_wall_ns, self._data_flow.feeds)
 
     def missed(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
         """Return who is dead, silent or not back yet in realtime, where nobody else is waited for."""

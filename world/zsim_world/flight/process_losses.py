@@ -1,16 +1,23 @@
 """What it means for a run that a process dies, falls silent, takes nothing, or was never there."""
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from msgspec import UNSET
+
 from zsim.contract.run_messages import Join
-from zsim.scenario.role_table import OnDeath, OnOverdue, on_overdue
+from zsim.scenario.role_table import ROLES, OnDeath, OnOverdue, agent_names, lets_drop, on_overdue
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.budgets import Budgets
 from zsim_world.flight.run_clock import RunClock
 from zsim_world.flight.run_outbox import RunOutbox
 
+START_TIMEOUT_S = 60.0  # wall; for processes that a launched run expects and does not start itself
+START_TIMEOUT_OWN_S = (
+    600.0  # for those that its launcher starts: chosen, the first start on a machine may compile for minutes
+)
 RETURNS = ("restart", "wait")  # of on_death: a process that died comes back, or may
 
 
@@ -23,6 +30,9 @@ class _Run(Protocol):
     outbox: RunOutbox
     budgets: Budgets
     on_death: Callable[[Participant], OnDeath]
+    fail: Callable[[str], None]
+    is_launched: bool
+    start_wall_ns: int
     release_drones: Callable[[str], None]
     expect_again: Callable[[Participant], None]
 
@@ -55,7 +65,26 @@ class ProcessLosses:
         elif self._run.clock.mode == "realtime":
             self._run.release_drones(name)
         if action == "end":
-            self._run.clock.stop(f"{name} died")
+            self._run.fail(f"{name} died")
+
+    def failed(self, name: str, reason: str, wall_ns: int) -> None:
+        """Take it that a process has left since it cannot go on; started again, it would fail again."""
+        participant = self._barrier.participants.get(name)
+        if participant is None:
+            return
+        action = self._run.on_death(participant)
+        action = "end" if action == "restart" else action
+        data = {"host": participant.join.host, "pid": participant.join.pid, "on_death": action}
+        self._outbox.event("failure", name, reason, data, name)
+        if action == "drop":
+            self._drop(name)
+            return
+        self._run.release_drones(name)
+        if action == "wait":
+            self._barrier.mark_dead(name, wall_ns)
+        else:
+            self._barrier.remove(name)
+            self._run.fail(reason)
 
     def _drop(self, name: str, is_news: bool = True) -> None:
         """Go on without a process."""
@@ -70,7 +99,12 @@ class ProcessLosses:
         return self._run.on_death(participant) in RETURNS
 
     def overdue(self, wall_ns: int) -> str | None:
-        """Return who is dead or silent and has had its time to come back, None if nobody is."""
+        """Return who has had its time to join, or to come back since it is dead or silent; None if nobody has."""
+        if self._run.clock.state == "waiting":
+            waited_s = (wall_ns - self._run.start_wall_ns) / 1e9
+            absent = self._barrier.absent()
+            if late := next((name for name in absent if waited_s > self._start_timeout_s(name)), None):
+                return late
         return_s = self._run.scenario.processes.return_s
         if return_s is None:
             return None
@@ -83,10 +117,33 @@ class ProcessLosses:
             return participant.since_wall_ns if self.may_return(participant) else None
         return participant.silent_wall_ns if participant.is_waited_for else None
 
+    def _start_timeout_s(self, name: str) -> float:
+        """Return how long a run waits at its start for a process that is expected [s, wall]."""
+        scenario, asked_s = self._run.scenario, self._run.scenario.processes.start_timeout_s
+        if asked_s is not UNSET:
+            return asked_s
+        if not self._run.is_launched:
+            return math.inf
+        is_started = name in agent_names(scenario) or name.partition(".")[0] in ROLES
+        return START_TIMEOUT_OWN_S if is_started else START_TIMEOUT_S
+
+    def _never_came(self, name: str) -> None:
+        """End a run for which a process has not come, or begin without it where the scenario says so."""
+        processes = self._run.scenario.processes
+        action: OnOverdue = "drop" if lets_drop(processes.on_overdue or {}, name) else "end"
+        text = f"{name} has not joined within {self._start_timeout_s(name):g} s; see processes.start_timeout_s"
+        self._outbox.event("overdue", name, text, {"host": "", "pid": 0, "on_overdue": action})
+        if action == "drop":
+            self._drop(name)
+        else:
+            self._run.fail(text)
+
     def expired(self, name: str) -> None:
-        """Take it that a process has not come back in its time: the run ends, or goes on without it."""
+        """Take it that a process has not come, or not come back, in its time: the run ends, or goes on without it."""
         participant = self._barrier.participants.get(name)
         if participant is None:
+            if name in self._barrier.absent():
+                self._never_came(name)
             return
         action, join = self._overdue_action(participant), participant.join
         within_s = self._run.scenario.processes.return_s
@@ -96,7 +153,7 @@ class ProcessLosses:
         if action == "drop":
             self._drop(name)
         else:
-            self._run.clock.stop(text)
+            self._run.fail(text)
 
     def _overdue_action(self, participant: Participant) -> OnOverdue:
         action = self._run.on_death(participant)

@@ -14,10 +14,13 @@ from zsim.contract.fingerprint import TruthHash, fingerprint
 from zsim.contract.flight_messages import Status
 from zsim.contract.snapshot import State
 from zsim.contract.views import DroneView, ViewDrones
+from zsim.errors import UserCodeError
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
 from zsim.scenario.external_bodies import check_pace
+from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import DivergedError, Fleet
@@ -49,7 +52,7 @@ class World(Coordinator):
         drivers: what is published of the external ones among them.
         queue: of the commands, with the commander of each drone.
         faults: that are injected.
-        diverged: what is to be raised once the end is published, None for a state that stayed finite.
+        failure: what is to be raised once the end is published, None for a run that ended well.
     """
 
     def __init__(
@@ -115,6 +118,7 @@ class World(Coordinator):
             fingerprint=fingerprint(),
             user_sensors=_own_sensors(s) or UNSET,
             sightings=self.fleet.has_sightings or UNSET,
+            module_folders=tuple(map(str, plugin.folders())) if s.names_own_code() else UNSET,
         )
 
     # To go on elsewhere
@@ -172,7 +176,7 @@ class World(Coordinator):
     def advance(self, wall_ns: int) -> None:
         """Go to the next gate (or publish gate 0) and put all its messages into the outbox.
 
-        A state that is no longer finite ends the run at the gate before; see `diverged`.
+        A state that is no longer finite, or a user's sensor that fails, ends the run at the gate before; see `failure`.
         """
         if self.clock.state == "waiting":
             self.clock.start(self.fleet.t_ns)
@@ -193,8 +197,13 @@ class World(Coordinator):
         try:
             self.fleet.advance()
         except DivergedError as error:
-            self.diverged = error
+            self.failure = error
             self.outbox.event("diverged", error.drone, str(error))
+            self.clock.complete(str(error))
+            return False
+        except UserCodeError as error:
+            self.failure = error
+            self.outbox.event("failure", WORLD, str(error), {"on_death": "end"})
             self.clock.complete(str(error))
             return False
         self.clock.advance(self.fleet.t_ns)

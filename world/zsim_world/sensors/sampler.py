@@ -91,7 +91,7 @@ class Sampler:
         """Return what falls due up to now of what was logged and of what waits.
 
         Raises:
-            RunError: the equation of a user's sensor fails.
+            UserCodeError: the equation of a user's sensor fails.
         """
         rows, place = self._anchor
         whose, value = self._senses.whose[:logged], self._senses.value[:logged]

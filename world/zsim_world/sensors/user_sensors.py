@@ -4,10 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.snapshot import State
-from zsim.errors import RunError
+from zsim.errors import UserCodeError, reason_of
 from zsim.math.frames import rotation_matrix
 from zsim.math.random_streams import stream
 from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
+from zsim.schema.checker import show
 from zsim.sensors.sensor import Sensor, SensorTruth, SensorType
 from zsim_world.physics.normal_variates import place, words
 from zsim_world.sensors.reading import read
@@ -50,7 +52,7 @@ class UserSensors:
         """Return whose (M, 3) and values (M, 6) of what the kernel logged in a gate, without what is lost.
 
         Raises:
-            RunError: an equation fails, or returns what is no reading.
+            UserCodeError: an equation fails, or returns what is no reading.
         """
         senses, kept = self._senses, []
         count = int(senses.exposed_count[0])
@@ -104,16 +106,20 @@ class _UserSensor:
         """Write the errorless values into a row (6,)."""
         assert self._kind.equation is not None  # a module without one is refused
         count = self._kind.values
+        equation, where = self._kind.equation, f"{self._what} at {truth.t_s:.3f} s"
+        name = f"{equation.__module__}:{getattr(equation, '__qualname__', type(equation).__qualname__)}"
         try:
-            values[:count] = np.reshape(self._kind.equation(truth, self._settings, environment), (count,))
+            returned = equation(truth, self._settings, environment)
         except Exception as error:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise RunError(
-                f"{self._what} at {truth.t_s:g} s: its equation gives no {count} numbers ({reason})"
-            ) from error
+            failure = plugin.user_code_error(error, where)
+            raise failure or UserCodeError(f"{name} raised {reason_of(error)}", where) from error
+        try:
+            values[:count] = np.reshape(np.asarray(returned, dtype=float), (count,))
+        except (TypeError, ValueError) as error:
+            raise UserCodeError(f"{name} returns {show(returned)}; must be {count} numbers", where) from error
         if not np.isfinite(values).all():
             numbers = [float(value) for value in values[:count]]
-            raise RunError(f"{self._what} at {truth.t_s:g} s: its equation gives {numbers}; must be finite")
+            raise UserCodeError(f"{name} returns {numbers}; must be finite", where)
 
     def numbers(self) -> NDArray[np.float64]:
         """Return the standard normal numbers of one sample: white, walk of the bias, and one for drop-out."""

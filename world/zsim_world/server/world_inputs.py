@@ -29,7 +29,6 @@ TICK_S = 0.1  # how often a standing world looks at the wall clock
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
 REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take until a process can be asked
 PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
-RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
 OF_CAMERAS = (camera_messages.CameraInfo, camera_messages.Sightings)  # relayed too, from whoever has a camera
 OF_DRIVERS = ("truth", "link")  # what they publish of an external drone beside its sensors
 PROCESSES, VIEWS = "process/", "view/"  # the last are nothing to the world
@@ -239,13 +238,13 @@ class MessageIntake:
     def _learn_handler(self, key: str) -> Handler:
         """Return what takes the messages of a key, and remember it: the same keys come at every gate."""
         kind = messages.type_of(key)
-        if kind in RELAYED:
+        if kind in messages.RELAYED:
             handler = self._relay
         elif kind in OF_CAMERAS and not keys.is_sensor(key):
             handler = self._relay_of_camera
         elif self._is_of_driver(key):
             handler = self._take_of_driver
-        elif key.startswith(PROCESSES) or (key.startswith("drone/") and "/cmd/" in key):
+        elif key.startswith(PROCESSES) or keys.is_command(key):
             handler = self._hand_over
         elif kind is None:
             handler = self._keep_foreign

@@ -101,7 +101,7 @@ class WorldProcess:
         """Run to the end: wait for the participants, integrate, publish the end.
 
         Raises:
-            DivergedError: the state of a drone was no longer finite; the end has been published before.
+            RunError: a failure has ended the run; the end has been published before.
         """
         self._inputs = open_inputs(self._link, self._clock.mode == "realtime")
         self._resume()
@@ -120,8 +120,8 @@ class WorldProcess:
             self._journal.close()
         if self._clock.is_complete:
             self._journal.remove()
-        if self._world.diverged:
-            raise self._world.diverged
+        if self._world.failure:
+            raise self._world.failure
 
     def _announce(self) -> None:
         if not self._history.last(keys.INFO):
@@ -195,13 +195,13 @@ class WorldProcess:
         late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
         self._world.statistics.world_misses += late
         self._world.advance(wall_ns)
-        if self._world.diverged is None:
+        if self._world.failure is None:
             self._journal.note(Advanced(wall_ns, late))
         self._outputs.gather()
         self._add_checkpoint(wall_ns)
         if not self._pipelining.continues():
             self._outputs.send()
-        if self._world.diverged is None:
+        if self._world.failure is None:
             self._publish_view(wall_ns)
         self.health.step(time.monotonic_ns() - wall_ns)
 

@@ -9,12 +9,16 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.errors import UserCodeError
 from zsim.math.compiled import portable
+from zsim.schema import plugin
+from zsim.schema.checker import show
 
 Array = NDArray[np.float64]
 
@@ -177,6 +181,52 @@ class ClusterSpace(ABC):
         if name not in self.names:
             raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {_listed(self.names)}")
         return self.names.index(name)
+
+
+def checked(space: ClusterSpace) -> ClusterSpace:
+    """Let a space of a user's own refuse, in every method, what is no finite number of the right shape.
+
+    Its methods then raise UserCodeError, which names class, method and value.
+    """
+    n, size = space.n, space.size
+    shapes: dict[str, tuple[tuple[int, ...], ...]] = {
+        "forward": ((size,),),
+        "inverse": ((n, 3), (n,)),
+        "jacobian": ((size, size),),
+        "inverse_jacobian": ((size, size),),
+        "spread": ((),),
+        "motion": ((size,),),
+    }
+    for method, wanted in shapes.items():
+        setattr(space, method, _Checked(getattr(space, method), f"{plugin.full_name(type(space))}.{method}", wanted))
+    return space
+
+
+class _Checked:
+    """A method of a user's space, with the shapes of what it returns."""
+
+    def __init__(self, method: Callable[..., Any], name: str, shapes: tuple[tuple[int, ...], ...]) -> None:
+        self._method = method
+        self._name = name
+        self._shapes = shapes
+
+    def __call__(self, *arguments: Any) -> Any:
+        returned = self._method(*arguments)
+        try:
+            parts = tuple(returned) if len(self._shapes) > 1 else (returned,)
+            arrays = [np.asarray(part, dtype=float) for part in parts]
+        except (TypeError, ValueError):
+            arrays = []
+        if [array.shape for array in arrays] != list(self._shapes):
+            found = " and ".join(f"shape {array.shape}" for array in arrays) or show(returned)
+            allowed = " and ".join(map(str, self._shapes)) if self._shapes != ((),) else "a number"
+            raise UserCodeError(f"{self._name} returns {found}; must be {allowed}")
+        for array in arrays:
+            if not np.isfinite(array).all() and all(np.isfinite(argument).all() for argument in arguments):
+                place = np.argwhere(~np.isfinite(array))[0].tolist()
+                at = f" at {place}" if place else ""
+                raise UserCodeError(f"{self._name} returns {array[tuple(place)]}{at}; must be finite")
+        return tuple(arrays) if len(arrays) > 1 else arrays[0] if arrays[0].ndim else float(arrays[0])
 
 
 def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Array]:

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from zsim.errors import DocumentError
 from zsim.scenario.scenario import ROBOTS_MAX, Cluster, ClusterGroup, Scenario, space_name
 from zsim.schema import plugin
-from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, checked
 from zsim_agents.formation.spaces.nested_cluster import NestedCluster
 from zsim_agents.formation.spaces.pair_cluster import PairCluster
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
@@ -22,7 +21,8 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     """Return the cluster space of one of a scenario's clusters.
 
     Raises:
-        ValueError: there is none: a template in one line, or a class of the user's own that cannot be loaded.
+        ValueError: there is none: a template in one line.
+        DocumentError: it is a class of the user's own that cannot be loaded; the line names its module.
     """
     starts = _starts(scenario, cluster.drones)
     if not cluster.groups:
@@ -59,12 +59,8 @@ def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
     name = space_name(spec.space, len(places_m), bool(spec.template_m))
     if name in STOCK:
         return STOCK[name](places_m)
-    try:
-        own: Any = plugin.load(name, "space", ClusterSpace)
-    except DocumentError as error:
-        raise ValueError(str(error)) from error
-    space: ClusterSpace = own.for_places(places_m)
-    return space
+    own: Any = plugin.load(name, "space", ClusterSpace)
+    return checked(own.for_places(places_m))
 
 
 def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:

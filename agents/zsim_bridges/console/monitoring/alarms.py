@@ -16,7 +16,14 @@ BATTERY_LOW_PERCENT, BATTERY_EMPTY_PERCENT = 20.0, 10.0  # the AR.Drone warns at
 LATE_MS = 200.0  # of an estimator: ten gates of 20 ms
 SIGMA_HIGH_M = 2.0  # of a position; chosen: as far apart as the paper's drones may come
 LINK_OLD_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # chosen: PX4 leaves offboard mode after the first
-LOST = {"death": "dead", "no_show": "missing", "silent": "silent", "overdue": "overdue", "diverged": "diverged"}
+LOST = {
+    "death": "dead",
+    "no_show": "missing",
+    "silent": "silent",
+    "overdue": "overdue",
+    "failure": "failed",
+    "diverged": "diverged",
+}
 """Kinds of events that report a process or drone that is lost, and the name of the alarm."""
 BACK = frozenset({"join", "restart", "superseded", "silent_end", "leave", "drop"})  # kinds that end it
 

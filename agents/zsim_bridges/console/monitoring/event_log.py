@@ -20,7 +20,19 @@ KINDS: dict[str, frozenset[str]] = {
     "faults": frozenset({"fault", "fault_end", "fault_clear", "collision", "diverged", *FALLS}),
     "flight": frozenset({"mode", "state", "commander", "release", "collision", "landing", *FALLS}),
     "processes": frozenset(
-        {"join", "leave", "restart", "superseded", "death", "drop", "overdue", "silent", "silent_end", "no_show"}
+        {
+            "join",
+            "leave",
+            "restart",
+            "superseded",
+            "death",
+            "drop",
+            "failure",
+            "overdue",
+            "silent",
+            "silent_end",
+            "no_show",
+        }
     ),
 }
 """What may be chosen, and the kinds of events in it; empty: of any kind."""

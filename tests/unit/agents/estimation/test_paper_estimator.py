@@ -9,7 +9,7 @@ from refused import refused
 from scipy.stats import chi2
 from synthetic_flight import GATE_S, Flight, Reading, message, readings, scenario, seconds
 
-from zsim.errors import DocumentError, RunError
+from zsim.errors import DocumentError, UserCodeError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import ESTIMATORS, Scenario
 from zsim_agents.estimation.drone_estimator import EstimatorSet, StateEstimate, estimator_class
@@ -127,7 +127,7 @@ def test_numbers_of_any_kind_are_published_as_floats():
 )
 def test_what_is_no_estimate_is_refused_in_a_line(field: str, value: Any):
     wrong = type("Wrong", (Constant,), {"given": Constant.given._replace(**{field: value})})
-    with refused(RunError, "estimator.drone1", "0.02", field, "finite"):
+    with refused(UserCodeError, f"{__name__}:Wrong.estimate", "drone1", field, "finite"):
         set_of(wrong).estimate(0.02)
 
 

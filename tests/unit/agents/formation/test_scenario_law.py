@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refused import has_terms, refused
+from refused import refused
 
 from zsim.errors import RunError, ScenarioError
 from zsim.scenario import scenario_file
@@ -30,8 +30,35 @@ class Short(ControlLaw):
     def rates(self, c, p_W, v_W, c_des, c_dot_des):
         return np.zeros(3)
 
+class Lost(ControlLaw):
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        r_dot = np.zeros(self.space.size)
+        r_dot[6] = np.nan
+        return r_dot
+
+class Nothing(ControlLaw):
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        return None
+
+class Raises(ControlLaw):
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        return divided(self.space.size)
+
+def divided(size):
+    return size / 0
+
 class Half(ControlLaw):
     pass
+
+class Flat(TriadCluster):
+    def forward(self, p_W, yaw):
+        return super().forward(p_W, yaw)[:3]
+
+class Lame(TriadCluster):
+    def motion(self, c, c_dot):
+        r_dot = super().motion(c, c_dot)
+        r_dot[2] = np.inf
+        return r_dot
 
 class Named(TriadCluster):
     def __init__(self, n):
@@ -96,10 +123,19 @@ def test_a_space_of_the_user_s_own_gets_the_places_of_its_robots(module: str) ->
     ("field", "name", "terms"),
     [
         ("law", "nowhere:Law", ("ModuleNotFoundError",)),
-        ("law", "formation_of_mine:Other", ("Half", "Named", "Short", "Still")),
+        ("law", "formation_of_mine:Other", ("Half", "Lost", "Named", "Nothing", "Raises", "Short", "Still")),
         ("law", "formation_of_mine:Half", ("rates()",)),
-        ("law", "formation_of_mine:Short", ("3,",)),
-        ("space", "formation_of_mine:Still", ("forward…",)),
+        ("law", "formation_of_mine:Short", ("(3,)",)),
+        ("law", "formation_of_mine:Lost", ("formation_of_mine:Lost.rates", "nan", "vz", "robot", "2")),
+        ("law", "formation_of_mine:Nothing", ("formation_of_mine:Nothing.rates", "shape ()")),
+        (
+            "law",
+            "formation_of_mine:Raises",
+            ("formation_of_mine:Raises.rates", "ZeroDivisionError", "formation_of_mine.py:29"),
+        ),
+        ("space", "formation_of_mine:Flat", ("formation_of_mine:Flat.forward", "(3,)", "(12,)")),
+        ("space", "formation_of_mine:Lame", ("formation_of_mine:Lame.motion", "inf", "2")),
+        ("space", "formation_of_mine:Still", ("forward",)),
         ("space", "nowhere:Space", ("ModuleNotFoundError",)),
     ],
 )
@@ -108,8 +144,8 @@ def test_what_cannot_be_flown_is_one_line(module: str, field: str, name: str, te
     with pytest.raises(RunError) as raised:
         engagement_of(made, made.clusters[0])
     line = str(raised.value)
-    assert line.startswith(f"cluster 'main': {field}")
-    assert has_terms(line, *terms)
+    assert line.startswith("cluster 'main'")
+    assert all(term in line for term in terms), line
     assert "\n" not in line
 
 

@@ -434,3 +434,47 @@ def end_of(folder: Path, report: bool, capsys: pytest.CaptureFixture[str]) -> tu
         code = end.exit_code
     out, err = capsys.readouterr()
     return code, err.strip().rpartition("\n")[2], out.count(f"{NOT_AS_PLANNED}: ")
+
+
+# Processes that were expected
+
+
+def process_event(kind: str, subject: str, **data: Any) -> Event:
+    return Event(5_000_000_000, 0, kind, "world", subject, f"{subject} {kind}", data)
+
+
+EXPECTS_FENCE = 'processes.expect=["estimator.drone1", "fence.main"]'
+
+
+@pytest.mark.parametrize(
+    ("events", "processes", "fails"),
+    [
+        ([process_event("failure", "controller.main")], (), [True]),
+        ([process_event("failure", "controller.main")], ("processes.on_death={controller: drop}",), []),
+        ([process_event("overdue", "fence.main")], (EXPECTS_FENCE,), [True]),
+        ([process_event("overdue", "fence.main")], (EXPECTS_FENCE, "processes.on_overdue={fence.main: drop}"), []),
+        (
+            [process_event("death", "fence.main", on_death="drop"), process_event("drop", "fence.main")],
+            (EXPECTS_FENCE,),
+            [True],
+        ),
+        ([process_event("death", "fence.main", on_death="drop"), process_event("drop", "fence.main")], (), []),
+        ([process_event("death", "fence.main", on_death="drop")], (EXPECTS_FENCE,), []),  # another does its work
+        (
+            [process_event("death", "fence.main", on_death="drop"), process_event("drop", "fence.main")],
+            (EXPECTS_FENCE, "processes.on_death={fence: drop}"),
+            [],
+        ),
+        ([process_event("death", "estimator.drone1", on_death="restart")], (), []),
+        ([process_event("death", "estimator.drone1", on_death="end")], (), [True]),
+        ([process_event("leave", "fence.main")], (EXPECTS_FENCE,), [False]),
+        ([process_event("end", "world"), process_event("death", "fence.main", on_death="end")], (EXPECTS_FENCE,), []),
+    ],
+)
+def test_a_process_that_was_expected_and_is_lost_is_one(
+    events: list[Event], processes: tuple[str, ...], fails: list[bool]
+) -> None:
+    numbered = [msgspec.structs.replace(event, seq=seq) for seq, event in enumerate(events, start=100)]
+    lines = found(lambda t_s: {"phase": "engaged"}, events=numbered, overrides=(*SOON, *processes))
+    assert [line.fails for line in lines if line.kind == "process"] == fails
+    assert all(line.subject in line.text and line.t_s == 5.0 for line in lines if line.kind == "process")

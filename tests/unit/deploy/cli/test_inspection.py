@@ -156,7 +156,7 @@ def test_messages_keep_to_their_schedule(monkeypatch: pytest.MonkeyPatch):
         watch.now_s += 0.004
 
     link.on_publish = take
-    assert inspection.publish(link, INFO, MODE, TAKEOFF, 5, 10.0) == 5  # type: ignore[arg-type]
+    assert inspection.publish(link, INFO, MODE, TAKEOFF, 5, 10.0).sent == 5  # type: ignore[arg-type]
     assert sent_s == pytest.approx([100.0, 100.1, 100.2, 100.3, 100.4])
     first = messages.decode(MODE, link.published[0][1])
     assert (first.t_ns, first.seq, first.source) == (60_000_000, 0, "zsim.pub")
@@ -225,3 +225,104 @@ def test_keys_are_chosen_by_an_expression(
 def test_what_is_no_expression_is_refused() -> None:
     with pytest.raises(SessionError):
         inspection.list_keys(FakeLink(), "drone//truth")  # type: ignore[arg-type]
+
+
+# What was asked of the world
+
+
+def command_event(seq: int, apply_t_ns: int) -> run_messages.Event:
+    data = {"command": "mode", "apply_t_ns": apply_t_ns, "message": {}}
+    return run_messages.Event(20_000_000, seq, "command", inspection.PUB, "drone1", "", data)
+
+
+def refusal_event(seq: int, subject: str = MODE) -> run_messages.Event:
+    return run_messages.Event(40_000_000, seq, "refused", inspection.PUB, subject, f"{subject}: drone1 flies", {})
+
+
+def test_refusals_of_others_on_the_same_key_are_not_ours(monkeypatch: pytest.MonkeyPatch):
+    link = FakeLink()
+    monkeypatch.setattr(inspection, "time", Clock(link, []))
+
+    def answer(key: str, payload: bytes) -> None:
+        link.deliver(keys.EVENT, msgspec.structs.replace(refusal_event(0), source="controller.main"))
+        link.deliver(keys.EVENT, command_event(1, 40_000_000))
+        link.deliver(keys.CLOCK, clock_at(60_000_000))
+
+    link.on_publish = answer
+    assert inspection.publish(link, INFO, MODE, TAKEOFF, 1, 10.0).refused == 0  # type: ignore[arg-type]
+
+
+def clock_at(t_ns: int, state: str = "running") -> run_messages.Clock:
+    return run_messages.Clock(t_ns, 0, "run", 0, state, 1.0, ())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("answers", "refused_count", "reason", "note"),
+    [
+        ([(keys.EVENT, refusal_event(0))], 1, f"{MODE}: drone1 flies", ""),
+        ([(keys.EVENT, command_event(0, 40_000_000)), (keys.CLOCK, clock_at(60_000_000))], 0, "", ""),
+        (
+            [
+                (keys.EVENT, command_event(0, 40_000_000)),
+                (keys.EVENT, refusal_event(1)),
+                (keys.CLOCK, clock_at(60_000_000)),
+            ],
+            1,
+            f"{MODE}: drone1 flies",
+            "",
+        ),
+        (
+            [(keys.EVENT, refusal_event(0, "drone/drone2/cmd/mode")), (keys.CLOCK, clock_at(20_000_000, "paused"))],
+            0,
+            "",
+            "paused",
+        ),
+    ],
+    ids=["refused at once", "carried out", "refused when due", "not known"],
+)
+def test_what_became_of_a_command_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+    answers: list[tuple[str, msgspec.Struct]],
+    refused_count: int,
+    reason: str,
+    note: str,
+):
+    link = FakeLink()
+    monkeypatch.setattr(inspection, "time", Clock(link, []))
+
+    def answer(key: str, payload: bytes) -> None:
+        for about, message in answers:
+            link.deliver(about, message)
+
+    link.on_publish = answer
+    found = inspection.publish(link, INFO, MODE, TAKEOFF, 1, 10.0)  # type: ignore[arg-type]
+    assert (found.sent, found.refused, found.reason) == (1, refused_count, reason)
+    assert note in found.note
+    assert bool(found.note) is bool(note)
+
+
+TRUTH = (1.5, "drone/drone1/truth", b"\x80")
+
+
+def test_who_waits_for_a_key_that_nobody_publishes_is_told_so_with_keys_like_it(monkeypatch: pytest.MonkeyPatch):
+    link, notes = FakeLink(), []
+    monkeypatch.setattr(inspection, "time", Clock(link, [TRUTH]))
+    came = inspection.echo(link, "drone/drone1/trut", None, print, False, 20.0, notes.append)  # type: ignore[arg-type]
+    assert came == 0
+    (line,) = notes
+    assert "drone/drone1/trut for 3 s" in line
+    assert line.endswith("drone/drone1/truth")
+
+
+def test_who_hears_something_is_told_nothing(monkeypatch: pytest.MonkeyPatch):
+    link, shown, notes = FakeLink(), [], []
+    monkeypatch.setattr(inspection, "time", Clock(link, [TRUTH]))
+    heard = inspection.echo(link, TRUTH[1], 1, lambda key, _: shown.append(key), True, note=notes.append)  # type: ignore[arg-type]
+    assert (heard, shown, notes) == (1, [TRUTH[1]], [])
+
+
+def test_the_rate_of_what_never_came_is_that_of_no_message(monkeypatch: pytest.MonkeyPatch):
+    link, lines = FakeLink(), []
+    monkeypatch.setattr(inspection, "time", Clock(link, [TRUTH]))
+    assert inspection.hz(link, "drone/drone1/trut", 10, 6.0, lines.append) == 0  # type: ignore[arg-type]
+    assert "drone/drone1/truth" in lines[-1]

@@ -6,8 +6,8 @@ import pytest
 from refused import has_terms
 
 from zsim.contract import keys
-from zsim.contract.run_messages import Event, Join
-from zsim.errors import ScenarioError
+from zsim.contract.run_messages import Bye, Event, Join
+from zsim.errors import RunFailedError, ScenarioError
 from zsim.scenario import scenario_file
 from zsim_world.flight.world import World
 
@@ -102,7 +102,6 @@ def test_unless_it_goes_on_before() -> None:
 @pytest.mark.parametrize(
     ("processes", "path"),
     [
-        ("on_overdue: {estimator: drop}", "processes.on_overdue"),
         ("return_s: 1, on_overdue: {estimator: wait}", "processes.on_overdue.estimator"),
     ],
 )
@@ -117,3 +116,82 @@ def test_the_journal_has_it() -> None:
 
     made: Any = entries.decode(entries.encode([entries.Expired(ME)]))
     assert made == [entries.Expired(ME)]
+
+
+# One that never comes
+
+WAITED_NS = 61_000_000_000
+OWN = "fence.main"
+
+
+def waiting(processes: str, is_launched: bool = True) -> World:
+    """Return a world that waits for OWN, and for the estimator that its launcher starts."""
+    text = SCENARIO.replace("expect: [], PROCESSES", f"expect: [{OWN}, {ME}], {processes}")
+    made = World(scenario_file.from_text(text), run_id="run1", wall_ns=lambda: 0)
+    made.is_launched = is_launched
+    return made
+
+
+@pytest.mark.parametrize(
+    ("processes", "is_launched", "after_s", "name"),
+    [
+        ("on_death: {}", True, 59.9, None),
+        ("on_death: {}", True, 60.1, OWN),
+        ("on_death: {}", False, 10_000.0, None),
+        ("start_timeout_s: 5", False, 5.1, OWN),
+        ("start_timeout_s: 500", True, 400.0, None),
+    ],
+)
+def test_one_that_never_joins_is_overdue_after_its_time(
+    processes: str, is_launched: bool, after_s: float, name: str | None
+) -> None:
+    assert waiting(processes, is_launched).losses.overdue(round(after_s * 1e9)) == name
+
+
+def test_one_that_the_launcher_starts_may_compile_first() -> None:
+    made = waiting("on_death: {}")
+    made.handle(keys.process(OWN, "join"), Join(0, 0, "run1", 1, "fence", "h", 7, GATE_NS), 0)
+    assert made.losses.overdue(WAITED_NS) is None
+    assert made.losses.overdue(601_000_000_000) == ME
+
+
+def test_then_the_run_fails_and_names_it() -> None:
+    made = waiting("start_timeout_s: 5")
+    made.losses.expired(OWN)
+    assert events(made) == [("overdue", OWN)]
+    assert isinstance(made.failure, RunFailedError)
+    assert has_terms(str(made.failure), OWN, "5", "processes.start_timeout_s")
+    assert made.ended == str(made.failure)
+
+
+def test_or_begins_without_it_where_the_scenario_says_so() -> None:
+    made = waiting("start_timeout_s: 5, on_overdue: {fence: drop}")
+    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "estimator", "h", 7, GATE_NS), 0)
+    assert not made.may_advance()
+    made.losses.expired(OWN)
+    assert [kind for kind, name in events(made) if name == OWN] == ["overdue", "drop"]
+    assert made.may_advance()
+    assert made.failure is None
+
+
+# One that cannot go on
+
+
+@pytest.mark.parametrize(
+    ("on_death", "kinds", "ends", "waits"),
+    [
+        ("restart", ["failure"], True, False),
+        ("end", ["failure"], True, False),
+        ("wait", ["failure"], False, True),
+        ("drop", ["failure", "drop"], False, False),
+    ],
+)
+def test_one_that_cannot_go_on_is_named_and_on_death_says_what_follows(
+    on_death: str, kinds: list[str], ends: bool, waits: bool
+) -> None:
+    made = world(f"on_death: {{estimator: {on_death}}}")
+    made.handle(keys.process(ME, "bye"), Bye(0, 0, "mine:Law.rates raised", failed=True), 5)
+    assert [kind for kind, name in events(made) if name == ME] == kinds
+    assert made.ended == ("mine:Law.rates raised" if ends else None)
+    assert (made.failure is not None) is ends
+    assert made.may_advance() is not (ends or waits)

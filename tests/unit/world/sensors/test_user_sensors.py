@@ -191,5 +191,5 @@ def test_what_is_no_reading_ends_the_run_in_a_line(tmp_path: Path, monkeypatch: 
         (tmp_path / f"{name}.py").write_text(text.replace(line, f"return {equation}"))
     monkeypatch.syspath_prepend(str(tmp_path))
     for name in ("fails", "long", "infinite"):
-        with pytest.raises(RunError, match=r"d0: sensors\.my_uwb at 0 s"):
+        with pytest.raises(RunError, match=r"d0: sensors\.my_uwb at 0\.000 s"):
             Fleet(scenario(my_uwb={"module": name}))

@@ -1,9 +1,11 @@
 """The in-memory bus: agents get each gate once and whole, the world their outputs and then their dones."""
 
+import math
 import os
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 from msgspec import Struct
 from refused import refused
@@ -13,13 +15,20 @@ from zsim.contract.flight_messages import ClusterState, Estimate, Status, Veloci
 from zsim.contract.messages import Imu, Info
 from zsim.contract.run_messages import Bye, Done, Join, Waiting
 from zsim.contract.views import ViewCluster
-from zsim.errors import RunError
+from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
 
 GATE_NS = 20_000_000
 DRONES = ("d1", "d2")
 KeyedMessages = list[tuple[str, Any]]
+
+
+class Timing(Struct):
+    """What the bus needs of `world/info`."""
+
+    command_delay_ns: int
+    gate_ns: int
 
 
 class Hub:
@@ -49,7 +58,7 @@ class Hub:
         self.outputs.append(source)
 
     def info(self) -> Info:
-        raise AssertionError("nobody asks where there are no faults")
+        return Timing(command_delay_ns=0, gate_ns=GATE_NS)  # type: ignore[return-value]
 
     def may_advance(self) -> bool:
         last_ns = (self._gate - 1) * GATE_NS
@@ -233,3 +242,129 @@ def test_waiting_for_somebody_who_is_not_there_is_an_error_and_no_endless_loop()
     bus = Bus(Hub(3, waits_for=["estimator.d9", "console.1"]), team(), lambda: 0)
     with refused(RunError, "waits", "estimator.d9", "console.1"):
         bus.turn()
+
+
+# Agents of a user's own
+
+
+class Chatter(Agent):
+    """Publishes the state of a cluster of its own at every gate, and notes what it hears of all."""
+
+    def __init__(self, name: str, returns: Any = None) -> None:
+        super().__init__()
+        self.name, self.period_ns = f"talk.{name}", GATE_NS
+        self.gate_keys = (keys.status("d1"),)
+        self.reads = (keys.status("d1"), keys.cluster_state("*"))
+        self.heard: list[tuple[int, str, int]] = []  # at which gate what was handed over, and its stamp
+        self._now: list[tuple[str, int]] = []
+        self._returns = returns
+        self._key = keys.cluster_state(name)
+
+    def receive(self, key: str, message: Any) -> None:
+        if key != keys.status("d1"):
+            self._now.append((key, message.t_ns))
+
+    def step(self, t_ns: int) -> list[Output]:
+        self.heard += [(t_ns, *each) for each in self._now]
+        self._now = []
+        if self._returns is not None:
+            return self._returns(t_ns)
+        state = ClusterState(t_ns, self.next_seq(self._key), "idle", (), (), (), (), (), None, 0.0, "")
+        return [Output(self._key, state)]
+
+
+class AheadHub(Hub):
+    """A world with a command delay: it goes so many gates ahead of the dones."""
+
+    delay = 1
+
+    def info(self) -> Info:
+        return Timing(command_delay_ns=self.delay * GATE_NS, gate_ns=GATE_NS)  # type: ignore[return-value]
+
+    def may_advance(self) -> bool:
+        need_ns = (self._gate - 1 - self.delay) * GATE_NS
+        return self.ended is None and all(self._done.get(name, -GATE_NS) >= need_ns for name in self._periods)
+
+
+def talk(names: Sequence[str], delay: int = 1) -> dict[str, list[tuple[int, str, int]]]:
+    hub, team = AheadHub(40), [Chatter(name) for name in names]
+    hub.delay = delay
+    bus = Bus(hub, team, lambda: 0)
+    bus.join()
+    while bus.turn():
+        pass
+    bus.end()
+    return {agent.name: agent.heard for agent in team}
+
+
+def test_what_is_received_does_not_depend_on_the_order_of_agents():
+    forth, back = talk("abcde"), talk("edcba")
+    assert forth == back
+    assert len({tuple(heard) for heard in forth.values()}) == 1
+    assert {stamp for _, key, stamp in forth["talk.a"] if key == keys.cluster_state("e")} == {
+        gate * GATE_NS for gate in range(38)
+    }
+
+
+@pytest.mark.parametrize("delay", [1, 3, 12])
+@pytest.mark.parametrize("gates_max", [1, 2, 10])
+def test_nor_on_how_many_gates_the_bus_takes_at_once(monkeypatch: pytest.MonkeyPatch, delay: int, gates_max: int):
+    monkeypatch.setattr("zsim.runtime.bus.GATES_MAX", gates_max)
+    for heard in talk("abc", delay).values():
+        assert {t_ns - stamp for t_ns, _, stamp in heard} == {(delay + 1) * GATE_NS}
+        assert len(heard) == 3 * (40 - delay - 1)
+
+
+def velocity(t_ns: int, **fields: Any) -> list[Output]:
+    made: dict[str, Any] = {"velocity_m_s": (0.0, 0.0, 0.0), "yaw_rate_rad_s": 0.0, **fields}
+    return [Output(keys.command("d1", "velocity"), Velocity(t_ns, t_ns // GATE_NS, made.pop("source", ""), **made))]
+
+
+def failed(returns: Any) -> tuple[Hub, KeyedMessages, str]:
+    hub, published = Hub(5), []
+    bus = Bus(hub, [Chatter("a", returns)], lambda: 0, lambda key, message: published.append((key, message)))
+    bus.join()
+    while bus.turn() and not any(isinstance(message, Bye) for _, message in hub.handled):
+        pass
+    with pytest.raises(UserCodeError) as raised:
+        bus.end()
+    return hub, published, str(raised.value)
+
+
+def test_numbers_and_arrays_of_numpy_are_taken_as_they_would_arrive():
+    def returns(t_ns: int) -> list[Output]:
+        return velocity(t_ns, velocity_m_s=np.array([1.0, 2.0, 3.0]), yaw_rate_rad_s=np.float32(0.5))
+
+    hub, agent = Hub(1), Chatter("a", returns)
+    bus = Bus(hub, [agent], lambda: 0)
+    bus.join()
+    bus.turn()
+    sent = next(message for _, message in hub.handled if isinstance(message, Velocity))
+    assert (sent.velocity_m_s, sent.yaw_rate_rad_s, sent.source) == ((1.0, 2.0, 3.0), 0.5, "talk.a")
+    assert [type(number) for number in (*sent.velocity_m_s, sent.yaw_rate_rad_s)] == [float] * 4
+
+
+@pytest.mark.parametrize(
+    ("returns", "terms"),
+    [
+        (lambda t_ns: velocity(t_ns, velocity_m_s=(0.0, math.nan, 0.0)), ("drone/d1/cmd/velocity", "[1]", "nan")),
+        (lambda t_ns: velocity(t_ns, source="talk.b"), ("source", "'talk.b'", "'talk.a'")),
+        (lambda t_ns: [Output("swarm/d1/state", Bye(t_ns, 0, ""))], ("swarm/d1/state", "no key of the contract")),
+        (lambda t_ns: [Output("view/cluster/a", ViewCluster(t_ns, 0, "idle", (), (), (), ""))], ("view", "`views`")),
+        (lambda t_ns: [Output(keys.status("d1"), Bye(t_ns, 0, ""))], ("drone/d1/sensor/status",)),
+        (lambda t_ns: [Output(keys.estimate("d1"), Bye(t_ns, 0, ""))], ("drone/d1/estimate", "Bye", "Estimate")),
+        (lambda t_ns: 1 / (t_ns - t_ns), ("Chatter", "ZeroDivisionError", "test_bus.py:")),
+    ],
+)
+def test_what_cannot_be_sent_ends_its_sender_with_class_gate_key_and_field(returns: Any, terms: tuple[str, ...]):
+    hub, _, line = failed(lambda t_ns: velocity(t_ns) if t_ns < 2 * GATE_NS else returns(t_ns))
+    assert line.startswith("talk.a at 0.04 s: ")
+    assert all(term in line for term in terms), line
+    (bye,) = [message for _, message in hub.handled if isinstance(message, Bye)]
+    assert (bye.failed, bye.reason) == (True, line)
+    assert [message.done_ns for _, message in hub.handled if isinstance(message, Done)] == [0, GATE_NS]
+
+
+def test_only_what_the_world_counts_is_counted():
+    hub, _ = fly(2, team())
+    assert {message.sent for key, message in hub.handled if key == keys.process("controller.main", "done")} == {2}

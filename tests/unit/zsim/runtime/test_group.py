@@ -18,7 +18,9 @@ CLUSTER = keys.cluster_control("main")
 
 
 class Member(Agent):
-    """Says one message per gate on a key of its own, and notes what it hears."""
+    """Says one message per gate on a key of its own, and notes what it hears; its messages are not the keys' own."""
+
+    _is_own = False  # type: ignore[assignment]
 
     def __init__(self, name: str, reads: Sequence[str], writes: str, period_ns: int = GATE_NS) -> None:
         super().__init__()

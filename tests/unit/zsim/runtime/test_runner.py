@@ -25,7 +25,7 @@ from zsim.contract.run_messages import (
     Snapshot,
 )
 from zsim.contract.snapshot import VERSION, State, pack, unpack
-from zsim.errors import BehindError, RunError, SupersededError
+from zsim.errors import BehindError, RunError, SupersededError, UserCodeError
 from zsim.runtime import membership
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
@@ -548,3 +548,22 @@ def test_one_whose_state_cannot_be_packed_says_so_once_and_goes_on():
     assert world.published_on(keys.process(ME, "snapshot")) == []
     assert world.gates_done()[-1] == END
     assert len([line for line in said if has_terms(line, ME, "object", "snapshots")]) == 1
+
+
+class Failing(Judge):
+    """Divides by zero in gate 3."""
+
+    def step(self, t_ns: int) -> list[Output]:
+        return [] if t_ns < 3 * GATE_NS else [1 / 0]  # type: ignore[list-item]
+
+
+def test_one_of_a_user_s_own_that_raises_tells_the_world_and_its_caller_where():
+    world = World(estimates(range(END + 1)))
+    with pytest.raises(UserCodeError) as raised:
+        Runner(world, info(), Failing(), lambda: False).run()  # type: ignore[arg-type]
+    line = str(raised.value)
+    assert line.startswith(f"{ME} at 0.06 s: ")
+    assert all(term in line for term in ("Failing.step", "ZeroDivisionError", "test_runner.py:")), line
+    (bye,) = world.published_on(keys.process(ME, "bye"))
+    assert (bye.reason, bye.failed) == (line, True)
+    assert world.gates_done() == [0, 1, 2]

@@ -1,0 +1,194 @@
+"""What a user's class does wrong is told with class, method, gate, and value or line, and its module is found again."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from shutil import move
+
+import pytest
+
+from zsim.errors import DocumentError, UserCodeError
+from zsim.scenario import scenario_file
+from zsim.schema import plugin
+from zsim_analysis.in_process import fly
+from zsim_analysis.reading.flight import read_flight
+from zsim_analysis.reading.formation import formations_of
+from zsim_analysis.reading.verdict import verdict
+from zsim_analysis.rerun import rerun_record
+from zsim_analysis.sweep import sweep_run
+from zsim_analysis.sweep.sweep_run import Task
+
+PAIR = """
+name: pair
+duration_s: 12
+drones: [{name: d1, position_m: [0, 3, 0]}, {name: d2, position_m: [0, -3, 0]}]
+clusters: [{name: main, drones: [d1, d2], plan: {takeoff_s: 0.1}}]
+"""
+MODULE = '''
+import numpy as np
+
+from zsim.sensors.sensor import Channel, ErrorModel, RateHz, Sample, Sensor, SensorType
+from zsim.schema.message import Number
+from zsim_agents.estimation.paper_estimator import PaperEstimator
+from zsim_agents.formation.control_law import ControlLaw
+from zsim_agents.formation.spaces.pair_cluster import PairCluster
+
+
+class Law(ControlLaw):
+    """Raises in its hundredth gate, and returns NaN where the gain is another one."""
+
+    calls = 0
+
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        self.calls += 1
+        r_dot = np.zeros(self.space.size)
+        if self.calls > 100 and self.gains.k_1_s < 0.7:
+            r_dot[7] = np.nan
+        elif self.calls > 100:
+            divided(0)  # called here
+        return r_dot
+
+
+def divided(number):
+    return 1 / number  # raised here
+
+
+class Estimator(PaperEstimator):
+    def receive(self, sensor, message):
+        if message.t_ns > 2_000_000_000:
+            raise KeyError(sensor)
+        super().receive(sensor, message)
+
+
+class Space(PairCluster):
+    def __init__(self, n):
+        super().__init__()
+
+
+class RangeOf(Sample, frozen=True):
+    range_m: Number
+
+
+class Settings(Sensor, frozen=True, kw_only=True):
+    rate_hz: RateHz = 10.0
+    range_m: ErrorModel = ErrorModel()
+
+
+def distance(truth, settings, environment):
+    return [np.inf if truth.t_s > 1.0 else 1.0]
+
+
+SENSOR = SensorType(message=RangeOf, settings=Settings, channels=(Channel("range_m", "m"),), equation=distance)
+'''
+
+
+def line_of(text: str) -> int:
+    return next(number for number, line in enumerate(MODULE.splitlines(), start=1) if text in line)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    """Yield a folder with a scenario and the module that it may name."""
+    (tmp_path / "pair.yaml").write_text(PAIR)
+    (tmp_path / "users_code.py").write_text(MODULE)
+    yield tmp_path
+    forget(tmp_path)
+
+
+def forget(folder: Path) -> None:
+    """Let this process know of no module in a folder any more, as another process would not."""
+    sys.modules.pop("users_code", None)
+    sys.path[:] = [place for place in sys.path if not place.startswith(str(folder))]
+    plugin.search()
+
+
+LAW, ESTIMATOR = "clusters.main.law=users_code:Law", "estimation.algorithm=users_code:Estimator"
+SENSOR = "sensors.beam={module: users_code}"
+FAILURES = {
+    "nan": ([LAW], ("controller.main at ", "users_code:Law.rates", "nan", "yaw rate of d2")),
+    "raises": (
+        [LAW, "clusters.main.gains.proportional_1_s=0.75"],
+        ("controller.main at ", "users_code:Law.rates", "ZeroDivisionError", f"users_code.py:{line_of('# raised')}"),
+    ),
+    "estimator": (
+        [ESTIMATOR],
+        ("at 2.02 s", "users_code:Estimator.receive", "KeyError", f"users_code.py:{line_of('raise Key')}", "d1"),
+    ),
+    "sensor": ([SENSOR], ("d1: sensors.beam at 1.", "users_code:distance", "inf")),
+}
+
+
+@pytest.mark.parametrize(("overrides", "terms"), FAILURES.values(), ids=FAILURES)
+def test_a_class_that_fails_ends_the_run_as_a_failure_that_is_on_record(
+    folder: Path, overrides: list[str], terms: tuple[str, ...]
+) -> None:
+    record = folder / "run.mcap"
+    with pytest.raises(UserCodeError) as raised:
+        fly(scenario_file.load(folder / "pair.yaml", overrides), record)
+    line = str(raised.value)
+    assert all(term in line for term in terms), line
+    judged = verdict(record)
+    assert judged.completeness.complete
+    assert [each.text for each in judged.shortfalls if each.fails and each.kind == "process"] == [line]
+    assert "end" in {event.kind for event in read_flight(record, motion=False).events}
+
+
+def test_the_scenario_may_let_a_run_go_on_without_who_fails(folder: Path) -> None:
+    allowed = scenario_file.load(folder / "pair.yaml", [ESTIMATOR, "processes.on_death={controller.main: drop}"])
+    assert fly(allowed, folder / "run.mcap") == "the scenario's duration is over"
+    assert [each for each in verdict(folder / "run.mcap").shortfalls if each.kind == "process"] == []
+
+
+def test_a_run_of_a_sweep_that_fails_has_the_line_in_its_row(folder: Path) -> None:
+    row = sweep_run.fly(Task(0, 0, {}, scenario_file.load(folder / "pair.yaml", [ESTIMATOR])))
+    assert all(term in row["failure"] for term in FAILURES["estimator"][1])
+
+
+def flown(folder: Path) -> Path:
+    """Return the folder of a record of a run with a space and a sensor of the user's own."""
+    scenario = scenario_file.load(
+        folder / "pair.yaml",
+        ["clusters.main.space=users_code:Space", "duration_s=1", "sensors.beam={module: users_code}"],
+    )
+    (folder / "run").mkdir()
+    fly(scenario, folder / "run" / "run.mcap")
+    forget(folder)
+    return folder / "run"
+
+
+def judged(run: Path) -> list[str]:
+    """Return which formations a report judges, and fly the run again."""
+    forget(run.parent)
+    faults: list[str] = []
+    assert rerun_record(run, False, faults.append, faults.append) == ""
+    return [formation.name for formation in formations_of(read_flight(run / "run.mcap"))]
+
+
+def test_modules_are_found_where_the_run_found_them_wherever_one_is(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = flown(folder)
+    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+    assert judged(run) == ["main"]
+
+
+@pytest.mark.parametrize("beside", ["record", "working folder"])
+def test_or_beside_the_record_or_in_the_working_folder(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, beside: str
+) -> None:
+    run, there = flown(folder), tmp_path_factory.mktemp("elsewhere")
+    monkeypatch.chdir(there)
+    (there / "moved").mkdir()
+    moved = Path(move(run, there / "moved" / "run"))
+    move(folder / "users_code.py", (moved if beside == "record" else there) / "users_code.py")
+    assert judged(moved) == ["main"]
+    forget(there)
+
+
+def test_one_that_is_nowhere_is_named(folder: Path) -> None:
+    run = flown(folder)
+    (folder / "users_code.py").unlink()
+    forget(folder)
+    with pytest.raises(DocumentError) as raised:
+        formations_of(read_flight(run / "run.mcap"))
+    assert "'users_code:Space'" in str(raised.value)
