@@ -87,6 +87,8 @@ class EstimatorBank:
         self._held, self._held_rows = hold(self.rows), self.rows
         self._make_room(_ROOM)
         self._count = 0
+        self._sensors, used, refused = zip(*self.counted, strict=True)
+        self._used, self._refused = itemgetter(*used), itemgetter(*refused)
         self._reader = GateReader([drone.name for drone in drones])
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
@@ -116,7 +118,11 @@ class EstimatorBank:
         counts = self.rows.counts[:, COUNT.used :].tolist()
         rows = self._estimates.tolist()
         places = range(len(rows)) if wanted is None else wanted
-        return [_estimate(rows[i], counts[i], self.counted) for i in places]
+        sensors, used, refused = self._sensors, self._used, self._refused
+        return [
+            _estimate(rows[i], dict(zip(sensors, zip(used(counts[i]), refused(counts[i]), strict=True), strict=True)))
+            for i in places
+        ]
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Use readings (M, READING.size) and return the estimates for `t_s`, (N, ESTIMATE.size)."""
@@ -168,7 +174,7 @@ class EstimatorBank:
         self._readings = np.frombuffer(self._room).reshape(readings, READING.size)
 
 
-def _estimate(row: list[float], count: list[int], counted: Sequence[tuple[str, int, int]]) -> StateEstimate:
+def _estimate(row: list[float], sensors: dict[str, tuple[int, int]]) -> StateEstimate:
     """Return a row of estimates and its drone's (used, refused) by sensor as what is published."""
     return StateEstimate(
         _p_WB(row),
@@ -178,7 +184,7 @@ def _estimate(row: list[float], count: list[int], counted: Sequence[tuple[str, i
         tuple(row[_COVARIANCE]),
         row[_YAW_SIGMA],
         _gyro_bias(row),
-        {name: (count[used], count[refused]) for name, used, refused in counted},
+        sensors,
     )
 
 

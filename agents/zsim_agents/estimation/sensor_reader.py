@@ -1,6 +1,7 @@
 """Reads the sensors of several drones out of a gate's messages, straight into the rows of an EstimatorBank."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from zsim.contract import encoding, keys, messages
 from zsim.contract.encoding import GAP, Layouts, Program
 from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
-from zsim.math.compiled import portable
+from zsim.math.compiled import Held, hold, portable
 from zsim_agents.estimation.filter_state import BARO, FLOW, GPS, IMU, READING, SIZES, SONAR, VALUES_MAX
 
 NOBODY = -1
@@ -19,6 +20,16 @@ RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # of keys in the 
 GPS_FIX, SONAR_VALID = 3, 3  # whole numbers of these messages
 
 read = portable(encoding.read)
+
+
+class ReaderTables(NamedTuple):
+    """What compiled code knows of the messages of a gate, and where it reads one into."""
+
+    program: Program
+    owner: NDArray[np.int64]  # (keys, 2): drone and sensor of each key of the table, or NOBODY
+    ints: NDArray[np.int64]
+    floats: NDArray[np.float64]
+    bits: NDArray[np.uint64]  # of the floats
 
 
 class GateReader:
@@ -33,13 +44,12 @@ class GateReader:
             keys.sensor(drone, kind): (i, SENSORS.index(kind)) for i, drone in enumerate(drones) for kind in SENSORS
         }
         self._table: Sequence[str] = ()
-        self._owner = np.empty((0, 2), dtype=np.int64)
         kinds = [messages.type_of(keys.sensor("any", sensor)) for sensor in SENSORS]
         layouts = Layouts(kind for kind in kinds if kind)
-        self._program = layouts.program
-        self._ints = np.zeros(layouts.ints, dtype=np.int64)
-        self._floats = np.zeros(layouts.floats)
-        self._bits = self._floats.view(np.uint64)
+        floats, owner = np.zeros(layouts.floats), np.empty((0, 2), dtype=np.int64)
+        ints = np.zeros(layouts.ints, dtype=np.int64)
+        self._tables = ReaderTables(layouts.program, owner, ints, floats, floats.view(np.uint64))
+        self._held = hold(self._tables)
 
     def take(self, gate: GateMessages, readings: NDArray[np.float64], count: int) -> int:
         """Write readings from row `count` on; return how many rows there are then, -1 if a message must be decoded.
@@ -50,29 +60,25 @@ class GateReader:
         if gate.table is not self._table:
             self._learn(gate.table)
         data = np.frombuffer(gate.buffer, dtype=np.uint8)
-        for array in (gate.which, gate.ends, data):
-            array.setflags(write=False)  # as off the wire: what may be written is compiled anew
-        row = (self._ints, self._floats, self._bits)
-        return collect(self._program, self._owner, gate.which, gate.ends, data, row, readings, count)
+        if gate.which.flags.writeable:
+            for array in (gate.which, gate.ends, data):
+                array.setflags(write=False)  # as off the wire: what may be written is compiled anew
+        return collect(self._held, gate.which, gate.ends, data, readings, count)
 
     def _learn(self, table: Sequence[str]) -> None:
         self._table = table
-        self._owner = np.array([self._whose.get(key, (NOBODY, NOBODY)) for key in table], dtype=np.int64)
+        owner = np.array([self._whose.get(key, (NOBODY, NOBODY)) for key in table], dtype=np.int64)
+        self._held = hold(self._tables._replace(owner=owner))
 
 
 @portable
-def collect(
-    program: Program,
-    owner: NDArray,
-    which: NDArray,
-    ends: NDArray,
-    data: NDArray,
-    row: tuple[NDArray, NDArray, NDArray],
-    readings: NDArray,
-    count: int,
-) -> int:
-    """Write what a gate has of sensors as readings, of each drone by time and name; see GateReader.take."""
-    ints, floats, bits = row
+def collect(held: Held, which: NDArray, ends: NDArray, data: NDArray, readings: NDArray, count: int) -> int:
+    """Write what a gate has of sensors as readings, of each drone by time and name; see GateReader.take.
+
+    Args:
+        held: ReaderTables, by `hold`.
+    """
+    program, owner, ints, floats, bits = held.content
     start, first = 0, count
     marks = np.empty(which.shape[0], np.int64)
     for m in range(which.shape[0]):

@@ -154,7 +154,9 @@ class GatePublication:
             self._commanders = commanders
         out = self._written
         size = publish(self._held, *fleet.sampled, *payloads, fleet.t_ns)
-        which, stamps, ends = out.columns[:, :count].copy()
+        columns = out.columns[:, :count].copy()
+        columns.setflags(write=False)
+        which, stamps, ends = columns
         seq = int(wide.counts[self._first, STATUS]) - 1
         data = out.data[:size].tobytes()
         return GateMessages(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())

@@ -343,12 +343,13 @@ class Coordinator(ABC):
 
     def clock_message(self, waiting_for: tuple[run_messages.Waiting, ...] = ()) -> run_messages.Clock:
         """Return the next message of `clock`."""
+        clock, now_ns = self.clock, self.clock.now_ns
         return run_messages.Clock(
-            t_ns=self.now_ns,
+            t_ns=now_ns,
             seq=self.outbox.next_seq(keys.CLOCK),
             run_id=self.run_id,
-            step=self.now_ns // self.clock.gate_ns,
-            state=self.clock.state,  # type: ignore[arg-type]
+            step=now_ns // clock.gate_ns,
+            state=clock.state,  # type: ignore[arg-type]
             rate=round(self.statistics.rate.now(), 3),
             waiting_for=waiting_for,
         )
