@@ -179,14 +179,16 @@ def test_a_fault_of_the_file_is_told_once() -> None:
 
 
 def test_every_drawn_value_is_checked() -> None:
-    (fault,) = faults("seed", "drones.drone1.limits.tilt_deg=uniform(29,31)", runs=40)
+    (fault,) = faults("seed", "drones.drone1.battery_percent=uniform(99,101)", runs=40)
     design = SweepDesign(
-        SweepPlan(source="", document={}, vary=("drones.drone1.limits.tilt_deg=uniform(29,31)",), runs=40)
+        SweepPlan(source="", document={}, vary=("drones.drone1.battery_percent=uniform(99,101)",), runs=40)
     )
-    too_much = [run for run in range(40) if design.values(run)["drones.drone1.limits.tilt_deg"] > 30]
+    too_much = [run for run in range(40) if design.values(run)["drones.drone1.battery_percent"] > 100]
     assert 0 < len(too_much) < 40
-    field = "drones[0].limits.tilt_deg"
-    assert has_terms(fault, field, ">", "0", "<=", "30", str(len(too_much)), "40", "drones.drone1.limits.tilt_deg=30.…")
+    field = "drones[0].battery_percent"
+    assert has_terms(
+        fault, field, ">=", "0", "<=", "100", str(len(too_much)), "40", "drones.drone1.battery_percent=100.…"
+    )
 
 
 @pytest.mark.parametrize(
