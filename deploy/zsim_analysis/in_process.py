@@ -48,18 +48,19 @@ class InProcessFlight:
     Args:
         scenario: resolved.
         run_id: set only by tests that compare records.
+        changed: as of `World`.
 
     Raises:
         ScenarioError, RunError: the scenario cannot be flown.
     """
 
-    def __init__(self, scenario: Scenario, run_id: str | None = None) -> None:
+    def __init__(self, scenario: Scenario, run_id: str | None = None, changed: Sequence[str] | None = None) -> None:
         if scenario.gates("camera"):
             raise RunError(
                 "processes.gating is [camera]; must be left out in one process, which has no cameras: "
                 "fly it as processes, or with --set processes.gating=[]"
             )
-        self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id)
+        self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)
         for name in set(scenario.expected()) - set(agent_names(scenario)):
             if lets_drop(scenario.processes.on_overdue or {}, name):
                 self.world.losses.expired(name)  # nobody else can come here
@@ -112,6 +113,7 @@ def fly(
     stop_reason: Callable[[], str | None] = lambda: None,
     screen: Screen | None = None,
     run_id: str | None = None,
+    changed: Sequence[str] | None = None,
 ) -> str:
     """Fly a scenario and record it; return why it ended.
 
@@ -121,6 +123,7 @@ def fly(
         stop_reason: called at every gate; a text ends the run.
         screen: shows progress.
         run_id: set only by tests that compare records.
+        changed: as of `World`.
 
     Raises:
         RunError: a failure has ended the run, of a user's class, or since the state of a drone was no longer finite;
@@ -129,7 +132,7 @@ def fly(
     progress = _Progress(scenario, screen) if screen else None
     writer = None
     try:
-        flight = InProcessFlight(scenario, run_id)
+        flight = InProcessFlight(scenario, run_id, changed)
         writer = RecordWriter(record) if record else None  # after it: a refused scenario leaves no record in the way
         flight.run([each for each in (writer, progress) if each], stop_reason)
     finally:

@@ -25,6 +25,7 @@ REPORT_NEEDS = {"report": ("matplotlib", "jinja2", "mcap", "zstandard")}
 CONSOLE_PORT = 8080  # of its page
 RUN, HOSTS = "Run", "On several machines"  # panels of the help
 REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
+CHANGED = "--changed"  # of the world: what a launcher, whose scenario is resolved, has changed of its file
 LOOK_S = 5.0  # wall; for which a command that a person types waits for a world
 
 
@@ -141,6 +142,17 @@ def load_scenario(
     return scenario
 
 
+def changed_fields(overrides: Sequence[str] | None, seed: int | None, duration: float | None) -> list[str]:
+    """Return what a command line changes of a scenario as texts of `--set`."""
+    own = {"seed": seed, "duration_s": duration}
+    return [*(overrides or ()), *(f"{name}={value}" for name, value in own.items() if value is not None)]
+
+
+def changed_options(changed: Sequence[str]) -> list[str]:
+    """Return changed fields as options of the world."""
+    return [word for text in changed for word in (CHANGED, text)]
+
+
 def pace_options(mode: str, rate: float) -> list[str]:
     """Return mode and pace as options of the world."""
     return [*([REALTIME] if mode == "realtime" else []), *(["--rate", str(rate)] if rate else [])]
@@ -171,6 +183,10 @@ class FlightOptions(NamedTuple):
         scenario = load_scenario(self.path, self.overrides, self.seed, self.duration, elsewhere)
         check_pace(scenario, self.mode_and_rate()[0])
         return scenario
+
+    def changed(self) -> list[str]:
+        """Return the texts `a.b.c=value` by which the scenario is changed against its file."""
+        return changed_fields(self.overrides, self.seed, self.duration)
 
     def mode_and_rate(self) -> tuple[str, float]:
         """Return the mode of a run, and its pace in simulated per wall seconds; 0 is as fast as it goes."""

@@ -30,7 +30,7 @@ FLIGHT = ("--duration", str(DURATION_S), "--set", "drones.drone1.mass_kg=0.45")
 PLAN = ("--vary", "seed", "--vary", "wind.gust_m_s=0,1", *FLIGHT)
 RUNS = 4
 FIRST = rf" [1-{RUNS - 1}] / {RUNS} runs"  # a line while there is still something to fly
-WALL = ("wall_s", "real_time_factor")  # all that may differ between two sweeps
+WALL = ("wall_s", "real_time_factor", "date")  # all that may differ between two sweeps
 
 
 def rows(out: Path) -> list[dict[str, Any]]:

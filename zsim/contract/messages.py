@@ -87,8 +87,9 @@ class Info(Message, frozen=True):
     `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
     run_id of the run that is played back; empty for a flight. `user_sensors` is left out where all sensors are the
     contract's, `sightings` where the world computes none. `module_folders` are those in which the world has looked for
-    modules that the scenario names, for who reads the record later; left out where it names none. Wherever an Info is
-    made or decoded, the messages of its sensors can be encoded and decoded.
+    modules that the scenario names, for who reads the record later; left out where it names none. `changed` has the
+    texts `a.b.c=value` by which the scenario was changed against its file; left out where nobody said. Wherever an Info
+    is made or decoded, the messages of its sensors can be encoded and decoded.
     """
 
     contract: Count
@@ -111,6 +112,7 @@ class Info(Message, frozen=True):
     user_sensors: tuple[SensorInfo, ...] | UnsetType = UNSET
     sightings: bool | UnsetType = UNSET
     module_folders: tuple[str, ...] | UnsetType = UNSET
+    changed: tuple[str, ...] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         register_sensors(self.own_sensors)

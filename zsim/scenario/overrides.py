@@ -1,17 +1,18 @@
 """Overrides of a scenario document: texts `a.b.c=value`, entries of lists by place or by name."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, get_args
 
 from msgspec import Struct, structs
 
 from zsim.scenario.scenario import Document
-from zsim.schema.checker import show
+from zsim.schema.checker import meant, show
 
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
 PATH_MAX = 1000  # characters; the longest of a scenario has a tenth of that
+NOTHING: Mapping[str, Any] = {}
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # one step of a path: a word, or anything between brackets
 _FIRST = re.compile(r"[^.\[\]]+")
 _PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
@@ -31,29 +32,62 @@ def apply(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> s
     if not equals or not _PATH.fullmatch(path):
         return f"{_name(text)}: is no assignment; must be {SYNTAX}"
     try:
-        _assign(document, steps_of(path), parse(value_text))
+        _assign(document, steps_of(path, document), parse(value_text))
     except ValueError as error:
         return f"{_name(text)}: {error}"
     return None
 
 
-def steps_of(path: str) -> list[str]:
-    """Return the steps of a path from the top of a scenario: fields, and entries by place or by name."""
-    return [word or bracket for word, bracket in _STEP.findall(whole_path(path))]
+def steps_of(path: str, document: Mapping[str, Any] = NOTHING) -> list[str]:
+    """Return the steps of a path from the top of a scenario: fields, and entries by place or by name.
+
+    Arguments and errors as `whole_path`.
+    """
+    return [word or bracket for word, bracket in _STEP.findall(whole_path(path, document))]
 
 
-def whole_path(path: str) -> str:
+def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
     """Return the path of a field from the top of a scenario.
 
     The name of a section may be left out where only one section has such a field: wind.gust_m_s stands for
-    environment.wind.gust_m_s.
+    environment.wind.gust_m_s. Of a list of sections it may be left out where the list has one entry:
+    gains.proportional_1_s stands for clusters.main.gains.proportional_1_s.
+
+    Args:
+        path: as given.
+        document: the scenario that is meant, raw.
+
+    Raises:
+        ValueError: the field is one of a list of sections, of which the document has several.
     """
     first = _FIRST.match(path)
     sections = {field.name: field for field in _fields(Document)}
     if first is None or first[0] in sections:
         return path
-    owners = [name for name, field in sections.items() if any(f.name == first[0] for f in _fields(field.type))]
-    return f"{owners[0]}.{path}" if len(owners) == 1 else path
+    owners = [name for name, field in sections.items() if first[0] in _names(field.type)]
+    if owners:
+        return f"{owners[0]}.{path}" if len(owners) == 1 else path
+    lists = [name for name, field in sections.items() if any(first[0] in _names(each) for each in get_args(field.type))]
+    return _in_entry(path, lists[0], document.get(lists[0])) if len(lists) == 1 else path
+
+
+def _in_entry(path: str, section: str, entries: Any) -> str:
+    """Return the path of a field of the one entry of a list, by its name if it has one."""
+    if not isinstance(entries, list) or not entries:
+        return path
+    names = [entry.get("name") if isinstance(entry, dict) else None for entry in entries]
+    places = [f"{section}.{name}" if _is_step(name) else f"{section}[{place}]" for place, name in enumerate(names)]
+    if len(places) > 1:
+        raise ValueError(f"is a field of each of {len(places)} {section}; give the whole path, e.g. {places[0]}.{path}")
+    return f"{places[0]}.{path}"
+
+
+def _is_step(name: Any) -> bool:
+    return isinstance(name, str) and _FIRST.fullmatch(name) is not None
+
+
+def _names(kind: Any) -> list[str]:
+    return [field.name for field in _fields(kind)]
 
 
 @cache
@@ -92,9 +126,10 @@ def _index(place: list[Any], step: str, path: list[str]) -> int:
         return names.index(step)
     if re.fullmatch(r"[0-9]{1,9}", step) and int(step) < len(place):
         return int(step)
-    known = ", ".join(str(name) for name in names if isinstance(name, str))
+    texts = [name for name in names if isinstance(name, str)]
+    known = ", ".join(texts)
     allowed = f"0 to {len(place) - 1}{' or ' if known else ''}{known}" if place else "nothing, it is empty"
-    raise ValueError(f"{step[:40]} is not in {'.'.join(path)}; allowed: {allowed}")
+    raise ValueError(f"{step[:40]} is not in {'.'.join(path)}; {meant(step, texts)}allowed: {allowed}")
 
 
 def _name(text: str) -> str:

@@ -7,6 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Iterator
+from difflib import get_close_matches
 from functools import lru_cache
 from itertools import islice
 from types import SimpleNamespace
@@ -101,7 +102,7 @@ def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[Fau
     if info.forbid_unknown_fields:
         for key in value:
             if key not in names:
-                yield field_path(path, key), f"is not known; allowed: {', '.join(sorted(names))}"
+                yield field_path(path, key), f"is not known; {meant(key, names)}allowed: {', '.join(sorted(names))}"
     for name, entry in names.items():
         if name in value:
             yield from _check(value[name], entry.type, field_path(path, name))
@@ -259,6 +260,12 @@ def _sound_field(value: dict[str, Any], entry: types.Field) -> Any:
     if entry.default_factory is not msgspec.NODEFAULT:
         return entry.default_factory()
     return None if entry.default is msgspec.NODEFAULT else entry.default
+
+
+def meant(name: Any, known: Iterable[str]) -> str:
+    """Return a question for the known name that is most like an unknown one; "" where none is like it."""
+    close = get_close_matches(str(name)[:SHOWN_MAX], known, 1)
+    return f"did you mean {close[0]}? " if close else ""
 
 
 def field_path(path: str, name: Any) -> str:

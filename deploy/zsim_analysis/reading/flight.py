@@ -149,6 +149,7 @@ class FlightReader:
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Add the world's messages of a gate of a flight in this process."""
+        self._first_wall_ns, self._last_wall_ns = self._first_wall_ns or wall_ns, wall_ns
         for key, payload in gate.pairs:
             if handler := self.handler(key):
                 handler[1](keys.parts(key)[1], handler[0].decode(payload))
@@ -199,6 +200,7 @@ class FlightReader:
             completeness=completeness or Completeness(),
             wall_s=(self._last_wall_ns - (self._first_wall_ns or 0)) / 1e9,
             undecoded=self._undecoded,
+            began_ns=self._first_wall_ns,
             estimates=self._answers.estimates() if self._answers else {},
             commands=self._answers.commands() if self._answers else {},
         )

@@ -135,6 +135,7 @@ class RecordedFlight:
         messages: on record, all keys.
         completeness: of the record.
         wall_s: wall time from the first truth to the last, as they reached the recorder.
+        began_ns: wall time of the first truth, nanoseconds since 1970; None where nothing flew.
         undecoded: payloads that are not of the type of their key.
         estimates, commands: by drone; empty where they were not asked for.
     """
@@ -149,6 +150,7 @@ class RecordedFlight:
     completeness: Completeness
     wall_s: float
     undecoded: int = 0
+    began_ns: int | None = None
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
 

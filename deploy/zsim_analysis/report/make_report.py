@@ -100,8 +100,12 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
     factor = "not known" if summary.real_time_factor is None else f"{summary.real_time_factor:.1f}"
     seed = "–" if summary.seed is None else summary.seed
     separation = summary.min_separation_m
+    versions = dict.fromkeys(version for name, version in summary.versions.items() if name != "report")
     return [
         ("Scenario", f"{summary.scenario or 'not known'}, seed {seed}"),
+        ("Changed", changed_text(summary.changed)),
+        ("Date", date_text(summary.date)),
+        ("Version", ", ".join(versions) or "not known"),
         ("Mode", summary.mode or "not known"),
         ("Ended", summary.ended),
         ("Flown as planned", _planned(summary)),
@@ -115,6 +119,16 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
         ("Fingerprint", summary.fingerprint or "not known"),
     ]
+
+
+def changed_text(changed: Sequence[str] | None) -> str:
+    """Return what was changed of a scenario's file, in words."""
+    return "not known" if changed is None else ", ".join(changed) or "nothing: as in its file"
+
+
+def date_text(date: str | None) -> str:
+    """Return a date of ISO 8601 as a reader has it, to the minute."""
+    return f"{date[:16].replace('T', ' ')} UTC" if date else "not known"
 
 
 def _planned(summary: RunSummary) -> str:
@@ -170,11 +184,9 @@ def fact_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
 
 def _more(run: ComparedRun) -> list[tuple[str, str]]:
     summary, flight = run.summary, run.flight
-    versions = ", ".join(dict.fromkeys(value for name, value in summary.versions.items() if name != "report"))
     return [
         ("Drones", f"{len(flight.tracks)}"),
         ("Clusters", ", ".join(f"{c.name} of {len(c.drones)}" for c in flight.clusters) or "none"),
-        ("Versions", versions or "not known"),
         ("Scenario's hash", flight.info.scenario_sha256[:16] if flight.info else "not known"),
         ("Messages", f"{summary.record.messages}"),
     ]

@@ -24,15 +24,16 @@ COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's con
 DPI = 200  # of PNG files
 PAPER_PT = 8.0  # of text, points: that of a paper's captions
 LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of an entry of a legend besides its name, in its text's size
+LETTER_PAD_PT = 3.0  # between the letter of a panel and its axes
 FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE takes no Type 3
 POINTS = 2000  # per line: more than a page has pixels
 # Okabe and Ito's colours, distinct with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, VERMILION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
-GREY, DARK = "#8c959f", "#444c56"
+GREY, DARK, GRID = "#8c959f", "#444c56", "#c9d1d9"
 DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.0, "ls": (0, (5, 3)), "zorder": 4}
-MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 0.6, "zorder": 3}
-TRUE: dict[str, Any] = {"color": BLUE, "lw": 0.9, "zorder": 2}
+MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 1.1, "zorder": 2}  # seen on both sides of truth where they agree
+TRUE: dict[str, Any] = {"color": BLUE, "lw": 0.6, "zorder": 3}
 
 
 SYMBOLS = {
@@ -103,7 +104,7 @@ def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
 
 def dress(axes: Axes, label: str = "") -> None:
     """Give axes their grid and the label of their y axis."""
-    axes.grid(True, color="#d8dee4", lw=0.6)
+    axes.grid(True, color=GRID, lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(which="both", labelsize=PAPER_PT - 1)
@@ -130,9 +131,31 @@ def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
     axes.plot(*thinned(x, y), **style)
 
 
+def letter_panels(panels: Iterable[Axes]) -> None:
+    """Name panels, or columns by their uppermost panel, (a), (b) and so on; one alone needs no letter.
+
+    Args:
+        panels: in the order of reading, their titles being written already.
+    """
+    panels = list(panels)
+    for number, axes in enumerate(panels if len(panels) > 1 else ()):
+        letters = chr(ord("a") + number % 26) * (1 + number // 26)
+        place = "center" if axes.get_title() else "left"
+        title = axes.get_title(loc=place)
+        look: Any = {"fontsize": PAPER_PT, "pad": LETTER_PAD_PT}
+        if title:
+            axes.set_title(f"({letters}) {title}", loc=place, **look)
+        else:
+            axes.set_title(f"({letters})", loc=place, ha="right", **look)  # beside all that stands above axes
+
+
 def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
-    """Put the legend of some axes above all axes of the figure, where it covers no data."""
-    handles, labels = axes.get_legend_handles_labels()
+    """Put the legend above all axes of a figure, where it covers no data: each name once, first those of `axes`."""
+    named: dict[str, Any] = {}
+    for each in (axes, *figure.axes):
+        for handle, name in zip(*each.get_legend_handles_labels(), strict=True):
+            named.setdefault(name, handle)
+    handles, labels = list(named.values()), list(named)
     if handles:
         longest = (ENTRY_EMS + LETTER_EMS * max(map(len, labels))) * PAPER_PT / 72  # inches
         columns = min(columns, max(1, int(figure.get_size_inches()[0] / longest)))

@@ -1,4 +1,4 @@
-"""What the paper printed of its Test 1, and which flights stand beside it: by what they flew, not by a name. Pure.
+"""What the paper printed of its tests, and which flights stand beside them: by what they flew, not by a name. Pure.
 
 I. Mas, S. Curi, R. Sanchez Pena, Open-source Multi-UAV Simulator for the ROS Environment.
 """
@@ -13,7 +13,7 @@ from msgspec import UNSET
 from zsim.scenario.scenario import Cluster, ClusterPlan, Drone, Scenario
 from zsim.sensors.sensor import Sensor
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK
-from zsim_agents.formation.expression import ExpressionError
+from zsim_agents.formation.expression import Expression, ExpressionError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.variable_values import TrajectoryError, named_values
 from zsim_analysis.reading.formation import Formation
@@ -53,6 +53,18 @@ TEST_1_TARGET = {
     "q": 4.0,
     "beta": math.pi / 4,
 }
+# Equation (4): the trajectory of Test 2 in t [s]; m and rad.
+TEST_2_F_HZ = 0.01
+TEST_2_REFERENCE = {
+    "x_c": "5*cos(2*pi*f*t)",
+    "y_c": "-5*(1 + 1/2*sin(4*pi*f*t))",
+    "z_c": "15 + 5/2*(1 - cos(3*pi*f*t))",
+    "yaw": "0.1*t",
+    "p": "4",
+    "q": "4",
+    "beta": "pi/4",
+}
+COMPARED_S = (0.0, 7.0, 31.0, 88.0, 140.0)  # at which expressions are the same that have the same values; chosen
 ROBOTS = 3
 TOLERANCE = 1e-3  # of a target that is written with fewer digits
 SETTLED_S, JUDGED_S = 100.0, 200.0  # from the take-off to the window, and the window: of scenarios/step.yaml
@@ -74,12 +86,44 @@ def paper_table(scenario: Scenario, cluster: str) -> Mapping[str, float]:
     return PAPER_TABLE_1 if flies else {}
 
 
+def flies_paper_test(flight: RecordedFlight, cluster: str) -> bool:
+    """Return whether a cluster flew one of the paper's tests, for whatever time and whatever window it is judged in."""
+    scenario = flight.scenario
+    if scenario is None or any(event.kind == "fault" for event in flight.events):
+        return False
+    own = [each for each in scenario.clusters if each.name == cluster and _is_set_up(scenario, each)]
+    return any(_is_led(each) or _is_along_equation_4(each.plan) for each in own)
+
+
 def _is_test_1(scenario: Scenario, cluster: Cluster) -> bool:
+    return _is_set_up(scenario, cluster) and _is_judged(scenario, cluster.plan) and _is_led(cluster)
+
+
+def _is_set_up(scenario: Scenario, cluster: Cluster) -> bool:
+    """Return whether a cluster of three has the paper's drones and sensors, in calm air and without faults."""
     wind = scenario.environment.wind
     calm = not any(wind.steady_m_s) and wind.gust_m_s <= GUST_MAX_M_S
-    members = [scenario.drone(name) for name in cluster.drones]
-    as_printed = all(_is_printed(drone) for drone in members)
-    return calm and not scenario.faults and as_printed and _is_judged(scenario, cluster.plan) and _is_led(cluster)
+    as_printed = all(_is_printed(scenario.drone(name)) for name in cluster.drones)
+    return len(cluster.drones) == ROBOTS and calm and not scenario.faults and as_printed
+
+
+def _is_along_equation_4(plan: ClusterPlan) -> bool:
+    """Return whether a plan leads along equation (4), however it is written."""
+    trajectory = plan.trajectory
+    if trajectory is None or trajectory.waypoints or set(trajectory.expressions) != set(TEST_2_REFERENCE):
+        return False
+    try:
+        return all(
+            math.isclose(
+                Expression(name, str(text), trajectory.constants)(t_s)[0],
+                Expression(name, TEST_2_REFERENCE[name], {"f": TEST_2_F_HZ})(t_s)[0],
+                abs_tol=TOLERANCE,
+            )
+            for name, text in trajectory.expressions.items()
+            for t_s in COMPARED_S
+        )
+    except ExpressionError:
+        return False  # it was refused in flight
 
 
 def _is_printed(drone: Drone) -> bool:
@@ -109,9 +153,9 @@ def _is_judged(scenario: Scenario, plan: ClusterPlan) -> bool:
 
 
 def _is_led(cluster: Cluster) -> bool:
-    """Return whether a cluster of three drones is led from the ground to equation (3)."""
+    """Return whether a cluster of ROBOTS is led from the ground to equation (3)."""
     plan = cluster.plan
-    if len(cluster.drones) != ROBOTS or plan.takeoff_s is None or plan.trajectory is not None:
+    if plan.takeoff_s is None or plan.trajectory is not None:
         return False
     space = cluster_space(ROBOTS)
     try:

@@ -1,11 +1,12 @@
 """summary.json: what a run was and how well it flew, beside what the paper printed."""
 
 from collections import Counter
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Struct
 
 from zsim import __version__
 from zsim.contract.run_messages import Event
@@ -64,6 +65,8 @@ class RunSummary(Struct, frozen=True):
     """The content of summary.json; None where the record does not show a value.
 
     Attributes:
+        date: when it was flown, to the second in UTC (ISO 8601).
+        changed: texts `a.b.c=value` by which the scenario was changed against its file.
         as_planned: the flight did what its plan says, as far as the run went; `shortfalls` has what it did not do.
         links: to the aircraft that flew as external drones, by drone.
         window_note: why the window is not that of the scenario, empty where it is.
@@ -73,6 +76,8 @@ class RunSummary(Struct, frozen=True):
     seed: int | None
     mode: str | None
     run_id: str | None
+    date: str | None
+    changed: list[str] | None
     versions: dict[str, str]
     fingerprint: str | None
     real_time_factor: float | None
@@ -130,6 +135,8 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         seed=info.seed if info else None,
         mode=info.mode if info else None,
         run_id=info.run_id if info else None,
+        date=_date(flight.began_ns) if flight.began_ns else None,
+        changed=list(info.changed) if info and info.changed is not UNSET else None,
         versions=_versions(flight),
         fingerprint=info.fingerprint if info else None,
         real_time_factor=end.get("real_time_factor", span_s / wall_s if wall_s > 0 else None),
@@ -156,6 +163,10 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         record=record_facts,
         notes=_notes(flight, record_facts, formations, window_s, window_note),
     )
+
+
+def _date(wall_ns: int) -> str:
+    return datetime.fromtimestamp(wall_ns // 10**9, UTC).isoformat().replace("+00:00", "Z")
 
 
 def _notes(

@@ -1,36 +1,48 @@
-"""What varies from run to run: a seed for each, values of a field in turn, or values drawn for each run."""
+"""What varies from run to run: seeds, values of a field in turn, or values drawn for each run."""
 
 import itertools
 import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, get_type_hints
 
 import numpy as np
 from msgspec import Struct
 
 from zsim.math.random_streams import stream
-from zsim.scenario.overrides import steps_of, whole_path
+from zsim.scenario.overrides import NOTHING, steps_of, whole_path
+from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
-from zsim.schema.checker import show
+from zsim.schema.checker import first_fault, show
 
 SEED = "seed"
 SHOWN_MAX = 24  # characters of a value in a table or figure
 SEEDS = 2**32  # drawn below it: ten digits that a person can type
-SYNTAX = "seed, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
+SYNTAX = "seed, seed=paired, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
+PAIRED = "paired"
 FieldPath = tuple[str | int, ...]  # steps to a field of a scenario from the top
+_SEED_TYPE = get_type_hints(Scenario, include_extras=True)[SEED]
 _DRAWN = re.compile(r"\s*([a-z]+)\((.*)\)\s*")
 
 
 class Seeds(Struct, frozen=True):
-    """A distinct seed for every run."""
+    """A distinct seed for every run, or, paired, for every run of a combination: all combinations have the same ones.
+
+    Attributes:
+        paired: with the seed, values that are drawn are the same for all combinations, too.
+        values: the seeds; none: they are drawn from the scenario's own.
+    """
 
     path: str = SEED
+    paired: bool = False
+    values: tuple[int, ...] = ()
 
     def draw(self, seed: int, count: int) -> list[int]:
-        """Return the seeds of the first runs of a scenario's seed; more runs leave the earlier ones as they are."""
+        """Return the first seeds of a scenario's seed; more of them leave the earlier ones as they are."""
+        if self.values:
+            return list(self.values[:count])
         rng = stream(seed, "sweep/seed")
         seeds: dict[int, None] = {}
         while len(seeds) < count:
@@ -68,20 +80,33 @@ class Draw(Struct, frozen=True):
 Axis = Seeds | Grid | Draw
 
 
-def parse(text: str) -> Axis:
-    """Return the axis of a text of `--vary`.
+def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
+    """Return the axis of a text of `--vary`, for a raw document.
 
     Raises:
-        ValueError: it is not of the form of SYNTAX.
+        ValueError: it is not of the form of SYNTAX, or its path has several meanings.
     """
     path, equals, values = text.partition("=")
     if text.strip() == SEED:
         return Seeds()
     if not equals or not path.strip():
         raise ValueError(f"is no variation; must be {SYNTAX}")
-    path = whole_path(path.strip())
+    path = whole_path(path.strip(), document)
+    if path == SEED:
+        return Seeds(paired=True, values=_seeds(values))
     drawn = _DRAWN.fullmatch(values)
     return _draw(path, drawn[1], drawn[2]) if drawn else Grid(path, _grid_values(values))
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of a text, none where they are to be drawn."""
+    if text.strip() == PAIRED:
+        return ()
+    seeds = _grid_values(text)
+    for seed in seeds:
+        if fault := first_fault(seed, _SEED_TYPE):
+            raise ValueError(f"{fault[1]}; or give seed={PAIRED}, which draws them")
+    return seeds
 
 
 def _grid_values(text: str) -> tuple[Any, ...]:

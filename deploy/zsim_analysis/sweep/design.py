@@ -21,7 +21,7 @@ from zsim.scenario.scenario_file import EXAMPLE
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import first_lines
 from zsim_agents.hosting import check_classes
-from zsim_analysis.sweep.axes import SEED, Axis, Draw, FieldPath, Grid, field_path, is_inside, parse, text_of
+from zsim_analysis.sweep.axes import SEED, Axis, Draw, FieldPath, Grid, Seeds, field_path, is_inside, parse, text_of
 from zsim_analysis.sweep.metrics import check_metrics
 
 PLAN = "plan.json"
@@ -39,6 +39,7 @@ class SweepPlan(Struct, frozen=True, kw_only=True):
         vary: texts of `--vary`, in their order.
         runs: how many; a plan of more runs begins with the same ones.
         records: whether every run keeps its record.
+        changed: texts `a.b.c=value` that the command line has changed of the file; None: not known.
         version: of zsim; another one need not give the same numbers.
     """
 
@@ -47,6 +48,7 @@ class SweepPlan(Struct, frozen=True, kw_only=True):
     vary: tuple[str, ...]
     runs: int
     records: bool = False
+    changed: tuple[str, ...] | None = None
     version: str = __version__
 
 
@@ -58,7 +60,7 @@ def difference(old: SweepPlan, new: SweepPlan) -> str | None:
         keys = sorted(old.document.keys() | new.document.keys())
         other = next(key for key in keys if old.document.get(key) != new.document.get(key))
         return f"{other} of its scenario is another one"
-    if _whole(old.vary) != _whole(new.vary):
+    if _whole(old) != _whole(new):
         return f"it varies {' '.join(old.vary) or 'nothing'}, not {' '.join(new.vary) or 'nothing'}"
     if old.records != new.records:
         return f"it {'keeps' if old.records else 'does not keep'} records"
@@ -67,10 +69,10 @@ def difference(old: SweepPlan, new: SweepPlan) -> str | None:
     return None
 
 
-def _whole(vary: tuple[str, ...]) -> list[str]:
+def _whole(plan: SweepPlan) -> list[str]:
     """Return texts of `--vary` with their paths from the top of the scenario."""
-    parts = [text.partition("=") for text in vary]
-    return [f"{whole_path(path.strip())}{equals}{values}" for path, equals, values in parts]
+    parts = [text.partition("=") for text in plan.vary]
+    return [f"{whole_path(path.strip(), plan.document)}{equals}{values}" for path, equals, values in parts]
 
 
 def is_sweep(folder: Path) -> bool:
@@ -84,13 +86,17 @@ class SweepDesign:
     Attributes:
         axes: what varies.
         points: how many combinations of the grid's values there are; run i flies the i-th, then the first again.
+        seeds: how they vary, None where all runs have the scenario's own.
+        paired: the n-th runs of all combinations have the same seed.
     """
 
     def __init__(self, plan: SweepPlan) -> None:
         self.plan = plan
-        self.axes: list[Axis] = [parse(text) for text in plan.vary]
+        self.axes: list[Axis] = [parse(text, plan.document) for text in plan.vary]
         self._grids = [axis for axis in self.axes if isinstance(axis, Grid)]
         self.points = math.prod(len(grid.values) for grid in self._grids)
+        self.seeds = next((axis for axis in self.axes if isinstance(axis, Seeds)), None)
+        self.paired = self.seeds is not None and self.seeds.paired
 
     @property
     def seed(self) -> int:
@@ -129,13 +135,14 @@ class SweepDesign:
 
     def values(self, run: int) -> dict[str, Any]:
         """Return what a run sets, by path, in the order of the axes."""
-        at = self.at(self.point(run))
-        return {axis.path: at[axis.path] if axis.path in at else self._drawn[axis.path][run] for axis in self.axes}
+        at, draw = self.at(self.point(run)), run // self.points if self.paired else run
+        return {axis.path: at[axis.path] if axis.path in at else self._drawn[axis.path][draw] for axis in self.axes}
 
     @cached_property
     def _drawn(self) -> dict[str, list[Any]]:
         drawn = [axis for axis in self.axes if not isinstance(axis, Grid)]
-        return {axis.path: axis.draw(self.seed, self.plan.runs) for axis in drawn}
+        count = -(-self.plan.runs // self.points) if self.paired else self.plan.runs
+        return {axis.path: axis.draw(self.seed, count) for axis in drawn}
 
     def scenario(self, run: int) -> Scenario:
         """Return the resolved scenario of a run, which is flown in lockstep.
@@ -189,17 +196,19 @@ def make_plan(
     records: bool = False,
     progress: Callable[[int, int], None] = lambda run, of: None,
     earlier_faults: Sequence[str] = (),
+    changed: Sequence[str] | None = None,
 ) -> SweepPlan:
-    """Return the plan of a sweep, all its combinations checked; without `runs`, one run for each of them.
+    """Return the plan of a sweep, all its combinations checked.
 
     Args:
         source: name of the scenario's file, for messages.
         document: raw; see `read_document`.
         vary: texts of `--vary`.
-        runs: how many, None: as many as the grid has combinations.
+        runs: how many, None: as many as the grid has combinations, of each seed that is given.
         records: whether every run keeps its record.
         progress: called with the number of the combination that is checked, and how many there are.
         earlier_faults: of the overrides, reported with the others.
+        changed: as of the plan.
 
     Raises:
         ScenarioError: with every fault of the variations and of the scenarios that result, a line each.
@@ -207,8 +216,11 @@ def make_plan(
     texts, vary_faults = _parsed(vary, document)
     faults = [*earlier_faults, *vary_faults]
     source = source.encode(errors="surrogateescape").decode(errors="replace")  # a file's name may be any bytes
-    plan = SweepPlan(source=source, document=document, vary=tuple(texts), runs=runs or 1, records=records)
-    plan = msgspec.structs.replace(plan, runs=runs or SweepDesign(plan).points)
+    told = None if changed is None else tuple(changed)
+    plan = SweepPlan(source=source, document=document, vary=tuple(texts), runs=runs or 1, records=records, changed=told)
+    design = SweepDesign(plan)
+    given = len(design.seeds.values) if design.seeds else 0
+    plan = msgspec.structs.replace(plan, runs=runs or design.points * max(given, 1))
     design = SweepDesign(plan)
     faults += _count_faults(design, all_known=not vary_faults)
     if plan.runs <= RUNS_MAX:
@@ -226,7 +238,7 @@ def _parsed(vary: list[str], document: dict[str, Any]) -> tuple[list[str], list[
     for text in vary:
         shown = _shown(text)
         try:
-            path = parse(text).path
+            path = parse(text, document).path
         except ValueError as error:
             faults.append(f"--vary {shown}: {error}")
             continue
@@ -262,6 +274,9 @@ def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
         return [f"--runs is {runs}; must be at most {RUNS_MAX}"]
     if runs < points:
         return [f"--runs is {runs}; must be at least {points}, the combinations of the grid"]
+    seeds = len(design.seeds.values) if design.seeds else 0
+    if seeds and runs > points * seeds:
+        return [f"--runs is {runs}; must be at most {points * seeds}, each seed that is given for every combination"]
     if all_known and runs > points and all(isinstance(axis, Grid) for axis in design.axes):
         return [f"--runs is {runs}; must be {points}, for further ones would have the same bits, or add --vary seed"]
     return []

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from zsim.errors import ScenarioError
 from zsim.scenario.scenario import Scenario
 from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
-from zsim_analysis.sweep.axes import Draw, Seeds
+from zsim_analysis.sweep.axes import Draw
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.intervals import LEVEL, RUNS_MIN, mean_interval, share_interval
 from zsim_analysis.sweep.metrics import metric_columns, metrics_function
@@ -40,7 +40,7 @@ class SweepResults:
         self.clusters = _clusters(rows)
         self.metrics = metric_columns(rows)
         self.metrics_function = metrics_function(design.plan.document)
-        self.has_seeds = any(isinstance(axis, Seeds) for axis in design.axes)
+        self.has_seeds = design.seeds is not None
         self.drawn = [axis.path for axis in design.axes if isinstance(axis, Draw)]
         self.paper_std = _paper_std(design)
 
@@ -59,6 +59,17 @@ class SweepResults:
         if not column.startswith(PLANNED_ONLY):
             return values
         return np.where(self.values("as_planned", point) == 0, np.nan, values)
+
+    def differences(self, column: str, point: int) -> NDArray[np.float64]:
+        """Return value − value at the first point of each pair of runs with one seed that are both of `flown`.
+
+        Empty at the first point, and where seeds are not paired.
+        """
+        if not self.design.paired or point == 0:
+            return np.zeros(0)
+        first, own = (dict(zip(self.values("run", at), self.flown(column, at), strict=True)) for at in (0, point))
+        pairs = np.array([value - first.get(run - point, np.nan) for run, value in own.items()], np.float64)
+        return pairs[np.isfinite(pairs)]
 
     def parameters(self) -> dict[str, FormationParameter]:
         """Return the formation parameters, by the beginning of their columns."""
@@ -110,10 +121,13 @@ class SweepResults:
         plan = self.design.plan
         rows = self.rows
         engaged, of = self.engaged()
+        dates = sorted(row["date"] for row in rows if row.get("date"))
         return SweepSummary(
             scenario=str(plan.document["name"]),
             seed=self.design.seed,
             vary=plan.vary,
+            changed=plan.changed,
+            dates=(dates[0], dates[-1]) if dates else None,
             runs=plan.runs,
             finished=len(rows),
             failed=dict(Counter(row["failure"] for row in rows if row["failure"]).most_common()),
@@ -141,6 +155,8 @@ class SweepResults:
         engaged, of = self.engaged(point)
         columns = ("min_separation_m", *self.errors, *self.metrics)
         spreads = {column: each for column in columns if (each := distribution(self.flown(column, point)))}
+        compared = (*self.metrics, "min_separation_m", *(each for each in self.errors if each.endswith(".true_rms")))
+        differences = {column: each for column in compared if (each := distribution(self.differences(column, point)))}
         separations = self.values("min_separation_m", point)
         return GridPoint(
             label=self.label(point),
@@ -153,6 +169,7 @@ class SweepResults:
             as_planned=share_interval(*planned) if (planned := self.as_planned(point))[1] else None,
             spreads=spreads,
             least_separation_m=float(np.nanmin(separations)) if np.isfinite(separations).any() else None,
+            differences=differences,
         )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import UNSET, Struct
 
 from zsim.contract.fingerprint import fingerprint
 from zsim.errors import RecordError, reason_of
@@ -54,6 +54,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
     """The columns that every run has, in their order; None where a failed run has no value.
 
     Attributes:
+        date: when it was flown (ISO 8601, UTC).
         failure: why it did not end well, None if it did.
         ended: the reason that the world gave.
         wall_s: wall time of the flight.
@@ -90,6 +91,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
     window_from_s: float | None = None
     window_to_s: float | None = None
     window_note: str | None = None
+    date: str | None = None
     host: str = ""
     fingerprint: str = ""
 
@@ -138,11 +140,13 @@ def fly(task: Task) -> Row:
 def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[RecordedFlight, Exception | None]:
     """Fly a scenario; return the flight, and the error by which it diverged if it did.
 
+    A flight for a user's metrics has the drones' estimates and commands, too.
+
     Args:
         scenario: resolved.
         writer: records every message as well.
     """
-    flight, reader = InProcessFlight(scenario), FlightReader()
+    flight, reader = InProcessFlight(scenario), FlightReader(answers=scenario.report.metrics is not UNSET)
     flight.run([reader, writer] if writer else [reader])
     return reader.flight(), flight.world.failure
 
@@ -232,6 +236,7 @@ def _row(
         window_from_s=summary.window_s[0],
         window_to_s=summary.window_s[1],
         window_note=summary.window_note,
+        date=summary.date,
         **where,
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}

@@ -67,6 +67,8 @@ class GridPoint(Struct, frozen=True):
         spreads: by column of the table, of those that ended well; of the separation and the errors, of those among them
             that did what their plan says.
         least_separation_m: of all that ended well, None where no run has any.
+        differences: by column, of its value less that at the first point in the run with the same seed, over the pairs
+            of runs of which both are in the spreads; empty at the first point, and where seeds are not paired.
     """
 
     label: str
@@ -79,6 +81,7 @@ class GridPoint(Struct, frozen=True):
     as_planned: ConfidenceInterval | None
     spreads: dict[str, Distribution]
     least_separation_m: float | None = None
+    differences: dict[str, Distribution] = {}
 
     @property
     def well(self) -> int:
@@ -95,6 +98,8 @@ class SweepSummary(Struct, frozen=True):
     """summary.json of a sweep.
 
     Attributes:
+        changed: texts `a.b.c=value` by which the scenario was changed against its file; None: not known.
+        dates: when the first and the last run were flown (ISO 8601, UTC); None where no run has a date.
         not_engaged: runs that ended well, but a cluster was never engaged within the judged window.
         not_as_planned: by what the first of them did not do, how many runs ended well and did not do what their plan
             says; texts that differ in figures only are one.
@@ -110,6 +115,8 @@ class SweepSummary(Struct, frozen=True):
     scenario: str
     seed: int
     vary: tuple[str, ...]
+    changed: tuple[str, ...] | None
+    dates: tuple[str, str] | None
     runs: int
     finished: int
     failed: dict[str, int]

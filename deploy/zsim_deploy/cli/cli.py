@@ -119,6 +119,7 @@ def run(
         if in_process:
             check_plans(scenario, flight.path.name)  # as processes, controllers refuse them
         options = RunOptions(scenario, Path(), *pace, listen, insecure, hosted, first, shown, cameras, detect)
+        options.changed = flight.changed()
     if not in_process:
         if options.camera_children():
             require("run", camera_commands.CAMERA_NEEDS)

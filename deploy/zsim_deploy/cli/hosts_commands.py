@@ -66,7 +66,8 @@ def up(
     require_files(host_launcher_files(count, hosts_count), f"{count} processes on {hosts_count} hosts")
     with _folder(out, loaded, force) as folder:
         with StatusTable(loaded.duration_s, choice=choice) as status:
-            outcome = HostRun(HostRunOptions(loaded, placed, folder, mode, pace), status).run()
+            options = HostRunOptions(loaded, placed, folder, mode, pace, changed=flight.changed())
+            outcome = HostRun(options, status).run()
         conclude(outcome, folder, report)
 
 

@@ -24,6 +24,7 @@ from zsim_deploy.arguments import (
     Seed,
     Set,
     To,
+    changed_fields,
     check_range,
     require,
 )
@@ -187,7 +188,9 @@ def sweep(
     ] = None,
     vary: Annotated[
         list[str] | None,
-        typer.Option(help="seed, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std). Repeatable."),
+        typer.Option(
+            help="seed, seed=paired, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std). Repeatable."
+        ),
     ] = None,
     set_: Set = None,
     seed: Seed = None,
@@ -249,6 +252,7 @@ def _plan(
             records,
             lambda run, of: status.update(f"checking combination {run + 1} of {of}"),
             faults,
+            changed_fields(overrides, seed, duration),
         )
 
 

@@ -10,6 +10,7 @@ import typer
 from zsim.contract.run_messages import RATE_MAX
 from zsim.scenario.role_table import AGENTS, Role
 from zsim_deploy.arguments import (
+    CHANGED,
     CONSOLE_NEEDS,
     DEFAULT_ENDPOINT,
     RUN,
@@ -53,6 +54,7 @@ def world(
         Path | None, typer.Option(help="Folder of the run's journal: started again with it, it goes on.")
     ] = None,
     all_died: Annotated[bool, typer.Option("--all-died", hidden=True)] = False,
+    changed: Annotated[list[str] | None, typer.Option(CHANGED, hidden=True)] = None,
     launched: Launched = None,
     tls: Tls = None,
     access: Access = None,
@@ -70,7 +72,9 @@ def world(
     loaded = scenario_file.load(path, overrides, modules, seed=flight.seed, duration_s=flight.duration)
     mode, pace = flight.mode_and_rate()
     who = identity(host, tls, insecure, access)
-    world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who, journal, all_died)
+    changes = [*(changed or ()), *flight.changed()]
+    endpoints = listen or [DEFAULT_ENDPOINT]
+    world_role.world(loaded, mode, pace, endpoints, launched, expect, who, journal, all_died, changes)
 
 
 def _agent_command(name: str, role: Role) -> Callable[..., None]:

@@ -3,7 +3,7 @@
 import contextlib
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +14,7 @@ from zsim.record import repair
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.arguments import pace_options
+from zsim_deploy.arguments import changed_options, pace_options
 from zsim_deploy.hosts.control_socket import ControlSocket
 from zsim_deploy.hosts.doctor import compare_reports, host_report
 from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
@@ -38,7 +38,7 @@ CLEAN_S = 5.0  # how long a host may take to remove the run's folder; one that w
 
 @dataclass
 class HostRunOptions:
-    """How to run a scenario on the hosts of an inventory."""
+    """How to run a scenario, of whose file some fields were changed, on the hosts of an inventory."""
 
     scenario: Scenario
     placed: InventoryFile
@@ -46,10 +46,11 @@ class HostRunOptions:
     mode: str = "lockstep"
     rate: float = 0.0
     run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
+    changed: Sequence[str] = ()
 
     def pace(self) -> list[str]:
-        """Return that as options of the world."""
-        return pace_options(self.mode, self.rate)
+        """Return mode, rate and changed fields as options of the world."""
+        return [*pace_options(self.mode, self.rate), *changed_options(self.changed)]
 
 
 class HostInspection(NamedTuple):

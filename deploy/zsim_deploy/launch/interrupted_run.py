@@ -25,6 +25,7 @@ class Launch(msgspec.Struct, frozen=True):
     insecure: bool = False
     listen: str | None = None
     modules: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
 
 
 def keep(folder: Path, launch: Launch) -> None:

@@ -6,6 +6,7 @@ import re
 import signal
 import socket
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from zsim.schema import plugin
 from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
-from zsim_deploy.arguments import load_scenario, pace_options
+from zsim_deploy.arguments import changed_options, load_scenario, pace_options
 from zsim_deploy.inventory.processes import COMMANDS
 from zsim_deploy.launch import interrupted_run
 from zsim_deploy.launch.camera_children import CameraChild, camera_children
@@ -49,6 +50,7 @@ class RunOptions:
         console: owns the console that is started; None for a run without.
         continued: whether it goes on where an earlier launch of it was interrupted.
         supervisor: over its processes, once they are started.
+        changed: texts `a.b.c=value` by which the scenario was changed against its file.
     """
 
     scenario: Scenario
@@ -65,6 +67,7 @@ class RunOptions:
     run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
     continued: bool = False
     supervisor: Supervisor | None = None
+    changed: Sequence[str] = ()
 
     def status(self) -> dict[str, Any]:
         """Return what `zsim ps` shows of the run; callable from any thread."""
@@ -93,7 +96,17 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
     launched = ["--launched", options.run_id, *(["--insecure"] if options.insecure else [])]
     reach = ["--connect", endpoint, "--federation", federation, *launched]
     pace = pace_options(options.mode, options.rate)
-    world = ["world", str(file), "--listen", endpoint, "--expect", RECORDER, *pace, *launched]
+    world = [
+        "world",
+        str(file),
+        "--listen",
+        endpoint,
+        "--expect",
+        RECORDER,
+        *pace,
+        *launched,
+        *changed_options(options.changed),
+    ]
     world += ["--journal", str(options.out / JOURNAL), *(["--all-died"] if options.continued else [])]
     record = ["record", "--out", str(options.out), *reach]
     children = [
@@ -163,7 +176,8 @@ def options_of(folder: Path) -> tuple[RunOptions, bool]:
     scenario = load_scenario(folder / "scenario.yaml", None, modules=map(Path, launch.modules))
     pace = (launch.mode, launch.rate)
     where = (launch.listen, launch.insecure, launch.hosted)
-    return RunOptions(scenario, folder, *pace, *where, run_id=launch.run_id, continued=True), launch.in_process
+    how = {"run_id": launch.run_id, "continued": True, "changed": launch.changed}
+    return RunOptions(scenario, folder, *pace, *where, **how), launch.in_process
 
 
 def fly(options: RunOptions, in_process: bool) -> Outcome:
@@ -256,8 +270,8 @@ def _write_scenario(options: RunOptions, in_process: bool) -> None:
         RunError: it cannot be written.
     """
     pace = (options.mode, options.rate)
-    modules = tuple(map(str, plugin.folders()))
-    launch = Launch(options.run_id, *pace, in_process, options.hosted, options.insecure, options.listen, modules)
+    where = (options.listen, tuple(map(str, plugin.folders())), tuple(options.changed))
+    launch = Launch(options.run_id, *pace, in_process, options.hosted, options.insecure, *where)
     try:
         if not in_process:
             (options.out / "logs").mkdir(exist_ok=True)
@@ -283,7 +297,7 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
             return signals.reason or stop.reason()
 
         try:
-            ended = fly(options.scenario, options.out / "run.mcap", reason, screen)
+            ended = fly(options.scenario, options.out / "run.mcap", reason, screen, changed=options.changed)
         except (DivergedError, RunFailedError) as error:
             return Outcome(str(error), failed=True)
         finally:

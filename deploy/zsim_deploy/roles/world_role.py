@@ -45,12 +45,14 @@ def world(
     identity: Identity,
     journal: Path | None = None,
     all_died: bool = False,
+    changed: Sequence[str] | None = None,
 ) -> None:
     """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it.
 
     Args:
         journal: folder of it.
         all_died: whether, when the run goes on from there, all who took part in it have to be started again.
+        changed: as of `World`.
 
     Raises:
         RunError: the journal is of another run.
@@ -67,7 +69,7 @@ def world(
     stop = StopChannel(launched, identity)
     with _slow_start_notice(JsonProgress() if launched else None):
         run_id = launched or (journaled_run(journal) if journal else None)
-        run_world = World(scenario, mode, rate, time.monotonic_ns, run_id)
+        run_world = World(scenario, mode, rate, time.monotonic_ns, run_id, changed)
     run_world.is_launched = launched is not None
     for name in expect or ():
         run_world.barrier.expect(name)

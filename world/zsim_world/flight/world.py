@@ -3,7 +3,7 @@
 What it shares with a replay, first of all who takes part and who is waited for, is in `zsim_world.flight.coordinator`.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from msgspec import UNSET
@@ -43,6 +43,7 @@ class World(Coordinator):
         rate: simulated per wall seconds to pace at; 0 = as fast as possible.
         wall_ns: monotonic wall time.
         run_id: given by a launcher, and by tests that compare records.
+        changed: texts `a.b.c=value` by which the scenario was changed against its file, None: not known.
 
     Raises:
         ScenarioError: it has external drones, and the mode is "lockstep".
@@ -62,10 +63,12 @@ class World(Coordinator):
         rate: float = 0.0,
         wall_ns: Callable[[], int] = lambda: 0,
         run_id: str | None = None,
+        changed: Sequence[str] | None = None,
     ) -> None:
         check_pace(scenario, mode)
         super().__init__(scenario, mode, rate, wall_ns, run_id, scenario.expected())
         clock, barrier, outbox = self.clock, self.barrier, self.outbox
+        self._changed = UNSET if changed is None else tuple(changed)
         self.fleet = Fleet(scenario)
         self.drivers = ExternalDrones(self.fleet)
         self.external = self.drivers.names
@@ -119,6 +122,7 @@ class World(Coordinator):
             user_sensors=_own_sensors(s) or UNSET,
             sightings=self.fleet.has_sightings or UNSET,
             module_folders=tuple(map(str, plugin.folders())) if s.names_own_code() else UNSET,
+            changed=self._changed,
         )
 
     # To go on elsewhere

@@ -11,7 +11,7 @@ from zsim_analysis.report.comparison import ComparedRun
 from zsim_analysis.report.figures.drone_panels import draw_drone_panels, drone_panel_heights, name_states
 from zsim_analysis.report.figures.plan_view import NAMED_MAX, draw_obstacles, draw_path
 from zsim_analysis.report.figures.time_marks import draw_marks, time_marks
-from zsim_analysis.report.pages import PAGE_IN, PAPER_PT, dress, legend_above, new_figure
+from zsim_analysis.report.pages import PAGE_IN, PAPER_PT, dress, legend_above, letter_panels, new_figure
 
 COLUMNS = 3  # runs beside each other in a row of a figure, at most
 
@@ -43,6 +43,7 @@ def draw_plans(runs: Sequence[ComparedRun]) -> Figure:
     for axes in grid[:, 0]:
         axes.set_ylabel("north y (m)", fontsize=PAPER_PT)
     _even_out(grid)
+    letter_panels(list(grid.flat[: len(runs)]))
     _name_drones(figure, grid[0, 0], colours)
     return figure
 
@@ -80,6 +81,7 @@ def draw_drones(runs: Sequence[ComparedRun]) -> Figure:
     for index, run in enumerate(runs):
         row, column = divmod(index, across)
         _draw_run_drones(run, grid[3 * row : 3 * row + 3, column], colours, first=column == 0)
+    letter_panels([grid[3 * (index // across), index % across] for index in range(len(runs))])
     for kind in (0, 2):
         _share_range(list(grid[kind::3].flat))
     name_states(figure, [track for run in runs for track in run.flight.tracks])

@@ -12,12 +12,13 @@ from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import Array
 from zsim_analysis.report.comparison import ComparedRun, clusters, parameters
 from zsim_analysis.report.figures.comparison_drones import columns, draw_drones, draw_plans
-from zsim_analysis.report.figures.formation_figures import curves, draw_error, parameter_groups, scale
+from zsim_analysis.report.figures.formation_figures import curves, draw_error, numbered, parameter_groups, scale
 from zsim_analysis.report.figures.run_marks import LANE_IN, draw_instants, draw_lanes, name_marks, run_marks
 from zsim_analysis.report.figures.run_style import run_style
-from zsim_analysis.report.figures.time_marks import draw_marks, time_marks
+from zsim_analysis.report.figures.time_marks import TAKE_OVER, draw_marks, shade_window, time_marks
 from zsim_analysis.report.pages import (
     BLACK,
+    GRID,
     PAGE_IN,
     PAPER_PT,
     ReportFigure,
@@ -25,10 +26,13 @@ from zsim_analysis.report.pages import (
     label,
     label_time,
     legend_above,
+    letter_panels,
     line,
     new_figure,
 )
+from zsim_analysis.report.paper import flies_paper_test
 
+ROOM = 0.03  # of the greatest RMS, beyond it: its mark is whole
 ROWS_MAX = 24  # parameters in one figure; 6 drones
 DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.0, "ls": (0, (1, 2)), "zorder": 6}
 
@@ -54,6 +58,7 @@ def comparison_figures(runs: Sequence[ComparedRun]) -> Iterator[ReportFigure]:
 
 def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[ReportFigure]:
     names = parameters(runs, cluster)
+    paper = all(flies_paper_test(run.flight, cluster) and not time_marks(run.flight).has(TAKE_OVER) for run in runs)
     suffix = f", cluster {cluster}" if len(clusters(runs)) > 1 else ""
     yield ReportFigure(
         f"rms_{cluster}.png",
@@ -67,22 +72,17 @@ def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[ReportFig
         if any(run.formation(cluster) for run in some):
             yield ReportFigure(
                 f"figure_5_errors_{cluster}_{number}.png",
-                f"Formation parameters' errors (the paper's Figure 5){suffix}",
+                f"Formation parameters' errors{numbered(5, paper)}{suffix}",
                 "Runs side by side, each row on one scale, that of the windows (shaded), which larger errors leave.",
                 _draw_errors(some, runs, cluster, names),
             )
-    yield from _of_parameters(runs, cluster, names, suffix)
-
-
-def _of_parameters(
-    runs: Sequence[ComparedRun], cluster: str, names: Sequence[str], suffix: str
-) -> Iterator[ReportFigure]:
     for file, number, what, group in parameter_groups(names):
         if shown := group[:ROWS_MAX]:
             yield ReportFigure(
                 f"{file}_{cluster}.png",
-                f"{what} (the paper's Figure {number}){suffix}",
-                f"True and measured (from the estimates) {', '.join(shown)}; dotted: desired. Above: each run's marks.",
+                f"{what}{numbered(number, paper)}{suffix}",
+                f"(a) True and (b) measured (from the estimates) {', '.join(shown)}; dotted: desired. "
+                "Above: each run's marks.",
                 _draw_parameters(runs, cluster, shown),
             )
 
@@ -97,6 +97,7 @@ def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -
     for axes, (measure, group) in zip(panels, groups.items(), strict=True):
         _draw_rms_panel(axes, runs, cluster, group)
         axes.set_xlabel(f"RMS error ({measure})", fontsize=PAPER_PT)
+    letter_panels(panels)
     for i, run in enumerate(runs):
         look = run_style(i)
         panels[0].plot([], [], look.marker, color=look.color, ms=7, label=run.label)
@@ -114,12 +115,13 @@ def _draw_rms_panel(axes: Axes, runs: Sequence[ComparedRun], cluster: str, names
             y = row + (i - (len(runs) - 1) / 2) * lane
             for value, face in ((errors and errors.true_rms, look.color), (errors and errors.est_rms, "white")):
                 if value is not None:
-                    axes.plot(value, y, look.marker, color=look.color, mfc=face, ms=7, zorder=3)
+                    axes.plot(value, y, look.marker, color=look.color, mfc=face, ms=7, zorder=3, clip_on=False)
     axes.set_yticks(range(len(names)), [label(name) for name in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.margins(x=ROOM)
     axes.set_xlim(left=0)
     for row in range(1, len(names)):
-        axes.axhline(row - 0.5, color="#d8dee4", lw=0.6, zorder=1)
+        axes.axhline(row - 0.5, color=GRID, lw=0.6, zorder=1)
     axes.grid(False, axis="y")
 
 
@@ -139,8 +141,9 @@ def _draw_errors(
                 _draw_absence(axes)
                 continue
             draw_error(axes, formation, name, np.ones(len(formation.t_s), bool))
-            axes.axvspan(*run.summary.window_s, color="#eef2f6", zorder=0)
+            shade_window(axes, run.summary.window_s)
             draw_marks([axes], time_marks(run.flight, formation))
+    letter_panels(grid[0])
     for name, axes in zip(shown, grid[:, 0], strict=True):
         axes.set_ylabel(label(name), fontsize=PAPER_PT)
         if limit := _greatest(runs, cluster, name):
@@ -184,6 +187,7 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
     for axes, title in zip(lanes, ("true", "measured (estimates)"), strict=True):
         draw_lanes(axes, marks, named=axes is lanes[0])
         axes.set_title(title, fontsize=PAPER_PT)
+    letter_panels(lanes)
     grid[0][0].plot([], [], label="desired, while engaged", **DESIRED)
     name_marks(grid[0][0], marks)
     label_time(grid[-1])

@@ -25,6 +25,7 @@ from zsim_analysis.report.pages import (
     dress,
     label_time,
     legend_above,
+    letter_panels,
     line,
     new_figure,
 )
@@ -46,7 +47,7 @@ def draw_drones(flight: RecordedFlight, marks: TimeMarks) -> Figure:
     """Return altitude, state and battery of every drone over the run."""
     count = len(flight.tracks)
     heights = drone_panel_heights(count)
-    figure = new_figure(COLUMN_IN, 1.2 + 0.5 * sum(heights))
+    figure = new_figure(COLUMN_IN, 1.6 + 0.5 * sum(heights))
     panels = figure.subplots(3, 1, sharex=True, height_ratios=heights)
     for axes, quantity in zip(panels, DRONE_PANELS, strict=True):
         dress(axes, quantity)
@@ -54,6 +55,7 @@ def draw_drones(flight: RecordedFlight, marks: TimeMarks) -> Figure:
     draw_drone_panels(panels, flight.tracks, colours, count if count <= NAMED_MAX else 0)
     name_states(figure, flight.tracks)
     draw_marks(panels, marks)
+    letter_panels(panels)
     figure.align_ylabels()
     legend_above(figure, panels[0], columns=3)
     if count > NAMED_MAX:

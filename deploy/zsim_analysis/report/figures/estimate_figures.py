@@ -16,12 +16,12 @@ from zsim_analysis.report.figures.time_marks import TimeMarks, draw_marks
 from zsim_analysis.report.pages import (
     BLACK,
     BLUE,
-    ORANGE,
     PAGE_IN,
     PAPER_PT,
     dress,
     label_time,
     legend_above,
+    letter_panels,
     line,
     new_figure,
     thinned,
@@ -32,6 +32,8 @@ QUANTITIES = ("x (m)", "y (m)", "z (m)", "yaw (rad)")
 INSIDE = 0.9545  # share of a normal error within SIGMAS standard deviations
 SMALL_PT, NOTE_PAD_PT = PAPER_PT - 1.5, 2.0  # of a figure of merit above its axes
 CONSISTENT = "95 % of χ²"  # the range of NEES that nineteen of twenty have whose covariance is true
+BAND_GREY = "#9aa5b1"  # of no time mark's colour
+CHI_BAND: dict[str, Any] = {"fc": "none", "ec": BAND_GREY, "hatch": "////", "lw": 0.0}
 FLOOR = 0.1  # of NEES on its axis, which is logarithmic
 
 
@@ -50,6 +52,7 @@ def draw_estimates(
     _share_ranges(grid, errors.values(), marks.engaged_s)
     for axes, quantity in zip(grid[:, 0], (*QUANTITIES, "NEES"), strict=True):
         axes.set_ylabel(quantity, fontsize=PAPER_PT)
+    letter_panels(grid[0])
     label_time(grid[-1])
     figure.align_ylabels(grid[:, 0])
     legend_above(figure, grid[0, 0], columns=7)
@@ -74,7 +77,7 @@ def _draw_drone(column: Sequence[Axes], errors: EstimateErrors, colour: str, row
             color=colour,
             lw=0.6,
             zorder=3,
-            label=None if i else "estimate − truth",
+            label="estimate − truth",
         )
         _note(axes, f"{100 * inside[i]:.0f} % in {SIGMAS:g}σ")
     _draw_nees(column[-1], errors.t_s, errors.nees, colour)
@@ -85,7 +88,7 @@ def _draw_drone(column: Sequence[Axes], errors: EstimateErrors, colour: str, row
 def draw_band(axes: Axes, t_s: Array, half: Array) -> None:
     """Draw a band of a half width around zero."""
     at, width = thinned(t_s, half)
-    axes.fill_between(at, -width, width, color=ORANGE, alpha=0.25, lw=0, zorder=1, label=f"±{SIGMAS:g}σ as stated")
+    axes.fill_between(at, -width, width, color=BAND_GREY, alpha=0.45, lw=0, zorder=1, label=f"±{SIGMAS:g}σ as stated")
     axes.axhline(0, color=BLACK, lw=0.5, zorder=1)
 
 
@@ -98,7 +101,7 @@ def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, of: int = 1) ->
     """Draw NEES, or its mean over `of` drones, with the range of nineteen of twenty consistent ones."""
     dress(axes)
     low, high = (float(chdtri(of * DEGREES, share)) / of for share in (0.975, 0.025))
-    axes.axhspan(low, high, color=ORANGE, alpha=0.25, lw=0, zorder=0.6, label=CONSISTENT)
+    axes.axhspan(low, high, zorder=0.6, label=CONSISTENT, **CHI_BAND)
     line(axes, t_s, np.maximum(nees, FLOOR), color=colour, lw=0.6, zorder=3)
     axes.set_yscale("log")
     axes.tick_params(which="both", labelsize=PAPER_PT - 1)
@@ -133,9 +136,8 @@ def _draw_many(
     draw_marks(grid[:, 0], marks)
     label_time(grid[1:, 0])
     _draw_each(grid[:, 1], errors, colours, window_s)
+    letter_panels(list(grid.flat))
     figure.align_ylabels()
-    grid[0, 0].fill_between([], [], color=ORANGE, alpha=0.25, lw=0, label=CONSISTENT)
-    grid[0, 0].plot([], [], "_", color=BLACK, ms=5, label="σ as stated")
     legend_above(figure, grid[0, 0], columns=6)
     return figure
 
@@ -159,13 +161,13 @@ def _draw_each(
     numbers, tints = np.arange(1, len(errors) + 1), [colours[name] for name in errors]
     rms, stated, inside = np.array([_figures(each, _rows(each, window_s)) for each in errors.values()]).T
     dress(panels[0], "RMS (m)")
-    panels[0].scatter(numbers, rms, c=tints, s=14, zorder=3)
-    panels[0].plot(numbers, stated, "_", color=BLACK, ms=5, zorder=2)
+    panels[0].scatter(numbers, rms, c=tints, s=14, zorder=3, clip_on=False)
+    panels[0].plot(numbers, stated, "_", color=BLACK, ms=5, zorder=2, label="σ as stated", clip_on=False)
     panels[0].set_ylim(bottom=0)
     panels[0].set_title("each drone, within the window", fontsize=PAPER_PT)
     dress(panels[1], f"x, y, z in {SIGMAS:g}σ (%)")
-    panels[1].scatter(numbers, 100 * inside, c=tints, s=14, zorder=3)
-    panels[1].axhline(100 * INSIDE, color=BLACK, lw=0.7, ls="--")
+    panels[1].scatter(numbers, 100 * inside, c=tints, s=14, zorder=3, clip_on=False)
+    panels[1].axhline(100 * INSIDE, color=BLACK, lw=0.7, ls="--", label=f"share of a normal error in {SIGMAS:g}σ")
     panels[1].set_ylim(top=101)
     panels[1].set_xlabel("drone, in the order of the scenario", fontsize=PAPER_PT)
 

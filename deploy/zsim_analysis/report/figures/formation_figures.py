@@ -13,7 +13,7 @@ from zsim_analysis.reading.goal import GoalErrors
 from zsim_analysis.reading.recorded_flight import Array
 from zsim_analysis.reading.window_text import span_text
 from zsim_analysis.report.figures.spread import draw_spread
-from zsim_analysis.report.figures.time_marks import TimeMarks, draw_marks
+from zsim_analysis.report.figures.time_marks import TimeMarks, draw_marks, shade_window
 from zsim_analysis.report.pages import (
     BLACK,
     BLUE,
@@ -27,6 +27,7 @@ from zsim_analysis.report.pages import (
     label,
     label_time,
     legend_above,
+    letter_panels,
     line,
     new_figure,
     padded_range,
@@ -35,9 +36,9 @@ from zsim_analysis.report.pages import (
 POSITION = ("x_c", "y_c", "z_c")
 ORIENTATION = ("roll", "pitch", "yaw")
 ROWS_MAX = 16  # parameters in one figure; 4 drones, and the height of a page
+ROW_IN = 1.0  # of a parameter over time, with its letter
 ROWS_IN = 8.4  # of all rows, on a page of 9.25 in
 MOVED_MAX = 3  # parameters of a large formation that are drawn one by one
-SHADE: dict[str, Any] = {"color": "#eef2f6", "zorder": 0}
 
 
 def draw_errors(
@@ -75,8 +76,9 @@ def _finish_errors(figure: Figure, grid: Any, window_s: tuple[float, float], mar
     titles = ("against the final goal", "against the reference", f"the same, {span_text(window_s)}")
     for column, title in zip(grid.T, titles[-grid.shape[1] :], strict=True):
         column[0].set_title(title, fontsize=PAPER_PT)
+    letter_panels(grid[0])
     for axes in grid[:, :-1].flat:
-        axes.axvspan(*window_s, **SHADE)
+        shade_window(axes, window_s)
     for column in grid.T[:-1]:
         draw_marks(column, marks)
     draw_marks(grid[:, -1], marks, whole=False)
@@ -159,13 +161,13 @@ def draw_parameters(formation: Formation, names: Sequence[str], marks: TimeMarks
     shown = list(names) if len(names) <= ROWS_MAX else _moved_most(formation, names)
     others = _by_unit(names) if len(names) > ROWS_MAX else {}
     count = max(1, len(shown) + len(others))
-    figure = new_figure(COLUMN_IN, 0.75 + min(0.85 * count, ROWS_IN))
+    figure = new_figure(COLUMN_IN, 0.75 + min(ROW_IN * count, ROWS_IN))
     grid = figure.subplots(count, 1, squeeze=False, sharex=True)[:, 0]
     for name, axes in zip(shown, grid, strict=False):
         dress(axes, label(name))
         desired, measured, true = curves(formation, name)
-        line(axes, formation.t_s, measured, label="measured", **MEASURED)
         line(axes, formation.t_s, true, label="true", **TRUE)
+        line(axes, formation.t_s, measured, label="measured", **MEASURED)
         line(axes, formation.t_s, desired, label="desired", **DESIRED)
         since = formation.since_engaged
         scale(axes, true, measured[since], desired[since])
@@ -173,6 +175,7 @@ def draw_parameters(formation: Formation, names: Sequence[str], marks: TimeMarks
         _draw_others(axes, formation, members, formation.since_engaged)
         axes.set_ylabel(f"errors of\nall {len(members)} ({measure})", fontsize=PAPER_PT)
     draw_marks(list(grid[: len(shown) + len(others)]), marks)
+    letter_panels(grid)
     label_time(grid[-1:])
     figure.align_ylabels(grid)
     legend_above(figure, grid[0], columns=3)
@@ -232,3 +235,8 @@ def parameter_groups(names: Sequence[str]) -> list[tuple[str, int, str, list[str
         ("figure_7_orientation", 7, "Orientation of the formation", [name for name in ORIENTATION if name in names]),
         ("figure_8_shape", 8, "Shape of the formation", shape),
     ]
+
+
+def numbered(number: int, paper: bool) -> str:
+    """Return what a title says of the figure of the paper that its own shows; nothing of any other flight."""
+    return f" (the paper's Figure {number})" if paper else ""

@@ -22,6 +22,7 @@ from zsim_analysis.report.pages import (
     dress,
     label_time,
     legend_above,
+    letter_panels,
     line,
     new_figure,
 )
@@ -43,11 +44,13 @@ def draw_velocities(responses: Mapping[str, VelocityResponse], colours: Mapping[
         column[0].set_title(name, fontsize=PAPER_PT)
         for i, axes in enumerate(column):
             dress(axes)
-            line(axes, each.t_s, _broken(each.t_s, each.flown[:, i]), color=colours[name], lw=0.6, label="flown")
-            line(axes, each.t_s, _broken(each.t_s, each.commanded[:, i]), color=BLACK, lw=0.5, label="commanded")
+            flown, commanded = (_broken(each.t_s, values[:, i]) for values in (each.flown, each.commanded))
+            line(axes, each.t_s, flown, color=colours[name], lw=0.6, zorder=3, label="flown")
+            line(axes, each.t_s, commanded, color=BLACK, lw=1.0, zorder=2, label="commanded")
         draw_marks(column, marks)
     for axes, quantity in zip(grid[:, 0], QUANTITIES, strict=True):
         axes.set_ylabel(quantity, fontsize=PAPER_PT)
+    letter_panels(grid[0])
     label_time(grid[-1])
     figure.align_ylabels(grid[:, 0])
     legend_above(figure, grid[0, 0], columns=7)
@@ -68,13 +71,14 @@ def _draw_many(responses: Mapping[str, VelocityResponse], marks: TimeMarks) -> F
         place, error = np.searchsorted(t_s, each.t_s), each.flown - each.commanded
         for table, column in zip(values, (np.hypot(error[:, 0], error[:, 1]), error[:, 2], error[:, 3]), strict=True):
             table[place, k] = column
-    figure = new_figure(COLUMN_IN, 3.6)
+    figure = new_figure(COLUMN_IN, 4.0)
     grid = figure.subplots(len(panels), 1, sharex=True)
     for axes, quantity, table in zip(grid, panels, values, strict=True):
         dress(axes, quantity)
         draw_spread(axes, t_s, table, BLUE)
     grid[0].set_title("flown − commanded", fontsize=PAPER_PT)
     draw_marks(grid, marks)
+    letter_panels(grid)
     label_time(grid[-1:])
     figure.align_ylabels()
     legend_above(figure, grid[0], columns=3)

@@ -17,6 +17,7 @@ from zsim_analysis.reading.formation import Formation, common_instants
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track
 from zsim_analysis.report.pages import BLACK, COLUMN_IN, DARK, PAPER_PT, dress, legend_above, new_figure
 
+ROOM = 0.06  # of the plan's range, at each end: marks at its edge are whole
 OUTLINES = 7  # formations drawn into the plan, few enough to be distinct
 APART = 0.6  # of the formation's own size: outlines nearer than this would cover each other
 NAMED_MAX = 12  # drones that a legend names
@@ -30,6 +31,7 @@ def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure
     dress(axes, "north y (m)")
     axes.set_xlabel("east x (m)", fontsize=PAPER_PT)
     axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(ROOM)
     draw_obstacles(axes, flight.scenario)
     colours = drone_colours(len(flight.tracks))
     few = len(flight.tracks) <= NAMED_MAX
@@ -45,7 +47,7 @@ def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure
 def draw_obstacles(axes: Axes, scenario: Scenario | None) -> None:
     """Draw the outlines of a scenario's obstacles from above; the first one names them."""
     for number, obstacle in enumerate(scenario.environment.obstacles if scenario else ()):
-        look = {"facecolor": "#8c959f55", "edgecolor": DARK, "lw": 1.0, "zorder": 1.5}
+        look = {"facecolor": "#8c959f99", "edgecolor": DARK, "hatch": "///", "lw": 1.0, "zorder": 1.5}
         patch = _outline(row_of(obstacle), {**look, "label": None if number else "obstacle"})
         axes.add_patch(patch)
 
@@ -67,8 +69,9 @@ def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
     step = max(1, len(track.t_ns) // 4000)  # a path has no extremes to keep, only a shape
     x, y = track.p_W[::step, 0], track.p_W[::step, 1]
     axes.plot(x, y, color=colour, lw=0.6, alpha=0.7, zorder=2, label=track.name if named else None)
-    axes.plot(x[0], y[0], marker="s", color=colour, ms=4, mec="white", mew=0.5, zorder=5)
-    axes.plot(*track.p_W[-1, :2], marker="o", color=colour, ms=4, mec="white", mew=0.5, zorder=5)
+    look: dict[str, Any] = {"color": colour, "ms": 4, "mec": "white", "mew": 0.5, "zorder": 5, "clip_on": False}
+    axes.plot(x[0], y[0], marker="s", **look)
+    axes.plot(*track.p_W[-1, :2], marker="o", **look)
 
 
 def _draw_desired(axes: Axes, formation: Formation) -> None:
@@ -82,9 +85,10 @@ def _draw_desired(axes: Axes, formation: Formation) -> None:
 
 def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
     members = [track for name in formation.drones for track in tracks if track.name == name]
-    for t_s, p_W in outlines(members):
+    for number, (t_s, p_W) in enumerate(outlines(members)):
         ring = p_W if len(p_W) <= RING_MAX else _hull(p_W)
-        axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=DARK, lw=0.7, zorder=4)
+        name = None if number else f"{formation.name}, at times"
+        axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=DARK, lw=0.7, zorder=4, label=name)
         out = p_W[0] - p_W.mean(axis=0)
         away = out / max(float(np.linalg.norm(out)), 1e-9)
         axes.annotate(

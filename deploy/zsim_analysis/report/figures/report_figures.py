@@ -11,18 +11,25 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.figures.drone_panels import draw_drones
 from zsim_analysis.report.figures.estimate_figures import draw_estimates
 from zsim_analysis.report.figures.figure_mark import mark_figure
-from zsim_analysis.report.figures.formation_figures import ROWS_MAX, draw_errors, draw_parameters, parameter_groups
+from zsim_analysis.report.figures.formation_figures import (
+    ROWS_MAX,
+    draw_errors,
+    draw_parameters,
+    numbered,
+    parameter_groups,
+)
 from zsim_analysis.report.figures.motion_figures import PAIRS_MAX, draw_distances, draw_velocities
 from zsim_analysis.report.figures.plan_view import draw_plan
-from zsim_analysis.report.figures.time_marks import TimeMarks, time_marks
+from zsim_analysis.report.figures.time_marks import TAKE_OVER, TimeMarks, time_marks
 from zsim_analysis.report.pages import DARK, VERMILION, ReportFigure
+from zsim_analysis.report.paper import flies_paper_test
 from zsim_analysis.report.summary import RunSummary
 
 REFERENCE = (
     "Estimate − desired is what the controller sees; truth − desired is what the drones do. Until the formation is "
     "engaged, the controller takes its own estimate as the desired value."
 )
-GOAL = "Left: against the target of the plan, as the paper has it; the climb from the ground is in z_c. Middle: "
+GOAL = "(a) Against the target of the plan; the climb from the ground is in z_c. "
 SPREAD = "Of the variables that have no row: median, 5 to 95 % and extremes of truth − desired. "
 
 
@@ -106,19 +113,21 @@ def _of_cluster(
     flight: RecordedFlight, formation: Formation, window_s: tuple[float, float], suffix: str
 ) -> Iterator[ReportFigure]:
     marks, goal = time_marks(flight, formation), goal_errors(formation, flight.scenario)
+    paper = flies_paper_test(flight, formation.name) and not marks.has(TAKE_OVER)
+    reference, window = ("(b)", "(c)") if goal else ("(a)", "(b)")
     large = SPREAD if len(formation.names) > ROWS_MAX else ""
     yield ReportFigure(
         f"figure_5_errors{suffix}.png",
-        "Formation parameters' errors (the paper's Figure 5)",
-        f"{GOAL if goal else 'Left: '}against the reference, the whole run; right: the window of the statistics, on an "
-        f"axis of its own. {large}{REFERENCE}",
+        f"Formation parameters' errors{numbered(5, paper)}",
+        f"{GOAL if goal else ''}{reference} Against the reference, the whole run. {window} The window of the "
+        f"statistics, on an axis of its own. {large}{REFERENCE}",
         draw_errors(formation, window_s, marks, goal),
     )
     for file, number, what, names in parameter_groups(formation.names):
         shown = ", ".join(names) if len(names) <= ROWS_MAX else f"of the {len(names)} variables those that move most"
         yield ReportFigure(
             f"{file}{suffix}.png",
-            f"{what} (the paper's Figure {number})",
+            f"{what}{numbered(number, paper)}",
             f"Desired, measured (from the estimates) and true {shown}.",
             draw_parameters(formation, names, marks),
         )

@@ -14,7 +14,8 @@ from zsim_analysis.report.pages import DARK, PAPER_PT
 LANE_IN = 0.24  # height of a lane
 HATCHES = {"assembly": "////", "held": "xxxx", "landing": "....", FAULT: "", TAKE_OVER: "\\\\\\\\"}
 POINTS = {"take-off": "^", "engagement": "D", "collision": "X"}
-FACE, FAULT_FACE, EMPTY = 0.35, 0.65, "#e6eaee"
+FACE, FAULT_FACE = 0.35, 0.65
+EMPTY, GREY_FACE = "#e6eaee", "#b6bfc9"  # of a lane in which nothing is, and of a bar in the legend
 NAME_MAX = 20  # characters of a run's name beside its lane
 
 
@@ -75,7 +76,7 @@ def _draw_lane(lanes: Axes, run: RunMarks, look: RunStyle, place: int) -> None:
             zorder=2,
         )
     for kind, t_s in run.points():
-        lanes.plot([t_s], [place], POINTS[kind], color=look.color, ms=8, mec="white", mew=0.8, zorder=4)
+        lanes.plot([t_s], [place], POINTS[kind], color=look.color, ms=8, mec="white", mew=0.8, zorder=4, clip_on=False)
 
 
 def draw_instants(axes: Axes, marks: Sequence[RunMarks]) -> None:
@@ -89,7 +90,7 @@ def draw_instants(axes: Axes, marks: Sequence[RunMarks]) -> None:
 def name_marks(axes: Axes, marks: Sequence[RunMarks]) -> None:
     """Name in the legend of axes what the lanes hold, without the colour of any run."""
     for kind in dict.fromkeys(band.kind for each in marks for band in each.marks.bands):
-        face = DARK if kind == FAULT else "#d8dee4"
+        face = DARK if kind == FAULT else GREY_FACE
         axes.fill_between([], [], facecolor=face, edgecolor=DARK, hatch=HATCHES.get(kind, ""), lw=0.8, label=kind)
     for kind in dict.fromkeys(kind for each in marks for kind, _ in each.points()):
         axes.plot([], [], POINTS[kind], color=DARK, ms=7, label=kind)

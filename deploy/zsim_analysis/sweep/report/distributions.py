@@ -94,7 +94,7 @@ def _draw_point(axes: Axes, samples: Samples, place: Place, axis: GridAxis) -> t
     shares = ((np.arange(len(dots)) + 0.5) * GOLDEN + 0.5 * (1 - GOLDEN)) % 1
     low, high = place.room
     size = 7 if len(dots) < 30 else 4
-    axes.plot(low + shares * (high - low), dots, ".", color=colour, ms=size, alpha=0.45, mew=0, zorder=3)
+    axes.plot(low + shares * (high - low), dots, ".", color=colour, ms=size, alpha=0.45, mew=0, zorder=3, clip_on=False)
     mean_x = place.x if axis.field else place.x + 0.36  # beside the box
     mean_colour = VERMILION if len(axis.series) == 1 else colour
     interval = DrawnInterval(mean_x, mean_interval(samples), mean_colour)

@@ -8,6 +8,7 @@ import numpy as np
 
 from zsim.errors import ReportError
 from zsim_analysis.reading.window_text import span_text
+from zsim_analysis.report.make_report import changed_text, date_text
 from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.paper import PAPER_NOTE
 from zsim_analysis.sweep.intervals import RUNS_MIN, ConfidenceInterval
@@ -43,12 +44,14 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
         parameters=list(names),
         errors=_blocks(points, axes, {f"{prefix}.true_rms": each.titled for prefix, each in names.items()}),
         metrics=_blocks(points, axes, own),
+        differences=_blocks([each for each in points if each.differences], axes, differing(summary), _difference),
+        reference=heading_of(summary.points[0]),
         without_data=without_data(summary),
         left_out=len(summary.flown) - len(points),
         window=windows_of(summary),
         paper_column=PAPER_COLUMN,
         details=[column for column in DETAILS if column != PAPER_COLUMN or summary.paper_std],
-        tables=[(_heading(point), details(point, names, summary.paper_std)) for point in points[:DETAILED_MAX]],
+        tables=[(heading_of(point), details(point, names, summary.paper_std)) for point in points[:DETAILED_MAX]],
         paper_note=PAPER_NOTE if summary.paper_std else "",
         figures=sources(pictures),
     )
@@ -64,18 +67,34 @@ def values_of(point: GridPoint) -> list[str]:
     return list(point.names.values()) or [point.label]
 
 
-def _heading(point: GridPoint) -> str:
+def heading_of(point: GridPoint) -> str:
+    """Return the fields of a point with their values, in words."""
     return ", ".join(field_name(path).at(value) for path, value in point.names.items()) or point.label
 
 
-def _blocks(points: Sequence[GridPoint], axes: Sequence[FieldName], titles: dict[str, str]) -> list[Block]:
-    """Return the means of some columns at each point as tables that fit the page: their heads, and their rows."""
+def differing(summary: SweepSummary) -> dict[str, str]:
+    """Return the titles of the columns of which points have paired differences, the user's own first."""
+    errors = {f"{prefix}.true_rms": f"RMS of {each.titled}" for prefix, each in summary.parameters.items()}
+    own = {column: str(field_name(column)) for column in summary.metrics}
+    titles = {**own, **errors, "min_separation_m": "separation (m)"}
+    known = {column for point in summary.points for column in point.differences}
+    return {column: title for column, title in titles.items() if column in known}
+
+
+def _blocks(
+    points: Sequence[GridPoint],
+    axes: Sequence[FieldName],
+    titles: dict[str, str],
+    cell: Callable[[GridPoint, str], str] | None = None,
+) -> list[Block]:
+    """Return some columns at each point, by default their means, in tables that fit the page: heads and rows."""
+    cell = cell or _mean
     columns, across = list(titles), max(2, BLOCK_COLUMNS - len(axes))
     parts = np.array_split(np.array(columns, object), max(1, -(-len(columns) // across))) if columns else []
     return [
         (
             [*map(str, axes), *(titles[column] for column in part)],
-            [[*values_of(point), *(_mean(point, column) for column in part)] for point in points],
+            [[*values_of(point), *(cell(point, column) for column in part)] for point in points],
         )
         for part in parts
     ]
@@ -87,8 +106,10 @@ def facts(summary: SweepSummary) -> list[tuple[str, str]]:
     hosts = ", ".join(f"{host} ({count})" for host, count in summary.hosts.items())
     return [
         ("Scenario", f"{summary.scenario}, seed {summary.seed}"),
+        ("Changed", changed_text(summary.changed)),
         ("Varied", " ".join(summary.vary) or "nothing"),
         ("Runs", f"{summary.finished} of {summary.runs} finished, {well} of them ended well"),
+        ("Date", " to ".join(dict.fromkeys(map(date_text, summary.dates or (None,))))),
         ("Flown", f"{summary.flown_wall_s:.0f} s of wall time in all, on {hosts or 'no host'}"),
         ("Window", windows_of(summary)),
         ("Fingerprint", ", ".join(summary.fingerprints) or "not known"),
@@ -175,6 +196,12 @@ def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: d
 
 def _mean(point: GridPoint, column: str) -> str:
     return _noted(_spread(point.spreads.get(column), 4), point.count(column))
+
+
+def _difference(point: GridPoint, column: str) -> str:
+    """Return the mean of paired differences with its interval, and of how many pairs it is."""
+    spread = point.differences.get(column)
+    return _noted(_spread(spread, 4), f"n = {spread.runs}" if spread else "")
 
 
 def _noted(text: str, count: str) -> str:

@@ -21,6 +21,7 @@ from zsim_analysis.report.pages import (
     dress,
     label,
     legend_above,
+    letter_panels,
     new_figure,
 )
 from zsim_analysis.sweep.intervals import LEVEL, RUNS_MIN, mean_interval, share_interval
@@ -49,6 +50,13 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
         [panel for panel in panels if len(known(results.flown(panel.column)))]
         for panels in (rms_panels(parameters), std_panels(parameters, results.paper_std), metric_panels(results))
     )
+    if own:
+        yield ReportFigure(
+            "metrics.png",
+            "Figures of the user's own",
+            f"What {results.metrics_function} returned of each run." + _legend(results),
+            _panels(results, own),
+        )
     if rms:
         yield ReportFigure(
             "true_rms.png",
@@ -63,22 +71,15 @@ def figures(results: SweepResults) -> Iterator[ReportFigure]:
             f"Standard deviation of estimate − desired within the window{_window(results)}." + _legend(results),
             _panels(results, std),
         )
-    if own:
-        yield ReportFigure(
-            "metrics.png",
-            "Figures of the user's own",
-            f"What {results.metrics_function} returned of each run." + _legend(results),
-            _panels(results, own),
-        )
     yield ReportFigure(
         "safety.png",
         "How the runs ended, and how near the drones came to each other",
-        "Left: share of runs that ended well, and of those flown as planned and without a collision, "
+        "(a) Share of runs that ended well, and of those flown as planned and without a collision, "
         "with exact intervals. "
-        "Right: least true distance of two drones in the air." + _legend(results),
+        "(b) Least true distance of two drones in the air." + _legend(results),
         _safety(results),
     )
-    panels = [*rms, *own]
+    panels = [*own, *rms]
     for i, path in enumerate(results.drawn):
         if panels:
             yield ReportFigure(
@@ -148,6 +149,7 @@ def _panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
     figure = new_figure(PAGE_IN if across > 1 else COLUMN_IN, 0.8 + rows * (2.0 if axis and axis.is_turned else 1.8))
     grid = figure.subplots(rows, across, squeeze=False).ravel()
     beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(grid, panels, strict=False)]
+    letter_panels(grid[: len(panels)])
     for axes in grid[len(panels) :]:
         axes.set_visible(False)
     paper = any(panel.printed is not None for panel in panels)
@@ -196,6 +198,7 @@ def _safety(results: SweepResults) -> Figure:
     shares, *others = figure.subplots(1, 1 + len(panels), squeeze=False).ravel()
     _shares(shares, results, axis)
     beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(others, panels, strict=True)]
+    letter_panels([shares, *others])
     _name(figure, shares, results, axis, any(beyond), means=bool(panels))
     return figure
 
@@ -238,12 +241,13 @@ def _scatter(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figur
         dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
         axes.set_xlabel(wrapped(str(field_name(path)), LEVEL_LETTERS), fontsize=PAPER_PT)
         y = results.flown(panel.column)
-        axes.plot(x, y, ".", color=BLUE, ms=4, alpha=0.45, mew=0, zorder=2)
+        axes.plot(x, y, ".", color=BLUE, ms=4, alpha=0.45, mew=0, zorder=2, clip_on=False)
         intervals = [DrawnInterval(middle, mean_interval(samples)) for middle, samples in slices(x, y)]
         for each in intervals:
             each.draw(axes)
         scale_to_samples(axes, known(y))
         beyond |= mark_beyond(axes, intervals)
+    letter_panels(grid[: len(panels)])
     for axes in grid[len(panels) :]:
         axes.set_visible(False)
     grid[0].plot([], [], ".", color=BLUE, ms=7, alpha=0.6, label=ONE_RUN)

@@ -15,7 +15,15 @@ from zsim.errors import printable
 from zsim.runtime.progress import cell
 from zsim_analysis.sweep.intervals import ConfidenceInterval
 from zsim_analysis.sweep.report.field_names import field_name
-from zsim_analysis.sweep.report.make_sweep_report import axes_of, marks_of, values_of, windows_of, without_data
+from zsim_analysis.sweep.report.make_sweep_report import (
+    axes_of,
+    differing,
+    heading_of,
+    marks_of,
+    values_of,
+    windows_of,
+    without_data,
+)
 from zsim_analysis.sweep.sweep_summary import FormationParameter, GridPoint, SweepSummary
 
 POINTS_MAX = 40  # on a terminal
@@ -44,13 +52,14 @@ class TerminalColumn(Struct, frozen=True):
 
 
 class TerminalText(Struct, frozen=True):
-    """What the runs did not do, how they ended at each point, their errors, and the figures of the user's own."""
+    """What the runs did not do; at each point the figures of the user's own, how the runs ended, and their errors."""
 
     summary: SweepSummary
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield from (Text(printable(mark), style="bold red") for mark in marks_of(self.summary))
-        for part in (overview(self.summary), errors(self.summary), own_figures(self.summary)):
+        parts = (own_figures, differences, overview, errors)
+        for part in (each(self.summary) for each in parts):
             if part.columns:
                 yield from part.lines(self.summary, options.max_width)
         if missing := without_data(self.summary):
@@ -119,6 +128,23 @@ def own_figures(summary: SweepSummary) -> PointTable:
     return PointTable("Figures of your own, means over the runs", "", tuple(columns))
 
 
+def differences(summary: SweepSummary) -> PointTable:
+    """Return the paired differences from the first point: of figures of the user's own, else of the errors."""
+    shown = errors_of_terminal(summary)
+    titles = {
+        column: title
+        for column, title in differing(summary).items()
+        if column in summary.metrics or (not summary.metrics and column.rpartition(".")[0] in shown)
+    }
+    columns = [
+        _column(summary, title, lambda point, column=column: _difference(point, column))
+        for column, title in titles.items()
+    ]
+    title = f"Differences from {heading_of(summary.points[0])} of runs with the same seed"
+    caption = f"means ± half of the {100 * summary.level:g} % interval, of n pairs; of few pairs each one\n"
+    return PointTable(title, caption, tuple(columns))
+
+
 def errors_of_terminal(summary: SweepSummary) -> dict[str, FormationParameter]:
     """Return the parameters whose errors stand on a terminal: the paper's, else the first ones that are no heading."""
     flown = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in summary.known}
@@ -143,6 +169,15 @@ def _mean(point: GridPoint, column: str, digits: int = 3) -> str:
 def _significant(point: GridPoint, column: str) -> str:
     samples = point.spreads.get(column)
     return "–" if samples is None else f"{samples.mean.value:.4g}{_count(point, column)}"
+
+
+def _difference(point: GridPoint, column: str) -> str:
+    spread = point.differences.get(column)
+    if spread is None:
+        return "–"
+    if spread.samples:  # too few for an interval
+        return ", ".join(f"{each:+.3g}" for each in spread.samples)
+    return f"{spread.mean.value:+.3g} ± {spread.mean.high - spread.mean.value:.2g} (n={spread.runs})"
 
 
 def _count(point: GridPoint, column: str) -> str:

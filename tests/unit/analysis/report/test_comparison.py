@@ -228,7 +228,8 @@ def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
     assert [line.get_label() for line in x_true.lines[::2][:3]] == [four[i].label for i in (0, 1, 3)]
     assert largest == pytest.approx([ERRORS[0], 3 * ERRORS[0], ERRORS[0]], rel=1e-3)
     assert len(x_measured.lines) == 9  # measured, desired, and the engagement of three runs
-    assert [axes.get_title() for axes in drawn["plan_view.png"].axes] == [run.label for run in four]
+    plans = [axes.get_title() for axes in drawn["plan_view.png"].axes]
+    assert plans == [f"({letter}) {run.label}" for letter, run in zip("abcd", four, strict=True)]
 
 
 def test_runs_over_each_other_have_each_its_marks_in_its_colour(tmp_path: Path) -> None:

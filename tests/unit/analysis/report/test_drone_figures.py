@@ -76,6 +76,30 @@ def large(count: int) -> Formation:
     return Formation("main", tuple(names(count)), named, T_S, *pair, ["engaged"] * len(T_S))
 
 
+def legend_of(figure: Figure) -> set[str]:
+    """Return what the legend above a figure names, each once."""
+    texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert len(set(texts)) == len(texts)
+    return set(texts)
+
+
+def test_what_was_flown_lies_over_what_was_commanded() -> None:
+    for axes in draw_velocities(responses(3), colours(3), MARKS).axes:
+        order = {str(line.get_label()): line.get_zorder() for line in axes.lines}
+        assert order["flown"] > order["commanded"]
+
+
+@pytest.mark.parametrize("count", [30, 100])
+def test_marks_of_many_drones_are_whole_and_named(count: int) -> None:
+    figure = draw_estimates(estimates(count), colours(count), WINDOW_S, MARKS)
+    titles = [axes.get_title(loc="left") or axes.get_title() for axes in figure.axes]
+    assert [title[:3] for title in titles] == ["(a)", "(b)", "(c)", "(d)"]
+    dots = [dots for axes in (figure.axes[1], figure.axes[3]) for dots in axes.collections]
+    assert len(dots) == 2
+    assert not any(each.get_clip_on() for each in dots)
+    assert {"σ as stated", "95 % of χ²", "median", "5 to 95 %"} < legend_of(figure)
+
+
 def fits(figure: Figure) -> None:
     """Judge that a figure fits the page, and that its text is neither too large nor too small for it."""
     width, height = figure.get_size_inches()
@@ -105,7 +129,9 @@ def test_figures_of_drones_fit_a_page(count: int) -> None:
 def test_few_drones_have_a_column_each_with_band_and_nees() -> None:
     figure = draw_estimates(estimates(3), colours(3), WINDOW_S, MARKS)
     assert len(figure.axes) == 5 * 3
-    assert {axes.get_title(loc="left") for axes in figure.axes[:3]} == set(names(3))
+    titles = [axes.get_title(loc="left") for axes in figure.axes[:3]]
+    assert titles == ["(a) drone1", "(b) drone2", "(c) drone3"]
+    assert {"±2σ as stated", "95 % of χ²", "estimate − truth", "take-off", "engagement"} == legend_of(figure)
     for axes in figure.axes[: 4 * 3]:
         assert len(axes.collections) == 1  # the band
         assert "2σ" in axes.get_title(loc="right")

@@ -13,7 +13,7 @@ from zsim.scenario import scenario_file
 from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table, paper_table_of
+from zsim_analysis.report.paper import PAPER_TABLE_1, flies_paper_test, paper_table, paper_table_of
 from zsim_analysis.sweep.design import SweepDesign, make_plan, read_document
 from zsim_analysis.sweep.points import SweepResults
 
@@ -52,6 +52,30 @@ def test_it_does_not_stand_beside_another_scenario(override: str) -> None:
 
 def test_it_does_not_stand_beside_test_2() -> None:
     assert not stands(scenario="trajectory")
+
+
+def flies(*overrides: str, scenario: str) -> bool:
+    reader = FlightReader()
+    for key, message, wall_ns in synthetic_record.traffic(
+        Flown(duration_s=0.1, scenario=scenario, overrides=overrides)
+    ):
+        reader.add_message(key, message, wall_ns)
+    return flies_paper_test(reader.flight(), "main")
+
+
+@pytest.mark.parametrize("scenario", ["step", "trajectory"])
+def test_figures_are_the_paper_s_of_both_its_tests_whatever_the_window(scenario: str) -> None:
+    assert flies(scenario=scenario)
+    assert flies("report.window_s=[20, 30]", "name=mine", scenario=scenario)
+    for other in ("environment.wind.gust_m_s=2", "sensors.preset=ardrone2", "drones.drone1.mass_kg=0.6"):
+        assert not flies(other, scenario=scenario)
+
+
+def test_test_2_is_equation_4_however_it_is_written() -> None:
+    expressions = "clusters.main.plan.trajectory.expressions"
+    assert flies(f"{expressions}.p=2*2", f"{expressions}.x_c='5*sin(2*pi*f*t + pi/2)'", scenario="trajectory")
+    assert not flies(f"{expressions}.p=5", scenario="trajectory")
+    assert not flies("clusters.main.plan.trajectory.constants.f=0.02", scenario="trajectory")
 
 
 @pytest.fixture(scope="module")

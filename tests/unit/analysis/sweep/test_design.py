@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from refused import has_terms
+from refused import has_terms, refused
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
@@ -35,7 +35,8 @@ def faults(*vary: str, runs: int | None = None, **values: Any) -> list[str]:
     ("text", "axis"),
     [
         ("seed", Seeds()),
-        ("seed=1,2", Grid("seed", (1, 2))),
+        ("seed=paired", Seeds(paired=True)),
+        ("seed=1,2", Seeds(paired=True, values=(1, 2))),
         ("environment.wind.gust_m_s=0,1.5,2", Grid(GUST, (0, 1.5, 2))),
         ("drones.drone1.position_m=[0,0,0],[1, 0, 0]", Grid("drones.drone1.position_m", ([0, 0, 0], [1, 0, 0]))),
         ("sensors.preset=paper,ardrone2", Grid("sensors.preset", ("paper", "ardrone2"))),
@@ -57,6 +58,9 @@ def test_variations(text: str, axis: Seeds | Grid | Draw) -> None:
         ("duration_s=[1", ("YAML",)),
         ("duration_s=5,5.0", ("5", "twice")),
         ("duration_s=triangle(1,2)", ("triangle", "uniform(low,high)", "normal(mean,std)")),
+        ("seed=1,-2", ("-2", ">=", "0", "seed=paired")),
+        ("seed=1,1", ("1", "twice")),
+        ("seed=two", ("'two'", "whole number", "seed=paired")),
         ("duration_s=uniform(2,1)", ("finite", "low", "<", "high")),
         ("duration_s=uniform(1)", ("two numbers",)),
         ("duration_s=normal(1,0)", ("finite", "std", ">", "0")),
@@ -99,6 +103,43 @@ def test_seeds_are_distinct_and_those_of_a_longer_sweep_begin_alike() -> None:
     assert [design.scenario(run).seed for run in range(3)] == short[:3]
 
 
+def test_paired_seeds_and_draws_are_the_same_for_every_combination() -> None:
+    mass = "drones.drone2.mass_kg"
+    design = SweepDesign(plan("seed=paired", "wind.gust_m_s=0,1,2", f"{mass}=uniform(0.4,0.5)", runs=6, seed=7))
+    values = [design.values(run) for run in range(6)]
+    assert [each[GUST] for each in values] == [0, 1, 2, 0, 1, 2]
+    assert [each["seed"] for each in values] == [seed for seed in Seeds().draw(7, 2) for _ in range(3)]
+    assert [each[mass] for each in values] == [
+        kg for kg in Draw(mass, "uniform", 0.4, 0.5).draw(7, 2) for _ in range(3)
+    ]
+    assert [design.scenario(run).seed for run in range(6)] == [each["seed"] for each in values]
+
+
+def test_seeds_that_are_given_are_flown_at_every_combination() -> None:
+    given = plan("wind.gust_m_s=0,1", "seed=5,9,2")
+    design = SweepDesign(given)
+    assert (given.runs, design.points, design.paired) == (6, 2, True)
+    flown = [(design.values(run)["seed"], design.values(run)[GUST]) for run in range(6)]
+    assert flown == [(5, 0), (5, 1), (9, 0), (9, 1), (2, 0), (2, 1)]
+    assert has_terms(faults("wind.gust_m_s=0,1", "seed=5,9,2", runs=7)[0], "--runs", "7", "6")
+
+
+def test_the_section_of_the_one_cluster_may_be_left_out() -> None:
+    design = SweepDesign(plan("gains.proportional_1_s=0.4,0.8", "plan.takeoff_s=2"))
+    assert design.varied == ["clusters.main.gains.proportional_1_s", "clusters.main.plan.takeoff_s"]
+    assert [design.scenario(run).clusters[0].gains.proportional_1_s for run in range(2)] == [0.4, 0.8]
+    assert difference(plan("gains.proportional_1_s=0.4"), plan("clusters.main.gains.proportional_1_s=0.4")) is None
+    document, _ = read_document(STEP, [])
+    document["clusters"].append({"name": "other", "drones": ["drone1", "drone2"]})
+    with refused(ScenarioError, "gains.proportional_1_s=0.4", "2", "clusters.main.gains.proportional_1_s"):
+        make_plan(STEP.name, document, ["gains.proportional_1_s=0.4"], None)
+
+
+def test_an_unknown_field_hints_at_the_one_that_is_like_it() -> None:
+    assert has_terms(faults("seeds=1,2")[0], "seeds", "mean", "seed", "allowed")
+    assert has_terms(faults("wind.gust=1")[0], "environment.wind.gust", "mean", "gust_m_s", "allowed")
+
+
 def test_draws_are_of_their_distribution_and_know_nothing_of_each_other() -> None:
     uniform, normal = Draw("a", "uniform", -1.0, 3.0), Draw("b", "normal", 5.0, 0.5)
     u, n = np.array(uniform.draw(1, 20_000)), np.array(normal.draw(1, 20_000))
@@ -138,14 +179,16 @@ def test_a_fault_of_the_file_is_told_once() -> None:
 
 
 def test_every_drawn_value_is_checked() -> None:
-    (fault,) = faults("seed", "drones.drone1.limits.tilt_deg=uniform(29,31)", runs=40)
+    (fault,) = faults("seed", "drones.drone1.battery_percent=uniform(99,101)", runs=40)
     design = SweepDesign(
-        SweepPlan(source="", document={}, vary=("drones.drone1.limits.tilt_deg=uniform(29,31)",), runs=40)
+        SweepPlan(source="", document={}, vary=("drones.drone1.battery_percent=uniform(99,101)",), runs=40)
     )
-    too_much = [run for run in range(40) if design.values(run)["drones.drone1.limits.tilt_deg"] > 30]
+    too_much = [run for run in range(40) if design.values(run)["drones.drone1.battery_percent"] > 100]
     assert 0 < len(too_much) < 40
-    field = "drones[0].limits.tilt_deg"
-    assert has_terms(fault, field, ">", "0", "<=", "30", str(len(too_much)), "40", "drones.drone1.limits.tilt_deg=30.…")
+    field = "drones[0].battery_percent"
+    assert has_terms(
+        fault, field, ">=", "0", "<=", "100", str(len(too_much)), "40", "drones.drone1.battery_percent=100.…"
+    )
 
 
 @pytest.mark.parametrize(

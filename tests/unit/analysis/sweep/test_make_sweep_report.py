@@ -72,6 +72,31 @@ def test_the_report_of_a_sweep(tmp_path: Path, vary: tuple[str, ...], figures: s
 
 
 @pytest.mark.usefixtures("unrendered")
+def test_the_user_s_own_figures_come_first_and_pairs_have_their_differences(tmp_path: Path) -> None:
+    of = plan("seed=paired", "duration_s=1,2", "wind.gust_m_s=uniform(0,1)", runs=10, report={"metrics": "mine:own_m"})
+    of = msgspec.structs.replace(of, changed=("duration_s=9",))
+    day = {"date": "2026-01-02T03:04:05Z"}
+    rows = [{**well(of, run), **day, "metrics.own_m": run // 2 + 0.5 * (run % 2)} for run in range(10)]
+    page = report_of(tmp_path, of, rows)
+    heads = re.findall("<h2>(.*?)</h2>", page)
+    assert [has_terms(head, term) for head, term in zip(heads, ("own", "Paired", "ended"), strict=False)] == [True] * 3
+    assert "<td>0.5000 ± 0.0000 (n = 5)</td>" in page
+    assert "<dt>Changed</dt><dd>duration_s=9</dd>" in page
+    assert "<dt>Date</dt><dd>2026-01-02 03:04 UTC</dd>" in page
+    results = SweepResults(SweepDesign(of), rows)
+    drawn = list(figures(results))
+    assert drawn[0].name == "metrics.png"
+    against = next(each for each in drawn if each.name == "drawn_1.png").drawing
+    assert against.axes[0].get_ylabel() == "own (m)"
+    letters = [axes.get_title(loc="left") for axes in against.axes if axes.get_visible()]
+    assert letters == [f"({letter})" for letter in "abcd"]
+    console = Console(file=io.StringIO(), width=100)
+    console.print(terminal_text(results.summary()))
+    text = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]: a StringIO
+    assert text.index("own (m)") < text.index("+0.5 ± 0 (n=5)") < text.index("ended")
+
+
+@pytest.mark.usefixtures("unrendered")
 def test_figures_in_other_formats_stand_beside_the_pictures_until_a_report_without_them(tmp_path: Path) -> None:
     of = plan("seed", runs=4)
     report_of(tmp_path, of, [well(of, run) for run in range(of.runs)])

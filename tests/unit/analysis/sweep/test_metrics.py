@@ -2,17 +2,22 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from effort import effort
 from refused import has_terms, refused
 from settling import settled, settling
 from short_flight import ONE
 from synthetic_record import Flown, traffic
 
+from zsim.contract.framing import GateMessages
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.schema import plugin
+from zsim_analysis.in_process import InProcessFlight
+from zsim_analysis.reading.drone_errors import estimate_errors
 from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.sweep.design import SweepDesign, make_plan, read_document
@@ -70,6 +75,49 @@ def test_the_example_of_the_documentation() -> None:
     assert found["overshoot_m"] == pytest.approx(1.0)
     assert found["settled_s"] == pytest.approx(5.66, abs=0.03)  # the sine falls below 0.5 m at 5 s + 2/3 s
     assert settled(formation.t_s, np.ones_like(wave), engaged_s=0.0)["settled_s"] is None
+
+
+PAIR = """
+name: pair
+seed: 3
+duration_s: 8
+sensors: {preset: paper}
+drones:
+  - {name: drone1, position_m: [2, 0, 0], yaw_deg: 90}
+  - {name: drone2, position_m: [-2, 0, 0], yaw_deg: 90}
+clusters:
+  - {name: main, drones: [drone1, drone2], plan: {takeoff_s: 0.2}}
+report: {metrics: 'effort:effort'}
+"""
+
+
+def test_commands_and_estimates_are_there_for_metrics() -> None:
+    """The example of the documentation: control effort and NEES are those of the messages of the same flight."""
+    found = fly(Task(0, 0, {}, scenario_file.from_text(PAIR)))
+    assert found["metrics_failure"] is None
+    commands: list[tuple[int, float]] = []
+
+    class Commands:
+        def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+            if key.endswith("/cmd/velocity"):
+                commands.append((message.t_ns, float(np.sum(np.square(message.velocity_m_s)))))
+
+        def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+            pass
+
+    reader = FlightReader(answers=True)
+    InProcessFlight(scenario_file.from_text(PAIR)).run([reader, Commands()])
+    flight = reader.flight()
+    engaged_s = formations_of(flight)[0].engaged_s
+    assert engaged_s is not None
+    squares = [square for t_ns, square in commands if t_ns >= engaged_s * 1e9]
+    assert len(squares) > 100
+    assert found["metrics.command_rms_m_s"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-6)
+    errors = estimate_errors(flight)
+    assert list(errors) == ["drone1", "drone2"]
+    nees = np.concatenate([each.nees[each.t_s >= engaged_s] for each in errors.values()])
+    assert found["metrics.nees"] == pytest.approx(np.nanmean(nees), rel=1e-12)
+    assert effort(flight)["nees"] == found["metrics.nees"]
 
 
 def row(function: str) -> dict[str, object]:

@@ -5,6 +5,7 @@ import itertools
 import os
 import pickle
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def task(text: str = ONE, run: int = 7, record: Path | None = None, varied: dict
 def test_a_row_is_what_the_report_of_a_record_says(tmp_path: Path) -> None:
     """The same numbers as from the record of `zsim run --in-process`, and the same from a record of its own."""
     row = fly(task(PAIR, record=tmp_path / "000007", varied={"environment.wind.gust_m_s": 0.3}))
-    in_process.fly(scenario_file.from_text(PAIR), tmp_path / "run.mcap")
+    in_process.fly(scenario_file.from_text(PAIR), tmp_path / "run.mcap", changed=("wind.gust_m_s=0.3",))
     for record in (tmp_path / "run.mcap", tmp_path / "000007/run.mcap"):
         _, _, summary = judge(record)
         assert row["truth_sha256"] == summary.truth_sha256
@@ -59,6 +60,9 @@ def test_a_row_is_what_the_report_of_a_record_says(tmp_path: Path) -> None:
         for parameter, errors in summary.errors.items():
             for each in ("est_std", "est_rms", "est_mean", "true_std", "true_rms", "true_mean"):
                 assert row[f"errors.{parameter}.{each}"] == getattr(errors, each)
+        assert datetime.fromisoformat(row["date"]) <= datetime.fromisoformat(summary.date or "") <= datetime.now(UTC)
+    assert judge(tmp_path / "run.mcap")[2].changed == ["wind.gust_m_s=0.3"]
+    assert summary.changed is None  # nobody said: it has no file
     assert len(summary.errors) == 8
     assert list(row)[:4] == ["run", "point", "seed", "environment.wind.gust_m_s"]
     assert (row["run"], row["failure"], row["collisions"], row["fingerprint"]) == (7, None, 0, fingerprint())

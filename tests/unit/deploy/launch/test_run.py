@@ -1,5 +1,6 @@
 """`zsim run` before and around its processes: their command lines, the port, the folder."""
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -9,6 +10,7 @@ from synthetic_record import SCENARIOS
 
 from zsim.errors import RunError, SessionError
 from zsim.scenario import scenario_file
+from zsim_deploy.arguments import changed_fields
 from zsim_deploy.launch import free_ports, run
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.run import RunOptions
@@ -99,6 +101,15 @@ def test_trying_ports_has_an_end(watched: type[FakeSupervisor], tmp_path: Path):
     assert len(watched.ports) == run.PORTS_TRIED
 
 
+def test_the_world_is_told_what_was_changed_of_the_file(tmp_path: Path):
+    changed = changed_fields(["wind.gust_m_s=1"], 12345678, 20.0)
+    assert changed == ["wind.gust_m_s=1", "seed=12345678", "duration_s=20.0"]
+    made = options(tmp_path, changed=changed)
+    children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
+    world = next(child._arguments for child in children if child.name == "world")
+    assert [word for flag, word in pairwise(world) if flag == "--changed"] == changed
+
+
 def test_no_name_is_taken_for_an_option(tmp_path: Path):
     made = options(tmp_path, "drones.drone1.name=-._", "clusters.main.drones=[-._, drone2, drone3]")
     children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
@@ -178,7 +189,7 @@ def test_good_endpoints_pass(endpoint: str | None):
 
 
 def test_a_run_in_one_process_says_where_it_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr("zsim_analysis.in_process.fly", lambda *_: "over")
+    monkeypatch.setattr("zsim_analysis.in_process.fly", lambda *_, changed: "over")
     screen = Say()
     screen.hang_up = lambda: None  # type: ignore[attr-defined]
     run.run_in_process(options(tmp_path), screen)  # type: ignore[arg-type]

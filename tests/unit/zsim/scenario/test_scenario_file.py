@@ -316,6 +316,42 @@ def test_the_name_of_a_section_may_be_left_out(path: str, whole: str):
     assert whole_path(path) == whole
 
 
+@pytest.mark.parametrize(
+    ("path", "entries", "whole"),
+    [
+        ("gains.proportional_1_s", ["main"], "clusters.main.gains.proportional_1_s"),
+        ("plan.takeoff_s", ["a.b"], "clusters[0].plan.takeoff_s"),
+        ("gains.proportional_1_s", [], "gains.proportional_1_s"),
+        ("seeds", ["main"], "seeds"),
+    ],
+)
+def test_the_name_of_a_list_with_one_entry_may_be_left_out(path: str, entries: list[str], whole: str) -> None:
+    assert whole_path(path, {"clusters": [{"name": name} for name in entries]}) == whole
+
+
+def test_a_field_of_several_entries_is_refused_with_the_path_of_one() -> None:
+    with pytest.raises(ValueError, match=r"2 clusters.*clusters\.left\.gains\.proportional_1_s"):
+        whole_path("gains.proportional_1_s", {"clusters": [{"name": "left"}, {"name": "right"}]})
+    assert scenario_file.load(STEP, ["gains.proportional_1_s=0.4"]).clusters[0].gains.proportional_1_s == 0.4
+
+
+@pytest.mark.parametrize(
+    ("override", "meant"),
+    [
+        ("seeds=3", "seed"),
+        ("wind.gust=1", "gust_m_s"),
+        ("drones.drone11.mass_kg=1", "drone1"),
+        ("gains.proportional=0.4", "proportional_1_s"),
+        ("sensors.gpss={rate_hz: 5}", "gps"),
+        ("faults=[{kind: gps_dropout, target: drone1, fro_s: 3}]", "for_s"),
+    ],
+)
+def test_what_is_not_known_hints_at_what_is_like_it(override: str, meant: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        scenario_file.load(STEP, [override])
+    assert any(has_terms(line, "mean", meant, "allowed") for line in caught.value.faults)
+
+
 def test_an_override_may_leave_out_the_name_of_a_section():
     assert scenario_file.load(STEP, ["wind.gust_m_s=0.25"]).environment.wind.gust_m_s == 0.25
 

@@ -1,0 +1,28 @@
+"""Metrics of a user's own for a sweep: the control effort of a formation, and whether its estimators state the truth.
+
+    PYTHONPATH=examples zsim sweep scenarios/step.yaml --vary gains.proportional_1_s=0.4,0.8 --vary seed=paired \
+        --runs 8 --set report.metrics=effort:effort
+
+See docs/sweep.md.
+"""
+
+import numpy as np
+
+from zsim_analysis.reading.drone_errors import estimate_errors
+from zsim_analysis.reading.formation import formations_of
+from zsim_analysis.reading.recorded_flight import RecordedFlight
+
+
+def effort(flight: RecordedFlight) -> dict[str, float | None]:
+    """Return the RMS over drones and time of the commanded velocity [m/s], and the mean NEES of their estimates.
+
+    Both from the engagement on; None where the formation never engaged. The NEES of an estimator that states its true
+    covariance is 6 on average.
+    """
+    engaged_s = formations_of(flight)[0].engaged_s
+    if engaged_s is None:
+        return {"command_rms_m_s": None, "nees": None}
+    commanded = [each.velocity[each.t_ns >= engaged_s * 1e9] for each in flight.commands.values()]
+    nees = [each.nees[each.t_s >= engaged_s] for each in estimate_errors(flight).values()]
+    squares = np.sum(np.concatenate(commanded) ** 2, axis=1)
+    return {"command_rms_m_s": float(np.sqrt(squares.mean())), "nees": float(np.nanmean(np.concatenate(nees)))}
