@@ -23,7 +23,8 @@ from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank, sort_readings, write_estimate
 from zsim_agents.estimation.filter_state import COUNT, NOMINAL, Rows
 from zsim_agents.estimation.joint.sighting_update import SIGHTING, use_sightings
-from zsim_agents.estimation.joint_covariance import block, predict_jointly, put_block
+from zsim_agents.estimation.joint_covariance import block, put_block
+from zsim_agents.estimation.kalman_update import predict_jointly
 
 SIGHTED_A_GATE = 1000  # more of one gate are a flood, and left out
 PICTURES_KEPT = 256  # the last that were used; of 12 drones at 15 Hz, those of 1.4 s
@@ -163,8 +164,9 @@ def step_jointly(
         measurement_update.fuse(rows, i, P, readings, first[i], after)
     use_sightings(rows, sightings, hat_B)
     for i in range(count):
+        strapdown.clone(rows, i, rows.joint, i * n)
         rows.covariance[i] = block(rows.joint, i, n)
-        write_estimate(rows.nominal[i], rows.covariance[i], t_s, estimates[i])
+        write_estimate(rows.nominal[i], rows.setting[i], rows.covariance[i], t_s, estimates[i])
 
 
 @portable
