@@ -53,6 +53,7 @@ VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would
 SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
 HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which turns the attitude to it
 SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
+MOVES_SIGMAS = 2.0  # of the velocity, chosen: one that stands still moves so fast at 2 % of the samples
 DENIED_S = 2.0  # s since two drones saw each other, chosen: errors grow little meanwhile
 HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
 
@@ -307,6 +308,22 @@ def stack(
 
 
 @portable
+def distrust_turn(P: np.ndarray, H: np.ndarray, expected: np.ndarray, at: int) -> None:
+    """Let the flow tell a heading, in rows from `at` on, only as far as the drone surely moves.
+
+    A heading's error turns the velocity. Turned by the error of an estimate that should be zero, it would tell a
+    heading that nothing measures (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for
+    designing consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010).
+    """
+    squared = expected[at] * expected[at] + expected[at + 1] * expected[at + 1]
+    noise = MOVES_SIGMAS * MOVES_SIGMAS * (P[VELOCITY, VELOCITY] + P[VELOCITY + 1, VELOCITY + 1])
+    share = 1.0 - noise / squared if squared > noise else 0.0
+    for r in range(at, at + 2):
+        for k in range(3):
+            H[r, ATTITUDE + k] *= share
+
+
+@portable
 def write_variance(reading: np.ndarray, setting: np.ndarray, variance: np.ndarray, at: int) -> None:
     """Write the variances of a reading's rows; a GPS receiver's own figure counts where it is worse."""
     kind = int(reading[READING.sensor])
@@ -355,6 +372,8 @@ def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, af
         if known[0][0] != t_sample_s:
             known = strapdown.recall_known(rows, i, t_sample_s, now)
         stack(rows, i, reading, H, z, expected, m, known)
+        if kind == FLOW and not rows.layout[i, LAYOUT.compass]:
+            distrust_turn(P, H, expected, m)
         write_variance(reading, setting, variance, m)
         patience_s = setting[SETTING.sensors + kind * SENSOR.size + SENSOR.patience]
         if row[NOMINAL.t] - row[NOMINAL.refused_since + kind] > patience_s and not is_denied(rows, i, kind):

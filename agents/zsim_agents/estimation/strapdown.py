@@ -161,7 +161,10 @@ def grow(rows: Rows, i: int, P: np.ndarray) -> np.ndarray:
 
 @portable
 def write_growth(rows: Rows, i: int, F: np.ndarray, Q: np.ndarray) -> None:
-    """Write how the errors grow over the interval that ends now: transition into F, the identity, and noise into Q."""
+    """Write how the errors grow over the interval that ends now: transition into F, the identity, and noise into Q.
+
+    Biases that are Gauss-Markov processes decay.
+    """
     row, setting = rows.nominal[i], rows.setting[i]
     dt, dt_squared = row[NOMINAL.t] - row[NOMINAL.t_start], row[NOMINAL.dt_squared]
     turned = setting[SETTING.gyro_variance] * dt_squared + row[NOMINAL.lost_turn]
@@ -183,6 +186,7 @@ def write_growth(rows: Rows, i: int, F: np.ndarray, Q: np.ndarray) -> None:
             x = 0.5 * dt * rows.decay[i, k]
             if x > 0.0:
                 F[k, k] = max(1.0 - x, 0.0) / (1.0 + x)  # exp(-2 x) to x^3, without libm
+                rows.bias[i, k] *= F[k, k]
                 Q[k, k] = 0.5 * rows.walk[i, k] / rows.decay[i, k] * (1.0 - F[k, k] * F[k, k])
 
 
