@@ -71,7 +71,9 @@ def test_the_autocorrelation_decays_with_the_correlation_time(lag_s: float):
     lag = round(lag_s * RATE_HZ)
     found = np.mean(x[lag:] * x[: x.size - lag])
     white = 0.002**2 * RATE_HZ if lag == 0 else 0.0
-    assert found == pytest.approx(0.01 * math.exp(-lag_s) + white, abs=0.01 * 4.0 * math.sqrt(2.0 / (400_000 / RATE_HZ)))
+    assert found == pytest.approx(
+        0.01 * math.exp(-lag_s) + white, abs=0.01 * 4.0 * math.sqrt(2.0 / (400_000 / RATE_HZ))
+    )
 
 
 def test_in_the_world_it_is_stationary_from_the_first_sample():

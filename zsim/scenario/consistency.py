@@ -248,9 +248,8 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
         for channel in kind.channels:
             model = getattr(getattr(sensors, name), channel.settings, None)
             if model and _known(model.bias_instability) and model.bias_instability and not model.correlation_s:
-                yield f"{name}.{channel.settings}.bias_instability", (
-                    f"is {model.bias_instability:g}; must be 0 or unset unless correlation_s says how fast it changes"
-                )
+                needed = "must be 0 unless correlation_s says how fast it changes"
+                yield f"{name}.{channel.settings}.bias_instability", f"is {model.bias_instability:g}; {needed}"
     sonar = sensors.sonar
     if sonar and _known(sonar.min_m, sonar.max_m) and sonar.min_m >= sonar.max_m:
         yield "sonar.min_m", f"is {sonar.min_m:g}; must be < max_m ({sonar.max_m:g})"

@@ -58,7 +58,8 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenari
     document, misread = _in_channel_units(document)
     vehicles, unknown = _vehicles(document)
     document, unsound = _separate_sensors(_expand_presets(document, vehicles))
-    flaws = chain(misread, faults(document, Document), unknown, unsound, cross_faults(sound(document, Scenario), vehicles))
+    between = cross_faults(sound(document, Scenario), vehicles)
+    flaws = chain(misread, faults(document, Document), unknown, unsound, between)
     found = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
     if found:
         raise ScenarioError(found)

@@ -225,9 +225,12 @@ def scaled(model: ErrorModel, to_si: float) -> ErrorModel:
     if to_si == 1.0:
         return model
     given = msgspec.structs.asdict(model)
-    return ErrorModel(**{
-        field: value if field == "correlation_s" or value is UNSET else value * to_si for field, value in given.items()
-    })
+    return ErrorModel(
+        **{
+            field: value if field == "correlation_s" or value is UNSET else value * to_si
+            for field, value in given.items()
+        }
+    )
 
 
 def noise_sigma(model: ErrorModel, rate_hz: float) -> float:

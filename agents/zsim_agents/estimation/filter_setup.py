@@ -359,7 +359,8 @@ def _sensor_setting(name: str, sensors: Sensors) -> list[float]:
                 correlated = _error_model(sensors, channel).correlated_sigma
     variance += [0.0] * (VALUES_MAX - len(variance))
     R_BS = np.array(matrix_from_rpy(*map(math.radians, section.mount.rpy_deg)))
-    row = [*variance, *section.mount.position_m, *R_BS.flat, *-R_BS[:, 2], PATIENCE_S.get(name, math.inf), correlated**2]
+    mount, patience_s = (*section.mount.position_m, *R_BS.flat, *-R_BS[:, 2]), PATIENCE_S.get(name, math.inf)
+    row = [*variance, *mount, patience_s, correlated**2]
     assert len(row) == SENSOR.size
     return row
 

@@ -327,13 +327,13 @@ def distrust_turn(P: np.ndarray, H: np.ndarray, expected: np.ndarray, at: int) -
 def write_variance(reading: np.ndarray, setting: np.ndarray, variance: np.ndarray, at: int) -> None:
     """Write the variances of a reading's rows; a GPS receiver's own figure counts where it is worse."""
     kind = int(reading[READING.sensor])
-    known = SETTING.sensors + kind * SENSOR.size + SENSOR.variance
+    known = SETTING.sensors + kind * SENSOR.size
     for k in range(SIZES[kind]):
-        variance[at + k] = setting[known + k]
+        variance[at + k] = setting[known + SENSOR.variance + k]
     if kind == GPS:
+        claimed = reading[READING.extra] * reading[READING.extra] - setting[known + SENSOR.correlated]
         for k in range(3):
-            claimed = reading[READING.extra] * reading[READING.extra] - setting[known - SENSOR.variance + SENSOR.correlated]
-            variance[at + k] = max(claimed, setting[known])
+            variance[at + k] = max(claimed, setting[known + SENSOR.variance])
 
 
 @portable

@@ -237,7 +237,7 @@ def clone(rows: Rows, i: int, J: np.ndarray, first: int) -> None:
     if not layout[LAYOUT.clones] or not rows.counts[i, COUNT.heading_known]:
         return
     every_s = rows.setting[i, SETTING.clone_every]
-    count = int(math.floor(row[NOMINAL.t] / every_s + 1e-6))  # from t = 0 on, as samples are
+    count = math.floor(row[NOMINAL.t] / every_s + 1e-6)  # from t = 0 on, as samples are
     slot = count % layout[LAYOUT.clones]
     former = rows.clones[i, slot]
     if former[CLONE.t] / every_s + 1e-6 >= count:  # also false where there is none

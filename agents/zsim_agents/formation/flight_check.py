@@ -121,8 +121,8 @@ class FlightCheck:
         if kind == TURNED:
             sigma_deg, most_deg = math.degrees(gate.yaw_sigma[i]), math.degrees(factor * self.limits.yaw_sigma_max_rad)
             return f"the heading of {drone} has a sigma of {sigma_deg:.1f} deg; allowed: {most_deg:g} deg"
-        worst_m = max(gate.sigma_m[i].tolist())
-        return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {factor * self.limits.sigma_max_m:g} m"
+        worst_m, most_m = max(gate.sigma_m[i].tolist()), factor * self.limits.sigma_max_m
+        return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {most_m:g} m"
 
 
 @portable
