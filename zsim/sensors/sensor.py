@@ -224,13 +224,8 @@ def scaled(model: ErrorModel, to_si: float) -> ErrorModel:
     """Return an error model in SI units, given what its unit is in them."""
     if to_si == 1.0:
         return model
-    given = msgspec.structs.asdict(model)
-    return ErrorModel(
-        **{
-            field: value if field == "correlation_s" or value is UNSET else value * to_si
-            for field, value in given.items()
-        }
-    )
+    scales = {field: value for field, value in msgspec.structs.asdict(model).items() if field != "correlation_s"}
+    return msgspec.structs.replace(model, **{f: value * to_si for f, value in scales.items() if value is not UNSET})
 
 
 def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
