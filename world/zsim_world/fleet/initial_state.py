@@ -114,10 +114,12 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
         setpoint=np.zeros((n, firmware.SETPOINT.size)),
         set_tick=np.zeros(n, dtype=np.int64),
         memory=np.zeros((n, firmware.MEMORY.size)),
-        belief=np.array([
-            _first_belief(drone, own, board, obstacles, each)
-            for drone, own, board in zip(drones, row, calibration, strict=True)
-        ]),
+        belief=np.array(
+            [
+                _first_belief(drone, own, board, obstacles, each)
+                for drone, own, board in zip(drones, row, calibration, strict=True)
+            ]
+        ),
         actuator=sound_actuators(n, each),
         device=np.zeros((n, DEVICE.size)),
         lanes=board_blocks(row, rotors, setting, mounts),
