@@ -227,7 +227,7 @@ def _noisy(truth: Array, error: ErrorModel, rate_hz: float, rng: np.random.Gener
     if error.correlated_sigma:
         decay, kicks = math.exp(-1.0 / rate_hz / error.correlation_time_s), rng.standard_normal(truth.shape)
         kicks[1:] *= math.sqrt(1.0 - decay**2)  # the first is the stationary one
-        z += error.correlated_sigma * lfilter([1.0], [1.0, -decay], kicks, axis=0)
+        z += error.correlated_sigma * np.asarray(lfilter([1.0], [1.0, -decay], kicks, axis=0))
     return (z if error.quantum == 0.0 else np.round(z / error.quantum) * error.quantum).tolist()
 
 

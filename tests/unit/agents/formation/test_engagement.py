@@ -299,7 +299,7 @@ def test_requests_that_do_not_fit_the_phase_are_refused():
     ("spoil", "terms"),
     [
         ({"sigma_m": np.full((3, 3), 1.5)}, ("drone1", "sigma", "1.50", "1")),
-        ({"yaw_sigma": np.radians([5.0, 16.0, 5.0])}, ("drone2", "heading", "sigma", "16.0", "15")),
+        ({"yaw_sigma": np.radians([5.0, 16.0, 5.0])}, ("heading", "drone2", "sigma", "16.0 deg", "15 deg")),
         ({"age_s": np.array([0.0, 0.6, 0.0])}, ("drone2", "0.60", "old", "0.5")),
         ({"age_s": np.array([0.0, 0.0, math.inf])}, ("drone3", "inf", "old")),
         ({"p_W": np.full((3, 3), math.nan)}, ("drone1", "finite")),
@@ -349,7 +349,7 @@ def test_a_take_off_command_that_was_lost_is_sent_again():
         ({"p_W": np.full((3, 3), math.nan)}, ("drone1", "finite")),
         ({"yaw": np.array([0.0, math.inf, 0.0])}, ("drone2", "finite")),
         ({"sigma_m": np.full((3, 3), 2.5)}, ("drone1", "sigma", "2.50")),
-        ({"yaw_sigma": np.radians([5.0, 5.0, 31.0])}, ("drone3", "heading", "sigma", "31.0", "30")),
+        ({"yaw_sigma": np.radians([5.0, 5.0, 31.0])}, ("heading", "drone3", "sigma", "31.0 deg", "30 deg")),
         ({"states": ("flying", "emergency", "flying")}, ("drone2", "emergency")),
         ({"p_W": GROUND * (1.0, 0.0, 1.0) + (0, 0, 5.0)}, ("in line",)),
         ({"p_W": GROUND * (0.2, 1.0, 1.0) + (0, 0, 5.0)}, ("sin(beta)", "min(p, q)", "0.60")),
