@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from zsim.contract import messages
 from zsim.math.random_streams import stream
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim.sensors.sensor import ErrorModel, Sensor
+from zsim.sensors.sensor import ErrorModel, Sensor, noise_sigma
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank
 
@@ -171,6 +172,20 @@ class Flight:
         return u**4 * (35.0 - 84.0 * u + 70.0 * u**2 - 20.0 * u**3)
 
 
+class Circle(Flight):
+    """Stand until `start_s`, then fly at 2 m/s on a circle of 5 m, and climb; arguments as of `Flight`."""
+
+    RADIUS_M, SPEED_M_S, BEGIN_S = 5.0, 2.0, 4.0
+
+    def position(self, t: Array) -> Array:
+        u = np.clip(t - self.start_s, 0.0, None)
+        x = np.clip(u / self.BEGIN_S, 0.0, 1.0)
+        begun = self.BEGIN_S * (x**6 - 3.0 * x**5 + 2.5 * x**4)  # its derivative rises from 0 to 1
+        angle = self.SPEED_M_S / self.RADIUS_M * np.where(u < self.BEGIN_S, begun, u - 0.5 * self.BEGIN_S)
+        x, y = self.RADIUS_M * np.sin(angle), self.RADIUS_M * (1.0 - np.cos(angle))
+        return np.stack([1.0 + x, 2.0 + y, HEIGHT_M * self._ramp(t, CLIMB_S)], 1)
+
+
 def readings(flight: Flight, of: Scenario, seed: int, end_s: float) -> list[Reading]:
     """Return all readings up to `end_s` in the order in which they arrive."""
     found = [r for name in _READERS for r in _readings_of(name, flight, of, seed, end_s)]
@@ -204,11 +219,15 @@ def _readings_of(name: str, flight: Flight, of: Scenario, seed: int, end_s: floa
 
 
 def _noisy(truth: Array, error: ErrorModel, rate_hz: float, rng: np.random.Generator) -> list[Any]:
-    """Return readings of a channel, (n, axes): bias, its walk, white noise, rounding."""
+    """Return readings of a channel, (n, axes): bias, its walk, white and Gauss-Markov noise, rounding."""
     bias = error.bias * rng.standard_normal(truth.shape[1])
     walk = error.bias_walk / math.sqrt(rate_hz) * np.cumsum(rng.standard_normal(truth.shape), 0)
-    white = math.hypot(error.noise, error.density * math.sqrt(rate_hz)) * rng.standard_normal(truth.shape)
+    white = error.white_sigma(rate_hz) * rng.standard_normal(truth.shape)
     z = truth + bias + walk + white
+    if error.correlated_sigma:
+        decay, kicks = math.exp(-1.0 / rate_hz / error.correlation_time_s), rng.standard_normal(truth.shape)
+        kicks[1:] *= math.sqrt(1.0 - decay**2)  # the first is the stationary one
+        z += error.correlated_sigma * np.asarray(lfilter([1.0], [1.0, -decay], kicks, axis=0))
     return (z if error.quantum == 0.0 else np.round(z / error.quantum) * error.quantum).tolist()
 
 
@@ -222,7 +241,8 @@ def _gps(flight: Flight, t: Array, p_BS: Array, R_BS: Array, s: Any, rng: Any, f
     p, v = flight.point(t, p_BS)
     position = _noisy(p, s.position_m, s.rate_hz, rng)
     velocity = _noisy(v, s.velocity_m_s, s.rate_hz, rng)
-    return [(tuple(a), tuple(b), s.position_m.noise, 3) for a, b in zip(position, velocity, strict=True)]
+    sigma_m = noise_sigma(s.position_m, s.rate_hz)
+    return [(tuple(a), tuple(b), sigma_m, 3) for a, b in zip(position, velocity, strict=True)]
 
 
 def _mag(flight: Flight, t: Array, p_BS: Array, R_BS: Array, s: Any, rng: Any, field: Array) -> list[Any]:

@@ -423,7 +423,7 @@ UNITS = {
 }  # fmt: skip
 OWN_UNITS = {
     "noise": "channel's", "density": "channel's/√Hz", "bias": "channel's", "bias_walk": "channel's/√s",
-    "quantum": "channel's", "madgwick_beta": "rad/s", "values": "m, rad", "target": "m, rad",
+    "bias_instability": "channel's", "quantum": "channel's", "madgwick_beta": "rad/s", "values": "m, rad", "target": "m, rad",
 }  # fmt: skip
 BY_PRESET = {"rate_hz", "imu", "gps", "mag", "baro", "sonar", "flow"}  # required once the preset is applied
 

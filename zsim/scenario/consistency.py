@@ -20,7 +20,7 @@ from zsim.scenario.sighting_check import sighting_faults
 from zsim.schema.checker import Fault, show
 from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
 from zsim.sensors.imu import BOARD_RATE_HZ
-from zsim.sensors.sensor_catalogue import DECLARED, MODULE, declarations, own_sections
+from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations, own_sections
 from zsim.vehicles.vehicle import Vehicle, lift_shares
 
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
@@ -244,6 +244,12 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
     if sensors.imu and _known(sensors.imu.rate_hz) and sensors.imu.rate_hz > BOARD_RATE_HZ:
         most = f"{BOARD_RATE_HZ:g}, the rate of the navigation board"
         yield "imu.rate_hz", f"is {sensors.imu.rate_hz:g}; must be <= {most}"
+    for name, kind in STOCK.items():
+        for channel in kind.channels:
+            model = getattr(getattr(sensors, name), channel.settings, None)
+            if model and _known(model.bias_instability) and model.bias_instability and not model.correlation_s:
+                needed = "must be 0 unless correlation_s says how fast it changes"
+                yield f"{name}.{channel.settings}.bias_instability", f"is {model.bias_instability:g}; {needed}"
     sonar = sensors.sonar
     if sonar and _known(sonar.min_m, sonar.max_m) and sonar.min_m >= sonar.max_m:
         yield "sonar.min_m", f"is {sonar.min_m:g}; must be < max_m ({sonar.max_m:g})"

@@ -121,6 +121,9 @@ class Silence(Spec, frozen=True, kw_only=True):
     land_s: Positive = 2.0  # after that; the AR.Drone's com_watchdog
 
 
+HeadingSigma = Annotated[float, Meta(gt=0, le=180)]
+
+
 class Gains(Spec, frozen=True, kw_only=True):
     """Of the cluster controller; see zsim_agents.formation.control_law.
 
@@ -134,6 +137,10 @@ class Gains(Spec, frozen=True, kw_only=True):
     yaw_rate_deg_s: Positive = 60.0  # of 200 deg/s; a turning drone lags across its way
     separation_min_m: NonNegative = 2.0  # about four hulls; estimates err by 0.2 m along a side
     separation_alarm_m: NonNegative = 1.5  # about three hulls
+    sigma_max_m: Positive | UnsetType = UNSET
+    """Of each drone's position, per axis, for take-off and engagement; unset: 1 m. In flight twice as much."""
+    heading_sigma_max_deg: HeadingSigma | UnsetType = UNSET
+    """Likewise of its heading; unset: 15 deg."""
 
 
 Value = Annotated[Real | str, Meta(description="a finite number or an expression")]

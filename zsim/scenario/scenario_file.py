@@ -16,7 +16,8 @@ from zsim.scenario.scenario import DRONES_MAX, Document, Scenario
 from zsim.scenario.shared_vehicle import shared, upon
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, sound
-from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
+from zsim.sensors.error_units import in_channel_units
+from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors, flattened, separate
 from zsim.vehicles import vehicle_catalogue
 from zsim.vehicles.vehicle import DEFAULTS, Aerodynamics, Vehicle
 
@@ -54,9 +55,11 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
 
 def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenario:
     document = _share_vehicle(document)
+    document, misread = _in_channel_units(document)
     vehicles, unknown = _vehicles(document)
     document, unsound = _separate_sensors(_expand_presets(document, vehicles))
-    flaws = chain(faults(document, Document), unknown, unsound, cross_faults(sound(document, Scenario), vehicles))
+    between = cross_faults(sound(document, Scenario), vehicles)
+    flaws = chain(misread, faults(document, Document), unknown, unsound, between)
     found = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
     if found:
         raise ScenarioError(found)
@@ -89,6 +92,24 @@ def _share_vehicle(document: dict[str, Any]) -> dict[str, Any]:
     if not fields or not isinstance(drones, list) or len(drones) > DRONES_MAX:
         return document
     return {**document, "drones": [upon(fields, drone) for drone in drones]}
+
+
+def _in_channel_units(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
+    """Return a document whose sensors' errors are in the units of their channels, and where they cannot be read."""
+    misread: list[Fault] = []
+    read = _with_units(document, "sensors", misread)
+    drones = document.get("drones")
+    if isinstance(drones, list) and len(drones) <= DRONES_MAX:
+        read = {**read, "drones": [_with_units(d, f"drones[{i}].sensors", misread) for i, d in enumerate(drones)]}
+    return read, misread
+
+
+def _with_units(section: Any, where: str, misread: list[Fault]) -> Any:
+    if not isinstance(section, dict) or not isinstance(section.get("sensors"), dict):
+        return section
+    sensors, wrong = in_channel_units(section["sensors"], STOCK, where)
+    misread += wrong
+    return {**section, "sensors": sensors}
 
 
 def _vehicles(document: dict[str, Any]) -> tuple[dict[str, Vehicle], list[Fault]]:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec import inspect as types
 from numpy.typing import NDArray
 
@@ -23,6 +23,7 @@ from zsim.schema.quantities import Fraction, NonNegative, Vector3
 VALUES_MAX = 6  # numbers of one reading
 RateHz = Annotated[float, Meta(ge=0.01, le=1000)]
 LatencyMs = Annotated[float, Meta(ge=0, le=10_000)]
+CorrelationS = Annotated[float, Meta(ge=0, le=1e6)]
 FieldType = Literal[
     "number", "whole", "flag", "number[1]", "number[2]", "number[3]", "number[4]", "number[5]", "number[6]"
 ]
@@ -32,18 +33,38 @@ MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
 
 
 class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Error of one channel, in the channel's unit."""
+    """Error of one channel, in the channel's unit; units of data sheets and of Kalibr: zsim.sensors.error_units."""
 
     noise: NonNegative = 0.0
-    """White, standard deviation per sample."""
+    """Standard deviation of each sample; white, or with `correlation_s` a Gauss-Markov process."""
     density: NonNegative = 0.0
-    """White, per sqrt(Hz): adds density * sqrt(rate) in quadrature to `noise`."""
+    """White, per sqrt(Hz): density * sqrt(rate) of each sample."""
     bias: NonNegative = 0.0
     """Constant over a run, standard deviation over runs, per axis."""
     bias_walk: NonNegative = 0.0
     """Random walk of the bias, per sqrt(s)."""
+    bias_instability: NonNegative | UnsetType = UNSET
+    """Standard deviation of a Gauss-Markov process, in quadrature to a `noise` that is one; unset: none."""
+    correlation_s: CorrelationS | UnsetType = UNSET
+    """Correlation time of the Gauss-Markov process; unset or 0: `noise` is white."""
     quantum: NonNegative = 0.0
     """Step of the converter; 0 = none."""
+
+    @property
+    def correlation_time_s(self) -> float:
+        """Return the correlation time [s], 0 where no error is correlated."""
+        return 0.0 if self.correlation_s is UNSET else self.correlation_s
+
+    @property
+    def correlated_sigma(self) -> float:
+        """Return the stationary standard deviation of the Gauss-Markov process."""
+        if not self.correlation_time_s:
+            return 0.0
+        return math.hypot(self.noise, 0.0 if self.bias_instability is UNSET else self.bias_instability)
+
+    def white_sigma(self, rate_hz: float) -> float:
+        """Return the standard deviation of a sample's white noise: what is no step of the converter's."""
+        return math.hypot(0.0 if self.correlation_time_s else self.noise, self.density * math.sqrt(rate_hz))
 
 
 class Mount(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -203,12 +224,14 @@ def scaled(model: ErrorModel, to_si: float) -> ErrorModel:
     """Return an error model in SI units, given what its unit is in them."""
     if to_si == 1.0:
         return model
-    return ErrorModel(**{field: getattr(model, field) * to_si for field in ErrorModel.__struct_fields__})
+    scales = {field: value for field, value in msgspec.structs.asdict(model).items() if field != "correlation_s"}
+    return msgspec.structs.replace(model, **{f: value * to_si for f, value in scales.items() if value is not UNSET})
 
 
 def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
-    """Return the standard deviation of a sample's white noise: noise, and density over the device's rate."""
-    return math.hypot(model.noise, model.density * math.sqrt(rate_hz))
+    """Return the standard deviation of a sample's noise, white or correlated, about its bias."""
+    white, correlated = model.white_sigma(rate_hz), model.correlated_sigma
+    return math.hypot(white, correlated) if correlated else white
 
 
 # Messages by the types of their fields

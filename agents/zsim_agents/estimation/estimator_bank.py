@@ -41,6 +41,7 @@ from zsim_agents.estimation.filter_state import (
 from zsim_agents.estimation.madgwick import rotation_vector_quaternion
 from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, YAW, set_variance
 from zsim_agents.estimation.sensor_reader import GateReader
+from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2
 
 _READING = struct.Struct(f"{READING.size}d")
 _ROOM = 256  # readings of a gate, at first
@@ -244,21 +245,31 @@ def _step_one(
     if not counts[COUNT.heading_known]:
         measurement_update.start_heading(rows, i, P, t_s, readings, first, after)
     P = measurement_update.fuse(rows, i, P, readings, first, after)
+    strapdown.clone(rows, i, P, 0)
     rows.covariance[i, :n, :n] = P
-    write_estimate(row, P, t_s, estimate)
+    write_estimate(row, rows.setting[i], P, t_s, estimate)
 
 
 @portable
-def write_estimate(row: np.ndarray, P: np.ndarray, t_s: float, estimate: np.ndarray) -> None:
-    """Write the estimate for an instant that the IMU may not have reached yet, (ESTIMATE.size,)."""
+def write_estimate(row: np.ndarray, setting: np.ndarray, P: np.ndarray, t_s: float, estimate: np.ndarray) -> None:
+    """Write the estimate for an instant that the IMU may not have reached yet, (ESTIMATE.size,).
+
+    Until then it goes on with the acceleration of the IMU's last sample, its noise and what the drone does meanwhile.
+    """
     p, v, q, a_W, w, _ = reckoning(row)
     ahead = t_s - row[NOMINAL.t]
     if ahead > 1e-9:
         p, v = axpy(p, ahead, v), axpy(v, ahead, a_W)
         q = normalised(multiply(q, rotation_vector_quaternion(scaled(w, ahead))))
-        P = P.copy()
+        P = P[:9, :9].copy()
         P[:3] += ahead * P[3:6]
         P[:, :3] += ahead * P[:, 3:6]
+        velocity = (setting[SETTING.accel_variance] + MANOEUVRE_M_S2 * MANOEUVRE_M_S2) * ahead * ahead
+        for k in range(3):
+            P[k, k] += 0.25 * ahead * ahead * velocity
+            P[k, 3 + k] += 0.5 * ahead * velocity
+            P[3 + k, k] += 0.5 * ahead * velocity
+            P[3 + k, 3 + k] += velocity
     yaw, yaw_sigma = heading_and_sigma(q, P)
     put(estimate, ESTIMATE.p_WB, p)
     put(estimate, ESTIMATE.v_WB, v)

@@ -16,13 +16,15 @@ from scipy.special import chdtri
 from zsim.contract.keys import SENSORS
 from zsim.math.rotation import LEVEL, matrix_from_rpy
 from zsim.scenario.scenario import Drone, Environment, Estimation
-from zsim.sensors.imu import BOARD_RATE_HZ, ImuConfig
-from zsim.sensors.sensor import ErrorModel, Sensor
+from zsim.sensors.imu import ImuConfig
+from zsim.sensors.sensor import ErrorModel, Sensor, scaled
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from zsim_agents.estimation.filter_state import (
     BIAS,
     CHANNELS,
+    CLONE,
+    CLONED,
     COUNT,
     ESTIMATE,
     LAYOUT,
@@ -35,7 +37,7 @@ from zsim_agents.estimation.filter_state import (
 )
 from zsim_agents.estimation.kalman_update import DOF_MAX
 from zsim_agents.estimation.madgwick import beta_for, levelling_time_s
-from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD
+from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, SET_DOWN_SIGMA_RAD
 from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, MANOEUVRE_S, ZERO
 
 Array = NDArray[np.float64]
@@ -44,6 +46,9 @@ LINK_S = (
     0.4  # s, chosen: what a radio, and telemetry that is sent now and then, add to the latency of an external drone
 )
 LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the gyroscope's drift
+CLONE_EVERY_S = 0.1  # s, chosen: process noise of half of it is small to any sensor's noise
+CLONED_FROM = 0.01  # of a reading's variance, chosen: less process noise since its instant is neglected
+COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # chosen: a worse reading is used, but not to start with
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
 VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest, or in gentle flight
 TILT_SIGMA_RAD = 0.05  # rad: ground that is level to 3 deg
@@ -79,6 +84,9 @@ AIDING = (  # in the order of the values of a reading
 )
 
 
+HEADING_CHANNEL = next(channel for channel in AIDING if channel.sensor == "mag")
+
+
 class BiasPrior(NamedTuple):
     """Equal states of bias."""
 
@@ -87,9 +95,18 @@ class BiasPrior(NamedTuple):
     """Standard deviation at the start, in the channel's unit."""
     walk: float
     """Random walk, per sqrt(s)."""
+    decay_1_s: float = 0.0
+    """Of a Gauss-Markov process: 1 over its correlation time."""
 
 
-BiasPriors = dict[UpdateChannel | str, BiasPrior]
+class AidingBias(NamedTuple):
+    """Names a bias of an aiding channel: constant or walking, or a Gauss-Markov process."""
+
+    channel: UpdateChannel
+    correlated: bool
+
+
+BiasPriors = dict[AidingBias | str, BiasPrior]
 """In the order of the error state: "gyro", "accel" if present, then aiding channels."""
 
 
@@ -98,7 +115,14 @@ def white_sigma(error: ErrorModel, rate_hz: float) -> float:
 
     Noise, density * sqrt(rate) and the converter's rounding (uniform: quantum^2/12) in quadrature.
     """
-    return math.sqrt(error.noise**2 + error.density**2 * rate_hz + error.quantum**2 / 12.0)
+    noise = 0.0 if error.correlation_time_s else error.noise
+    return math.sqrt(noise**2 + error.density**2 * rate_hz + error.quantum**2 / 12.0)
+
+
+def gauss_markov_walk(error: ErrorModel) -> float:
+    """Return what drives a channel's Gauss-Markov process, per sqrt(s): sigma sqrt(2/T)."""
+    sigma = error.correlated_sigma
+    return sigma * math.sqrt(2.0 / error.correlation_time_s) if sigma else 0.0
 
 
 def has_bias(error: ErrorModel) -> bool:
@@ -108,7 +132,12 @@ def has_bias(error: ErrorModel) -> bool:
 
 def accel_sigma(imu: ImuConfig) -> float:
     """Return the accelerometer's white noise per sample [m/s^2]."""
-    return max(white_sigma(imu.accel_m_s2, BOARD_RATE_HZ), ACCEL_SIGMA_MIN)
+    return max(white_sigma(imu.accel_m_s2, imu.rate_hz), ACCEL_SIGMA_MIN)
+
+
+def gyro_sigma(imu: ImuConfig) -> float:
+    """Return the gyroscope's white noise per sample [rad/s]."""
+    return max(math.radians(white_sigma(imu.gyro_deg_s, imu.rate_hz)), GYRO_SIGMA_MIN)
 
 
 def madgwick_beta(estimation: Estimation, imu: ImuConfig, gravity: float) -> float:
@@ -132,43 +161,64 @@ def tilt_density(beta: float, direction_sigma: float, gravity: float, period_s: 
 
 
 def bias_priors(sensors: Sensors, estimation: Estimation) -> BiasPriors:
-    """Return the biases that the filter estimates."""
-    accel, gyro = sensors.imu.accel_m_s2, sensors.imu.gyro_deg_s
-    sigma = max(math.radians(gyro.bias), GYRO_BIAS_MIN)
-    priors: BiasPriors = {"gyro": BiasPrior(3, sigma, max(math.radians(gyro.bias_walk), GYRO_WALK_MIN))}
-    if has_bias(accel):
-        priors["accel"] = BiasPrior(3, accel.bias, accel.bias_walk)
+    """Return the biases that the filter estimates.
+
+    A Gauss-Markov process of the IMU is counted with its other biases as a random walk, which over its correlation
+    time gains as much and goes on growing: never too sure. That of an aiding channel is a state by itself.
+    """
+    accel, gyro = sensors.imu.accel_m_s2, scaled(sensors.imu.gyro_deg_s, math.radians(1.0))
+    sigma, walk = _as_walk(gyro)
+    priors: BiasPriors = {"gyro": BiasPrior(3, max(sigma, GYRO_BIAS_MIN), max(walk, GYRO_WALK_MIN))}
+    if has_bias(accel) or accel.correlated_sigma:
+        priors["accel"] = BiasPrior(3, *_as_walk(accel))
     used = {"mag": estimation.magnetometer, "flow": estimation.flow}
     for channel in AIDING:
         error = _error_model(sensors, channel)
-        if has_bias(error) and used.get(channel.sensor, True):
-            priors[channel] = BiasPrior(channel.axes, error.bias, error.bias_walk)
+        if not used.get(channel.sensor, True):
+            continue
+        if has_bias(error):
+            priors[AidingBias(channel, False)] = BiasPrior(channel.axes, error.bias, error.bias_walk)
+        if error.correlated_sigma:
+            priors[AidingBias(channel, True)] = BiasPrior(
+                channel.axes, error.correlated_sigma, gauss_markov_walk(error), 1.0 / error.correlation_time_s
+            )
     return priors
+
+
+def _as_walk(error: ErrorModel) -> tuple[float, float]:
+    """Return standard deviation at the start and random walk of all biases of an IMU's channel together."""
+    if not error.correlated_sigma:
+        return error.bias, error.bias_walk
+    return math.hypot(error.bias, error.correlated_sigma), math.hypot(error.bias_walk, gauss_markov_walk(error))
 
 
 class ErrorState:
     """Places and beginning of an error state.
 
     Attributes:
-        size: n.
+        own: states without the clones; the clones are behind them.
+        size: n, clones included.
         first: first state of each bias.
         walk: density of each bias' random walk [unit^2/s], (n,).
+        decay: of each bias [1/s], (n,).
         covariance: at the start, (n, n).
     """
 
-    def __init__(self, priors: BiasPriors) -> None:
-        self.first: dict[UpdateChannel | str, int] = {}
+    def __init__(self, priors: BiasPriors, clones: int) -> None:
+        self.clones = clones
+        self.first: dict[AidingBias | str, int] = {}
         self.size = GYRO_BIAS
         for name, prior in priors.items():
             self.first[name] = self.size
             self.size += prior.axes
-        variance, self.walk = np.zeros(self.size), np.zeros(self.size)
+        self.own, self.size = self.size, self.size + clones * CLONED
+        variance, self.walk, self.decay = np.zeros(self.size), np.zeros(self.size), np.zeros(self.size)
         variance[POSITION : POSITION + 3] = POSITION_SIGMA_M**2
         variance[VELOCITY : VELOCITY + 3] = VELOCITY_SIGMA_M_S**2
         variance[ATTITUDE : ATTITUDE + 3] = TILT_SIGMA_RAD**2, TILT_SIGMA_RAD**2, HEADING_SIGMA_RAD**2
         for name, prior in priors.items():
             span = slice(self.first[name], self.first[name] + prior.axes)
-            variance[span], self.walk[span] = prior.sigma**2, prior.walk**2
+            variance[span], self.walk[span], self.decay[span] = prior.sigma**2, prior.walk**2, prior.decay_1_s
         self.covariance = np.diag(variance)
 
 
@@ -183,23 +233,27 @@ def initial_rows(
         estimation: settings.
         gate_s: interval of the gates [s].
     """
-    states = [ErrorState(bias_priors(drone.sensors, estimation)) for drone in drones]
+    clones = [clone_count(drone.sensors, environment, estimation, gate_s) for drone in drones]
+    states = [ErrorState(bias_priors(d.sensors, estimation), k) for d, k in zip(drones, clones, strict=True)]
     count, size = len(drones), max(each.size for each in states)
-    covariance, walk = np.zeros((count, size, size)), np.zeros((count, size))
+    covariance, walk, decay = np.zeros((count, size, size)), np.zeros((count, size)), np.zeros((count, size))
     for i, each in enumerate(states):
-        covariance[i, : each.size, : each.size], walk[i, : each.size] = each.covariance, each.walk
+        covariance[i, : each.size, : each.size] = each.covariance
+        walk[i, : each.size], decay[i, : each.size] = each.walk, each.decay
     setting = np.array([_setting(drone, environment, estimation, gate_s) for drone in drones], dtype=float)
     pairs = zip(drones, states, strict=True)
-    layout = np.array([_layout(drone, estimation, gate_s, each) for drone, each in pairs], dtype=np.int64)
+    layout = np.array([_layout(drone, environment, estimation, gate_s, each) for drone, each in pairs], dtype=np.int64)
     rows = Rows(
         nominal=_nominal(setting),
         counts=np.zeros((count, COUNT.size), dtype=np.int64),
         covariance=covariance,
         bias=np.zeros((count, size)),
         history=np.zeros((count, layout[:, LAYOUT.history].max(), MOMENT.size)),
+        clones=np.full((count, max(clones), CLONE.size), math.nan),
         setting=setting,
         layout=layout,
         walk=walk,
+        decay=decay,
         limits=innovation_limits(estimation.gate_probability),
         joint=np.zeros((0, 0)),
         sighted=np.zeros((0, 0)),
@@ -219,6 +273,46 @@ def age_max_s(drone: Drone, gate_s: float) -> float:
     return 2.0 * latency_s + 5.0 * gate_s + link_s
 
 
+def clone_count(sensors: Sensors, environment: Environment, estimation: Estimation, gate_s: float) -> int:
+    """Return how many clones of position and velocity late readings need; 0 where process noise is small to theirs."""
+    longest_s = 0.0
+    for channel in AIDING:
+        section, used = _section(sensors, channel.sensor), {"mag": False, "flow": estimation.flow}
+        late_s = (section.latency_ms - sensors.imu.latency_ms) * 1e-3
+        if late_s <= gate_s or not used.get(channel.sensor, True):
+            continue
+        variance = max(white_sigma(_error_model(sensors, channel), section.rate_hz), channel.sigma_min) ** 2
+        position, velocity = gained_variance(sensors.imu, environment, estimation, late_s)
+        gained = velocity if channel.field == "velocity_m_s" else position
+        if gained > CLONED_FROM * variance:
+            longest_s = max(longest_s, late_s + gate_s)
+    return math.ceil(longest_s / CLONE_EVERY_S) + 1 if longest_s else 0
+
+
+def gained_variance(
+    imu: ImuConfig, environment: Environment, estimation: Estimation, span_s: float
+) -> tuple[float, float]:
+    """Return what process noise adds to position [m^2] and velocity [m^2/s^2], per horizontal axis, over a time.
+
+    White acceleration and a random walk of the tilt, integrated (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation
+    with Applications to Tracking and Navigation", 2001, section 6.2).
+    """
+    gravity = environment.gravity_m_s2
+    beta, direction_sigma = madgwick_beta(estimation, imu, gravity), accel_sigma(imu) / gravity
+    white = accel_sigma(imu) ** 2 / imu.rate_hz  # m^2/s^3
+    tilt = gyro_sigma(imu) ** 2 / imu.rate_hz + tilt_density(beta, direction_sigma, gravity, 1.0 / imu.rate_hz)
+    walk = gravity * gravity * tilt  # m^2/s^5
+    return white * span_s**3 / 3.0 + walk * span_s**5 / 20.0, white * span_s + walk * span_s**3 / 3.0
+
+
+def has_compass(drone: Drone, environment: Environment, estimation: Estimation) -> bool:
+    """Return whether one reading of the magnetometer tells a heading as well as setting the drone down by eye does."""
+    horizontal_ut, error = math.hypot(*environment.magnetic_field_ut[:2]), drone.sensors.mag.field_ut
+    white = max(white_sigma(error, drone.sensors.mag.rate_hz), HEADING_CHANNEL.sigma_min)
+    sideways_ut = math.hypot(white, math.hypot(error.bias, error.correlated_sigma))
+    return estimation.magnetometer and sideways_ut <= COMPASS_SIGMA_RAD * horizontal_ut
+
+
 def _section(sensors: Sensors, name: str) -> Sensor:
     return getattr(sensors, name)
 
@@ -231,7 +325,6 @@ def _setting(drone: Drone, environment: Environment, estimation: Estimation, gat
     """Return the columns SETTING of a drone."""
     imu, gravity = drone.sensors.imu, environment.gravity_m_s2
     beta, direction_sigma = madgwick_beta(estimation, imu, gravity), accel_sigma(imu) / gravity
-    gyro_sigma = max(math.radians(white_sigma(imu.gyro_deg_s, BOARD_RATE_HZ)), GYRO_SIGMA_MIN)
     row = [
         gravity,
         beta,
@@ -241,9 +334,10 @@ def _setting(drone: Drone, environment: Environment, estimation: Estimation, gat
         age_max_s(drone, gate_s),
         math.radians(drone.yaw_deg),
         accel_sigma(imu) ** 2,
-        gyro_sigma**2,
+        gyro_sigma(imu) ** 2,
         tilt_density(beta, direction_sigma, gravity, 1.0 / imu.rate_hz),
         levelling_time_s(beta, direction_sigma),
+        CLONE_EVERY_S,
         *environment.magnetic_field_ut,
     ]
     for name in SENSORS:
@@ -256,25 +350,32 @@ def _sensor_setting(name: str, sensors: Sensors) -> list[float]:
     """Return the columns SENSOR of one sensor."""
     section = _section(sensors, name)
     variance: list[float] = []
+    correlated = 0.0
     for channel in AIDING:
         if channel.sensor == name:
             sigma = max(white_sigma(_error_model(sensors, channel), section.rate_hz), channel.sigma_min)
             variance += [sigma**2] * channel.axes
+            if channel.field == "position_m":
+                correlated = _error_model(sensors, channel).correlated_sigma
     variance += [0.0] * (VALUES_MAX - len(variance))
     R_BS = np.array(matrix_from_rpy(*map(math.radians, section.mount.rpy_deg)))
-    row = [*variance, *section.mount.position_m, *R_BS.flat, *-R_BS[:, 2], PATIENCE_S.get(name, math.inf)]
+    mount, patience_s = (*section.mount.position_m, *R_BS.flat, *-R_BS[:, 2]), PATIENCE_S.get(name, math.inf)
+    row = [*variance, *mount, patience_s, correlated**2]
     assert len(row) == SENSOR.size
     return row
 
 
-def _layout(drone: Drone, estimation: Estimation, gate_s: float, states: ErrorState) -> list[int]:
+def _layout(
+    drone: Drone, environment: Environment, estimation: Estimation, gate_s: float, states: ErrorState
+) -> list[int]:
     """Return the columns LAYOUT of a drone."""
     mount = drone.sensors.imu.mount
     entries = int(age_max_s(drone, gate_s) / gate_s) + 3
     displaced = mount.rpy_deg != ZERO or mount.position_m != ZERO
-    aiding = any(isinstance(name, UpdateChannel) for name in states.first)
-    flags = (displaced, "accel" in states.first, aiding, estimation.magnetometer, estimation.flow)
-    row = [states.size, entries, *map(int, flags)]
+    aiding = any(isinstance(name, AidingBias) for name in states.first) or states.clones > 0
+    own = (displaced, "accel" in states.first, aiding, states.decay.any())
+    flags = (*own, estimation.magnetometer, has_compass(drone, environment, estimation), estimation.flow)
+    row = [states.size, states.clones, states.own, entries, *map(int, flags)]
     for name in SENSORS:
         row += _bias_places(name, states)
     assert len(row) == LAYOUT.size
@@ -287,8 +388,10 @@ def _bias_places(sensor: str, states: ErrorState) -> list[int]:
     row = 0
     for channel in AIDING:
         if channel.sensor == sensor:
-            if channel in states.first:
-                places += [states.first[channel], row, channel.axes]
+            for correlated in (False, True):
+                name = AidingBias(channel, correlated)
+                if name in states.first:
+                    places += [states.first[name], row, channel.axes]
             row += channel.axes
     return places + [-1, 0, 0] * (CHANNELS - len(places) // BIAS.size)
 

@@ -17,7 +17,7 @@ from zsim_agents.estimation.dead_reckoning import Reckoning, vector
 IMU, GPS, MAG, BARO, SONAR, FLOW = (SENSORS.index(name) for name in ("imu", "gps", "mag", "baro", "sonar", "flow"))
 SIZES = (6, 6, 3, 1, 1, 3)  # values of a reading of each sensor
 VALUES_MAX = max(SIZES)
-CHANNELS = 2  # of a sensor, at most, that have a bias of their own
+CHANNELS = 4  # biases of a sensor at most: of two channels, each a constant or walking one and a Gauss-Markov process
 
 _MOMENT_FIELDS = (
     Field("t", "s"),
@@ -48,6 +48,16 @@ NOMINAL = columns(  # begins as a moment does, so one function reads both
     ),
 )
 
+CLONE = columns(  # a former position and velocity whose errors stand in the error state, for readings that come late
+    "Clone",
+    (
+        Field("t", "s"),  # not a number where there is none
+        Field("p_corrected", "m", 3),  # in all by then
+        Field("v_corrected", "m/s", 3),
+    ),
+)
+CLONED = 6  # states of a clone: position and velocity, the first of the error state
+
 SENSOR = columns(  # settings of a sensor
     "Sensor",
     (
@@ -56,6 +66,7 @@ SENSOR = columns(  # settings of a sensor
         Field("R_BS", "1", 9),
         Field("down_B", "1", 3),
         Field("patience", "s"),
+        Field("correlated", "unit^2"),  # variance of the first channel's Gauss-Markov process
     ),
 )
 
@@ -73,6 +84,7 @@ SETTING = columns(
         Field("gyro_variance", "rad^2/s^2"),
         Field("tilt_density", "rad^2/s"),
         Field("levelling", "s"),
+        Field("clone_every", "s"),
         Field("field_W", "uT", 3),
         Field("sensors", "1", len(SENSORS) * SENSOR.size),
     ),
@@ -83,12 +95,16 @@ BIAS = columns("Bias", (Field("state", "1"), Field("row", "1"), Field("axes", "1
 LAYOUT = columns(
     "Layout",
     (
-        Field("states", "1"),  # of the error state
+        Field("states", "1"),  # of the error state, clones included
+        Field("clones", "1"),
+        Field("first_clone", "1"),  # its first state; clones are the last ones
         Field("history", "1"),  # entries of the ring
         Field("imu_displaced", "1"),
         Field("accel_bias", "1"),  # whether one is estimated
-        Field("aiding_biases", "1"),  # likewise
+        Field("aiding_biases", "1"),  # whether there are any, or clones
+        Field("correlated", "1"),  # whether a bias is a Gauss-Markov process
         Field("magnetometer", "1"),  # whether it is used
+        Field("compass", "1"),  # whether one reading of it gives a heading to start with
         Field("flow", "1"),  # likewise
         Field("biases", "1", len(SENSORS) * CHANNELS * BIAS.size),
     ),
@@ -143,11 +159,13 @@ class Rows(NamedTuple):
     nominal: NDArray[np.float64]  # (N, NOMINAL.size)
     counts: NDArray[np.int64]  # (N, COUNT.size)
     covariance: NDArray[np.float64]  # (N, n, n), of the error state
-    bias: NDArray[np.float64]  # (N, n), of the aiding sensors
+    bias: NDArray[np.float64]  # (N, n), of the aiding sensors, and what clones were corrected by since they were made
     history: NDArray[np.float64]  # (N, entries, MOMENT.size), a ring of past gates
+    clones: NDArray[np.float64]  # (N, most clones of a drone, CLONE.size)
     setting: NDArray[np.float64]  # (N, SETTING.size)
     layout: NDArray[np.int64]  # (N, LAYOUT.size)
     walk: NDArray[np.float64]  # (N, n), unit^2/s
+    decay: NDArray[np.float64]  # (N, n), 1/s, of Gauss-Markov biases; zero elsewhere
     limits: NDArray[np.float64]  # (7,), of the innovation gates by number of rows
     joint: NDArray[np.float64]  # (N n, N n), covariance of all of them together; (0, 0) where each stands for itself
     sighted: NDArray[np.float64]  # (N, N), when a sighting of one drone by another was used last [s]; (0, 0) likewise
@@ -159,6 +177,7 @@ STATES = (
     "covariance",
     "bias",
     "history",
+    "clones",
     "joint",
     "sighted",
 )  # rows that change; others are settings

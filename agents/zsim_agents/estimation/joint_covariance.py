@@ -1,4 +1,4 @@
-"""The covariance of several drones' errors together: its prediction, and updates that correct all of them.
+"""The covariance of several drones' errors together: updates that correct all of them.
 
 Compiled. D = N n: the error states of N drones one behind the other, n each (filter_setup); J is (D, D). Where there is
 none, J is (0, 0), and every drone's covariance stands for itself.
@@ -23,35 +23,6 @@ def put_block(J: np.ndarray, i: int, P: np.ndarray) -> None:
 def block(J: np.ndarray, i: int, n: int) -> np.ndarray:
     """Return a drone's own covariance, (n, n)."""
     return J[i * n : i * n + n, i * n : i * n + n].copy()
-
-
-@portable
-def predict_jointly(J: np.ndarray, i: int, F: np.ndarray, Q: np.ndarray) -> None:
-    """Let a drone's errors grow by F and Q, (n, n), those with others along with them."""
-    n, size = F.shape[0], J.shape[0]
-    first = i * n
-    former = J[first : first + n].copy()
-    for r in range(n):
-        for d in range(size):
-            J[first + r, d] = F[r, r] * former[r, d]
-        for c in range(n):
-            f = F[r, c]
-            if c != r and f != 0.0:
-                for d in range(size):
-                    J[first + r, d] += f * former[c, d]
-    own = J[first : first + n, first : first + n].copy()
-    for r in range(n):
-        for c in range(r, n):
-            total = Q[r, c]
-            for k in range(n):
-                f = F[c, k]
-                if f != 0.0:
-                    total += own[r, k] * f
-            J[first + r, first + c] = J[first + c, first + r] = total
-    for d in range(size):  # the rows of others stand in the columns as well
-        if d < first or d >= first + n:
-            for r in range(n):
-                J[d, first + r] = J[first + r, d]
 
 
 @portable

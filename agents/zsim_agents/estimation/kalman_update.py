@@ -26,6 +26,7 @@ from zsim_agents.estimation.dead_reckoning import (
 
 ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
 DOF_MAX = 6  # rows of the largest block, GPS with position and velocity
+JOSEPH_MAX = 24  # states, chosen: with more, of clones, its products of n^3 would cost more than all else
 COSINE_MIN = 0.1  # of the sonar's ray to the vertical; flatter than 84 deg it does not hit the ground below
 
 SIX = tuple[float, float, float, float, float, float]
@@ -139,6 +140,35 @@ def predicted_covariance(P: np.ndarray, F: np.ndarray, Q: np.ndarray) -> np.ndar
 
 
 @portable
+def predict_jointly(J: np.ndarray, i: int, F: np.ndarray, Q: np.ndarray) -> None:
+    """Let the i-th n errors of J grow by F and Q, (n, n), and their covariance with all others along with them."""
+    n, size = F.shape[0], J.shape[0]
+    first = i * n
+    former = J[first : first + n].copy()
+    for r in range(n):
+        for d in range(size):
+            J[first + r, d] = F[r, r] * former[r, d]
+        for c in range(n):
+            f = F[r, c]
+            if c != r and f != 0.0:
+                for d in range(size):
+                    J[first + r, d] += f * former[c, d]
+    own = J[first : first + n, first : first + n].copy()
+    for r in range(n):
+        for c in range(r, n):
+            total = Q[r, c]
+            for k in range(n):
+                f = F[c, k]
+                if f != 0.0:
+                    total += own[r, k] * f
+            J[first + r, first + c] = J[first + c, first + r] = total
+    for d in range(size):  # the rows of others stand in the columns as well
+        if d < first or d >= first + n:
+            for r in range(n):
+                J[d, first + r] = J[first + r, d]
+
+
+@portable
 def innovation_covariance(P: np.ndarray, H: np.ndarray, variance: np.ndarray, PHt: np.ndarray) -> np.ndarray:
     """Return S = H P H^T + R for a diagonal R, and write P H^T.
 
@@ -221,6 +251,21 @@ def joseph(P: np.ndarray, H: np.ndarray, variance: np.ndarray, K: np.ndarray) ->
 
 
 @portable
+def downdated(P: np.ndarray, PHt: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Return P - K H P, (n, n), symmetric, for P H^T and the gain K = P H^T S^-1, (n, m)."""
+    n, m = K.shape
+    updated = P.copy()
+    for i in range(n):
+        for k in range(m):
+            weight = PHt[i, k]
+            for j in range(i, n):
+                updated[i, j] -= weight * K[j, k]
+        for j in range(i, n):
+            updated[j, i] = updated[i, j]
+    return updated
+
+
+@portable
 def within_gates(S: np.ndarray, y: np.ndarray, blocks: np.ndarray, limits: np.ndarray, distances: np.ndarray) -> bool:
     """Write y^T S^-1 y of every block of innovations by itself; return whether all are within their limits.
 
@@ -290,4 +335,4 @@ def stacked_update(
     for i in range(P.shape[0]):
         for j in range(H.shape[0]):
             x[i] += K[i, j] * y[j]
-    return True, x, joseph(P, H, variance, K), S
+    return True, x, joseph(P, H, variance, K) if P.shape[0] <= JOSEPH_MAX else downdated(P, PHt, K), S

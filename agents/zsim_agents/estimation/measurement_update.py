@@ -16,6 +16,7 @@ from zsim_agents.estimation.filter_state import (
     BARO,
     BIAS,
     CHANNELS,
+    CLONED,
     COUNT,
     FLOW,
     GPS,
@@ -52,6 +53,7 @@ VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would
 SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
 HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which turns the attitude to it
 SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
+MOVES_SIGMAS = 2.0  # of the velocity, chosen: one that stands still moves so fast at 2 % of the samples
 DENIED_S = 2.0  # s since two drones saw each other, chosen: errors grow little meanwhile
 HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
 
@@ -98,13 +100,13 @@ def set_variance(P: np.ndarray, k: int, variance: float) -> None:
 def start_heading(
     rows: Rows, i: int, P: np.ndarray, t_s: float, readings: np.ndarray, first: int, after: np.ndarray
 ) -> None:
-    """Give the attitude its first heading: the magnetometer's, or the scenario's where there is none."""
+    """Give the attitude its first heading: the magnetometer's, or where it tells none, the one it was set down with."""
     row, counts, setting = rows.nominal[i], rows.counts[i], rows.setting[i]
     if math.isnan(row[NOMINAL.t_first_gate]):
         row[NOMINAL.t_first_gate] = t_s
     at = first
     while at >= 0:
-        if int(readings[at, READING.sensor]) == MAG:
+        if rows.layout[i, LAYOUT.compass] and int(readings[at, READING.sensor]) == MAG:
             R_BS = matrix_at(setting, SETTING.sensors + MAG * SENSOR.size + SENSOR.R_BS)
             seen = product(matrix(quaternion(row, NOMINAL.q_WB)), product(R_BS, vector(readings[at], READING.values)))
             field = vector(setting, SETTING.field_W)
@@ -112,7 +114,7 @@ def start_heading(
             _turn_heading(row, counts, setting[SETTING.gravity], angle)  # its certainty comes from the update
             return
         at = after[at]
-    if not rows.layout[i, LAYOUT.magnetometer] or t_s - row[NOMINAL.t_first_gate] > HEADING_WAIT_S:
+    if not rows.layout[i, LAYOUT.compass] or t_s - row[NOMINAL.t_first_gate] > HEADING_WAIT_S:
         angle = setting[SETTING.set_down_yaw] - heading(quaternion(row, NOMINAL.q_WB))
         _turn_heading(row, counts, setting[SETTING.gravity], angle)
         set_variance(P, YAW, SET_DOWN_SIGMA_RAD * SET_DOWN_SIGMA_RAD)
@@ -169,8 +171,21 @@ def is_denied(rows: Rows, i: int, kind: int) -> bool:
 
 
 @portable
-def inflate(row: np.ndarray, P: np.ndarray, kind: int, z: np.ndarray, expected: np.ndarray, at: int) -> None:
+def widen(P: np.ndarray, k: int, variance: float, layout: np.ndarray) -> None:
+    """Add a variance to a state of the position or velocity, and to its clones: it is one error of all of them."""
+    first, end = layout[LAYOUT.first_clone] + k, P.shape[0]
+    P[k, k] += variance
+    for a in range(first, end, CLONED):
+        P[a, k] += variance
+        P[k, a] += variance
+        for b in range(first, end, CLONED):
+            P[a, b] += variance
+
+
+@portable
+def inflate(rows: Rows, i: int, P: np.ndarray, kind: int, z: np.ndarray, expected: np.ndarray, at: int) -> None:
     """Make the states that a long refused sensor observes as uncertain as its innovation: it is trusted again."""
+    row, layout = rows.nominal[i], rows.layout[i]
     squares, total = np.zeros(VALUES_MAX), 0.0
     for k in range(SIZES[kind]):
         y = z[at + k] - expected[at + k]
@@ -178,12 +193,12 @@ def inflate(row: np.ndarray, P: np.ndarray, kind: int, z: np.ndarray, expected: 
         total += squares[k]
     if kind == GPS:
         for k in range(6):
-            P[POSITION + k, POSITION + k] += squares[k]
+            widen(P, POSITION + k, squares[k], layout)
     elif kind == FLOW:
         for k in range(3):
-            P[VELOCITY + k, VELOCITY + k] += total
+            widen(P, VELOCITY + k, total, layout)
     elif kind == BARO:
-        P[POSITION + 2, POSITION + 2] += squares[0]
+        widen(P, POSITION + 2, squares[0], layout)
     elif kind == MAG:
         P[YAW, YAW] += HEADING_SIGMA_RAD * HEADING_SIGMA_RAD
     row[NOMINAL.refused_since + kind] = row[NOMINAL.t]
@@ -269,26 +284,56 @@ def correct(
 
 @portable
 def stack(
-    rows: Rows, i: int, reading: np.ndarray, H: np.ndarray, z: np.ndarray, expected: np.ndarray, at: int, past: Moment
+    rows: Rows,
+    i: int,
+    reading: np.ndarray,
+    H: np.ndarray,
+    z: np.ndarray,
+    expected: np.ndarray,
+    at: int,
+    known: tuple[Moment, float, int],
 ) -> None:
-    """Put a reading on a stack of measurements from row `at` on, compared with the state of its own instant, `past`."""
+    """Put a reading on a stack of measurements from row `at` on, compared with the state of its own instant.
+
+    Args:
+        known: that state, as `strapdown.recall_known` returns it.
+    """
     kind, setting = int(reading[READING.sensor]), rows.setting[i]
-    predict(H, at, kind, setting, past, rows.nominal[i, NOMINAL.t] - past[0], expected)
+    past, lag, state = known
+    predict(H, at, kind, setting, past, lag, expected)
+    strapdown.move_columns(H, at, SIZES[kind], state)
     with_biases(rows, i, kind, H, at, expected)
     for k in range(SIZES[kind]):
         z[at + k] = reading[READING.values + k]
 
 
 @portable
+def distrust_turn(P: np.ndarray, H: np.ndarray, expected: np.ndarray, at: int) -> None:
+    """Let the flow tell a heading, in rows from `at` on, only as far as the drone surely moves.
+
+    A heading's error turns the velocity. Turned by the error of an estimate that should be zero, it would tell a
+    heading that nothing measures (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for
+    designing consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010).
+    """
+    squared = expected[at] * expected[at] + expected[at + 1] * expected[at + 1]
+    noise = MOVES_SIGMAS * MOVES_SIGMAS * (P[VELOCITY, VELOCITY] + P[VELOCITY + 1, VELOCITY + 1])
+    share = 1.0 - noise / squared if squared > noise else 0.0
+    for r in range(at, at + 2):
+        for k in range(3):
+            H[r, ATTITUDE + k] *= share
+
+
+@portable
 def write_variance(reading: np.ndarray, setting: np.ndarray, variance: np.ndarray, at: int) -> None:
     """Write the variances of a reading's rows; a GPS receiver's own figure counts where it is worse."""
     kind = int(reading[READING.sensor])
-    known = SETTING.sensors + kind * SENSOR.size + SENSOR.variance
+    known = SETTING.sensors + kind * SENSOR.size
     for k in range(SIZES[kind]):
-        variance[at + k] = setting[known + k]
+        variance[at + k] = setting[known + SENSOR.variance + k]
     if kind == GPS:
+        claimed = reading[READING.extra] * reading[READING.extra] - setting[known + SENSOR.correlated]
         for k in range(3):
-            variance[at + k] = max(reading[READING.extra] * reading[READING.extra], setting[known])
+            variance[at + k] = max(claimed, setting[known + SENSOR.variance])
 
 
 @portable
@@ -304,11 +349,11 @@ def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, af
         after: of each reading, the next one of the same drone, (M,); -1 after the last.
     """
     row, counts, setting, n = rows.nominal[i], rows.counts[i], rows.setting[i], P.shape[0]
-    longest = rows.layout[i, LAYOUT.history]
     H, z, expected, variance = np.zeros((ROWS_MAX, n)), np.zeros(ROWS_MAX), np.zeros(ROWS_MAX), np.zeros(ROWS_MAX)
     blocks, kinds = np.zeros((ROWS_MAX, 2), dtype=np.int64), np.zeros(ROWS_MAX, dtype=np.int64)
     m, b = 0, 0
-    now = past = moment(row)
+    now = moment(row)
+    known = now, 0.0, 0
     at = first
     while at >= 0:
         reading = readings[at]
@@ -322,17 +367,20 @@ def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, af
             P = correct(rows, i, P, H[:m], z[:m], expected[:m], variance[:m], blocks[:b], kinds)
             H[:m] = 0.0
             m, b = 0, 0
-            now = past = moment(row)
-        if past[0] != t_sample_s:
-            past = strapdown.recall(counts, rows.history[i], longest, t_sample_s, now)
-        stack(rows, i, reading, H, z, expected, m, past)
+            now = moment(row)
+            known = now, 0.0, 0
+        if known[0][0] != t_sample_s:
+            known = strapdown.recall_known(rows, i, t_sample_s, now)
+        stack(rows, i, reading, H, z, expected, m, known)
+        if kind == FLOW and not rows.layout[i, LAYOUT.compass]:
+            distrust_turn(P, H, expected, m)
         write_variance(reading, setting, variance, m)
         patience_s = setting[SETTING.sensors + kind * SENSOR.size + SENSOR.patience]
         if row[NOMINAL.t] - row[NOMINAL.refused_since + kind] > patience_s and not is_denied(rows, i, kind):
-            inflate(row, P, kind, z, expected, m)
+            inflate(rows, i, P, kind, z, expected, m)
         blocks[b, 0], blocks[b, 1], kinds[b] = m, size, kind
         m, b = m + size, b + 1
     if m:
         P = correct(rows, i, P, H[:m], z[:m], expected[:m], variance[:m], blocks[:b], kinds)
-    strapdown.remember(counts, rows.history[i], longest, moment(row))
+    strapdown.remember(counts, rows.history[i], rows.layout[i, LAYOUT.history], moment(row))
     return P

@@ -22,6 +22,7 @@ from zsim.contract.snapshot import State
 from zsim.math import frames
 from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone, Environment, Estimation
+from zsim.sensors.sensor import ErrorModel, noise_sigma
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.madgwick import madgwick_step
 
@@ -38,12 +39,14 @@ class PaperEstimator:
 
     def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None:
         gyro, flow = drone.sensors.imu.gyro_deg_s, drone.sensors.flow
-        self._gyro_sigma, self._gyro_bias = math.radians(gyro.noise), math.radians(gyro.bias)  # rad/s
+        gyro_sigma = noise_sigma(gyro, drone.sensors.imu.rate_hz)
+        self._gyro_sigma, self._gyro_bias = math.radians(gyro_sigma), math.radians(gyro.bias)  # rad/s
+        self._fix_variances = repeated(drone.sensors.gps.position_m, drone.sensors.gps.rate_hz)
         self._imu_period_s = 1.0 / drone.sensors.imu.rate_hz
         beta = estimation.madgwick_beta
         self._beta = math.sqrt(0.75) * (self._gyro_sigma + self._gyro_bias) if beta is None else beta  # Madgwick (50)
         self._q_BS = frames.quaternion_from_rpy(np.radians(drone.sensors.imu.mount.rpy_deg))
-        self._speed_sigma, self._flow_period_s = flow.velocity_m_s.noise, 1.0 / flow.rate_hz
+        self._speed_sigma, self._flow_period_s = noise_sigma(flow.velocity_m_s, flow.rate_hz), 1.0 / flow.rate_hz
         yaw = math.radians(drone.yaw_deg)
         self._q = _quaternion(frames.quaternion_from_heading(yaw))
         self._t_imu_s = math.nan
@@ -71,7 +74,7 @@ class PaperEstimator:
         yaw = float(frames.heading(self._q))
         self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, self._process_noise(dt), dt)
         if self._fix:
-            self._filter.correct(self._fix)
+            self._filter.correct(self._fix, self._fix_variances)
             self._fix = None
         turn = frames.quaternion_from_heading(self._filter.x[YAW] - yaw)
         self._q = _quaternion(frames.quaternion_multiply(turn, self._q))
@@ -163,10 +166,24 @@ class DeadReckoningFilter(ExtendedKalmanFilter):
         """Set the state to that of dead reckoning, which is not linear."""
         self.x = self._next
 
-    def correct(self, fix: Gps) -> None:
-        """Use a fix of the GPS receiver."""
-        H = np.eye(3, 4)
-        self.update(np.array(fix.position_m), lambda x: H, lambda x: x[:3], R=np.eye(3) * fix.sigma_m**2)
+    def correct(self, fix: Gps, variances: float = 1.0) -> None:
+        """Use a fix of the GPS receiver, its variance taken so many times."""
+        H, R = np.eye(3, 4), np.eye(3) * fix.sigma_m**2 * variances
+        self.update(np.array(fix.position_m), lambda x: H, lambda x: x[:3], R=R)
+
+
+def repeated(error: ErrorModel, rate_hz: float) -> float:
+    """Return for how many independent samples one is to be counted less: (1 + a)/(1 - a) of neighbours correlated by a.
+
+    The variance of a mean of n samples of a Gauss-Markov process is so many times sigma^2/n (G. V. Bayley,
+    J. M. Hammersley, "The 'effective' number of independent observations in an autocorrelated time series",
+    Supplement to the Journal of the Royal Statistical Society 8, 1946).
+    """
+    if not error.correlated_sigma:
+        return 1.0
+    a = math.exp(-1.0 / (rate_hz * error.correlation_time_s))
+    share = (error.correlated_sigma / noise_sigma(error, rate_hz)) ** 2
+    return 1.0 + share * 2.0 * a / (1.0 - a)
 
 
 def rotation_z(yaw: float) -> NDArray[np.float64]:

@@ -1,4 +1,12 @@
-"""The nominal state of a drone, a row: moved by every sample of its IMU, put right by the filter, and remembered."""
+"""The nominal state of a drone, a row: moved by every sample of its IMU, put right by the filter, and remembered.
+
+A reading that comes late measures a state that the process noise since then is no part of. Where that matters, clones
+of position and velocity stand in the error state: it is compared with the clone nearest to its instant, and the
+correlations do the rest. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized framework for processing
+relative state measurements", IEEE International Conference on Robotics and Automation, 2002.
+"""
+
+import math
 
 import numpy as np
 
@@ -6,6 +14,8 @@ from zsim.math.compiled import portable
 from zsim.math.rotation import Vector, about_z, add, axpy, multiply, normalised, product, scaled, subtract
 from zsim_agents.estimation.dead_reckoning import acceleration, arm_acceleration, corrected, reckon, write_prediction
 from zsim_agents.estimation.filter_state import (
+    CLONE,
+    CLONED,
     COUNT,
     IMU,
     LAYOUT,
@@ -25,7 +35,7 @@ from zsim_agents.estimation.filter_state import (
     reckoning,
     vector,
 )
-from zsim_agents.estimation.kalman_update import predicted_covariance
+from zsim_agents.estimation.kalman_update import predict_jointly, predicted_covariance
 from zsim_agents.estimation.madgwick import rotation_vector_quaternion
 
 ZERO: Vector = (0.0, 0.0, 0.0)
@@ -137,18 +147,24 @@ def coast(row: np.ndarray, setting: np.ndarray, t_s: float) -> None:
 @portable
 def grow(rows: Rows, i: int, P: np.ndarray) -> np.ndarray:
     """Return the covariance grown over the interval of dead reckoning that ends now, and begin the next one."""
-    row, n = rows.nominal[i], P.shape[0]
+    row, n = rows.nominal[i], rows.layout[i, LAYOUT.first_clone]
     if row[NOMINAL.t] > row[NOMINAL.t_start]:
         F, Q = np.eye(n), np.zeros((n, n))
         write_growth(rows, i, F, Q)
-        P = predicted_covariance(P, F, Q)
+        if n < P.shape[0]:
+            predict_jointly(P, 0, F, Q)  # the clones, which stay as they are, are the others
+        else:
+            P = predicted_covariance(P, F, Q)
     begin_interval(row, row[NOMINAL.t])
     return P
 
 
 @portable
 def write_growth(rows: Rows, i: int, F: np.ndarray, Q: np.ndarray) -> None:
-    """Write how the errors grow over the interval that ends now: transition into F, the identity, and noise into Q."""
+    """Write how the errors grow over the interval that ends now: transition into F, the identity, and noise into Q.
+
+    Biases that are Gauss-Markov processes decay.
+    """
     row, setting = rows.nominal[i], rows.setting[i]
     dt, dt_squared = row[NOMINAL.t] - row[NOMINAL.t_start], row[NOMINAL.dt_squared]
     turned = setting[SETTING.gyro_variance] * dt_squared + row[NOMINAL.lost_turn]
@@ -165,6 +181,13 @@ def write_growth(rows: Rows, i: int, F: np.ndarray, Q: np.ndarray) -> None:
         (velocity, turned + setting[SETTING.tilt_density] * dt, turned),
         dt,
     )
+    if rows.layout[i, LAYOUT.correlated]:
+        for k in range(F.shape[0]):
+            x = 0.5 * dt * rows.decay[i, k]
+            if x > 0.0:
+                F[k, k] = max(1.0 - x, 0.0) / (1.0 + x)  # exp(-2 x) to x^3, without libm
+                rows.bias[i, k] *= F[k, k]
+                Q[k, k] = 0.5 * rows.walk[i, k] / rows.decay[i, k] * (1.0 - F[k, k] * F[k, k])
 
 
 @portable
@@ -198,6 +221,67 @@ def remember(counts: np.ndarray, history: np.ndarray, longest: int, now: Moment)
     put_moment(history[newest], now)
     counts[COUNT.newest] = newest
     counts[COUNT.kept] = min(counts[COUNT.kept] + 1, longest)
+
+
+@portable
+def clone(rows: Rows, i: int, J: np.ndarray, first: int) -> None:
+    """Clone the present position and velocity in the place of the oldest clone, if it is time for one.
+
+    Args:
+        rows: of all drones.
+        i: the drone.
+        J: covariance of its errors, or of all drones' together; changed.
+        first: its first state in J.
+    """
+    row, layout = rows.nominal[i], rows.layout[i]
+    if not layout[LAYOUT.clones] or not rows.counts[i, COUNT.heading_known]:
+        return
+    every_s = rows.setting[i, SETTING.clone_every]
+    count = math.floor(row[NOMINAL.t] / every_s + 1e-6)  # from t = 0 on, as samples are
+    slot = count % layout[LAYOUT.clones]
+    former = rows.clones[i, slot]
+    if former[CLONE.t] / every_s + 1e-6 >= count:  # also false where there is none
+        return
+    former[CLONE.t] = row[NOMINAL.t]
+    put(former, CLONE.p_corrected, vector(row, NOMINAL.p_corrected))
+    put(former, CLONE.v_corrected, vector(row, NOMINAL.v_corrected))
+    state = layout[LAYOUT.first_clone] + CLONED * slot
+    rows.bias[i, state : state + CLONED] = 0.0
+    J[first + state : first + state + CLONED] = J[first : first + CLONED]
+    J[:, first + state : first + state + CLONED] = J[:, first : first + CLONED]
+
+
+@portable
+def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, float, int]:
+    """Return the state at `t_s` as it is known now, with the errors that it has.
+
+    Returns:
+        the state; how much earlier it is than the position and velocity whose errors it has [s]; the place of these
+        in the error state: 0 for the present ones, else those of a clone.
+    """
+    past = recall(rows.counts[i], rows.history[i], rows.layout[i, LAYOUT.history], t_s, now)
+    nearest, slot = abs(now[0] - t_s), -1
+    for k in range(rows.layout[i, LAYOUT.clones]):
+        away = abs(rows.clones[i, k, CLONE.t] - t_s)
+        if away < nearest:  # false where there is none
+            nearest, slot = away, k
+    if slot < 0:
+        return past, now[0] - past[0], 0
+    former, state = rows.clones[i, slot], rows.layout[i, LAYOUT.first_clone] + CLONED * slot
+    lag = former[CLONE.t] - past[0]
+    e_p, e_v = vector(rows.bias[i], state), vector(rows.bias[i], state + 3)
+    p = add(subtract(past[1], subtract(now[5], vector(former, CLONE.p_corrected))), axpy(e_p, -lag, e_v))
+    v = add(subtract(past[2], subtract(now[6], vector(former, CLONE.v_corrected))), e_v)
+    return (past[0], p, v, past[3], past[4], past[5], past[6]), lag, state
+
+
+@portable
+def move_columns(H: np.ndarray, at: int, size: int, state: int) -> None:
+    """Make rows of a Jacobian by the present position and velocity rows by those of a clone, whose place is `state`."""
+    for r in range(at, at + size if state > 0 else at):
+        for k in range(CLONED):
+            H[r, state + k] = H[r, k]
+            H[r, k] = 0.0
 
 
 @portable

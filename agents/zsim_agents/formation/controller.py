@@ -32,14 +32,14 @@ class GateTable:
     """The numbers of a GateInput of n drones; they hold until the next gate fills them anew.
 
     Attributes:
-        p_W, v_W, sigma_m: (n, 3); yaw, age_s: (n,).
-        fill: takes all numbers of p_W, then of v_W, sigma_m, yaw and age_s, drone by drone.
+        p_W, v_W, sigma_m: (n, 3); yaw, yaw_sigma, age_s: (n,).
+        fill: takes all numbers of p_W, then of v_W, sigma_m, yaw, yaw_sigma and age_s, drone by drone.
     """
 
     def __init__(self, n: int) -> None:
-        table = np.empty((11, n))
+        table = np.empty((12, n))
         self.p_W, self.v_W, self.sigma_m = table[:9].reshape(3, n, 3)
-        self.yaw, self.age_s = table[9:]
+        self.yaw, self.yaw_sigma, self.age_s = table[9:]
         self.fill = partial(Packing(f"={table.size}d").pack_into, table.data, 0)  # numpy takes three times as long
 
 
@@ -115,18 +115,20 @@ class Controller(Agent):
         ]
 
     def _gate(self, t_ns: int) -> GateInput:
-        positions, velocities, variances, yaws, ages_s = [], [], [], [], []
+        positions, velocities, variances, yaws, yaw_sigmas, ages_s = [], [], [], [], [], []
         for e in self._estimates:
             positions += e.position_m
             velocities += e.velocity_m_s
             variances += variances_of(e.covariance)
             yaws.append(e.yaw_rad)
+            yaw_sigmas.append(e.yaw_sigma_rad)
             ages_s.append((t_ns - e.t_ns) * 1e-9 if e is not _UNKNOWN else math.inf)
         table = self._table
-        table.fill(*positions, *velocities, *variances, *yaws, *ages_s)
+        table.fill(*positions, *velocities, *variances, *yaws, *yaw_sigmas, *ages_s)
         np.sqrt(table.sigma_m, table.sigma_m)
         p_W = ahead(table.p_W, table.v_W, table.age_s) if any(ages_s) else table.p_W
-        return GateInput(t_ns * 1e-9, p_W, table.yaw, table.v_W, table.sigma_m, table.age_s, tuple(self._states))
+        sigmas = table.sigma_m, table.yaw_sigma
+        return GateInput(t_ns * 1e-9, p_W, table.yaw, table.v_W, *sigmas, table.age_s, tuple(self._states))
 
     def _modes(self, t_ns: int, output: GateOutput) -> list[Output]:
         outputs = []

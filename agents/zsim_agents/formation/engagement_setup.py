@@ -3,8 +3,10 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
+from msgspec import UNSET
 
 from zsim.errors import DocumentError, RunError, UserCodeError
 from zsim.scenario.scenario import Cluster, Gains, Scenario
@@ -12,7 +14,7 @@ from zsim.schema import plugin
 from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, ProportionalLaw
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_check import all_near
-from zsim_agents.formation.flight_data import GateInput
+from zsim_agents.formation.flight_data import EngagementLimits, GateInput
 from zsim_agents.formation.flight_plan import FlightPlan, PlanError, plan_of
 from zsim_agents.formation.plan_check import check_flyable
 from zsim_agents.formation.robot_limits import guard, load
@@ -32,7 +34,7 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
     with _refusals_of(scenario, cluster):
         space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
         rehearse(space, gains, law)
-        engagement = Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
+        engagement = Engagement(space, cluster.drones, gains, limits_of(cluster.gains), plan_of(cluster), law)
         check_flyable(scenario, cluster, space, gains)
         return engagement
 
@@ -89,12 +91,23 @@ def rehearse(
     none = np.zeros((space.n, 3))
     rehearsal = Engagement(space, [f"robot {i + 1}" for i in range(space.n)], gains, law=law)
     rehearsal.warm_start("engaged", c)
-    rehearsal.step(GateInput(0.0, p_W, yaw, none, none, np.zeros(space.n), ("flying",) * space.n))
+    still = np.zeros(space.n)
+    rehearsal.step(GateInput(0.0, p_W, yaw, none, none, still, still, ("flying",) * space.n))
     ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)
     all_near(p_W, yaw)
     closest_pair(p_W)
     guard(p_W, none, none, gains.limits)
     load(*robot_rates(space, c, c), gains.limits)
+
+
+def limits_of(gains: Gains) -> EngagementLimits:
+    """Return the limits of the phase machine, those of certainty as the scenario has them."""
+    limits = EngagementLimits()
+    if gains.sigma_max_m is not UNSET:
+        limits = replace(limits, sigma_max_m=gains.sigma_max_m)
+    if gains.heading_sigma_max_deg is not UNSET:
+        limits = replace(limits, yaw_sigma_max_rad=math.radians(gains.heading_sigma_max_deg))
+    return limits
 
 
 def gains_of(gains: Gains) -> FormationGains:

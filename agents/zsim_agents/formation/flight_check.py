@@ -12,7 +12,7 @@ from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateIn
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
 
 FAR = 1e6  # m or rad: beyond it a value is a slip
-VALID, STALE, NOT_FINITE, UNCERTAIN = range(4)  # state of an estimate
+VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # state of an estimate
 
 
 class FlightCheck:
@@ -45,7 +45,7 @@ class FlightCheck:
     def observe(self, gate: GateInput) -> None:
         """Take over the estimates of a gate."""
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
-        self._flaw = self._first_flaw(gate, self.limits.sigma_lost_m)
+        self._flaw = self._first_flaw(gate, self.limits.lost)
         if self._flaw[0] != VALID and not all_near(gate.p_W, gate.yaw):
             return
         try:
@@ -92,7 +92,7 @@ class FlightCheck:
 
     def estimate_fault(self, gate: GateInput) -> str | None:
         """Return why the estimates of drones in flight cannot be flown on, those of the gate that was observed."""
-        return self._flaw_text(gate, self._flaw, self.limits.sigma_lost_m)
+        return self._flaw_text(gate, self._flaw, self.limits.lost)
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
         """Return which drone is in another state than those allowed."""
@@ -102,14 +102,14 @@ class FlightCheck:
         return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
 
     def _start_fault(self, gate: GateInput) -> str | None:
-        sigma_max_m = self.limits.sigma_max_m
-        return self._flaw_text(gate, self._first_flaw(gate, sigma_max_m), sigma_max_m)
+        return self._flaw_text(gate, self._first_flaw(gate))
 
-    def _first_flaw(self, gate: GateInput, sigma_max_m: float) -> tuple[int, int]:
-        age_max_s = self.limits.age_max_s
-        return estimate_flaw(gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, age_max_s, sigma_max_m)
+    def _first_flaw(self, gate: GateInput, factor: float = 1.0) -> tuple[int, int]:
+        limits, numbers = self.limits, (gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, gate.yaw_sigma)
+        most = limits.age_max_s, factor * limits.sigma_max_m, factor * limits.yaw_sigma_max_rad
+        return estimate_flaw(gate.age_s, *numbers, *most)
 
-    def _flaw_text(self, gate: GateInput, flaw: tuple[int, int], sigma_max_m: float) -> str | None:
+    def _flaw_text(self, gate: GateInput, flaw: tuple[int, int], factor: float = 1.0) -> str | None:
         kind, i = flaw
         if kind == VALID:
             return None
@@ -118,8 +118,11 @@ class FlightCheck:
             return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {age_max_s:g} s"
         if kind == NOT_FINITE:
             return f"the estimate of {drone} is not finite; allowed: up to {FAR:g} m, m/s or rad"
-        worst_m = max(gate.sigma_m[i].tolist())
-        return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {sigma_max_m:g} m"
+        if kind == TURNED:
+            sigma_deg, most_deg = math.degrees(gate.yaw_sigma[i]), math.degrees(factor * self.limits.yaw_sigma_max_rad)
+            return f"the heading of {drone} has a sigma of {sigma_deg:.1f} deg; allowed: {most_deg:g} deg"
+        worst_m, most_m = max(gate.sigma_m[i].tolist()), factor * self.limits.sigma_max_m
+        return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {most_m:g} m"
 
 
 @portable
@@ -139,9 +142,20 @@ def near(vectors: Array, i: int) -> bool:
 
 @portable
 def estimate_flaw(
-    age_s: Array, p_W: Array, v_W: Array, yaw: Array, sigma_m: Array, age_max_s: float, sigma_max_m: float
+    age_s: Array,
+    p_W: Array,
+    v_W: Array,
+    yaw: Array,
+    sigma_m: Array,
+    yaw_sigma: Array,
+    age_max_s: float,
+    sigma_max_m: float,
+    yaw_sigma_max: float,
 ) -> tuple[int, int]:
-    """Return what the first estimate that is not well is (STALE, NOT_FINITE or UNCERTAIN), and whose; else VALID."""
+    """Return what the first estimate that is not well is (STALE, NOT_FINITE, UNCERTAIN, TURNED), and whose; else VALID.
+
+    UNCERTAIN: where the drone is; TURNED: its heading.
+    """
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:
             return STALE, i
@@ -150,6 +164,8 @@ def estimate_flaw(
         for k in range(3):
             if not sigma_m[i, k] <= sigma_max_m:
                 return UNCERTAIN, i
+        if not yaw_sigma[i] <= yaw_sigma_max:
+            return TURNED, i
     return VALID, 0
 
 

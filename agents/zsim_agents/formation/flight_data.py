@@ -55,7 +55,8 @@ class EngagementLimits:
             assembly_within_m.
         assembly_climb_m_s: greatest speed of that climb.
         age_max_s: oldest estimate that is flown on.
-        sigma_max_m: greatest sigma of position for take-off and engagement; sigma_lost_m: in flight.
+        sigma_max_m, yaw_sigma_max_rad: greatest sigma of position and heading for take-off and engagement.
+        lost: in flight they may be so many times greater.
         heal_s: how long everything must be well before a held formation goes on.
         resend_s: after it a mode command without effect is sent again.
     """
@@ -67,7 +68,8 @@ class EngagementLimits:
     assembly_climb_m_s: float = 0.5  # half of what the firmware allows: the drones climb alike
     age_max_s: float = 0.5  # as the firmware's silence: 25 gates
     sigma_max_m: float = 1.0  # half of the least separation of 2 m
-    sigma_lost_m: float = 2.0  # of a single GPS fix: nothing else helps any more
+    yaw_sigma_max_rad: float = math.radians(15.0)  # half of the 30 deg at which three sigma turn a velocity by 90 deg
+    lost: float = 2.0  # of a position: 2 m, as of a single GPS fix: nothing else helps any more
     heal_s: float = 0.5  # 25 gates without a fault are no accident
     resend_s: float = 1.0  # ten times the delay of commands in the paper's scenario, 100 ms
 
@@ -88,7 +90,7 @@ class GateInput(Struct, eq=False):
     Attributes:
         t_s: simulated time.
         p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where nothing is known.
-        sigma_m: (n, 3) standard deviations of position.
+        sigma_m: (n, 3) standard deviations of position; yaw_sigma: (n,) of the heading [rad].
         age_s: (n,) ages of the estimates; infinite where there is none.
         states: (n,) `state` of each drone's sensor/status.
     """
@@ -98,6 +100,7 @@ class GateInput(Struct, eq=False):
     yaw: Array
     v_W: Array
     sigma_m: Array
+    yaw_sigma: Array
     age_s: Array
     states: tuple[str, ...]
 

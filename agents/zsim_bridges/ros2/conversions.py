@@ -27,7 +27,7 @@ from zsim.math.frames import (
 from zsim.math.rotation import LEVEL
 from zsim.schema.message import Vector3
 from zsim.sensors.camera_model import camera_pose
-from zsim.sensors.sensor import ErrorModel, Mount
+from zsim.sensors.sensor import ErrorModel, Mount, noise_sigma
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.sensors.sonar import SonarConfig
 from zsim_bridges.ros_frames import xyzw
@@ -282,7 +282,7 @@ def cluster_state(kind: Any, message: flight_messages.ClusterState, frame: str) 
 
 def variance(error: ErrorModel, rate_hz: float) -> float:
     """Return the variance of one sample about its bias, in the unit of the error squared."""
-    return error.noise**2 + error.density**2 * rate_hz + error.quantum**2 / 12.0  # a step's rounding is uniform
+    return noise_sigma(error, rate_hz) ** 2 + error.quantum**2 / 12.0  # a step's rounding is uniform
 
 
 def diagonal(each: float) -> Array:

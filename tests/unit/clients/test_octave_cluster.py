@@ -115,7 +115,9 @@ def flight() -> tuple[list[dict[str, Any]], list[GateOutput]]:
     while air.t_s < 92.0:
         gate = air.gate()
         arrays = {name: np.array(gate[name]) for name in ("p_W", "yaw", "v_W", "sigma_m", "age_s")}
-        output = engagement.step(GateInput(t_s=gate["t_s"], **arrays, states=tuple(MODES[m] for m in gate["modes"])))
+        output = engagement.step(
+            GateInput(t_s=gate["t_s"], **arrays, yaw_sigma=np.zeros(3), states=tuple(MODES[m] for m in gate["modes"]))
+        )
         gates.append(gate)
         outputs.append(output)
         air.fly(output)

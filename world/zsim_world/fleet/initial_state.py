@@ -52,7 +52,7 @@ def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensor
     clock = np.zeros(CLOCK.size, dtype=np.int64)
     clock[CLOCK.ticks_per_step] = round(observer.STEP_S / dt)
     time = KernelTime(clock=clock, spans=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]))
-    numbers = NoiseRows(table=noise.table, at=noise.at, cursor=noise.cursor)
+    numbers = NoiseRows(table=noise.table, at=noise.at, width=noise.width, cursor=noise.cursor)
     bodies, boards = _bodies(scenario, row, rotors, dt), _boards(scenario, vehicles, row, rotors)
     senses = _senses(scenario, sensors, noise)
     return Arrays(time, bodies, boards, numbers, senses, _wind(scenario), noise.gust)
@@ -114,7 +114,12 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
         setpoint=np.zeros((n, firmware.SETPOINT.size)),
         set_tick=np.zeros(n, dtype=np.int64),
         memory=np.zeros((n, firmware.MEMORY.size)),
-        belief=np.array([_first_belief(drone, own, obstacles, each) for drone, own in zip(drones, row, strict=True)]),
+        belief=np.array(
+            [
+                _first_belief(drone, own, board, obstacles, each)
+                for drone, own, board in zip(drones, row, calibration, strict=True)
+            ]
+        ),
         actuator=sound_actuators(n, each),
         device=np.zeros((n, DEVICE.size)),
         lanes=board_blocks(row, rotors, setting, mounts),
@@ -155,13 +160,19 @@ def _anchors(drone: Drone, row: np.ndarray) -> np.ndarray:
     return np.array(drone.position_m[:2]) + contact_points(row)[:, :2] @ turn.T
 
 
-def _first_belief(drone: Drone, row: np.ndarray, obstacles: np.ndarray, rotors: int) -> np.ndarray:
+def _first_belief(
+    drone: Drone, row: np.ndarray, calibration: np.ndarray, obstacles: np.ndarray, rotors: int
+) -> np.ndarray:
     """Return the belief at power-up: level, heading unknown until the first magnetometer sample.
 
-    One that starts on a roof knows of its height, as one that has landed there.
+    Where that tells none, the heading is the one that the drone was set down with. One that starts on a roof knows of
+    its height, as one that has landed there.
     """
     belief = np.zeros(BELIEF.size + rotors)
     belief[BELIEF.q_WB] = 1.0
+    if math.isnan(calibration[CALIBRATION.mag_bearing]):
+        belief[BELIEF.heading] = math.radians(drone.yaw_deg)
+        belief[BELIEF.q_WB : BELIEF.q_WB + 4] = quaternion_from_heading(belief[BELIEF.heading])
     belief[BELIEF.height] = row[VEHICLE.stand_height]
     roof_m = drone.position_m[2]
     is_on_roof = any(abs(obstacle.nearest(solid, *drone.position_m)[0]) < ON_ROOF_M for solid in obstacles)
@@ -172,12 +183,13 @@ def _first_belief(drone: Drone, row: np.ndarray, obstacles: np.ndarray, rotors: 
 
 
 def _calibration(drone: Drone, scenario: Scenario) -> np.ndarray:
-    """Return what the board knows of its mounts, and the bearing of the magnetic field at the place."""
+    """Return what the board knows of its mounts, and the bearing of the magnetic field where it gives a heading."""
     board = np.zeros(CALIBRATION.size)
     field = scenario.environment.magnetic_field_ut
     board[CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4] = _turn(drone.sensors.imu.mount.rpy_deg)
     board[CALIBRATION.mag_turn : CALIBRATION.mag_turn + 4] = _turn(drone.sensors.mag.mount.rpy_deg)
-    board[CALIBRATION.mag_bearing] = math.atan2(field[1], field[0])
+    compass = sensor_set.has_compass(drone.sensors.mag, field)
+    board[CALIBRATION.mag_bearing] = math.atan2(field[1], field[0]) if compass else math.nan
     board[CALIBRATION.sonar_min] = drone.sensors.sonar.min_m
     return board
 

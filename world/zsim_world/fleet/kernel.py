@@ -129,7 +129,7 @@ def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, va
     first, second = _ideal(s, x, mounted, site)
     put(value, 0, first)
     put(value, 3, second)
-    at = noise.at[s] + noise.cursor[i, s] * ss.NOISE_WIDTH[s]
+    at = noise.at[s] + noise.cursor[i, s] * noise.width[i, s]
     noise.cursor[i, s] += 1
     height = senses.place[PLACE.height]
     if config[CONFIG.faulty] != 0.0:

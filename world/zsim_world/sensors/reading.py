@@ -20,7 +20,16 @@ def rounded(value: float, bias: float, white: float, quantum: float) -> float:
 
 @inlined
 def add_errors(n: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int) -> None:
-    """Add the errors of n channels to a value, in place; `noise` has 2 n standard normal numbers from `at` on."""
+    """Add the errors of n channels to a value, in place.
+
+    `noise` has standard normal numbers from `at` on (sensor_set.noise_width); `bias` is the bias of each channel, and
+    behind those of all its Gauss-Markov process.
+    """
+    if config[CONFIG.correlated] != 0.0:
+        for k in range(n):
+            state = CHANNELS_MAX + k
+            bias[state] = config[CONFIG.decay + k] * bias[state] + config[CONFIG.kick + k] * noise[at + 2 * n + 1 + k]
+            value[k] += bias[state]
     for k in range(n):
         bias[k] += config[CONFIG.walk + k] * noise[at + n + k]
         white = config[CONFIG.white + k] * noise[at + k]

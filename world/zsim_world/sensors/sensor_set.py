@@ -1,6 +1,7 @@
 """The sensors of a fleet as arrays: errors, mounts and schedules, a row per drone and sensor."""
 
 import math
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -21,7 +22,6 @@ SENSORS = tuple(STOCK)  # the contract's order; a user's own count on from there
 IMU, GPS, MAG, BARO, SONAR, FLOW = range(len(SENSORS))
 CHANNELS = tuple(kind.width for kind in STOCK.values())  # numbers with an error of their own
 CHANNELS_MAX = VALUES_MAX
-NOISE_WIDTH = tuple(2 * n + 1 for n in CHANNELS)  # per sample: white, walk of the bias, and one for drop-out
 NEVER = 2**63 - 1  # a tick that does not come
 
 CONFIG = columns(  # of each drone and sensor
@@ -30,6 +30,9 @@ CONFIG = columns(  # of each drone and sensor
         Field("white", "channel's", CHANNELS_MAX),  # standard deviation per sample
         Field("walk", "channel's", CHANNELS_MAX),  # standard deviation of the bias's step per sample
         Field("quantum", "channel's", CHANNELS_MAX),
+        Field("correlated", "1"),  # 0: no channel has an error that is a Gauss-Markov process
+        Field("decay", "1", CHANNELS_MAX),  # of that error from sample to sample
+        Field("kick", "channel's", CHANNELS_MAX),  # standard deviation of what it gains per sample
         Field("p_BS", "m", 3),
         Field("q_BS", "1", 4),
         Field("drop", "1"),  # a sample is lost when its standard normal number is below this
@@ -50,6 +53,8 @@ FREE, ARMED, HOLDING = 0.0, 1.0, 2.0
 SCHEDULE = columns(  # sample n falls due at the first physics tick >= n * numerator / denominator
     "ScheduleColumns", (Field("numerator", "1"), Field("denominator", "1"), Field("count", "1"), Field("due", "tick"))
 )
+FIELD_MIN_UT = 1.0  # uT, of a horizontal field that still gives a heading: a fifteenth of that at 50 degrees north
+HEADING_SIGMA_MAX_RAD = 0.5  # rad, chosen: noisier, samples wrap around, and their mean is no heading
 DENOMINATOR_MAX = 1000  # of a rate in Hz: any is met within 0.05 %, and n * numerator stays below 2^63
 
 
@@ -99,14 +104,24 @@ def config(sensors: FleetSensors) -> NDArray[np.float64]:
 def _fill(row: NDArray[np.float64], name: str, kind: SensorType, settings: Sensor) -> None:
     rate = rate_of(settings, name)
     for k, model in enumerate(kind.errors(settings)):
-        row[CONFIG.white + k] = noise_sigma(model, rate)
+        row[CONFIG.white + k] = model.white_sigma(settings.rate_hz)
         row[CONFIG.walk + k] = model.bias_walk / math.sqrt(rate)
         row[CONFIG.quantum + k] = model.quantum
+        if model.correlated_sigma:  # exact from sample to sample: Brown and Hwang, "Random signals", section 5.3
+            decay = math.exp(-1.0 / (rate * model.correlation_time_s))
+            row[CONFIG.correlated] = 1.0
+            row[CONFIG.decay + k], row[CONFIG.kick + k] = decay, model.correlated_sigma * math.sqrt(1.0 - decay * decay)
     row[CONFIG.p_BS : CONFIG.p_BS + 3] = settings.mount.position_m
     row[CONFIG.q_BS : CONFIG.q_BS + 4] = quaternion_from_rpy(np.radians(settings.mount.rpy_deg))
     row[CONFIG.drop] = ndtri(settings.dropout)
     if isinstance(settings, SonarConfig):
         row[CONFIG.limit_min], row[CONFIG.limit_max] = settings.min_m, settings.max_m
+
+
+def noise_width(numbers: int, models: Sequence[ErrorModel]) -> int:
+    """Return how many normal numbers a sample takes: white, walk of the bias, one for drop-out, Gauss-Markov if any."""
+    correlated = any(model.correlated_sigma for model in models)
+    return (3 if correlated else 2) * numbers + 1
 
 
 def schedule(sensors: FleetSensors, tick_ms: float) -> NDArray[np.int64]:
@@ -141,6 +156,12 @@ def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:
 
 
 def heading_sigma(mag: MagConfig, horizontal_ut: float) -> float:
-    """Return the standard deviation [rad] of a heading from one magnetometer sample."""
+    """Return the standard deviation [rad] of a heading from one magnetometer sample: that of the field, sideways."""
     model = mag.field_ut
     return math.hypot(noise_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0)) / max(horizontal_ut, 1.0)
+
+
+def has_compass(mag: MagConfig, field_ut: Sequence[float]) -> bool:
+    """Return whether the magnetic field of the place [uT; W] shows a magnetometer where the nose points."""
+    horizontal_ut = math.hypot(*field_ut[:2])
+    return horizontal_ut >= FIELD_MIN_UT and heading_sigma(mag, horizontal_ut) <= HEADING_SIGMA_MAX_RAD

@@ -13,7 +13,7 @@ from zsim.schema.checker import show
 from zsim.sensors.sensor import Sensor, SensorTruth, SensorType
 from zsim_world.physics.normal_variates import place, words
 from zsim_world.sensors.reading import read
-from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors
+from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width
 from zsim_world.state.fleet_arrays import EXPOSED, STATE, Senses
 
 
@@ -75,7 +75,13 @@ class _UserSensor:
     ) -> None:
         self._what, self._kind, self._settings, self._rng = what, kind, settings, rng
         self.width = kind.width
-        self.bias = np.array([model.bias for model in kind.errors(settings)]) * rng.standard_normal(self.width)
+        models = kind.errors(settings)
+        self.bias = np.zeros(2 * CHANNELS_MAX)
+        self.bias[: self.width] = np.array([model.bias for model in models]) * rng.standard_normal(self.width)
+        self._numbers = noise_width(self.width, models)
+        if self._numbers > 2 * self.width + 1:
+            sigma = np.array([model.correlated_sigma for model in models])
+            self.bias[CHANNELS_MAX : CHANNELS_MAX + self.width] = sigma * rng.standard_normal(self.width)
         self._p_BS = config[CONFIG.p_BS : CONFIG.p_BS + 3].copy()
         self._R_BS = rotation_matrix(config[CONFIG.q_BS : CONFIG.q_BS + 4])
 
@@ -122,5 +128,5 @@ class _UserSensor:
             raise UserCodeError(f"{name} returns {numbers}; must be finite", where)
 
     def numbers(self) -> NDArray[np.float64]:
-        """Return the standard normal numbers of one sample: white, walk of the bias, and one for drop-out."""
-        return self._rng.standard_normal(2 * self.width + 1)
+        """Return the standard normal numbers of one sample, see `noise_width`."""
+        return self._rng.standard_normal(self._numbers)

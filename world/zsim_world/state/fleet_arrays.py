@@ -164,6 +164,7 @@ class NoiseRows(NamedTuple):
 
     table: NDArray  # (N + 1, all streams)
     at: NDArray  # int64 (STREAMS.size,), where each stream begins in a row
+    width: NDArray  # int64 (N + 1, STREAMS.size), numbers of a sample
     cursor: NDArray  # int64 (N + 1, STREAMS.size), how much of each stream is used
 
 
@@ -175,7 +176,7 @@ class Senses(NamedTuple):
     fault: NDArray  # (N, S, sensor_set.FAULT.size)
     schedule: NDArray  # int64 (N, S, sensor_set.SCHEDULE.size)
     soonest: NDArray  # int64 (N,), tick at which one of the sensors but the IMU falls due
-    bias: NDArray  # (N, 6, 6)
+    bias: NDArray  # (N, 6, 12): of each channel its bias, behind all of them their Gauss-Markov processes
     whose: NDArray  # int64 (samples, 3): sensor, drone, tick
     value: NDArray  # (samples, 6)
     exposed_count: NDArray  # int64 (1,), samples of users' sensors that are to be made of this gate

@@ -62,7 +62,7 @@ CALIBRATION = columns(  # what the board knows of its own mounts and of the plac
     (
         Field("imu_turn", "1", 4),  # q_BS
         Field("mag_turn", "1", 4),  # q_BS
-        Field("mag_bearing", "rad"),  # heading of the horizontal field
+        Field("mag_bearing", "rad"),  # heading of the horizontal field, not a number where that gives none
         Field("sonar_min", "m"),
     ),
 )
@@ -147,7 +147,7 @@ def observe(
         _measure_height(belief, gain, device, board[CALIBRATION.sonar_min])
     if device[DEVICE.new_baro] > 0.0:
         _see_baro(belief, gain, device[DEVICE.baro], on_ground)
-    if device[DEVICE.new_mag] > 0.0:
+    if device[DEVICE.new_mag] > 0.0 and not math.isnan(board[CALIBRATION.mag_bearing]):
         own = _see_mag(
             belief,
             gain,

@@ -86,11 +86,11 @@ def gain_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> Array:
     """Return the gains of one drone, shape (GAIN.size,)."""
     s, walks = drone.sensors, vehicle.firmware
     field = math.hypot(*environment.magnetic_field_ut[:2])
-    gyro = _sigma(scaled(s.imu.gyro_deg_s, DEG), BOARD_RATE_HZ, "gyro")
+    gyro = _sigma(scaled(s.imu.gyro_deg_s, DEG), s.imu.rate_hz, "gyro")
     design = ObserverDesign(
         drag_1_s=drone.drag_n_s_m * environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3 / drone.mass_kg,
         gravity_m_s2=environment.gravity_m_s2,
-        accel=(_sigma(s.imu.accel_m_s2, BOARD_RATE_HZ, "accel"), BOARD_RATE_HZ),
+        accel=(_sigma(s.imu.accel_m_s2, s.imu.rate_hz, "accel"), BOARD_RATE_HZ),
         accel_walk=max(s.imu.accel_m_s2.bias_walk, walks.lift_bias_walk),
         tilt_walk=math.hypot(gyro / math.sqrt(BOARD_RATE_HZ), walks.tilt_walk),
         gyro_walk=max(scaled(s.imu.gyro_deg_s, DEG).bias_walk, walks.bias_walk),

@@ -23,7 +23,8 @@ from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank, sort_readings, write_estimate
 from zsim_agents.estimation.filter_state import COUNT, NOMINAL, Rows
 from zsim_agents.estimation.joint.sighting_update import SIGHTING, use_sightings
-from zsim_agents.estimation.joint_covariance import block, predict_jointly, put_block
+from zsim_agents.estimation.joint_covariance import block, put_block
+from zsim_agents.estimation.kalman_update import predict_jointly
 
 SIGHTED_A_GATE = 1000  # more of one gate are a flood, and left out
 PICTURES_KEPT = 256  # the last that were used; of 12 drones at 15 Hz, those of 1.4 s
@@ -63,7 +64,7 @@ class JointBank(EstimatorBank):
         self._places = PerPattern(self._sighting_places)
         self._sighted: dict[Picture, tuple[str, list[_Row]]] = {}  # of this gate: by whom, and what
         self._hats = 0  # of this gate, those of pictures that another detector's replaced too
-        self._used: dict[Picture, None] = {}
+        self._pictures_used: dict[Picture, None] = {}
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
         if sensor == keys.SIGHTINGS:
@@ -92,7 +93,7 @@ class JointBank(EstimatorBank):
         Of two at one gate it is the first by name, whichever came first: other estimators of the cluster do the same.
         """
         other = self._sighted.get(picture)
-        return picture in self._used or (other is not None and other[0] <= source)
+        return picture in self._pictures_used or (other is not None and other[0] <= source)
 
     def receive_gate(self, gate: GateMessages) -> bool:
         if not super().receive_gate(gate):
@@ -115,11 +116,11 @@ class JointBank(EstimatorBank):
         put_block(self.rows.joint, i, self.rows.covariance[i])
 
     def snapshot(self) -> State:
-        return {**super().snapshot(), "pictures": [list(picture) for picture in self._used]}
+        return {**super().snapshot(), "pictures": [list(picture) for picture in self._pictures_used]}
 
     def restore(self, state: State) -> None:
         super().restore(state)
-        self._used = dict.fromkeys((i, camera, t_ns) for i, camera, t_ns in state["pictures"])
+        self._pictures_used = dict.fromkeys((i, camera, t_ns) for i, camera, t_ns in state["pictures"])
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         sightings = self._taken() if self._sighted else NO_SIGHTINGS
@@ -129,9 +130,9 @@ class JointBank(EstimatorBank):
     def _taken(self) -> NDArray[np.float64]:
         """Return what is in the pictures of this gate, (M, SIGHTING.size), and forget it."""
         rows = sorted(row for _, of_picture in self._sighted.values() for row in of_picture)
-        self._used |= dict.fromkeys(self._sighted)
-        while len(self._used) > PICTURES_KEPT:
-            del self._used[next(iter(self._used))]
+        self._pictures_used |= dict.fromkeys(self._sighted)
+        while len(self._pictures_used) > PICTURES_KEPT:
+            del self._pictures_used[next(iter(self._pictures_used))]
         self._sighted, self._hats = {}, 0
         return np.array(rows) if rows else NO_SIGHTINGS
 
@@ -163,8 +164,9 @@ def step_jointly(
         measurement_update.fuse(rows, i, P, readings, first[i], after)
     use_sightings(rows, sightings, hat_B)
     for i in range(count):
+        strapdown.clone(rows, i, rows.joint, i * n)
         rows.covariance[i] = block(rows.joint, i, n)
-        write_estimate(rows.nominal[i], rows.covariance[i], t_s, estimates[i])
+        write_estimate(rows.nominal[i], rows.setting[i], rows.covariance[i], t_s, estimates[i])
 
 
 @portable

@@ -12,10 +12,10 @@ from zsim.math.columns import Field, columns
 from zsim.math.compiled import portable
 from zsim.math.rotation import Vector, add, cross, dot, matrix, norm, product, scaled, subtract, transposed
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
-from zsim_agents.estimation.filter_state import COUNT, LAYOUT, NOMINAL, SETTING, Moment, Rows, moment, vector
+from zsim_agents.estimation.filter_state import COUNT, SETTING, Moment, Rows, moment, vector
 from zsim_agents.estimation.joint_covariance import add_innovation_covariance, add_projection, correct_all
 from zsim_agents.estimation.kalman_update import within_gates
-from zsim_agents.estimation.strapdown import recall
+from zsim_agents.estimation.strapdown import move_columns, recall_known
 
 SIGHTING = columns(  # one hat that was seen
     "SightingColumns",
@@ -102,14 +102,15 @@ def predict_sighting(
     """
     i, n = int(sighting[SIGHTING.drone]), rows.covariance.shape[1]
     t_s = sighting[SIGHTING.t_sample]
-    a = recall(rows.counts[i], rows.history[i], rows.layout[i, LAYOUT.history], t_s, moment(rows.nominal[i]))
-    b = recall(rows.counts[j], rows.history[j], rows.layout[j, LAYOUT.history], t_s, moment(rows.nominal[j]))
+    a, lag_a, state_a = recall_known(rows, i, t_s, moment(rows.nominal[i]))
+    b, lag_b, state_b = recall_known(rows, j, t_s, moment(rows.nominal[j]))
     r = expected(a, b, hat_B, vector(sighting, SIGHTING.p_BK))
     away = max(norm(r), NEAREST_M)
     axes = across(scaled(r, 1.0 / away))
     H_i, H_j = np.zeros((3, n)), np.zeros((3, n))
-    lags = (rows.nominal[i, NOMINAL.t] - a[0], rows.nominal[j, NOMINAL.t] - b[0])
-    write_rows(H_i, H_j, a, b, hat_B, axes, lags)
+    write_rows(H_i, H_j, a, b, hat_B, axes, (lag_a, lag_b))
+    move_columns(H_i, 0, 3, state_a)
+    move_columns(H_j, 0, 3, state_b)
     sideways = away * max(sighting[SIGHTING.sigma_direction], SIGMA_MIN_RAD)
     along = max(sighting[SIGHTING.sigma_range], SIGMA_MIN_M)
     HJ[:], S[:] = 0.0, 0.0

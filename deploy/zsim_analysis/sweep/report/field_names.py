@@ -31,7 +31,14 @@ UNITS = {  # by the end of a name, longer ones first
     "_m": "m",
     "_s": "s",
 }
-OF_CHANNEL = {"noise": "", "density": "/√Hz", "bias": "", "bias_walk": "/√s", "quantum": ""}  # units: zsim.sensors
+OF_CHANNEL = {  # units: zsim.sensors
+    "noise": "",
+    "density": "/√Hz",
+    "bias": "",
+    "bias_walk": "/√s",
+    "bias_instability": "",
+    "quantum": "",
+}
 SECTIONS = ("environment", "sensors", "drones", "clusters", "metrics")  # what stands in them names itself
 WORDS = {
     "gps": "GPS",

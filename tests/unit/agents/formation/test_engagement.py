@@ -97,6 +97,7 @@ class Fleet:
             yaw=self.yaw.copy(),
             v_W=self.v_W.copy(),
             sigma_m=np.full((n, 3), 0.2),
+            yaw_sigma=np.full(n, 0.05),
             age_s=np.zeros(n),
             states=tuple(self.states),
         )
@@ -298,6 +299,7 @@ def test_requests_that_do_not_fit_the_phase_are_refused():
     ("spoil", "terms"),
     [
         ({"sigma_m": np.full((3, 3), 1.5)}, ("drone1", "sigma", "1.50", "1")),
+        ({"yaw_sigma": np.radians([5.0, 16.0, 5.0])}, ("heading", "drone2", "sigma", "16.0 deg", "15 deg")),
         ({"age_s": np.array([0.0, 0.6, 0.0])}, ("drone2", "0.60", "old", "0.5")),
         ({"age_s": np.array([0.0, 0.0, math.inf])}, ("drone3", "inf", "old")),
         ({"p_W": np.full((3, 3), math.nan)}, ("drone1", "finite")),
@@ -307,7 +309,7 @@ def test_requests_that_do_not_fit_the_phase_are_refused():
         ({"p_W": GROUND * 0.6}, ("1.80", "apart")),
         ({"p_W": GROUND * (0.2, 1.0, 1.0)}, ("sin(beta)", "min(p, q)", "0.60", "above", "1")),
     ],
-    ids=["sigma", "old", "none", "nan", "emergency", "mirrored", "line", "near", "narrow"],
+    ids=["sigma", "heading", "old", "none", "nan", "emergency", "mirrored", "line", "near", "narrow"],
 )
 def test_take_off_is_refused_from_a_bad_start(spoil, terms):
     fleet = Fleet(Engagement(SPACE, DRONES))
@@ -347,11 +349,12 @@ def test_a_take_off_command_that_was_lost_is_sent_again():
         ({"p_W": np.full((3, 3), math.nan)}, ("drone1", "finite")),
         ({"yaw": np.array([0.0, math.inf, 0.0])}, ("drone2", "finite")),
         ({"sigma_m": np.full((3, 3), 2.5)}, ("drone1", "sigma", "2.50")),
+        ({"yaw_sigma": np.radians([5.0, 5.0, 31.0])}, ("heading", "drone3", "sigma", "31.0 deg", "30 deg")),
         ({"states": ("flying", "emergency", "flying")}, ("drone2", "emergency")),
         ({"p_W": GROUND * (1.0, 0.0, 1.0) + (0, 0, 5.0)}, ("in line",)),
         ({"p_W": GROUND * (0.2, 1.0, 1.0) + (0, 0, 5.0)}, ("sin(beta)", "min(p, q)", "0.60")),
     ],
-    ids=["old", "nan", "inf", "sigma", "emergency", "line", "narrow"],
+    ids=["old", "nan", "inf", "sigma", "heading", "emergency", "line", "narrow"],
 )
 def test_a_fault_in_flight_holds_the_formation_and_it_goes_on_without_a_bump(spoil, terms):
     fleet = engaged_fleet()
@@ -910,6 +913,7 @@ def test_every_output_is_finite_whatever_the_estimates_states_and_requests(seed)
             "v_W": (3, 3),
             "yaw": (3,),
             "sigma_m": (3, 3),
+            "yaw_sigma": (3,),
             "age_s": (3,),
         }.items():
             if rng.random() < 0.3:

@@ -7,7 +7,7 @@ import pytest
 
 from zsim.math.random_streams import stream
 from zsim.scenario.scenario_file import resolve
-from zsim_world.sensors.noise import WIDTHS, NoiseTable
+from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sensor_set import CHANNELS, SENSORS
 
 IMU = 0
@@ -23,7 +23,7 @@ def test_a_stream_goes_on_where_it_was_left(used: int):
     table = noise(gates=2)
     rng = stream(3, "b/imu")
     rng.standard_normal(CHANNELS[IMU])  # the bias at the start
-    width = WIDTHS[IMU]
+    width = table.width[1, IMU]
     rows = (table.at[IMU + 1] - table.at[IMU]) // width
     expected = rng.standard_normal((rows + used, width))
     np.testing.assert_array_equal(table.table[1, : rows * width], expected[:rows].ravel())

@@ -219,10 +219,10 @@ def test_judgements_are_the_same(both, n):
     found = set()
     for _ in range(300):
         p_W, yaw = robots(n, rng)
-        values = [np.full(n, 0.1), p_W, rng.normal(size=(n, 3)), yaw, np.full((n, 3), 0.2)]
-        spoiled = values[rng.integers(5)].reshape(-1)
+        values = [np.full(n, 0.1), p_W, rng.normal(size=(n, 3)), yaw, np.full((n, 3), 0.2), np.full(n, 0.1)]
+        spoiled = values[rng.integers(6)].reshape(-1)
         spoiled[rng.integers(spoiled.size)] = rng.choice(BAD)
-        flaws = [way.flight_check.estimate_flaw(*values, 0.5, 1.0) for way in both]
+        flaws = [way.flight_check.estimate_flaw(*values, 0.5, 1.0, 0.3) for way in both]
         assert flaws[0] == flaws[1]
         found.add(flaws[0][0])
         near = [way.flight_check.all_near(p_W, yaw) for way in both]
@@ -234,7 +234,7 @@ def test_judgements_are_the_same(both, n):
         out = ~((np.abs(c) < 1e6) & (bounds[:, 0] < c) & (c < bounds[:, 1]))
         assert outside[0] == (int(np.argmax(out)) if out.any() else -1)
     check = both[0].flight_check
-    assert found == {check.VALID, check.STALE, check.NOT_FINITE, check.UNCERTAIN}
+    assert found == {check.VALID, check.STALE, check.NOT_FINITE, check.UNCERTAIN, check.TURNED}
 
 
 FLIGHT = """
@@ -271,7 +271,7 @@ if kind == "nested":
 formation = Engagement(space, [str(i) for i in range(n)], gains)
 for gate in range(20):
     still = np.zeros((n, 3))
-    at = (gate * 0.02, p_W.copy(), yaw.copy(), still, still + 0.1, np.zeros(n), ("flying",) * n)
+    at = (gate * 0.02, p_W.copy(), yaw.copy(), still, still + 0.1, np.zeros(n), np.zeros(n), ("flying",) * n)
     if gate == 1:
         formation.warm_start("assembling", np.zeros(4 * n))
     elif gate == 5:
