@@ -1,6 +1,5 @@
 """A flight in this process: world, agents and what observes them on an in-memory bus, without Zenoh."""
 
-import gc
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,13 +13,12 @@ from zsim.errors import RunError, UserCodeError
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
+from zsim.runtime.collector import rare_collections
 from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World
-
-GC_ALLOCATIONS = 50_000  # between two searches for cycles, of which a flight makes none; a gate allocates hundreds
 
 
 class FlightObserver(Protocol):
@@ -90,21 +88,15 @@ class InProcessFlight:
         bus = Bus(self.world, self._agents, time.monotonic_ns, add_message, add_gate)
         add_message(keys.INFO, self.world.info())
         bus.join()
-        gc.collect()
-        gc.freeze()  # what lives as long as the flight is not searched again and again
-        thresholds = gc.get_threshold()
-        gc.set_threshold(GC_ALLOCATIONS, *thresholds[1:])
         try:
-            while bus.turn():
-                if reason := stop_reason():
-                    self.world.clock.stop(reason)
-            bus.end()
+            with rare_collections():
+                while bus.turn():
+                    if reason := stop_reason():
+                        self.world.clock.stop(reason)
+                bus.end()
         except UserCodeError:
             if self.world.failure:  # else the scenario lets the run go on without who has failed
                 raise
-        finally:
-            gc.set_threshold(*thresholds)
-            gc.unfreeze()
 
 
 def fly(

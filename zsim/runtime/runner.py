@@ -13,6 +13,7 @@ from zsim.contract.run_messages import ControlAnswer
 from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
+from zsim.runtime.collector import rare_collections
 from zsim.runtime.health import HealthMeter
 from zsim.runtime.membership import Membership
 from zsim.runtime.runner_inputs import RunnerInputs
@@ -95,8 +96,9 @@ class Runner:
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
         try:
-            while self._leave is None:
-                self._turn()
+            with rare_collections():
+                while self._leave is None:
+                    self._turn()
         except Exception as error:
             failure = self._agent.failure(error, max(0, self._inbox.taken_ns))
             if failure is None:

@@ -11,6 +11,7 @@ from typing import Any
 
 from zsim.contract import keys, run_messages
 from zsim.runtime.agent import Output
+from zsim.runtime.collector import rare_collections
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
@@ -109,7 +110,7 @@ class WorldProcess:
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
         try:
-            with self._readers.watch:
+            with self._readers.watch, rare_collections():
                 while self._world.ended is None:
                     self._turn()
                 self._end()
