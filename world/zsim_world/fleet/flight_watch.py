@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.snapshot import State
 from zsim.math.columns import Field, columns
-from zsim.math.compiled import kernel
+from zsim.math.compiled import Held, hold, kernel
 from zsim.schema.quantities import G_M_S2
 from zsim_world.state.fleet_arrays import STATE, VEHICLE, Bodies
 from zsim_world.vehicles.firmware import EMERGENCY, LANDING, MEMORY
@@ -47,6 +47,16 @@ class Mishap(NamedTuple):
     data: dict[str, Any]
 
 
+class WatchedArrays(NamedTuple):
+    """What of N drones is compared from gate to gate."""
+
+    state: NDArray[np.float64]  # of Bodies
+    memory: NDArray[np.float64]  # of the firmware
+    energy: NDArray[np.float64]  # of Bodies
+    seen: NDArray[np.float64]  # (N, SEEN.size), written
+    found: NDArray[np.int64]  # (N,), bits of what befell each, written
+
+
 class FlightWatch:
     """Watches the drones of a fleet from gate to gate.
 
@@ -72,6 +82,7 @@ class FlightWatch:
         self._found = np.zeros(len(names), np.int64)
         self._change_m_s = IMPACT_G * G_M_S2 * gate_s
         self._quiet_gates = math.ceil(QUIET_S / gate_s)
+        self._held = hold(WatchedArrays(bodies.state, memory, bodies.energy, self._seen, self._found))
         self.look()  # loads or compiles it
 
     def snapshot(self) -> State:
@@ -88,9 +99,7 @@ class FlightWatch:
 
     def look(self) -> bool:
         """Compare the drones with what was seen at the last gate; return whether anything befell one."""
-        bodies = self._bodies
-        arrays = (bodies.state, self._memory, bodies.energy, self._seen, self._found)
-        return find(*arrays, self._change_m_s, self._quiet_gates) > 0
+        return find(self._held, self._change_m_s, self._quiet_gates) > 0
 
     def mishaps(self, touching: NDArray[np.bool_]) -> list[Mishap]:
         """Return what befell drones in the last gate; `touching` (N,) are those whose hulls touch another body."""
@@ -122,23 +131,16 @@ class FlightWatch:
         return Mishap(i, "landing", f"{name} lands by itself: nobody has commanded it for long", {"cause": "silence"})
 
 
-@kernel(makes_arrays=False)
-def find(
-    state: NDArray,
-    memory: NDArray,
-    energy: NDArray,
-    seen: NDArray,
-    found: NDArray,
-    change_m_s: float,
-    quiet_gates: int,
-) -> int:
+@kernel()
+def find(held: Held, change_m_s: float, quiet_gates: int) -> int:
     """Set what befell each of N drones since the last call (bits, (N,)); return how many it befell.
 
     Args:
-        state, energy: of Bodies; memory: of the firmware; seen: (N, SEEN.size), in place.
+        held: WatchedArrays, by `hold`.
         change_m_s: greatest change of velocity over a gate without an impact.
         quiet_gates: after an impact, gates in which no other one is found.
     """
+    state, memory, energy, seen, found = held.content
     count = 0
     for i in range(found.size):
         found[i] = 0
