@@ -31,7 +31,7 @@ SEEN = columns(
         Field("flipped", "1"),
         Field("empty", "1"),
         Field("quiet", "gates"),  # in which no impact is found any more
-        Field("led", "1"),  # its body is external
+        Field("external", "1"),  # its body is
         Field("v_WB", "m/s", 3),  # at the last gate
         Field("speed", "m/s"),  # at the gate before that, as a contact may last for two; from an impact on: of it
     ),
@@ -78,7 +78,7 @@ class FlightWatch:
     ) -> None:
         self._bodies, self._memory, self._setting, self._names = bodies, memory, setting, names
         self._seen = np.zeros((len(names), SEEN.size))
-        self._seen[:, SEEN.led] = [i in external for i in range(len(names))]
+        self._seen[:, SEEN.external] = [i in external for i in range(len(names))]
         self._found = np.zeros(len(names), np.int64)
         self._change_m_s = IMPACT_G * G_M_S2 * gate_s
         self._quiet_gates = math.ceil(QUIET_S / gate_s)
@@ -144,7 +144,7 @@ def find(held: Held, change_m_s: float, quiet_gates: int) -> int:
     count = 0
     for i in range(found.size):
         found[i] = 0
-        if seen[i, SEEN.led] != 0.0:
+        if seen[i, SEEN.external] != 0.0:
             continue
         bits, mode = 0, memory[i, MEMORY.mode]
         if mode != seen[i, SEEN.mode]:
