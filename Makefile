@@ -73,5 +73,5 @@ $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 $(VENV)/.compiled: pyproject.toml
 	@echo "compiling what flies, once on this machine: about a minute"
 	@$(BIN)/python -m zsim_deploy.roles.warm_up agents & agents=$$!; \
-		$(BIN)/python -m zsim_deploy.roles.warm_up world && wait $$agents
+		$(BIN)/python -m zsim_deploy.roles.warm_up world; world=$$?; wait $$agents && exit $$world
 	@touch $@

@@ -22,7 +22,7 @@ from zsim_world.flight.world import World
 
 
 class FlightObserver(Protocol):
-    """Receives every message of a flight, as a record writer does."""
+    """Receives messages of a flight, as a record writer does."""
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
         """Receive one message."""

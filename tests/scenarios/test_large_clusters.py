@@ -72,7 +72,7 @@ class Flight:
         return next(state for state in self.states if state.phase == phase)
 
 
-def fly(name: str, *overrides: str, **values: float) -> Flight:
+def fly(name: str, *overrides: str, **values: Any) -> Flight:
     scenario = scenario_file.load(SCENARIOS / f"{name}.yaml", overrides, **values)
     world, flight = World(scenario), Flight(scenario)
     bus = Bus(world, agents(world), time.monotonic_ns, flight.sink)

@@ -151,6 +151,9 @@ if njit is not None:
     class _CompiledHeld(structref.StructRefProxy):
         """A Held of compiled code."""
 
+        __slots__ = ()
+        _numba_type_ = structref.StructRefProxy.__dict__["_type"]  # read twice a call; numba's own is a Python property
+
     structref.define_proxy(_CompiledHeld, _HeldType, ["content"])
     _make_held = _CompiledHeld
 

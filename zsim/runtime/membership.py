@@ -339,7 +339,8 @@ class Membership:
         self.ask_faults()
         try:
             wanted = (*self._agent.reads, *self._agent.repeats, keys.FAULTS)
-            held_ns = self._info.command_delay_ns + self._info.gate_ns if self._agent.overhears else 0  # by an inbox
+            holds = self._agent.overhears and self._info.mode == "lockstep"  # its inbox, see RunnerInputs
+            held_ns = self._info.command_delay_ns + self._info.gate_ns if holds else 0
             for key, payload in replay(self._link, self._agent.name, max(-1, since_ns - held_ns), wanted, REPLAY_S):
                 self._take_in(ReceivedSample(key, payload))
         except NoWorldError:

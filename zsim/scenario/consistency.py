@@ -29,9 +29,7 @@ TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly,
 WORLD, WORLD_DEATHS = "world", ("restart", "end")
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
 UPON_COSINE, UPON_DEPTH_M = 0.999, 0.001  # of a roof's normal to the vertical; how deep a drone on it may be
-THRUST_SHARE_MIN = (
-    0.005  # of what the rotors lift, in a hover, chosen: racers that lift fifteen times themselves have .07
-)
+THRUST_SHARE_MIN = 0.005  # of the rotors' lift, in a hover, chosen: racers that lift fifteen times themselves have .07
 TILT_FREE_DEG = 30.0  # deg, allowed to whatever is light enough to fly
 # Chosen, a decade or more beyond what flies: 60 to 400 W/kg from racers' hover to large rotors; 3 min to 2 h
 HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power for the rotors
@@ -200,8 +198,8 @@ def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fa
         return
     tilt, lean = drone.limits and drone.limits.tilt_deg, math.degrees(math.acos(weight / (LIFT_SHARE_MAX * lift)))
     cut = math.degrees(math.acos(vehicle.firmware.tilt_cut_cosine))
-    if tilt is not None and tilt > max(lean, TILT_FREE_DEG):
-        yield "limits.tilt_deg", f"is {tilt:g}; must be <= {lean:.1f}, at which its rotors still carry its weight"
+    if tilt is not None and tilt > (most_deg := max(lean, TILT_FREE_DEG)):
+        yield "limits.tilt_deg", f"is {tilt:g}; must be <= {most_deg:.1f}; its rotors carry its weight up to {lean:.1f}"
     if tilt is not None and tilt >= cut:
         yield "limits.tilt_deg", f"is {tilt:g}; must be < {cut:.1f}, at which its firmware cuts the rotors"
     density = environment.air_density_kg_m3

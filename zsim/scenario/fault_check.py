@@ -8,7 +8,7 @@ from zsim.contract import keys
 from zsim.scenario.fault_kinds import KINDS, ROTOR, FaultKind, FaultParameter, expected
 from zsim.scenario.role_table import AGENTS
 from zsim.schema.checker import Fault as Flaw
-from zsim.schema.checker import meant, show
+from zsim.schema.checker import show, suggestion
 
 FOR_EVER_S = 1e6  # s, as the longest scenario
 UNGATED = ("world", "recorder", "console", "gateway", "router")  # roles that no gate waits for: they ignore faults
@@ -46,7 +46,7 @@ def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
     for field in fault:
         if field not in COMMON and field not in of:
             allowed = ", ".join([*COMMON, *of])
-            yield str(field)[:40], f"is not known; {meant(field, (*COMMON, *of))}allowed: {allowed} ({name})"
+            yield str(field)[:40], f"is not known; {suggestion(field, (*COMMON, *of))}allowed: {allowed} ({name})"
     faults = [*_target_flaws(fault, kind, known), *_time_flaws(fault, kind)]
     for parameter in kind.parameters:
         faults += _parameter_flaws(fault, _of_target(parameter, fault.get("target"), known), known)

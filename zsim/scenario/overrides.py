@@ -8,7 +8,7 @@ from typing import Any, get_args
 from msgspec import Struct, structs
 
 from zsim.scenario.scenario import Document
-from zsim.schema.checker import meant, show
+from zsim.schema.checker import show, suggestion
 
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
 PATH_MAX = 1000  # characters; the longest of a scenario has a tenth of that
@@ -129,7 +129,7 @@ def _index(place: list[Any], step: str, path: list[str]) -> int:
     texts = [name for name in names if isinstance(name, str)]
     known = ", ".join(texts)
     allowed = f"0 to {len(place) - 1}{' or ' if known else ''}{known}" if place else "nothing, it is empty"
-    raise ValueError(f"{step[:40]} is not in {'.'.join(path)}; {meant(step, texts)}allowed: {allowed}")
+    raise ValueError(f"{step[:40]} is not in {'.'.join(path)}; {suggestion(step, texts)}allowed: {allowed}")
 
 
 def _name(text: str) -> str:

@@ -102,7 +102,10 @@ def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[Fau
     if info.forbid_unknown_fields:
         for key in value:
             if key not in names:
-                yield field_path(path, key), f"is not known; {meant(key, names)}allowed: {', '.join(sorted(names))}"
+                yield (
+                    field_path(path, key),
+                    f"is not known; {suggestion(key, names)}allowed: {', '.join(sorted(names))}",
+                )
     for name, entry in names.items():
         if name in value:
             yield from _check(value[name], entry.type, field_path(path, name))
@@ -262,7 +265,7 @@ def _sound_field(value: dict[str, Any], entry: types.Field) -> Any:
     return None if entry.default is msgspec.NODEFAULT else entry.default
 
 
-def meant(name: Any, known: Iterable[str]) -> str:
+def suggestion(name: Any, known: Iterable[str]) -> str:
     """Return a question for the known name that is most like an unknown one; "" where none is like it."""
     close = get_close_matches(str(name)[:SHOWN_MAX], known, 1)
     return f"did you mean {close[0]}? " if close else ""

@@ -10,7 +10,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from zsim.errors import DocumentError
 from zsim.schema import plugin
-from zsim.schema.checker import Fault, faults, field_path, meant, show
+from zsim.schema.checker import Fault, faults, field_path, show, suggestion
 from zsim.sensors import baro, flow, gps, imu, mag, sonar
 from zsim.sensors.baro import BaroConfig
 from zsim.sensors.camera import CAMERAS, BottomCamera, Camera, FrontCamera, SightingModel
@@ -155,7 +155,7 @@ def separate(section: dict[str, Any]) -> OwnSections:
             continue
         if not (isinstance(value, dict) and MODULE in value):
             allowed = f"allowed: {', '.join(sorted(FIELDS))}, or a sensor of your own with its module"
-            wrong.append((field_path("", name), f"is not known; {meant(name, FIELDS)}{allowed}"))
+            wrong.append((field_path("", name), f"is not known; {suggestion(name, FIELDS)}{allowed}"))
             continue
         section_faults = [*_name_faults(name)] or [*_section_faults(name, value)]
         wrong += section_faults

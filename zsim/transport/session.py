@@ -354,9 +354,11 @@ class Session:
         def note(status: Any) -> None:
             self._matching[key] = status.matching
 
+        self._matching[key] = False
         self._keep(publisher.declare_matching_listener(zenoh.handlers.Callback(note, indirect=False)))
         status: Any = publisher.matching_status  # the stub says bool; it is an object that has one
-        self._matching[key] = status.matching
+        if status.matching:  # no more than that: the listener's thread may have noted a subscriber since it was asked
+            self._matching[key] = True
 
     def put_sample(self, key: str, payload: bytes, encoding: str) -> None:
         """Publish a payload of any encoding on any of many keys, without declaring a publisher.

@@ -110,7 +110,9 @@ class EstimatorSet:
         try:
             self._estimators[i].receive(sensor, message)
         except Exception as error:
-            raise self._failure(error, i) from error
+            if (failure := self._failure(error, i)) is None:
+                raise
+            raise failure from error
 
     def receive_gate(self, gate: Any) -> bool:
         """Refuse it: its messages are to be handed over one by one."""
@@ -128,13 +130,15 @@ class EstimatorSet:
         try:
             estimate = self._estimators[i].estimate(t_s)
         except Exception as error:
-            raise self._failure(error, i) from error
+            if (failure := self._failure(error, i)) is None:
+                raise
+            raise failure from error
         return _plain(estimate, self._estimators[i], self._drones[i])
 
-    def _failure(self, error: Exception, i: int) -> Exception:
-        """Return what a user's class raised with its drone; any other error as it is."""
+    def _failure(self, error: Exception, i: int) -> UserCodeError | None:
+        """Return what a user's class raised with its drone; None for any other error."""
         failure = plugin.user_code_error(error, "")
-        return UserCodeError(f"{failure.text}, for {self._drones[i]}") if failure else error
+        return UserCodeError(f"{failure.text}, for {self._drones[i]}") if failure else None
 
     def snapshot(self) -> State | None:
         """Return the states of all of them, None if their class has no `snapshot`."""

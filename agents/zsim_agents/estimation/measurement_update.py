@@ -173,7 +173,8 @@ def is_denied(rows: Rows, i: int, kind: int) -> bool:
 @portable
 def widen(P: np.ndarray, k: int, variance: float, layout: np.ndarray) -> None:
     """Add a variance to a state of the position or velocity, and to its clones: it is one error of all of them."""
-    first, end = layout[LAYOUT.first_clone] + k, P.shape[0]
+    first = layout[LAYOUT.first_clone] + k
+    end = first + CLONED * layout[LAYOUT.clones]  # beyond, P has room for those of other drones
     P[k, k] += variance
     for a in range(first, end, CLONED):
         P[a, k] += variance

@@ -41,7 +41,7 @@ class PaperEstimator:
         gyro, flow = drone.sensors.imu.gyro_deg_s, drone.sensors.flow
         gyro_sigma = noise_sigma(gyro, drone.sensors.imu.rate_hz)
         self._gyro_sigma, self._gyro_bias = math.radians(gyro_sigma), math.radians(gyro.bias)  # rad/s
-        self._fix_variances = repeated(drone.sensors.gps.position_m, drone.sensors.gps.rate_hz)
+        self._fix_variance_factor = correlation_factor(drone.sensors.gps.position_m, drone.sensors.gps.rate_hz)
         self._imu_period_s = 1.0 / drone.sensors.imu.rate_hz
         beta = estimation.madgwick_beta
         self._beta = math.sqrt(0.75) * (self._gyro_sigma + self._gyro_bias) if beta is None else beta  # Madgwick (50)
@@ -74,7 +74,7 @@ class PaperEstimator:
         yaw = float(frames.heading(self._q))
         self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, self._process_noise(dt), dt)
         if self._fix:
-            self._filter.correct(self._fix, self._fix_variances)
+            self._filter.correct(self._fix, self._fix_variance_factor)
             self._fix = None
         turn = frames.quaternion_from_heading(self._filter.x[YAW] - yaw)
         self._q = _quaternion(frames.quaternion_multiply(turn, self._q))
@@ -166,14 +166,14 @@ class DeadReckoningFilter(ExtendedKalmanFilter):
         """Set the state to that of dead reckoning, which is not linear."""
         self.x = self._next
 
-    def correct(self, fix: Gps, variances: float = 1.0) -> None:
-        """Use a fix of the GPS receiver, its variance taken so many times."""
-        H, R = np.eye(3, 4), np.eye(3) * fix.sigma_m**2 * variances
+    def correct(self, fix: Gps, variance_factor: float) -> None:
+        """Use a fix of the GPS receiver, its variance multiplied by a factor."""
+        H, R = np.eye(3, 4), np.eye(3) * fix.sigma_m**2 * variance_factor
         self.update(np.array(fix.position_m), lambda x: H, lambda x: x[:3], R=R)
 
 
-def repeated(error: ErrorModel, rate_hz: float) -> float:
-    """Return for how many independent samples one is to be counted less: (1 + a)/(1 - a) of neighbours correlated by a.
+def correlation_factor(error: ErrorModel, rate_hz: float) -> float:
+    """Return by how much correlation raises the variance of a mean of samples: (1 + a)/(1 - a), a of neighbours.
 
     The variance of a mean of n samples of a Gauss-Markov process is so many times sigma^2/n (G. V. Bayley,
     J. M. Hammersley, "The 'effective' number of independent observations in an autocorrelated time series",

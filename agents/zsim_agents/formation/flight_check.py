@@ -45,7 +45,7 @@ class FlightCheck:
     def observe(self, gate: GateInput) -> None:
         """Take over the estimates of a gate."""
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
-        self._flaw = self._first_flaw(gate, self.limits.lost)
+        self._flaw = self._first_flaw(gate, self.limits.in_flight_factor)
         if self._flaw[0] != VALID and not all_near(gate.p_W, gate.yaw):
             return
         try:
@@ -92,7 +92,7 @@ class FlightCheck:
 
     def estimate_fault(self, gate: GateInput) -> str | None:
         """Return why the estimates of drones in flight cannot be flown on, those of the gate that was observed."""
-        return self._flaw_text(gate, self._flaw, self.limits.lost)
+        return self._flaw_text(gate, self._flaw, self.limits.in_flight_factor)
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
         """Return which drone is in another state than those allowed."""

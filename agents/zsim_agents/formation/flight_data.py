@@ -56,7 +56,7 @@ class EngagementLimits:
         assembly_climb_m_s: greatest speed of that climb.
         age_max_s: oldest estimate that is flown on.
         sigma_max_m, yaw_sigma_max_rad: greatest sigma of position and heading for take-off and engagement.
-        lost: in flight they may be so many times greater.
+        in_flight_factor: by which both may be greater in flight.
         heal_s: how long everything must be well before a held formation goes on.
         resend_s: after it a mode command without effect is sent again.
     """
@@ -69,7 +69,7 @@ class EngagementLimits:
     age_max_s: float = 0.5  # as the firmware's silence: 25 gates
     sigma_max_m: float = 1.0  # half of the least separation of 2 m
     yaw_sigma_max_rad: float = math.radians(15.0)  # half of the 30 deg at which three sigma turn a velocity by 90 deg
-    lost: float = 2.0  # of a position: 2 m, as of a single GPS fix: nothing else helps any more
+    in_flight_factor: float = 2.0  # of a position: 2 m, as of a single GPS fix: nothing else helps any more
     heal_s: float = 0.5  # 25 gates without a fault are no accident
     resend_s: float = 1.0  # ten times the delay of commands in the paper's scenario, 100 ms
 

@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv, stdtrit
 
 LEVEL = 0.95  # of all intervals of a report
-RUNS_MIN = (
-    5  # chosen: Student's interval of two runs is nine times as wide as their distance; fewer are shown as they are
-)
+RUNS_MIN = 5  # chosen: of two runs Student's interval is nine times as wide as their distance; fewer are shown singly
 
 
 class ConfidenceInterval(Struct, frozen=True):

@@ -78,7 +78,8 @@ def echo(
                 return number
         if time.monotonic() >= until_s:
             return number
-        note(f"nobody has published on {expression} for {UNHEARD_S:g} s{keys_like(link, expression)}")
+        if not number:
+            note(f"nobody has published on {expression} for {UNHEARD_S:g} s{keys_like(link, expression)}")
         unheard_s = until_s
 
 

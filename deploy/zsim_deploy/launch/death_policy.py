@@ -4,7 +4,7 @@ import time
 from collections import defaultdict, deque
 from typing import NamedTuple
 
-from zsim.scenario.role_table import OnDeath, is_needed, on_death, on_overdue
+from zsim.scenario.role_table import OnDeath, is_needed, lets_drop, on_death, on_overdue
 from zsim.scenario.scenario import Processes
 from zsim_deploy import USER_FAULT
 
@@ -42,7 +42,8 @@ class DeathPolicy:
         action = on_death(self._processes.on_death, name)
         if action == "end":
             return DeathDecision("end", "on_death: end")
-        if code == USER_FAULT:
+        is_settled = flies and (action == "wait" or lets_drop(self._processes.on_death, name))  # by the scenario itself
+        if code == USER_FAULT and not is_settled:
             return self._without(name, flies, "a restart would not help", is_needed(name))
         if action == "restart" and self._dies_too_often(name):
             return self._without(name, flies, f"more than {RESTARTS_MAX} restarts within {RESTART_WINDOW_S:g} s")

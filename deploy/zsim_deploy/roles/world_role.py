@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 SLOW_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
 SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
 HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more
-VITAL = frozenset(
-    {"death", "doubled", "failure", "overdue", "end"}
-)  # why a run ends, and what is wrong with who takes part
+VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # why a run ends, and who is lost or doubled
 
 
 def world(

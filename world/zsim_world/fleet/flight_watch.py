@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.snapshot import State
 from zsim.math.columns import Field, columns
-from zsim.math.compiled import kernel
+from zsim.math.compiled import Held, hold, kernel
 from zsim.schema.quantities import G_M_S2
 from zsim_world.state.fleet_arrays import STATE, VEHICLE, Bodies
 from zsim_world.vehicles.firmware import EMERGENCY, LANDING, MEMORY
@@ -31,7 +31,7 @@ SEEN = columns(
         Field("flipped", "1"),
         Field("empty", "1"),
         Field("quiet", "gates"),  # in which no impact is found any more
-        Field("led", "1"),  # its body is external
+        Field("external", "1"),  # its body is
         Field("v_WB", "m/s", 3),  # at the last gate
         Field("speed", "m/s"),  # at the gate before that, as a contact may last for two; from an impact on: of it
     ),
@@ -45,6 +45,16 @@ class Mishap(NamedTuple):
     kind: str
     text: str
     data: dict[str, Any]
+
+
+class WatchedArrays(NamedTuple):
+    """What of N drones is compared from gate to gate."""
+
+    state: NDArray[np.float64]  # of Bodies
+    memory: NDArray[np.float64]  # of the firmware
+    energy: NDArray[np.float64]  # of Bodies
+    seen: NDArray[np.float64]  # (N, SEEN.size), written
+    found: NDArray[np.int64]  # (N,), bits of what befell each, written
 
 
 class FlightWatch:
@@ -68,10 +78,11 @@ class FlightWatch:
     ) -> None:
         self._bodies, self._memory, self._setting, self._names = bodies, memory, setting, names
         self._seen = np.zeros((len(names), SEEN.size))
-        self._seen[:, SEEN.led] = [i in external for i in range(len(names))]
+        self._seen[:, SEEN.external] = [i in external for i in range(len(names))]
         self._found = np.zeros(len(names), np.int64)
         self._change_m_s = IMPACT_G * G_M_S2 * gate_s
         self._quiet_gates = math.ceil(QUIET_S / gate_s)
+        self._held = hold(WatchedArrays(bodies.state, memory, bodies.energy, self._seen, self._found))
         self.look()  # loads or compiles it
 
     def snapshot(self) -> State:
@@ -88,9 +99,7 @@ class FlightWatch:
 
     def look(self) -> bool:
         """Compare the drones with what was seen at the last gate; return whether anything befell one."""
-        bodies = self._bodies
-        arrays = (bodies.state, self._memory, bodies.energy, self._seen, self._found)
-        return find(*arrays, self._change_m_s, self._quiet_gates) > 0
+        return find(self._held, self._change_m_s, self._quiet_gates) > 0
 
     def mishaps(self, touching: NDArray[np.bool_]) -> list[Mishap]:
         """Return what befell drones in the last gate; `touching` (N,) are those whose hulls touch another body."""
@@ -122,27 +131,20 @@ class FlightWatch:
         return Mishap(i, "landing", f"{name} lands by itself: nobody has commanded it for long", {"cause": "silence"})
 
 
-@kernel(makes_arrays=False)
-def find(
-    state: NDArray,
-    memory: NDArray,
-    energy: NDArray,
-    seen: NDArray,
-    found: NDArray,
-    change_m_s: float,
-    quiet_gates: int,
-) -> int:
+@kernel()
+def find(held: Held, change_m_s: float, quiet_gates: int) -> int:
     """Set what befell each of N drones since the last call (bits, (N,)); return how many it befell.
 
     Args:
-        state, energy: of Bodies; memory: of the firmware; seen: (N, SEEN.size), in place.
+        held: WatchedArrays, by `hold`.
         change_m_s: greatest change of velocity over a gate without an impact.
         quiet_gates: after an impact, gates in which no other one is found.
     """
+    state, memory, energy, seen, found = held.content
     count = 0
     for i in range(found.size):
         found[i] = 0
-        if seen[i, SEEN.led] != 0.0:
+        if seen[i, SEEN.external] != 0.0:
             continue
         bits, mode = 0, memory[i, MEMORY.mode]
         if mode != seen[i, SEEN.mode]:

@@ -14,10 +14,8 @@ from zsim_world.flight.budgets import Budgets
 from zsim_world.flight.run_clock import RunClock
 from zsim_world.flight.run_outbox import RunOutbox
 
-START_TIMEOUT_S = 60.0  # wall; for processes that a launched run expects and does not start itself
-START_TIMEOUT_OWN_S = (
-    600.0  # for those that its launcher starts: chosen, the first start on a machine may compile for minutes
-)
+START_TIMEOUT_S = 60.0  # wall; chosen, for processes that a launched run expects and does not start itself
+START_TIMEOUT_OWN_S = 600.0  # wall; chosen, for those that its launcher starts: the first start may compile for minutes
 RETURNS = ("restart", "wait")  # of on_death: a process that died comes back, or may
 
 

@@ -151,7 +151,7 @@ def accelerate(bodies: Bodies) -> None:
             if bodies.braced[i] != 0:
                 _accelerate_braced(bodies, i)
             elif _in_reach(bodies, i):
-                _accelerate_low(bodies, i)
+                _accelerate_alone(bodies, i, None)
             else:
                 for c in range(6):
                     bodies.accel[i, c] = lanes[LANES * (BODY_LANES.accel + c) + i - first]
@@ -249,27 +249,9 @@ def _accelerate_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, .
 
 
 @inlined
-def _accelerate_low(bodies: Bodies, i: int) -> None:
-    """Note the accelerations of a drone that has the ground in reach."""
+def _accelerate_alone(bodies: Bodies, i: int, touch: Touch | None) -> None:
+    """Note the accelerations of a drone that has the ground in reach, and what it touches besides."""
     each, row, anchor = bodies.each, bodies.vehicle[i], bodies.anchor[i]
-    p, v, q, w = body.pose(bodies.state[i])
-    rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
-    commands, air, push = PerRotor(bodies.command[i], 0, 1, each), vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-    aero = Aero(bodies.aero_parts, bodies.aero[i])
-    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, None, aero)
-    put(bodies.accel[i], 0, a)
-    put(bodies.accel[i], 3, alpha)
-
-
-@inlined
-def _touch(bodies: Bodies, i: int) -> Touch:
-    return Touch(bodies.obstacle, bodies.solid[i], bodies.held[i], vector(bodies.twist[i], 0))
-
-
-@apart
-def _accelerate_braced(bodies: Bodies, i: int) -> None:
-    """Do as `_accelerate_low`, with all that the drone touches."""
-    each, row, anchor, touch = bodies.each, bodies.vehicle[i], bodies.anchor[i], _touch(bodies, i)
     p, v, q, w = body.pose(bodies.state[i])
     rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
     commands, air, push = PerRotor(bodies.command[i], 0, 1, each), vector(bodies.air[i], 0), vector(bodies.push[i], 0)
@@ -277,6 +259,16 @@ def _accelerate_braced(bodies: Bodies, i: int) -> None:
     a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push, touch, aero)
     put(bodies.accel[i], 0, a)
     put(bodies.accel[i], 3, alpha)
+
+
+@apart
+def _accelerate_braced(bodies: Bodies, i: int) -> None:
+    _accelerate_alone(bodies, i, _touch(bodies, i))
+
+
+@inlined
+def _touch(bodies: Bodies, i: int) -> Touch:
+    return Touch(bodies.obstacle, bodies.solid[i], bodies.held[i], vector(bodies.twist[i], 0))
 
 
 @apart

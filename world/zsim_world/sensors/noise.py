@@ -17,9 +17,7 @@ from zsim_world.physics.normal_variates import WORDS, fill, words
 from zsim_world.sensors.sensor_set import CHANNELS, CHANNELS_MAX, SENSORS, channels, noise_width, rate_of
 
 GUST_WIDTH = 3  # numbers of a gust
-
-
-STREAMS = tuple(zip(SENSORS, CHANNELS, strict=True))
+STREAMS = tuple(zip(SENSORS, CHANNELS, strict=True))  # name and channels of each sensor
 
 
 class NoiseTable:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from zsim.contract.snapshot import State
 from zsim.math import geodetic
 from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined, kernel
+from zsim.math.compiled import Held, hold, inlined, kernel
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import SensorType
 from zsim_world.sensors import sensor_set
@@ -56,6 +56,16 @@ def _size(s: int, kind: SensorType) -> int:
 NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
 
 
+class SampledLog(NamedTuple):
+    """What the kernel logged, and what turns it into samples."""
+
+    whose: NDArray[np.int64]  # (M, 3): sensor, drone, tick
+    value: NDArray[np.float64]  # (M, CHANNELS_MAX)
+    latency_ns: NDArray[np.int64]  # (N, sensors)
+    rows: NDArray[np.float64]  # these two of geodetic.anchor
+    place: NDArray[np.float64]
+
+
 class Sampler:
     """Makes samples of what the kernel logged, and keeps back those that are delayed.
 
@@ -67,13 +77,14 @@ class Sampler:
 
     def __init__(self, scenario: Scenario, sensors: FleetSensors, senses: Senses) -> None:
         place = scenario.environment
-        self._anchor = geodetic.anchor(place.latitude_deg, place.longitude_deg, place.height_m)
-        self._latency_ns = sensor_set.latencies(sensors)
+        latency_ns = sensor_set.latencies(sensors)
+        anchor = geodetic.anchor(place.latitude_deg, place.longitude_deg, place.height_m)
+        self._log = SampledLog(senses.whose, senses.value, latency_ns, *anchor)
+        self._held = hold(self._log)
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
-        self._senses = senses
         own = len(sensors.names) > len(SENSORS)
         self._user_sensors = UserSensors(scenario, sensors, senses) if own else None
-        self._in_order = not (own or self._latency_ns.any())
+        self._in_order = not (own or latency_ns.any())
         self._later = NONE
 
     def snapshot(self) -> State:
@@ -93,12 +104,13 @@ class Sampler:
         Raises:
             UserCodeError: the equation of a user's sensor fails.
         """
-        rows, place = self._anchor
-        whose, value = self._senses.whose[:logged], self._senses.value[:logged]
+        held = self._held
         if self._user_sensors is not None:
             user_whose, user_value = self._user_sensors.readings()
-            whose, value = np.concatenate((whose, user_whose)), np.concatenate((value, user_value))
-        fresh = Sampled(*stamped(whose, value, self._latency_ns, self._tick_ns, rows, place))
+            whose = np.concatenate((self._log.whose[:logged], user_whose))
+            value = np.concatenate((self._log.value[:logged], user_value))
+            held, logged = hold(self._log._replace(whose=whose, value=value)), len(whose)
+        fresh = Sampled(*stamped(held, logged, self._tick_ns))
         return fresh if self._in_order else self._sort_out(fresh, now_ns)
 
     def _sort_out(self, fresh: Sampled, now_ns: int) -> Sampled:
@@ -111,11 +123,15 @@ class Sampler:
 
 
 @kernel()
-def stamped(
-    whose: NDArray, value: NDArray, latency_ns: NDArray, tick_ns: int, rows: NDArray, place: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Return index and values of what the kernel logged as (sensor, drone, tick); see Sampled and geodetic.anchor."""
-    count = whose.shape[0]
+def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
+    """Return index and values of Sampled of the first rows of a log.
+
+    Args:
+        held: a SampledLog, by `hold`.
+        count: of rows.
+        tick_ns: between two ticks [ns].
+    """
+    whose, value, latency_ns, rows, place = held.content
     index, values = np.empty((count, WHOSE.size), np.int64), np.empty((count, VALUE_COLUMNS))
     for m in range(count):
         s, i, first = whose[m, 0], whose[m, 1], 0

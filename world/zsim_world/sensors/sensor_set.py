@@ -158,7 +158,8 @@ def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:
 def heading_sigma(mag: MagConfig, horizontal_ut: float) -> float:
     """Return the standard deviation [rad] of a heading from one magnetometer sample: that of the field, sideways."""
     model = mag.field_ut
-    return math.hypot(noise_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0)) / max(horizontal_ut, 1.0)
+    sideways_ut = math.hypot(noise_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0))
+    return sideways_ut / max(horizontal_ut, FIELD_MIN_UT)
 
 
 def has_compass(mag: MagConfig, field_ut: Sequence[float]) -> bool:

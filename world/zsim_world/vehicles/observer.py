@@ -15,6 +15,7 @@ from zsim.math.rotation import Quaternion, Vector, axpy
 from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import free_thrust, lagged
+from zsim_world.sensors.sensor_set import FIELD_MIN_UT
 from zsim_world.state.fleet_arrays import VEHICLE, PerRotor, of, put_of
 from zsim_world.vehicles.observer_gains import GAIN
 
@@ -73,7 +74,6 @@ STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks on, so older samples have less 
 FLOW_QUALITY_MIN = 0.3  # below, the picture shows more horizon than ground
 FLOOR_MIN_M = 0.3  # m, chosen: a landing believed to be higher is on a roof; sonars measure from 0.25 m on or less
 SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barometer
-MAG_MIN_UT = 1.0  # uT, a horizontal field that still gives a heading
 
 
 @inlined
@@ -282,7 +282,7 @@ def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) 
 def _see_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, bearing: float) -> Quaternion:
     """Correct heading and the gyro's bias about the vertical; the first samples are averaged. Return the new frame."""
     field_H = rot.rotate(rot.level(own, four(belief, BELIEF.q_WB)), field_B)
-    if field_H[0] * field_H[0] + field_H[1] * field_H[1] < MAG_MIN_UT * MAG_MIN_UT:
+    if field_H[0] * field_H[0] + field_H[1] * field_H[1] < FIELD_MIN_UT * FIELD_MIN_UT:
         return own
     n = belief[BELIEF.mag_samples] + 1.0
     belief[BELIEF.mag_samples] = n

@@ -373,7 +373,7 @@ class LockstepLines(LockstepSession):
         loop: Any = SimpleNamespace(call_soon_threadsafe=lambda act, *args: act(*args))
         super().__init__(name, join, run, loop, lambda line: self.lines.append(json.loads(line)))
 
-    def answer(self, outputs: list[Any]) -> None:
+    def reply(self, outputs: list[Any]) -> None:
         self._answers.put(outputs)
 
 
@@ -403,7 +403,7 @@ def test_an_agent_reads_what_closes_its_gates_and_counts_the_sensors_that_it_tak
 def test_a_step_hands_over_what_came_and_returns_the_answer():
     session = LockstepLines()
     session.receive("drone/drone1/estimate", "e")
-    session.answer(["out"])
+    session.reply(["out"])
     assert session.step(40) == ["out"]
     assert session.lines == [{"op": "gate", "t_ns": 40, "inputs": [{"key": "drone/drone1/estimate", "value": "e"}]}]
     session.leave()
@@ -416,7 +416,7 @@ def test_in_realtime_a_late_gate_goes_with_a_newer_one():
     session.receive("a", 1)
     assert session.step(8 * GATE_NS) == []
     session.receive("b", 2)
-    session.answer([])
+    session.reply([])
     session.step(9 * GATE_NS)
     (line,) = session.lines
     assert (line["t_ns"], [(each["key"], each["value"]) for each in line["inputs"]]) == (

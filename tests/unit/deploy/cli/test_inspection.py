@@ -321,6 +321,14 @@ def test_who_hears_something_is_told_nothing(monkeypatch: pytest.MonkeyPatch):
     assert (heard, shown, notes) == (1, [TRUTH[1]], [])
 
 
+def test_nor_is_who_goes_on_listening(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first message comes while it is not yet told that there is none; the second after that time."""
+    link, notes, shown = FakeLink(), [], []
+    monkeypatch.setattr(inspection, "time", Clock(link, [TRUTH, (5.0, *TRUTH[1:])]))
+    came = inspection.echo(link, TRUTH[1], None, lambda key, _: shown.append(key), True, 8.0, notes.append)  # type: ignore[arg-type]
+    assert (came, shown, notes) == (2, [TRUTH[1]] * 2, [])
+
+
 def test_the_rate_of_what_never_came_is_that_of_no_message(monkeypatch: pytest.MonkeyPatch):
     link, lines = FakeLink(), []
     monkeypatch.setattr(inspection, "time", Clock(link, [TRUTH]))

@@ -224,6 +224,23 @@ def test_a_camera_that_gates_ends_the_run_where_no_restart_helps(name: str):
     assert DeathPolicy(Processes()).decide(name, USER_FAULT, flies=True).action == "drop"
 
 
+@pytest.mark.parametrize(
+    ("on_death", "flies", "action"),
+    [
+        ({}, True, "end"),
+        ({"controller": "restart"}, True, "end"),
+        ({"controller": "drop"}, True, "drop"),
+        ({"controller.main": "wait"}, True, "wait"),
+        ({"controller": "drop"}, False, "end"),  # a world that has not begun waits for it
+        ({"controller.main": "wait"}, False, "end"),
+    ],
+)
+def test_a_scenario_may_let_a_run_go_on_without_who_cannot(on_death: dict[str, Any], flies: bool, action: str):
+    """As the world decides of one whose class has raised: what it goes on without, its launcher does not end."""
+    policy = DeathPolicy(Processes(on_death=on_death))
+    assert policy.decide("controller.main", USER_FAULT, flies).action == action
+
+
 def test_a_dead_world_fails_the_run_and_stops_the_rest():
     team = Team(Member("estimator.d1"), world=[-signal.SIGKILL], on_death={"world": "end"})
     outcome = team.go()

@@ -119,7 +119,7 @@ def test_numbers_are_read_as_they_are_decoded(fields: list[tuple[int, int, int]]
     """Whatever the length of both integers, and of the map that they begin."""
     payloads = [encode({"t_ns": t_ns, "seq": seq, **{f"f{k}": k for k in range(more)}}) for t_ns, seq, more in fields]
     ends = np.cumsum([len(payload) for payload in payloads])
-    starts = ends - [len(payload) for payload in payloads]
+    starts = np.array([0, *ends[:-1]])
     spans = MessageSpans(b"".join(payloads), np.zeros(len(payloads), np.int64), starts, ends)
     assert sequence_numbers(spans).tolist() == [decode(payload)["seq"] for payload in payloads]
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from fake_link import UNANSWERED, FakeLink
+from msgspec.structs import replace
 from refused import refused
 
 from zsim.contract import keys, messages
@@ -64,6 +65,17 @@ def test_another_gate_is_asked_for_at_once():
     for gate in (3, 4):
         member.ask_again(gate * GATE_NS, "drone/d1/truth")
     assert [args["from_ns"] // GATE_NS for _, args in link.requests] == [2, 3]
+
+
+@pytest.mark.parametrize(("mode", "from_gate"), [("lockstep", 0), ("realtime", 2)])
+def test_what_an_inbox_holds_back_is_asked_for_where_there_is_such_a_hold(mode: Any, from_gate: int) -> None:
+    """Delay and a gate before; in realtime nothing is held, and an agent would get what it has had a second time."""
+    link, agent = FakeLink(), Quiet()
+    agent.reads = (*Quiet.reads, "drone/d2/estimate")
+    info = replace(INFO, mode=mode)
+    member = Membership(link, info, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    member.ask_again(3 * GATE_NS, "drone/d1/truth")
+    assert [args["from_ns"] // GATE_NS for _, args in link.requests] == [from_gate]
 
 
 def test_who_did_not_join_as_the_news_of_its_own_process_say_joins_again():

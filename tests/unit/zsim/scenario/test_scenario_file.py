@@ -628,6 +628,10 @@ def test_a_fault_that_all_drones_share_is_told_once():
             {"drones": [drone("a", limits={"tilt_deg": 58})]},
             ("drones[0].limits.tilt_deg", "58", "<=", "55.0", "weight"),
         ),
+        (  # its rotors carry it up to 15.4 deg, but 30 deg are allowed to all
+            {"drones": [drone("a", mass_kg=0.72, limits={"tilt_deg": 45})]},
+            ("drones[0].limits.tilt_deg", "45", "<=", "30.0", "weight"),
+        ),
         (
             {"sensors": {"imu": {"rate_hz": 500}}, "drones": [drone("a")]},
             ("drones[0].sensors.imu.rate_hz", "500", "<=", "200"),

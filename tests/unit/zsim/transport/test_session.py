@@ -4,11 +4,12 @@ import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import zenoh
 
-from zsim.transport.session import open_session
+from zsim.transport.session import Session, open_session
 from zsim.transport.tls import Identity
 
 ALONE = ("unshare", "--map-root-user", "--mount")  # Linux: mounts that nobody else sees
@@ -49,3 +50,24 @@ def test_a_far_end_that_takes_nothing_does_not_fail_who_leaves(monkeypatch: pyte
     with open_session({}, "zsim", Identity("here"), str):
         pass
     assert closed
+
+
+class LatePublisher:
+    """A publisher to which somebody subscribes between Zenoh's answer and its use."""
+
+    def declare_matching_listener(self, listener: Any) -> SimpleNamespace:
+        self._listener = listener
+        return SimpleNamespace(undeclare=lambda: None)
+
+    @property
+    def matching_status(self) -> SimpleNamespace:
+        self._listener(SimpleNamespace(matching=True))
+        return SimpleNamespace(matching=False)
+
+    def undeclare(self) -> None:
+        return
+
+
+def test_who_subscribes_while_it_is_asked_whether_anybody_does_is_not_overlooked() -> None:
+    raw: Any = SimpleNamespace(declare_publisher=lambda key, **settings: LatePublisher())
+    assert Session(raw, "zsim", Identity("here")).has_subscribers("drone/*/truth")
