@@ -22,7 +22,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -126,15 +126,16 @@ class Role:
                 self._news.wait(left_s)
         return pytest.fail(f"{self}: no line with {pattern!r} within {within_s:g} s:\n{self.text()}")
 
-    def ends(self, with_code: int, within_s: float = PATIENCE_S) -> float:
-        """Wait for its end; return the wall time of it."""
+    def ends(self, with_code: int | Collection[int], within_s: float = PATIENCE_S) -> float:
+        """Wait for its end, with a code or one of several; return the wall time of it."""
         try:
             code = self.process.wait(within_s)
         except subprocess.TimeoutExpired:
             pytest.fail(f"{self}: has not ended within {within_s:g} s:\n{self.text()}")
         end_s = time.monotonic()
         self._reader.join(PATIENCE_S)
-        assert code == with_code, f"{self} ended with {code}:\n{self.text()}"
+        allowed = (with_code,) if isinstance(with_code, int) else with_code
+        assert code in allowed, f"{self} ended with {code}:\n{self.text()}"
         return end_s
 
     def text(self) -> str:

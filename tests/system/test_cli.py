@@ -69,7 +69,7 @@ def test_looking_at_a_run(federation: Federation, flying: Role) -> None:
     (raw,) = terminal("echo", "clock", "-n", "1", "--raw").splitlines()
     assert bytes.fromhex(json.loads(raw)["message"]).startswith(b"\x87")  # a msgpack map of seven fields
     assert "50.0 Hz" in terminal("hz", "clock", "--seconds", "2.5")
-    assert "nothing/here" in terminal("hz", "nothing/here", "--seconds", "0.1")
+    assert "nothing/here" in terminal("hz", "nothing/here", "--seconds", "0.1", code=1)
     assert terminal("ask", "world/control", "stop") == "ok\n"
     flying.ends(with_code=0)
 

@@ -142,11 +142,11 @@ def test_ctrl_c_then_kill_then_the_same_command(federation: Federation, undistur
 
 
 def test_runs_that_fail_are_rows(federation: Federation) -> None:
-    """One combination cannot be flown: the others are, and a sweep of which nothing can be flown has failed."""
+    """One combination cannot be flown: the others are, and the sweep has failed."""
     out, path = federation.folder / "sweep", federation.write(PAIR, "pair.yaml")
     values = "processes.expect=[estimator.drone1,estimator.drone2,controller.main],[console.1]"
     role = federation.start("sweep", path, "--vary", values, "--duration", "0.2", "--out", str(out), "--workers", "1")
-    role.ends(with_code=0)
+    role.ends(with_code=1)
     failures = [row["failure"] for row in rows(out)]
     reason = "the world waits for console.1, not run in-process; see `processes.expect`"
     assert failures == [None, reason]
@@ -194,7 +194,10 @@ def test_a_scenario_file_of_any_name(federation: Federation, name: str) -> None:
 BAD = {
     "no such field": (("--vary", "wings=1"), "wings is not known; allowed: "),
     "several at once": (("--vary", "duration_s=1,-1", "--vary", "time.gate_ms=0"), "\npair.yaml: duration_s is -1"),
-    "no variation": (("--vary", "duration_s"), "--vary duration_s: is no variation; must be seed, a.b.c=v1,v2"),
+    "no variation": (
+        ("--vary", "duration_s"),
+        "--vary duration_s: is no variation; must be seed, seed=paired, a.b.c=v1,v2",
+    ),
     "a bad override": (("--set", "drones.drone9.mass_kg=1"), "--set drones.drone9.mass_kg=1: drone9 is not in drones"),
     "too few runs": (("--vary", "duration_s=1,2,3", "--runs", "2"), "--runs is 2; must be at least 3"),
     "the same again": (("--runs", "2"), "--runs is 2; must be 1, for further ones would have the same bits"),

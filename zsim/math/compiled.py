@@ -141,6 +141,7 @@ class Held:
 _make_held: Any = Held
 if njit is not None:
     from numba import types
+    from numba.core import config
     from numba.experimental import structref
 
     @structref.register
@@ -152,10 +153,12 @@ if njit is not None:
         """A Held of compiled code."""
 
         __slots__ = ()
-        _numba_type_ = structref.StructRefProxy.__dict__["_type"]  # read twice a call; numba's own is a Python property
+        # read twice a call: the slot behind numba's own, which is a property in Python
+        _numba_type_: Any = structref.StructRefProxy.__dict__["_type"]
 
     structref.define_proxy(_CompiledHeld, _HeldType, ["content"])
-    _make_held = _CompiledHeld
+    if not getattr(config, "DISABLE_JIT", False):  # with it compiled functions stay Python's, to be stepped through
+        _make_held = _CompiledHeld
 
 
 @portable
