@@ -190,7 +190,7 @@ def _imported(name: str, what: str) -> ModuleType:
             sys.path.append(folder)
     try:
         return importlib.import_module(name)
-    except Exception as error:
+    except RAISED as error:
         if isinstance(error, ModuleNotFoundError) and (lacking := extras.missing(error)):
             raise DocumentError([f"{what}, which cannot be imported: {lacking}"]) from error
         reason = " ".join(f"{type(error).__name__}: {error}".split())

@@ -20,6 +20,8 @@ from zsim.schema.checker import show
 
 CLASSES = {"paper": "zsim_agents.estimation.paper_estimator:PaperEstimator"}
 SIZES = {"position_m": 3, "velocity_m_s": 3, "orientation_wxyz": 4, "covariance": 36, "gyro_bias_rad_s": 3}
+STATES = 6  # of the covariance
+NORM_TOLERANCE = 1e-3  # chosen: of a quaternion; 0.1 % is a hundred times what single precision loses
 Numbers = Sequence[float] | NDArray[np.float64]
 
 
@@ -187,8 +189,8 @@ def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> St
 
 def _impossible(field: str, numbers: Sequence[float]) -> str:
     """Return what no state of a drone can have among the finite numbers of a field, empty where all may be."""
-    if field == "covariance" and min(numbers[:: DIMENSION + 1]) < 0.0:
-        return f"the variance {min(numbers[:: DIMENSION + 1]):g}; must be >= 0"
+    if field == "covariance" and min(numbers[:: STATES + 1]) < 0.0:
+        return f"the variance {min(numbers[:: STATES + 1]):g}; must be >= 0"
     if field == "yaw_sigma_rad" and numbers[0] < 0.0:
         return f"the value {numbers[0]:g}; must be >= 0"
     if field == "orientation_wxyz" and abs(math.hypot(*numbers) - 1.0) > NORM_TOLERANCE:
