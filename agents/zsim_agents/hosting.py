@@ -129,7 +129,7 @@ def made(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> lis
         if AGENTS[role].joint:
             return [agent(info, scenario, names)]
         return [agent(info, scenario, name) for name in names]
-    except Exception as error:
+    except plugin.RAISED as error:
         failure = plugin.user_code_error(error, f"{role} of {', '.join(names)}, before the start")
         if failure is None:
             raise

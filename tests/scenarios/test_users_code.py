@@ -53,6 +53,36 @@ def divided(number):
     return 1 / number  # raised here
 
 
+class Exits(ControlLaw):
+    calls = 0
+
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        self.calls += 1
+        if self.calls > 100:
+            raise SystemExit  # quietly
+        return np.zeros(self.space.size)
+
+
+class Early(ControlLaw):
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        return np.zeros(8) + np.zeros(7)  # of other shapes
+
+
+class Complex(ControlLaw):
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        return np.zeros(self.space.size) + 1j
+
+
+class Mirrored(PaperEstimator):
+    def estimate(self, t_s):
+        return super().estimate(t_s)._replace(yaw_sigma_rad=-0.1)
+
+
+class Unmade(PairCluster):
+    def __init__(self):
+        super().__init__()
+
+
 class Estimator(PaperEstimator):
     def receive(self, sensor, message):
         if message.t_ns > 2_000_000_000:
@@ -78,6 +108,12 @@ def distance(truth, settings, environment):
     return [np.inf if truth.t_s > 1.0 else 1.0]
 
 
+def converted(numbers, settings, environment):
+    conversions.append(numbers)
+    return [numbers[0] / (len(conversions) < 9)]  # converted
+
+
+conversions = []
 SENSOR = SensorType(message=RangeOf, settings=Settings, channels=(Channel("range_m", "m"),), equation=distance)
 '''
 
@@ -91,13 +127,16 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     """Yield a folder with a scenario and the module that it may name."""
     (tmp_path / "pair.yaml").write_text(PAIR)
     (tmp_path / "users_code.py").write_text(MODULE)
+    converting = MODULE.replace("equation=distance)", "equation=distance, convert=converted)")
+    (tmp_path / "users_conversion.py").write_text(converting)
     yield tmp_path
     forget(tmp_path)
 
 
 def forget(folder: Path) -> None:
     """Let this process know of no module in a folder any more, as another process would not."""
-    sys.modules.pop("users_code", None)
+    for name in ("users_code", "users_conversion"):
+        sys.modules.pop(name, None)
     sys.path[:] = [place for place in sys.path if not place.startswith(str(folder))]
     plugin.search()
 
@@ -113,6 +152,15 @@ FAILURES = {
     "estimator": (
         [ESTIMATOR],
         ("at 2.02 s", "users_code:Estimator.receive", "KeyError", f"users_code.py:{line_of('raise Key')}", "d1"),
+    ),
+    "exits": (
+        ["clusters.main.law=users_code:Exits"],
+        ("controller.main at ", "users_code:Exits.rates", "SystemExit", f"users_code.py:{line_of('# quietly')}"),
+    ),
+    "impossible": (["estimation.algorithm=users_code:Mirrored"], ("Mirrored.estimate", "yaw_sigma_rad", "-0.1")),
+    "conversion": (
+        ["sensors.beam={module: users_conversion}"],
+        ("d1: sensors.beam at 0.", "converted", "ZeroDivisionError", f"users_conversion.py:{line_of('# converted')}"),
     ),
     "sensor": ([SENSOR], ("d1: sensors.beam at 1.", "users_code:distance", "inf")),
 }
@@ -131,6 +179,20 @@ def test_a_class_that_fails_ends_the_run_as_a_failure_that_is_on_record(
     assert judged.completeness.complete
     assert [each.text for each in judged.shortfalls if each.fails and each.kind == "process"] == [line]
     assert "end" in {event.kind for event in read_flight(record, motion=False).events}
+
+
+@pytest.mark.parametrize(
+    ("override", "terms"),
+    [
+        ("law=users_code:Early", ("Early.rates", "ValueError", f"users_code.py:{line_of('# of other shapes')}")),
+        ("law=users_code:Complex", ("Complex.rates", "1.j")),
+        ("space=users_code:Unmade", ("Unmade.for_places", "TypeError")),
+    ],
+)
+def test_one_that_fails_before_the_flight_is_named_too(folder: Path, override: str, terms: tuple[str, ...]) -> None:
+    with pytest.raises(UserCodeError) as raised:
+        fly(scenario_file.load(folder / "pair.yaml", [f"clusters.main.{override}"]), None)
+    assert all(term in str(raised.value) for term in ("'main'", *terms)), raised.value
 
 
 def test_the_scenario_may_let_a_run_go_on_without_who_fails(folder: Path) -> None:

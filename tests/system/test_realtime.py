@@ -13,10 +13,10 @@ NOBODY_FLIES = "processes.on_death={controller: drop}"
 GATE_NS = 20_000_000
 
 
-def stop(client: Client, role: Role) -> None:
-    """End a run by request."""
+def stop(client: Client, role: Role, code: int = 0) -> None:
+    """End a run by request; its code is 1 where it has left its plan."""
     assert client.request("world/control", "stop")["ok"]
-    role.ends(with_code=0)
+    role.ends(with_code=code)
 
 
 @pytest.mark.parametrize("rate", [1, pytest.param(5, marks=pytest.mark.soak)])
@@ -81,7 +81,7 @@ def test_a_silent_commander_means_hover_then_land(federation: Federation) -> Non
     landing = states.until(lambda m: m["state"] == "landing")
     states.until(lambda m: m["state"] == "landed")
     federation.kill("controller.main", signal.SIGCONT)
-    stop(client, run)
+    stop(client, run, code=1)
     flown_ns = max(h.message["t_ns"] for h in states.received if h.message["state"] == "flying")
     hovering_ns = next(h.message["t_ns"] for h in states.received if h.message["t_ns"] > flown_ns)
     assert landing.message["t_ns"] - hovering_ns == pytest.approx(2e9, abs=GATE_NS)

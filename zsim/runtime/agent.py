@@ -112,13 +112,13 @@ class Agent(ABC):
                 return None
             outputs = self.step(t_ns)
             return [self._checked(output) for output in outputs] if self._is_own else outputs
-        except Exception as error:
+        except plugin.RAISED as error:
             failure = self.failure(error, t_ns)
             if failure is None:
                 raise
             raise failure from error
 
-    def failure(self, error: Exception, t_ns: int) -> UserCodeError | None:
+    def failure(self, error: BaseException, t_ns: int) -> UserCodeError | None:
         """Return what a user's code raised in this agent with the agent's name and the gate; None for other errors."""
         return plugin.user_code_error(error, f"{self.name} at {t_ns / 1e9:.2f} s")
 

@@ -204,7 +204,8 @@ class Bus:
         for fault in faults.faults:
             if fault.kind == PROCESS_KILL:
                 raise RunError(
-                    f"{PROCESS_KILL} of {fault.target}: must be left out in-process, where nobody is a process"
+                    f"faults: {PROCESS_KILL} of {fault.target} needs processes, and this run has all in one; "
+                    f"leave it out, or fly with `zsim run` without --in-process"
                 )
         info = self._info = self._info or self._coordinator.info()
         for agent, _ in self._agents:

@@ -18,6 +18,7 @@ from zsim.runtime.health import HealthMeter
 from zsim.runtime.membership import Membership
 from zsim.runtime.runner_inputs import RunnerInputs
 from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim.schema import plugin
 from zsim.transport.session import Query, Session
 
 TICK_S = 0.1  # how often a stop, and what the world has not answered, is looked for while nothing arrives
@@ -99,7 +100,7 @@ class Runner:
             with rare_collections():
                 while self._leave is None:
                     self._turn()
-        except Exception as error:
+        except plugin.RAISED as error:
             failure = self._agent.failure(error, max(0, self._inbox.taken_ns))
             if failure is None:
                 raise

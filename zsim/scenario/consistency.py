@@ -34,6 +34,9 @@ TILT_FREE_DEG = 30.0  # deg, allowed to whatever is light enough to fly
 # Chosen, a decade or more beyond what flies: 60 to 400 W/kg from racers' hover to large rotors; 3 min to 2 h
 HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power for the rotors
 HOVER_S = (10.0, 86_400.0)  # s on a full battery
+INERTIA_MAX_MR2 = (
+    10.0  # of mass times arm_m squared, chosen: that of the AR.Drone about z is 0.35, of a ring of rotors 1
+)
 
 
 def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
@@ -175,6 +178,11 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
     vehicle = vehicles.get(drone.model) if drone.model else None
     if vehicle and _known(drone.mass_kg, drone.thrust_n_s2, high, gravity):
         yield from _hover_faults(drone, vehicle, scenario.environment)
+    if _known(drone.mass_kg, drone.arm_m, drone.inertia_kg_m2) and None not in drone.inertia_kg_m2:
+        greatest = INERTIA_MAX_MR2 * drone.mass_kg * drone.arm_m**2
+        if max(drone.inertia_kg_m2) > greatest:
+            found = f"is {list(drone.inertia_kg_m2)}; sane: at most {greatest:.3g}, ten times mass_kg arm_m^2"
+            yield "inertia_kg_m2", f"{found}; check its unit, kg m^2"
     yield from _height_faults(drone, scenario.environment and scenario.environment.height_m)
     if drone.sensors is not None:
         yield from ((f"sensors.{path}", text) for path, text in _sensor_faults(drone.sensors))

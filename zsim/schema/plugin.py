@@ -12,11 +12,14 @@ import os
 import sys
 import sysconfig
 from collections.abc import Callable
-from inspect import isfunction
+from inspect import Parameter, getattr_static, isfunction, signature
 from pathlib import Path
 from traceback import walk_tb
 from types import FrameType, ModuleType
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from zsim import extras
 from zsim.errors import DocumentError, UserCodeError
@@ -49,16 +52,17 @@ def folders() -> tuple[Path, ...]:
     return tuple(map(Path, filter(None, os.environ.get(FOLDERS, "").split(os.pathsep))))
 
 
-def load(name: str, where: str, kind: type) -> Callable[..., Any]:
+def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Callable[..., Any]:
     """Return the class of a name `package.module:Class`.
 
     Args:
         name: the class.
         where: file and path of the field that names it, for the fault.
         kind: class or Protocol whose public methods it must have.
+        is_constructed: whether its constructor is called as that of `kind`.
 
     Raises:
-        DocumentError: no such module or class, or a method is missing; one line.
+        DocumentError: no such module or class, or a method is missing or takes other arguments; one line.
     """
     module_name, colon, class_name = name.partition(":")
     if not (colon and module_name and class_name):
@@ -72,6 +76,11 @@ def load(name: str, where: str, kind: type) -> Callable[..., Any]:
     if missing:
         lacks = f"{where} is {show(name)}, which has no {', '.join(missing)}()"
         raise DocumentError([f"{lacks}; must have the methods of {kind.__name__}"])
+    for method in (*(("__init__",) if is_constructed else ()), *_methods(kind)):
+        if (found := _other_arguments(loaded, kind, method)) is not None:
+            taken, given = found
+            what = f"{where} is {show(name)}, whose {method} takes ({taken})"
+            raise DocumentError([f"{what}; must take ({given}), as that of {kind.__name__}"])
     return loaded
 
 
@@ -115,7 +124,11 @@ def full_name(kind: type) -> str:
     return f"{kind.__module__}:{kind.__qualname__}"
 
 
-def user_code_error(error: Exception, where: str) -> UserCodeError | None:
+RAISED = (Exception, SystemExit)
+"""What a user's code may raise. An exit ends a run as an exception does: nobody would be told of it otherwise."""
+
+
+def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
     """Return what a user's code raised as an error that names class, method, file and line; None for other errors.
 
     Args:
@@ -124,18 +137,37 @@ def user_code_error(error: Exception, where: str) -> UserCodeError | None:
     """
     if isinstance(error, UserCodeError):
         return error if error.where else UserCodeError(error.text, where)
-    frames = [(frame, line) for frame, line in walk_tb(error.__traceback__) if _is_user_frame(frame)]
+    walked = list(walk_tb(error.__traceback__))
+    frames = [(frame, line) for frame, line in walked if _is_user_frame(frame)]
     if not frames:
         return None
+    if isinstance(error, SystemExit) and _package(walked[-1][0]) in PACKAGES:
+        return None  # the handler of a signal that came meanwhile
     (called, _), (deepest, line) = frames[0], frames[-1]
     method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
     raised = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
     return UserCodeError(f"{method} raised {raised} ({_shown_path(deepest.f_code.co_filename)}:{line})", where)
 
 
+def numbers(returned: Any) -> NDArray[np.float64]:
+    """Return what a user's code returned as an array.
+
+    Raises:
+        ValueError: it is something else than real numbers: text, None, complex numbers, sequences of unequal length.
+    """
+    array = np.asarray(returned)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"no real numbers: {array.dtype}")
+    return array.astype(float, copy=False)
+
+
+def _package(frame: FrameType) -> str:
+    return frame.f_globals.get("__name__", "").partition(".")[0]
+
+
 def _is_user_frame(frame: FrameType) -> bool:
     """Tell whether a frame is of a user's file, or of an installed package that a document names."""
-    package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename
+    package, path = _package(frame), frame.f_code.co_filename
     if package in PACKAGES or path.startswith("<"):
         return False
     is_library = path.startswith(LIBRARIES) or "site-packages" in path or "dist-packages" in path
@@ -158,7 +190,7 @@ def _imported(name: str, what: str) -> ModuleType:
             sys.path.append(folder)
     try:
         return importlib.import_module(name)
-    except Exception as error:
+    except RAISED as error:
         if isinstance(error, ModuleNotFoundError) and (lacking := extras.missing(error)):
             raise DocumentError([f"{what}, which cannot be imported: {lacking}"]) from error
         reason = " ".join(f"{type(error).__name__}: {error}".split())
@@ -184,3 +216,21 @@ def _methods(kind: type) -> list[str]:
 
 def _is_method(attribute: Any) -> bool:
     return callable(attribute) and not getattr(attribute, "__isabstractmethod__", False)
+
+
+def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:
+    """Return what a method of a class takes and is given, if it cannot be called as that of its kind is."""
+    wanted, own = getattr_static(kind, method), getattr_static(loaded, method)
+    if not (isfunction(wanted) and isfunction(own)) or wanted is own:
+        return None  # of a builtin, or bound in its own way
+    given = [name for name, each in signature(wanted).parameters.items() if _is_required(each)]
+    takes = signature(own)
+    try:
+        takes.bind(*given)
+    except TypeError:
+        return ", ".join(map(str, list(takes.parameters.values())[1:])), ", ".join(given[1:])
+    return None
+
+
+def _is_required(parameter: Parameter) -> bool:
+    return parameter.default is Parameter.empty and parameter.kind is Parameter.POSITIONAL_OR_KEYWORD

@@ -20,6 +20,8 @@ from zsim.schema.checker import show
 
 CLASSES = {"paper": "zsim_agents.estimation.paper_estimator:PaperEstimator"}
 SIZES = {"position_m": 3, "velocity_m_s": 3, "orientation_wxyz": 4, "covariance": 36, "gyro_bias_rad_s": 3}
+STATES = 6  # of the covariance
+NORM_TOLERANCE = 1e-3  # chosen: of a quaternion; 0.1 % is a hundred times what single precision loses
 Numbers = Sequence[float] | NDArray[np.float64]
 
 
@@ -83,7 +85,7 @@ def estimator_class(algorithm: str, where: str = "estimation.algorithm") -> Call
     """
     if algorithm == ESTIMATORS[0]:
         return None
-    return plugin.load(CLASSES.get(algorithm, algorithm), where, DroneEstimator)
+    return plugin.load(CLASSES.get(algorithm, algorithm), where, DroneEstimator, is_constructed=True)
 
 
 class EstimatorSet:
@@ -109,7 +111,7 @@ class EstimatorSet:
         """Hand a message over to the estimator of drone i."""
         try:
             self._estimators[i].receive(sensor, message)
-        except Exception as error:
+        except plugin.RAISED as error:
             if (failure := self._failure(error, i)) is None:
                 raise
             raise failure from error
@@ -129,13 +131,13 @@ class EstimatorSet:
     def _estimate(self, i: int, t_s: float) -> StateEstimate:
         try:
             estimate = self._estimators[i].estimate(t_s)
-        except Exception as error:
+        except plugin.RAISED as error:
             if (failure := self._failure(error, i)) is None:
                 raise
             raise failure from error
         return _plain(estimate, self._estimators[i], self._drones[i])
 
-    def _failure(self, error: Exception, i: int) -> UserCodeError | None:
+    def _failure(self, error: BaseException, i: int) -> UserCodeError | None:
         """Return what a user's class raised with its drone; None for any other error."""
         failure = plugin.user_code_error(error, "")
         return UserCodeError(f"{failure.text}, for {self._drones[i]}") if failure else None
@@ -165,14 +167,16 @@ def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> St
     for field in (*SIZES, "yaw_rad", "yaw_sigma_rad"):
         size, given = SIZES.get(field, 1), getattr(estimate, field, None)
         try:
-            numbers = np.asarray(given, dtype=float).ravel().tolist()
-        except (TypeError, ValueError):
+            numbers = plugin.numbers(given).ravel().tolist()
+        except ValueError:
             numbers = []
         if len(numbers) != size or not all(map(math.isfinite, numbers)):
             found = f"{field} = {show(given)}" if hasattr(estimate, field) else f"{show(estimate)} without {field}"
             raise UserCodeError(
                 f"{what} {found}; must be {f'{size} finite numbers' if size > 1 else 'a finite number'}"
             )
+        if wrong := _impossible(field, numbers):
+            raise UserCodeError(f"{what} {field} with {wrong}")
         values[field] = tuple(numbers)
     yaw, yaw_sigma = values.pop("yaw_rad"), values.pop("yaw_sigma_rad")
     try:
@@ -181,3 +185,14 @@ def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> St
         found = f"sensors = {show(getattr(estimate, 'sensors', None))}"
         raise UserCodeError(f"{what} {found}; must be a map of (used, refused) by sensor") from error
     return StateEstimate(**values, yaw_rad=yaw[0], yaw_sigma_rad=yaw_sigma[0], sensors=sensors)
+
+
+def _impossible(field: str, numbers: Sequence[float]) -> str:
+    """Return what no state of a drone can have among the finite numbers of a field, empty where all may be."""
+    if field == "covariance" and min(numbers[:: STATES + 1]) < 0.0:
+        return f"the variance {min(numbers[:: STATES + 1]):g}; must be >= 0"
+    if field == "yaw_sigma_rad" and numbers[0] < 0.0:
+        return f"the value {numbers[0]:g}; must be >= 0"
+    if field == "orientation_wxyz" and abs(math.hypot(*numbers) - 1.0) > NORM_TOLERANCE:
+        return f"the norm {math.hypot(*numbers):g}; must be 1"
+    return ""

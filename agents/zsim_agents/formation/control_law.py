@@ -143,9 +143,9 @@ class ControlLaw(ABC):
         what = f"{plugin.full_name(type(self))}.rates returns"
         size = self.space.size
         try:
-            rates = np.asarray(r_dot, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise UserCodeError(f"{what} {show(r_dot)}; must be an array of {size} rates") from error
+            rates = plugin.numbers(r_dot)
+        except ValueError as error:
+            raise UserCodeError(f"{what} {show(r_dot)}; must be {size} real numbers") from error
         if rates.shape != (size,):
             raise UserCodeError(f"{what} an array of shape {rates.shape}; must be ({size},), four for each robot")
         wrong = np.flatnonzero(~np.isfinite(rates))

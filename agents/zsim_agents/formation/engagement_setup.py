@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from msgspec import UNSET
 
-from zsim.errors import DocumentError, RunError, UserCodeError
+from zsim.errors import DocumentError, RunError
 from zsim.scenario.scenario import Cluster, Gains, Scenario
 from zsim.schema import plugin
 from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, ProportionalLaw
@@ -56,17 +56,17 @@ def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
     """Raise what is wrong with a cluster as a RunError that names it, in its plan with the path in the scenario."""
     try:
         yield
-    except UserCodeError as error:
-        raise UserCodeError(error.text, f"cluster {cluster.name!r}, in a gate of its rehearsal") from error
     except PlanError as error:
         raise RunError(f"clusters[{scenario.clusters.index(cluster)}].{error} (cluster {cluster.name!r})") from error
-    except (ValueError, DocumentError) as error:
+    except DocumentError as error:
         raise RunError(f"cluster {cluster.name!r}: {error}") from error
-    except Exception as error:
-        failure = plugin.user_code_error(error, f"cluster {cluster.name!r}, in a gate of its rehearsal")
-        if failure is None:
-            raise
-        raise failure from error
+    except plugin.RAISED as error:
+        failure = plugin.user_code_error(error, f"cluster {cluster.name!r}, rehearsed before the flight")
+        if failure is not None:
+            raise failure from error
+        if isinstance(error, ValueError):
+            raise RunError(f"cluster {cluster.name!r}: {error}") from error
+        raise
 
 
 def law_of(cluster: Cluster) -> Callable[[ClusterSpace, FormationGains], ControlLaw]:
@@ -76,7 +76,7 @@ def law_of(cluster: Cluster) -> Callable[[ClusterSpace, FormationGains], Control
         DocumentError: a class of the user's own that cannot be loaded.
     """
     name = cluster.law or "proportional"
-    return LAWS.get(name) or plugin.load(name, "law", ControlLaw)
+    return LAWS.get(name) or plugin.load(name, "law", ControlLaw, is_constructed=True)
 
 
 def rehearse(

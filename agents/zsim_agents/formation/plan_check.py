@@ -120,7 +120,7 @@ class _Rehearsal:
             factor = peak / self._share
             raise PlanError(
                 f"plan.target_over_s is {over_s:g}; must be {factor:.2g} times as long, {factor * over_s:.1f} s or "
-                f"more, for a robot to stay within {self._share:g} of its limits"
+                f"more, for a robot to need at most {self._share:g} times its speed limits"
             )
 
     def check_trajectory(self, start: Array, trajectory: Reference, start_s: float, ready_s: float) -> None:
@@ -140,8 +140,8 @@ class _Rehearsal:
         if peak > ROOM * LOAD_TOLERANCE * self._share:
             factor = peak / self._share
             raise PlanError(
-                f"plan.trajectory moves a robot at {peak:.2f} of its limits {peak_s:.1f} s after its start; "
-                f"must be within {self._share:g}: stretch its times by {factor:.2f}"
+                f"plan.trajectory needs {peak:.2f} times the speed limits of a robot {peak_s:.1f} s after its start; "
+                f"must be at most {self._share:g} times: stretch its times by {factor:.2f}"
             )
         for t_s in _instants(from_s, to_s):
             if fault := self._fault_at(trajectory.value(t_s)[0]):

@@ -167,20 +167,34 @@ def _hands(flight: RecordedFlight) -> Iterator[Shortfall]:
     """Yield for each drone of a cluster who beside its controller flew it, or had it land."""
     members = {drone for states in flight.clusters for drone in states.drones if _plan(flight.scenario, states.name)}
     for drone in sorted(members):
-        own = [event for event in flight.events if event.subject == drone]
-        parts: list[tuple[int, str]] = []
-        for place, event in enumerate(own):
-            if event.source.startswith(CONTROLLER):
-                continue
-            if event.kind == "commander":
-                ends = (each.t_ns for each in own[place + 1 :] if each.kind in ("commander", "release"))
-                span_s = (event.t_ns / 1e9, next(ends, flight.last_ns) / 1e9)
-                parts.append((event.t_ns, f"flown by {event.source} from {span_text(span_s)}"))
-            elif event.kind == "mode" and event.data.get("mode") == "land":
-                parts.append((event.t_ns, f"asked to land by {event.source} at {seconds_text(event.t_ns / 1e9)} s"))
+        parts = list(_interventions(drone, flight))
         if parts:
             more = f" (and {len(parts) - 1} more)" if len(parts) > 1 else ""
-            yield Shortfall("hand", drone, parts[0][0] / 1e9, f"{drone}: {parts[0][1]}{more}", False)
+            yield Shortfall("hand", drone, parts[0].from_ns / 1e9, f"{drone}: {parts[0].text}{more}", False)
+
+
+class _Intervention(NamedTuple):
+    """That another than its controller flew a drone, or had it land: from when until when [ns]."""
+
+    from_ns: int
+    until_ns: int
+    text: str
+
+
+def _interventions(drone: str, flight: RecordedFlight) -> Iterator[_Intervention]:
+    """Yield who beside its controller flew a drone, or had it land, in the order of time."""
+    own = [event for event in flight.events if event.subject == drone]
+    for place, event in enumerate(own):
+        if event.source.startswith(CONTROLLER):
+            continue
+        if event.kind == "commander":
+            ends = (each.t_ns for each in own[place + 1 :] if each.kind in ("commander", "release"))
+            until_ns = next(ends, flight.last_ns)
+            text = f"flown by {event.source} from {span_text((event.t_ns / 1e9, until_ns / 1e9))}"
+            yield _Intervention(event.t_ns, until_ns, text)
+        elif event.kind == "mode" and event.data.get("mode") == "land":
+            text = f"asked to land by {event.source} at {seconds_text(event.t_ns / 1e9)} s"
+            yield _Intervention(event.t_ns, flight.last_ns, text)
 
 
 # Formations
@@ -192,7 +206,7 @@ def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[f
     refused = [*_refused(states)]
     yield from refused
     if "engaged" in states.phases:
-        yield from _held(states)
+        yield from _held(states, flight)
         yield from _requests(states, flight.scenario)
         yield from _not_begun(states, flight)
         if not refused:
@@ -219,18 +233,26 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
             yield Shortfall("plan", states.name, begun[1], text, True)
 
 
-def _held(states: ClusterStates) -> Iterator[Shortfall]:
-    """Yield for how long, in all, a fault held a formation that had been engaged."""
+def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield for how long, in all, a formation that had been engaged was held, but at its own request.
+
+    What it was held while others than its controller flew a drone of it, or had one land, was theirs to decide.
+    """
     phases = np.array(states.phases)
     rows = np.flatnonzero(phases == "held")
     rows = rows[[HELD_ON_REQUEST not in states.reasons[row] for row in rows]] if len(rows) else rows
     if not len(rows):
         return
-    nexts = np.minimum(rows + 1, len(phases) - 1)
-    length_s = float((states.t_ns[nexts] - states.t_ns[rows]).sum()) / 1e9
-    span_s = (float(states.t_ns[rows[0]]) / 1e9, float(states.t_ns[nexts[-1]]) / 1e9)
-    text = f"{states.name}: held for {seconds_text(length_s)} s, from {span_text(span_s)}: {states.reasons[rows[0]]}"
-    yield Shortfall("held", states.name, span_s[0], text, length_s > HELD_MAX_S)
+    t_ns, nexts = states.t_ns[rows], np.minimum(rows + 1, len(phases) - 1)
+    lengths_s = (states.t_ns[nexts] - t_ns) / 1e9
+    acts = [act for drone in states.drones for act in _interventions(drone, flight)]
+    by_others = np.any([(act.from_ns <= t_ns) & (t_ns <= act.until_ns) for act in acts], axis=0) if acts else t_ns < 0
+    span_s = (float(t_ns[0]) / 1e9, float(states.t_ns[nexts[-1]]) / 1e9)
+    length = seconds_text(float(lengths_s.sum()))
+    text = f"{states.name}: held for {length} s, from {span_text(span_s)}: {states.reasons[rows[0]]}"
+    if by_others.any():
+        text += f"; {seconds_text(float(lengths_s[by_others].sum()))} s of it while others flew or landed its drones"
+    yield Shortfall("held", states.name, span_s[0], text, float(lengths_s[~by_others].sum()) > HELD_MAX_S)
 
 
 def _requests(states: ClusterStates, scenario: Scenario | None) -> Iterator[Shortfall]:

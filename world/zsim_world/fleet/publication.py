@@ -14,8 +14,9 @@ from zsim.contract.camera_messages import Sightings
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.snapshot import State
-from zsim.errors import RunError
+from zsim.errors import UserCodeError, reason_of
 from zsim.math.compiled import Held, compiled, hold, inlined, kernel
+from zsim.schema import plugin
 from zsim.sensors.sensor import Sample, as_fields, field_types, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
@@ -221,7 +222,7 @@ class UserMessages:
         """Return the message of a reading.
 
         Raises:
-            RunError: the sensor's conversion fails, or returns what the message has no place for.
+            UserCodeError: the sensor's conversion fails, or returns what the message has no place for.
         """
         kind, settings = self._fleet.sensors.types[s], self._fleet.sensors.settings[i][s]
         numbers = values[: kind.values].tolist()
@@ -231,10 +232,12 @@ class UserMessages:
             fields = as_fields(numbers, self._fields[s - STOCK_SENSORS])
             if not all(map(math.isfinite, numbers)):
                 raise ValueError(f"is {list(numbers)}; must be finite")
-        except Exception as error:
-            what = f"{self._fleet.names[i]}: sensors.{self._fleet.sensors.names[s]} at {stamps[0] / 1e9:g} s"
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise RunError(f"{what}: its reading makes no {kind.message.__name__} ({reason})") from error
+        except plugin.RAISED as error:
+            what = f"{self._fleet.names[i]}: sensors.{self._fleet.sensors.names[s]} at {stamps[0] / 1e9:.3f} s"
+            if (failure := plugin.user_code_error(error, what)) is not None:
+                raise failure from error
+            text = f"its reading makes no {kind.message.__name__} ({reason_of(error)})"
+            raise UserCodeError(text, what) from error
         return self._messages[s - STOCK_SENSORS](*stamps, *fields)
 
 

@@ -12,6 +12,7 @@ from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import TruthHash, fingerprint
 from zsim.contract.flight_messages import Status
+from zsim.contract.framing import GateMessages
 from zsim.contract.snapshot import State
 from zsim.contract.views import DroneView, ViewDrones
 from zsim.errors import UserCodeError
@@ -182,39 +183,44 @@ class World(Coordinator):
 
         A state that is no longer finite, or a user's sensor that fails, ends the run at the gate before; see `failure`.
         """
-        if self.clock.state == "waiting":
+        is_first = self.clock.state == "waiting"
+        if is_first:
             self.clock.start(self.fleet.t_ns)
-        elif not self._integrate():
+        else:
+            self._begin_gate()
+        try:
+            if not is_first:
+                self.fleet.advance()
+            gate = self._publication.gate(self.queue.commanders()) if self._simulated else None
+        except DivergedError as error:
+            self._fail("diverged", error.drone, error, {})
             return
-        self._publish_gate(wall_ns)
+        except UserCodeError as error:
+            self._fail("failure", WORLD, error, {"on_death": "end"})
+            return
+        if not is_first:
+            self.clock.advance(self.fleet.t_ns)
+            self.statistics.separation(self.fleet.closest_m())
+            self._publish_collisions()
+            self._publish_mishaps()
+        self._publish_gate(gate, wall_ns)
         if self.now_ns >= self._last_ns:
             self.clock.complete(DURATION_OVER)
 
-    def _integrate(self) -> bool:
-        """Integrate one gate; return whether the state is still finite."""
+    def _begin_gate(self) -> None:
+        """Take what has arrived before the fleet is integrated to the next gate."""
         if self.clock.mode == "realtime":
             self.statistics.deadlines(self._paced(), self.clock.required_ns)
             self.barrier.give_up_late()
         self._intake.apply(self.now_ns)
         self.faults.apply(self.now_ns)
         self.drivers.lead()
-        try:
-            self.fleet.advance()
-        except DivergedError as error:
-            self.failure = error
-            self.outbox.event("diverged", error.drone, str(error))
-            self.clock.complete(str(error))
-            return False
-        except UserCodeError as error:
-            self.failure = error
-            self.outbox.event("failure", WORLD, str(error), {"on_death": "end"})
-            self.clock.complete(str(error))
-            return False
-        self.clock.advance(self.fleet.t_ns)
-        self.statistics.separation(self.fleet.closest_m())
-        self._publish_collisions()
-        self._publish_mishaps()
-        return True
+
+    def _fail(self, kind: str, subject: str, error: DivergedError | UserCodeError, data: dict[str, Any]) -> None:
+        """End the run at the gate before this one."""
+        self.failure = error
+        self.outbox.event(kind, subject, str(error), data)
+        self.clock.complete(str(error))
 
     def _paced(self) -> list[Participant]:
         """Return who has a deadline at every gate."""
@@ -233,11 +239,11 @@ class World(Coordinator):
             data = {**each.data, "commander": self.queue.commanders()[each.drone]}
             self.outbox.notice(each.kind, self.names[each.drone], each.text, data)
 
-    def _publish_gate(self, wall_ns: int) -> None:
+    def _publish_gate(self, gate: GateMessages | None, wall_ns: int) -> None:
         state = self.fleet.bodies.state
         self._hash.add(self.now_ns, state[self._simulated] if self.external else state)
-        if self._simulated:
-            self.outbox.put(keys.GATE, self._publication.gate(self.queue.commanders()))
+        if gate is not None:
+            self.outbox.put(keys.GATE, gate)
         self.statistics.gate(self.now_ns, wall_ns)
         self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
 

@@ -116,12 +116,12 @@ class _UserSensor:
         name = f"{equation.__module__}:{getattr(equation, '__qualname__', type(equation).__qualname__)}"
         try:
             returned = equation(truth, self._settings, environment)
-        except Exception as error:
+        except plugin.RAISED as error:
             failure = plugin.user_code_error(error, where)
             raise failure or UserCodeError(f"{name} raised {reason_of(error)}", where) from error
         try:
-            values[:count] = np.reshape(np.asarray(returned, dtype=float), (count,))
-        except (TypeError, ValueError) as error:
+            values[:count] = np.reshape(plugin.numbers(returned), (count,))
+        except ValueError as error:
             raise UserCodeError(f"{name} returns {show(returned)}; must be {count} numbers", where) from error
         if not np.isfinite(values).all():
             numbers = [float(value) for value in values[:count]]

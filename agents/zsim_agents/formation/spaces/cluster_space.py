@@ -214,7 +214,7 @@ class _Checked:
         returned = self._method(*arguments)
         try:
             parts = tuple(returned) if len(self._shapes) > 1 else (returned,)
-            arrays = [np.asarray(part, dtype=float) for part in parts]
+            arrays = [plugin.numbers(part) for part in parts]
         except (TypeError, ValueError):
             arrays = []
         if [array.shape for array in arrays] != list(self._shapes):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from zsim.errors import UserCodeError
 from zsim.scenario.scenario import ROBOTS_MAX, Cluster, ClusterGroup, Scenario, space_name
 from zsim.schema import plugin
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, checked
@@ -23,6 +24,7 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     Raises:
         ValueError: there is none: a template in one line.
         DocumentError: it is a class of the user's own that cannot be loaded; the line names its module.
+        UserCodeError: it is a class of the user's own that cannot be made.
     """
     starts = _starts(scenario, cluster.drones)
     if not cluster.groups:
@@ -60,7 +62,11 @@ def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
     if name in STOCK:
         return STOCK[name](places_m)
     own: Any = plugin.load(name, "space", ClusterSpace)
-    return checked(own.for_places(places_m))
+    try:
+        return checked(own.for_places(places_m))
+    except TypeError as error:  # also of a constructor that cannot be called like this, in which no frame is the user's
+        failure = plugin.user_code_error(error, "")
+        raise failure or UserCodeError(f"{name}.for_places raised TypeError: {error}") from error
 
 
 def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:

@@ -258,6 +258,26 @@ def test_a_formation_that_a_fault_held_is_told_and_fails_if_it_was_for_long(leng
     assert has_terms(line.text, f"for {length_s:g} s", "drone2 is late")
 
 
+@pytest.mark.parametrize(
+    ("events", "fails"),
+    [
+        ((event(9.9, "mode", "drone2", "console.1", mode="land"),), False),
+        ((event(9.9, "mode", "drone2", "controller.main", mode="land"),), True),
+        ((event(9.9, "commander", "drone2", "console.1"), event(14, "release", "drone2", "console.1")), False),
+        ((event(9.9, "commander", "drone2", "console.1"), event(11, "release", "drone2", "console.1")), True),
+        ((event(9.9, "commander", "other", "console.1"), event(14, "release", "other", "console.1")), True),
+    ],
+)
+def test_a_hold_while_others_fly_or_land_a_drone_of_the_formation_is_told(
+    events: tuple[Event, ...], fails: bool
+) -> None:
+    def held(t_s: float) -> dict[str, Any]:
+        return {"phase": "held", "reason": "drone2 is late"} if 9.99 < t_s < 13.99 else {"phase": "engaged"}
+
+    line = next(line for line in found(held, events=events) if line.kind == "held")
+    assert (line.subject, line.fails) == ("main", fails)
+
+
 def test_what_others_asked_of_a_formation_is_told_and_a_hold_on_request_is_no_fault() -> None:
     def state(t_s: float) -> dict[str, Any]:
         return {"phase": "held", "reason": HELD_ON_REQUEST} if t_s > 20 else {"phase": "engaged"}

@@ -615,6 +615,10 @@ def test_a_fault_that_all_drones_share_is_told_once():
             ("drones[0].torque_nm_s2", "0.016", "3.36e+06 W", "1.29", "4.29e+03 W", "thrust_n_s2"),
         ),
         ({"drones": [drone("a", torque_nm_s2=1e-15)]}, ("drones[0].torque_nm_s2", "1e-15", "W", "N m s^2")),
+        (
+            {"drones": [drone("a", inertia_kg_m2=[2, 2, 4])]},
+            ("drones[0].inertia_kg_m2", "[2, 2, 4]", "0.137", "kg m^2"),
+        ),
         (  # per (rev/s)^2 instead of (rad/s)^2, and more
             {"drones": [drone("a", thrust_n_s2=0.01)]},
             ("drones[0].thrust_n_s2", "0.01", "0.042 %", "0.5", "90 %", "N s^2"),

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import pytest
 from refused import has_terms
@@ -27,6 +27,12 @@ class Good:
 class Half:
     def read(self): return 1.0
 
+class Narrow(Good):
+    def read(self, scale): return scale
+
+class Wide(Good):
+    def read(self, *more, scale=1.0): return scale
+
 def measure(): return 2.0
 
 number = 3
@@ -40,8 +46,19 @@ def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "plugin_meter.py").write_text(SOURCE)
     (tmp_path / "plugin_broken.py").write_text("1 / 0\n")
+    (tmp_path / "plugin_exits.py").write_text("raise SystemExit\n")
     plugin.search(tmp_path)
     return tmp_path
+
+
+def test_a_method_may_take_more_than_it_is_given(beside: Path) -> None:
+    assert plugin.load("plugin_meter:Wide", "a.yaml: meter", Meter)().read() == 1.0
+
+
+@pytest.mark.parametrize("returned", [None, "1", ["1"], [None, 1.0], 1j, [[1.0], [1.0, 2.0]], object()], ids=str)
+def test_what_is_no_real_numbers_is_refused(returned: Any) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - whose text is not shown
+        plugin.numbers(returned)
 
 
 def test_a_class_is_loaded_from_beside_the_document(beside: Path) -> None:
@@ -53,8 +70,10 @@ def test_a_class_is_loaded_from_beside_the_document(beside: Path) -> None:
     [
         ("plugin_nowhere:Good", "ModuleNotFoundError"),
         ("plugin_broken:Good", "ZeroDivisionError"),
-        ("plugin_meter:Bad", "Good, Half"),
-        ("plugin_meter:number", "Good, Half"),
+        ("plugin_exits:Good", "SystemExit"),
+        ("plugin_meter:Narrow", "scale"),
+        ("plugin_meter:Bad", "Good, Half, Narrow, Wide"),
+        ("plugin_meter:number", "Good, Half, Narrow, Wide"),
         ("plugin_meter:Half", "reset"),
         ("plugin_meter", "package.module:Class"),
         (":Good", "package.module:Class"),
