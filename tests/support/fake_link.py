@@ -161,8 +161,6 @@ class FakeLink:
         for key, payload in encoded:
             self.put_raw(key, payload)
 
-    put_subscribed = put_all
-
     def request(
         self, key: str, op: str, source: str, args: dict[str, Any] | None = None, timeout_s: float = 5.0
     ) -> ControlAnswer:

@@ -233,8 +233,7 @@ class Session:
         self._prefix = f"{federation}/" if federation else ""
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._cached_publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
-        self._matching: dict[str, bool] = {}  # by key or expression, whether another session subscribes to it
-        self._kinds: dict[str, str] = {}  # by key, the expression of such keys of any drone; empty for another key
+        self._matching: dict[str, bool] = {}
         self._declared: dict[int, Callable[[], Any]] = {}  # by id of what is declared, what undeclares it
         self._realtime = False
 
@@ -299,30 +298,6 @@ class Session:
             publisher = self._publishers.get(key) or self._declare(key)
             publisher.put(payload)
 
-    def put_subscribed(self, encoded: Sequence[tuple[str, bytes]]) -> None:
-        """Publish many encoded payloads in one go, those of drones only where anybody subscribes to keys of that kind.
-
-        Only the hub knows of all subscribers as soon as they have subscribed; a subscription that comes before a join
-        on the same link is known before it.
-        """
-        kinds, matching = self._kinds, self._matching
-        for key, payload in encoded:
-            kind = kinds.get(key)
-            if kind is None:
-                kind = self._learn_kind(key)
-            if kind and not matching[kind]:
-                continue
-            publisher = self._publishers.get(key) or self._declare(key)
-            publisher.put(payload)
-
-    def _learn_kind(self, key: str) -> str:
-        """Return the expression of a drone's key for any drone, empty for another key; listen for its subscribers."""
-        about, _, what = keys.parts(key)
-        self._kinds[key] = kind = f"{about}/*/{what}" if about == "drone" else ""
-        if kind:
-            self.has_subscribers(kind)
-        return kind
-
     def _declare(self, key: str) -> zenoh.Publisher:
         self._check("publish", key)
         view = key.startswith("view/") or keys.is_picture(key)
@@ -340,16 +315,14 @@ class Session:
         return publisher
 
     def has_subscribers(self, key: str) -> bool:
-        """Tell whether another session subscribes to a key of ours, or to one that an expression takes."""
+        """Tell whether anybody subscribes to a key of ours."""
         if key not in self._matching:
             self._listen_for_subscribers(key)
         return self._matching[key]
 
     def _listen_for_subscribers(self, key: str) -> None:
         """Keep up to date whether a key is subscribed to: asked at each gate, Zenoh takes long for it."""
-        publisher = self._keep(
-            self._raw.declare_publisher(self._prefix + key, allowed_destination=zenoh.Locality.REMOTE)
-        )
+        publisher = self._publishers.get(key) or self._declare(key)
 
         def note(status: Any) -> None:
             self._matching[key] = status.matching

@@ -15,6 +15,7 @@ from typing import Any
 
 from zsim import CONTRACT, __version__
 from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
+from zsim.errors import printable
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 
@@ -109,7 +110,7 @@ def _show_compilation() -> None:
         def on_start(self, event: Any) -> None:
             if not self.depth:
                 function = event.data["dispatcher"].py_func
-                print(f"compiling {function.__module__}.{function.__name__}", flush=True)
+                print(printable(f"compiling {function.__module__}.{function.__name__}"), flush=True)
             self.depth += 1
 
         def on_end(self, event: Any) -> None:

@@ -84,7 +84,7 @@ class WorldOutputs:
         """Put what was gathered in one go: readers wake once, and the transport sends few packets."""
         self._journal.commit()
         unsent, self._unsent = self._unsent, []
-        self._link.put_subscribed(unsent)
+        self._link.put_all(unsent)
         self.put_batch()
 
     def publish(self, output: Output) -> None:
