@@ -24,13 +24,11 @@ def scenario() -> Scenario:
 @pytest.fixture(scope="module")
 def flight() -> tuple[World, list[GateMessages]]:
     world = World(scenario())
-    world.clock.state = "running"
     gates = []
     for number in range(120):
         if number == 20:
             assert world.fleet.takeoff(0) is None
-        world._publish_gate(0)
-        gates += [message for key, message in world.take_outbox() if key == keys.GATE]
+        gates.append(world._publication.gate(world.queue.commanders()))
         world.fleet.advance()
     return world, gates
 
