@@ -300,7 +300,7 @@ def test_a_killed_process_is_started_again_and_gives_the_same_bits(federation: F
 
 
 def test_no_process_dies_where_none_is() -> None:
-    with pytest.raises(RunError, match=r"process_kill of estimator\.drone1: "):
+    with pytest.raises(RunError, match=r"process_kill of estimator\.drone1 "):
         fly([{"kind": KILL, "target": "estimator.drone1", "at_s": 1}])
 
 
