@@ -108,7 +108,7 @@ class Recorder:
         self._beside = [self._link.subscribe(expression) for expression in ("view/**", keys.camera("*", "*"))]
         self._link.declare_process(self._name)
         self._link.on_link(self._on_link)
-        if self._writer.messages:
+        if self._writer.has_former:
             self._resume()
             self._print(f"{self._name}: goes on with {self._writer.path} after t = {self._now_ns / 1e9:.2f} s")
         else:

@@ -39,7 +39,7 @@ class RecordWriter:
     are one write. Memory holds the open chunk and the names of the keys, however long the run.
 
     Attributes:
-        messages: taken so far.
+        has_former: whether it goes on behind messages of a writer that died.
         refused: messages on keys beyond the 65 535 that a record can hold.
     """
 
@@ -50,7 +50,7 @@ class RecordWriter:
             RecordError: the file exists, or is none that can be gone on with, or cannot be written.
         """
         self.path = Path(path)
-        self.messages = 0
+        self.has_former = False
         self.refused = 0
         self._channels: dict[str, int] = {}  # by key, counted from 1
         self._gate_channels = PerPattern(self._channels_of)
@@ -88,7 +88,7 @@ class RecordWriter:
                     channel = unpacked(Channel, source, group.place)
                     self._channels[channel.topic] = channel.id
                 counts.update({index.channel: index.messages for index in group.indexes})
-        self.messages = counts.total()
+        self.has_former = counts.total() > 0
         counted = [counts[number] for number in range(len(self._channels) + 1)]
         self._open = OpenChunk(CHUNK_BYTES + CHUNK_BYTES // 4, counted)
 
@@ -110,7 +110,7 @@ class RecordWriter:
             self.refused += 1
             return
         self._open.add(channel, payload, _time(t_ns), _time(wall_ns))
-        self._took(1, wall_ns)
+        self._end_if_full(wall_ns)
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
         """Take one message of this process, encoded as for the wire.
@@ -123,7 +123,8 @@ class RecordWriter:
             self.refused += 1
             return
         self._open.add(channel, _encode(message), message.t_ns, wall_ns)
-        self._took(1, wall_ns)
+        if self._open.size >= CHUNK_BYTES or wall_ns - self._open.since_ns >= CHUNK_AGE_NS:
+            self._end_chunk()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Take the messages of a gate, whose columns have been checked.
@@ -134,13 +135,12 @@ class RecordWriter:
         channels = self._gate_channels.of(gate)
         if channels:
             self._open.add_gate(channels, gate, wall_ns)
-            self._took(len(gate), wall_ns)
+            self._end_if_full(wall_ns)
         else:
             self._add_each(gate, wall_ns)
 
-    def _took(self, count: int, wall_ns: int) -> None:
-        """Note that messages have come into the open chunk; end one that is large or old."""
-        self.messages += count
+    def _end_if_full(self, wall_ns: int) -> None:
+        """End the open chunk if it is large or old."""
         if self._open.size >= CHUNK_BYTES or wall_ns - self._open.since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 

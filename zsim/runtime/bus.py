@@ -226,17 +226,17 @@ class Bus:
             t_ns = inbox.next_gate_ns()
 
     def _publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
-        sent = 0
+        sent, world, routes = 0, self._coordinator, self._routes
         for key, message in outputs:
-            inboxes, is_counted, is_relayed = self._route(key)
+            inboxes, is_counted, is_relayed = routes.get(key) or self._route(key)
             sent += is_counted
             for inbox in inboxes:
                 inbox.put(key, message)
+            self._sink(key, message)
             if is_relayed:
-                self._sink(key, message)
-                self._coordinator.count_output(agent.name)
+                world.count_output(agent.name)
             else:
-                self._to_world(key, message)
+                world.handle(key, message, self._wall_ns())
         done = run_messages.Done(t_ns, agent.next_seq("done"), self._coordinator.run_id, 0, t_ns, sent)
         self._to_world(self._done_keys[agent.name], done)
 

@@ -5,7 +5,7 @@ Readings are only written down when they come. At the end of the gate every dron
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
 from typing import Any
 
@@ -88,8 +88,6 @@ class EstimatorBank:
         self._held, self._held_rows = hold(self.rows), self.rows
         self._make_room(_ROOM)
         self._count = 0
-        self._sensors, used, refused = zip(*self.counted, strict=True)
-        self._used, self._refused = itemgetter(*used), itemgetter(*refused)
         self._reader = GateReader([drone.name for drone in drones])
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
@@ -116,14 +114,10 @@ class EstimatorBank:
         """Use what has come since the last gate and return the estimates for `t_s`, those of some drones, or of all."""
         count, self._count = self._count, 0
         self.use(t_s, self._readings[:count])
-        counts = self.rows.counts[:, COUNT.used :].tolist()
-        rows = self._estimates.tolist()
-        places = range(len(rows)) if wanted is None else wanted
-        sensors, used, refused = self._sensors, self._used, self._refused
-        return [
-            _estimate(rows[i], dict(zip(sensors, zip(used(counts[i]), refused(counts[i]), strict=True), strict=True)))
-            for i in places
-        ]
+        rows, counts = self._estimates.tolist(), self.rows.counts[:, COUNT.used :].tolist()
+        if wanted is not None:
+            rows, counts = [rows[i] for i in wanted], [counts[i] for i in wanted]
+        return [_estimate(row, of, self.counted) for row, of in zip(rows, counts, strict=True)]
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Use readings (M, READING.size) and return the estimates for `t_s`, (N, ESTIMATE.size)."""
@@ -175,8 +169,8 @@ class EstimatorBank:
         self._readings = np.frombuffer(self._room).reshape(readings, READING.size)
 
 
-def _estimate(row: list[float], sensors: dict[str, tuple[int, int]]) -> StateEstimate:
-    """Return a row of estimates and its drone's (used, refused) by sensor as what is published."""
+def _estimate(row: list[float], counts: list[int], counted: Iterable[tuple[str, int, int]]) -> StateEstimate:
+    """Return a row of estimates and its drone's counts as what is published."""
     return StateEstimate(
         _p_WB(row),
         _v_WB(row),
@@ -185,7 +179,7 @@ def _estimate(row: list[float], sensors: dict[str, tuple[int, int]]) -> StateEst
         tuple(row[_COVARIANCE]),
         row[_YAW_SIGMA],
         _gyro_bias(row),
-        sensors,
+        {sensor: (counts[used], counts[refused]) for sensor, used, refused in counted},
     )
 
 

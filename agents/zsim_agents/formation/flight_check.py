@@ -41,11 +41,14 @@ class FlightCheck:
         self._spread = 0.0
         self._no_frame: str | None = "nothing was observed yet"
         self._flaw = (VALID, 0)  # of the estimates of the gate that was observed, by the limits in flight
+        sigmas = limits.sigma_max_m, limits.yaw_sigma_max_rad
+        self._at_start = (limits.age_max_s, *sigmas)
+        self._in_flight = (limits.age_max_s, *(limits.in_flight_factor * sigma for sigma in sigmas))
 
     def observe(self, gate: GateInput) -> None:
         """Take over the estimates of a gate."""
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
-        self._flaw = self._first_flaw(gate, self.limits.in_flight_factor)
+        self._flaw = _first_flaw(gate, *self._in_flight)
         if self._flaw[0] != VALID and not all_near(gate.p_W, gate.yaw):
             return
         try:
@@ -102,12 +105,7 @@ class FlightCheck:
         return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
 
     def _start_fault(self, gate: GateInput) -> str | None:
-        return self._flaw_text(gate, self._first_flaw(gate))
-
-    def _first_flaw(self, gate: GateInput, factor: float = 1.0) -> tuple[int, int]:
-        limits, numbers = self.limits, (gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, gate.yaw_sigma)
-        most = limits.age_max_s, factor * limits.sigma_max_m, factor * limits.yaw_sigma_max_rad
-        return estimate_flaw(gate.age_s, *numbers, *most)
+        return self._flaw_text(gate, _first_flaw(gate, *self._at_start))
 
     def _flaw_text(self, gate: GateInput, flaw: tuple[int, int], factor: float = 1.0) -> str | None:
         kind, i = flaw
@@ -123,6 +121,11 @@ class FlightCheck:
             return f"the heading of {drone} has a sigma of {sigma_deg:.1f} deg; allowed: {most_deg:g} deg"
         worst_m, most_m = max(gate.sigma_m[i].tolist()), factor * self.limits.sigma_max_m
         return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {most_m:g} m"
+
+
+def _first_flaw(gate: GateInput, age_max_s: float, sigma_max_m: float, yaw_sigma_max: float) -> tuple[int, int]:
+    of_gate = gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, gate.yaw_sigma
+    return estimate_flaw(*of_gate, age_max_s, sigma_max_m, yaw_sigma_max)
 
 
 @portable

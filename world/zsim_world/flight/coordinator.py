@@ -141,12 +141,12 @@ class Coordinator(ABC):
     def handle(self, key: str, message: Any, wall_ns: int) -> None:
         """Take one message that a participant or anyone else published."""
         kind, name, what = keys.parts(key)
-        if kind == "process" and what == "done":
-            self._handle_done(name, message, wall_ns)
-        elif kind == "drone" and what.startswith("cmd/"):
+        if kind == "drone" and what.startswith("cmd/"):
             self.barrier.count_output(message.source)
             if self._handle_command(name, what[4:], message):
                 self.statistics.ages.command(message.t_ns, wall_ns)
+        elif kind == "process" and what == "done":
+            self._handle_done(name, message, wall_ns)
         elif kind == "process" and what == "join":
             self._handle_join(name, message, wall_ns)
         elif kind == "process" and what == "bye":
