@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from zsim.math.compiled import portable
+from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import (
     Matrix,
     Quaternion,
@@ -36,20 +36,20 @@ Reckoning = tuple[Vector, Vector, Quaternion, Vector, Vector, Vector]
 """p_WB [m], v_WB [m/s], q_WB, a_WB [m/s^2; W]; rate [rad/s] and specific force [m/s^2] in B, bias-free."""
 
 
-@portable
+@inlined
 def vector(row: np.ndarray, at: int) -> Vector:
     """Return three entries of an array."""
     return float(row[at]), float(row[at + 1]), float(row[at + 2])
 
 
-@portable
+@inlined
 def acceleration(q: Quaternion, f_B: Vector, gravity: float) -> Vector:
     """Return R_WB f_B + g_W [m/s^2; W]."""
     f_W = product(matrix(q), f_B)
     return f_W[0], f_W[1], f_W[2] - gravity
 
 
-@portable
+@inlined
 def reckon(
     state: Reckoning,
     accel: Vector,
@@ -82,7 +82,7 @@ def reckon(
     return p_new, v_new, q, a, w, f_B
 
 
-@portable
+@inlined
 def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravity: float) -> Reckoning:
     """Return the state with an error of the filter put into it, biases into what they were taken off.
 
@@ -101,14 +101,14 @@ def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravit
     return p, v, q, acceleration(q, f_B, gravity), w, f_B
 
 
-@portable
+@inlined
 def arm_acceleration(w: Vector, w_before: Vector, arm: Vector, dt: float) -> Vector:
     """Return alpha x r + w x (w x r) [m/s^2; B], which a sensor at p_BS = `arm` feels beyond the centre."""
     alpha = ((w[0] - w_before[0]) / dt, (w[1] - w_before[1]) / dt, (w[2] - w_before[2]) / dt)
     return add(cross(alpha, arm), cross(w, cross(w, arm)))
 
 
-@portable
+@inlined
 def write_minus_cross(M: np.ndarray, row: int, column: int, a: Vector, scale: float) -> None:
     """Write -scale [a]x into a 3 x 3 block whose diagonal is already zero."""
     M[row, column + 1] = scale * a[2]
@@ -119,7 +119,7 @@ def write_minus_cross(M: np.ndarray, row: int, column: int, a: Vector, scale: fl
     M[row + 2, column + 1] = -scale * a[0]
 
 
-@portable
+@inlined
 def write_minus_rotation(M: np.ndarray, row: int, column: int, R: Matrix, scale: float) -> None:
     """Write -scale R into a 3 x 3 block."""
     for i in range(3):
@@ -127,7 +127,7 @@ def write_minus_rotation(M: np.ndarray, row: int, column: int, R: Matrix, scale:
             M[row + i, column + j] = -scale * R[i][j]
 
 
-@portable
+@inlined
 def write_transition(
     F: np.ndarray, f_W: Vector, R_WB: Matrix, levelling_s: float, with_accel_bias: bool, dt: float
 ) -> None:
@@ -153,7 +153,7 @@ def write_transition(
         write_minus_rotation(F, VELOCITY, ACCEL_BIAS, R_WB, dt)
 
 
-@portable
+@inlined
 def write_process_noise(Q: np.ndarray, walk: np.ndarray, variances: Vector, dt: float) -> None:
     """Write the noise that the interval `dt` adds into Q, which starts as zero.
 
@@ -174,7 +174,7 @@ def write_process_noise(Q: np.ndarray, walk: np.ndarray, variances: Vector, dt: 
         Q[i, i] = walk[i] * dt
 
 
-@portable
+@inlined
 def write_prediction(
     F: np.ndarray,
     Q: np.ndarray,
@@ -205,7 +205,7 @@ def write_prediction(
     write_process_noise(Q, walk, variances, dt)
 
 
-@portable
+@inlined
 def heading_gradient(R: Matrix) -> Vector:
     """Return the derivative of the heading over a small world rotation; (0, 0, 1) when the nose is level."""
     x = column(R, 0)
@@ -213,7 +213,7 @@ def heading_gradient(R: Matrix) -> Vector:
     return -x[2] * x[0] / squared, -x[2] * x[1] / squared, 1.0
 
 
-@portable
+@inlined
 def heading_and_sigma(q: Quaternion, P: np.ndarray) -> tuple[float, float]:
     """Return the heading [rad] and its standard deviation [rad] under the covariance P of the error state."""
     gradient = heading_gradient(matrix(q))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.keys import SENSORS
 from zsim.math.columns import Field, columns
-from zsim.math.compiled import portable
+from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import Matrix, Quaternion, Vector
 from zsim_agents.estimation.dead_reckoning import Reckoning, vector
 
@@ -183,38 +183,38 @@ STATES = (
 )  # rows that change; others are settings
 
 
-@portable
+@inlined
 def put(row: np.ndarray, at: int, a: Vector) -> None:
     """Write three columns."""
     row[at], row[at + 1], row[at + 2] = a[0], a[1], a[2]
 
 
-@portable
+@inlined
 def increase(row: np.ndarray, at: int, more: np.ndarray, first: int) -> None:
     """Add three places of an array to three columns."""
     for k in range(3):
         row[at + k] += more[first + k]
 
 
-@portable
+@inlined
 def quaternion(row: np.ndarray, at: int) -> Quaternion:
     """Return four columns."""
     return float(row[at]), float(row[at + 1]), float(row[at + 2]), float(row[at + 3])
 
 
-@portable
+@inlined
 def put_quaternion(row: np.ndarray, at: int, q: Quaternion) -> None:
     """Write four columns."""
     row[at], row[at + 1], row[at + 2], row[at + 3] = q[0], q[1], q[2], q[3]
 
 
-@portable
+@inlined
 def matrix_at(row: np.ndarray, at: int) -> Matrix:
     """Return nine columns, row by row."""
     return vector(row, at), vector(row, at + 3), vector(row, at + 6)
 
 
-@portable
+@inlined
 def reckoning(row: np.ndarray) -> Reckoning:
     """Return the nominal state."""
     return (
@@ -223,7 +223,7 @@ def reckoning(row: np.ndarray) -> Reckoning:
     )  # fmt: skip
 
 
-@portable
+@inlined
 def put_reckoning(row: np.ndarray, state: Reckoning) -> None:
     """Set the nominal state."""
     put(row, NOMINAL.p_WB, state[0])
@@ -234,7 +234,7 @@ def put_reckoning(row: np.ndarray, state: Reckoning) -> None:
     put(row, NOMINAL.f_B, state[5])
 
 
-@portable
+@inlined
 def put_moment(row: np.ndarray, m: Moment) -> None:
     """Write a moment of the history."""
     row[MOMENT.t] = m[0]
@@ -246,7 +246,7 @@ def put_moment(row: np.ndarray, m: Moment) -> None:
     put(row, MOMENT.v_corrected, m[6])
 
 
-@portable
+@inlined
 def moment(row: np.ndarray) -> Moment:
     """Return a moment of the history, or the present one of the nominal state."""
     return (

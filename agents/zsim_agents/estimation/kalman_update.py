@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from zsim.math.compiled import portable
+from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import Matrix, Vector, add, column, composed, cross, product, transposed
 from zsim_agents.estimation.dead_reckoning import (
     ATTITUDE,
@@ -32,7 +32,7 @@ COSINE_MIN = 0.1  # of the sonar's ray to the vertical; flatter than 84 deg it d
 SIX = tuple[float, float, float, float, float, float]
 
 
-@portable
+@inlined
 def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Matrix, w: Vector, arm: Vector, lag: float) -> SIX:
     """Antenna at p_BS = `arm`: position p + R r [m], velocity v + R (w x r) [m/s]; six rows from `i`."""
     offset = product(R, arm)
@@ -46,7 +46,7 @@ def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Matrix, w: Vector,
     return *add(p, offset), *add(v, swing)
 
 
-@portable
+@inlined
 def write_mag(H: np.ndarray, i: int, R: Matrix, R_BS: Matrix, field_W: Vector) -> Vector:
     """Magnetometer turned by R_BS in a known field: (R R_BS)^T m [uT]; three rows from `i`."""
     R_WS = composed(R, R_BS)
@@ -58,7 +58,7 @@ def write_mag(H: np.ndarray, i: int, R: Matrix, R_BS: Matrix, field_W: Vector) -
     return product(transposed(R_WS), field_W)
 
 
-@portable
+@inlined
 def write_baro(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, lag: float) -> float:
     """Barometer at p_BS = `arm`: its height [m]; one row."""
     offset = product(R, arm)
@@ -69,7 +69,7 @@ def write_baro(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, lag: fl
     return p[2] + offset[2]
 
 
-@portable
+@inlined
 def write_sonar(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vector, lag: float) -> float:
     """Sonar at p_BS = `arm` that looks along `down_B` at the ground z_W = 0: height / cosine [m]; one row.
 
@@ -89,7 +89,7 @@ def write_sonar(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, down_B
     return height / cosine
 
 
-@portable
+@inlined
 def write_flow(H: np.ndarray, i: int, v: Vector, R: Matrix, w: Vector, arm: Vector) -> Vector:
     """Velocity of the camera at p_BS = `arm` in the heading frame, Rz(yaw)^T (v + R (w x r)); three rows."""
     swing = product(R, cross(w, arm))

@@ -7,14 +7,14 @@ Quaternions are Hamilton, w first, body to world; the world is z up, so a body a
 
 import math
 
-from zsim.math.compiled import portable
+from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import Quaternion, Vector, dot, multiply, norm, normalised, scaled
 
 # Mean of a unit vector in the plane along a small offset e under noise s per axis: slope * e/s.
 UNIT_VECTOR_SLOPE = math.sqrt(math.pi / 8)
 
 
-@portable
+@inlined
 def rotation_vector_quaternion(v: Vector) -> Quaternion:
     """Return the quaternion of a rotation vector [rad], by series: exact to 1e-9 up to 0.6 rad, without libm.
 
@@ -26,7 +26,7 @@ def rotation_vector_quaternion(v: Vector) -> Quaternion:
     return normalised((cosine, *scaled(v, sine)))
 
 
-@portable
+@inlined
 def gravity_gradient(q: Quaternion, f_B: Vector) -> Quaternion:
     """Return J^T f, the gradient of |R_BW z_W - f_B/|f_B||^2 / 2 over q [Madgwick (25), (26), (34)].
 
@@ -47,7 +47,7 @@ def gravity_gradient(q: Quaternion, f_B: Vector) -> Quaternion:
     )
 
 
-@portable
+@inlined
 def madgwick_step(q: Quaternion, w_WB_B: Vector, f_B: Vector, beta: float, dt: float) -> Quaternion:
     """Return the attitude after one IMU sample [Madgwick (33), the gyroscope's part integrated exactly].
 

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from zsim.math.compiled import portable
+from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import heading, matrix, product
 from zsim_agents.estimation import strapdown
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
@@ -58,7 +58,7 @@ DENIED_S = 2.0  # s since two drones saw each other, chosen: errors grow little 
 HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
 
 
-@portable
+@inlined
 def accept(rows: Rows, i: int, reading: np.ndarray) -> bool:
     """Whether an aiding reading is to be used at the end of the gate.
 
@@ -88,7 +88,7 @@ def accept(rows: Rows, i: int, reading: np.ndarray) -> bool:
     return False
 
 
-@portable
+@inlined
 def set_variance(P: np.ndarray, k: int, variance: float) -> None:
     """Give one state a new variance without any correlation with the others."""
     for j in range(P.shape[0]):
@@ -96,7 +96,7 @@ def set_variance(P: np.ndarray, k: int, variance: float) -> None:
     P[k, k] = variance
 
 
-@portable
+@inlined
 def start_heading(
     rows: Rows, i: int, P: np.ndarray, t_s: float, readings: np.ndarray, first: int, after: np.ndarray
 ) -> None:
@@ -120,14 +120,14 @@ def start_heading(
         set_variance(P, YAW, SET_DOWN_SIGMA_RAD * SET_DOWN_SIGMA_RAD)
 
 
-@portable
+@inlined
 def _turn_heading(row: np.ndarray, counts: np.ndarray, gravity: float, angle: float) -> None:
     strapdown.turn_heading(row, gravity, angle)
     counts[COUNT.kept] = 0  # a turn makes the past meaningless
     counts[COUNT.heading_known] = 1
 
 
-@portable
+@inlined
 def predict(H: np.ndarray, at: int, kind: int, setting: np.ndarray, past: Moment, lag: float, out: np.ndarray) -> None:
     """Write what a sensor should read into out[at:], and its rows of H."""
     aid = SETTING.sensors + kind * SENSOR.size
@@ -148,7 +148,7 @@ def predict(H: np.ndarray, at: int, kind: int, setting: np.ndarray, past: Moment
         put(out, at, write_flow(H, at, v, R, w, arm))
 
 
-@portable
+@inlined
 def with_biases(rows: Rows, i: int, kind: int, H: np.ndarray, at: int, out: np.ndarray) -> None:
     """Put the sensor's biases on the prediction, their columns of H written."""
     for channel in range(CHANNELS):
@@ -159,7 +159,7 @@ def with_biases(rows: Rows, i: int, kind: int, H: np.ndarray, at: int, out: np.n
             out[row + k] += rows.bias[i, state + k]
 
 
-@portable
+@inlined
 def is_denied(rows: Rows, i: int, kind: int) -> bool:
     """Tell whether who sees a drone, or is seen by it, trusts its own sensor of a kind, so that this one's is wrong."""
     for j in range(rows.sighted.shape[0]):
@@ -170,7 +170,7 @@ def is_denied(rows: Rows, i: int, kind: int) -> bool:
     return False
 
 
-@portable
+@inlined
 def widen(P: np.ndarray, k: int, variance: float, layout: np.ndarray) -> None:
     """Add a variance to a state of the position or velocity, and to its clones: it is one error of all of them."""
     first = layout[LAYOUT.first_clone] + k
@@ -205,7 +205,7 @@ def inflate(rows: Rows, i: int, P: np.ndarray, kind: int, z: np.ndarray, expecte
     row[NOMINAL.refused_since + kind] = row[NOMINAL.t]
 
 
-@portable
+@inlined
 def count_outcome(row: np.ndarray, counts: np.ndarray, kind: int, passed: bool) -> None:
     """Count a reading that went through its gate, or did not."""
     if passed:
@@ -283,7 +283,7 @@ def correct(
     return P
 
 
-@portable
+@inlined
 def stack(
     rows: Rows,
     i: int,
@@ -308,7 +308,7 @@ def stack(
         z[at + k] = reading[READING.values + k]
 
 
-@portable
+@inlined
 def distrust_turn(P: np.ndarray, H: np.ndarray, expected: np.ndarray, at: int) -> None:
     """Let the flow tell a heading, in rows from `at` on, only as far as the drone surely moves.
 
@@ -324,7 +324,7 @@ def distrust_turn(P: np.ndarray, H: np.ndarray, expected: np.ndarray, at: int) -
             H[r, ATTITUDE + k] *= share
 
 
-@portable
+@inlined
 def write_variance(reading: np.ndarray, setting: np.ndarray, variance: np.ndarray, at: int) -> None:
     """Write the variances of a reading's rows; a GPS receiver's own figure counts where it is worse."""
     kind = int(reading[READING.sensor])

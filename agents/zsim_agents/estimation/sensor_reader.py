@@ -10,7 +10,7 @@ from zsim.contract import encoding, keys, messages
 from zsim.contract.encoding import GAP, Layouts, Program
 from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
-from zsim.math.compiled import Held, hold, portable
+from zsim.math.compiled import Held, hold, inlined, portable
 from zsim_agents.estimation.filter_state import BARO, FLOW, GPS, IMU, READING, SIZES, SONAR, VALUES_MAX
 
 NOBODY = -1
@@ -19,7 +19,7 @@ BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # floats of t
 RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # of keys in the order in which runners hand over
 GPS_FIX, SONAR_VALID = 3, 3  # whole numbers of these messages
 
-read = portable(encoding.read)
+read = inlined(encoding.read)
 
 
 class ReaderTables(NamedTuple):
@@ -100,7 +100,7 @@ def collect(held: Held, which: NDArray, ends: NDArray, data: NDArray, readings: 
     return count
 
 
-@portable
+@inlined
 def fill(reading: NDArray, i: int, kind: int, ints: NDArray, floats: NDArray) -> None:
     """Write one message of drone i as a reading; the columns as in EstimatorBank."""
     reading[READING.drone], reading[READING.sensor] = i, kind

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from zsim.math.compiled import portable
+from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import Vector, about_z, add, axpy, multiply, normalised, product, scaled, subtract
 from zsim_agents.estimation.dead_reckoning import acceleration, arm_acceleration, corrected, reckon, write_prediction
 from zsim_agents.estimation.filter_state import (
@@ -48,7 +48,7 @@ COAST_TURN_DENSITY = LOST_TURN_RAD_S**2 * 2.0 * MANOEUVRE_S  # rad^2/s
 COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 
 
-@portable
+@inlined
 def possible(accel: Vector, gyro: Vector) -> bool:
     """Whether an IMU can read that; NaN fails each comparison."""
     good = True
@@ -57,7 +57,7 @@ def possible(accel: Vector, gyro: Vector) -> bool:
     return good
 
 
-@portable
+@inlined
 def begin_interval(row: np.ndarray, t_s: float) -> None:
     """Let the interval between two gates begin."""
     row[NOMINAL.t_start] = t_s
@@ -65,7 +65,7 @@ def begin_interval(row: np.ndarray, t_s: float) -> None:
     row[NOMINAL.dt_squared] = row[NOMINAL.lost_velocity] = row[NOMINAL.lost_turn] = 0.0
 
 
-@portable
+@inlined
 def begin(row: np.ndarray, counts: np.ndarray, t_s: float) -> None:
     """Begin at an instant."""
     row[NOMINAL.t] = t_s
@@ -73,7 +73,7 @@ def begin(row: np.ndarray, counts: np.ndarray, t_s: float) -> None:
     begin_interval(row, t_s)
 
 
-@portable
+@inlined
 def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
     """Move to an IMU sample's instant; ignore a duplicate, refuse and count a late or impossible sample.
 
@@ -113,14 +113,14 @@ def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
     counts[COUNT.used + IMU] += 1
 
 
-@portable
+@inlined
 def _lose(row: np.ndarray, missing_s: float) -> None:
     velocity, turned = MANOEUVRE_M_S2 * missing_s, LOST_TURN_RAD_S * missing_s
     row[NOMINAL.lost_velocity] += velocity * velocity
     row[NOMINAL.lost_turn] += turned * turned
 
 
-@portable
+@inlined
 def _of_body(row: np.ndarray, setting: np.ndarray, accel: Vector, gyro: Vector, dt: float) -> tuple[Vector, Vector]:
     """Return a sample of a turned or displaced IMU as one of the centre of mass, in body axes."""
     imu = SETTING.sensors + IMU * SENSOR.size
@@ -131,7 +131,7 @@ def _of_body(row: np.ndarray, setting: np.ndarray, accel: Vector, gyro: Vector, 
     return subtract(accel, swing), gyro
 
 
-@portable
+@inlined
 def coast(row: np.ndarray, setting: np.ndarray, t_s: float) -> None:
     """Go on without an IMU if none came for long: velocity and attitude held, their certainty fading."""
     dt = t_s - row[NOMINAL.t]
@@ -159,7 +159,7 @@ def grow(rows: Rows, i: int, P: np.ndarray) -> np.ndarray:
     return P
 
 
-@portable
+@inlined
 def write_growth(rows: Rows, i: int, F: np.ndarray, Q: np.ndarray) -> None:
     """Write how the errors grow over the interval that ends now: transition into F, the identity, and noise into Q.
 
@@ -203,7 +203,7 @@ def correct(row: np.ndarray, layout: np.ndarray, gravity: float, error: np.ndarr
         increase(row, NOMINAL.accel_bias, error, 12)
 
 
-@portable
+@inlined
 def turn_heading(row: np.ndarray, gravity: float, angle: float) -> None:
     """Turn the attitude about the world's z axis."""
     q = multiply(about_z(angle), quaternion(row, NOMINAL.q_WB))
@@ -212,7 +212,7 @@ def turn_heading(row: np.ndarray, gravity: float, angle: float) -> None:
     put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
 
 
-@portable
+@inlined
 def remember(counts: np.ndarray, history: np.ndarray, longest: int, now: Moment) -> None:
     """Keep one more instant, not before any other."""
     newest = counts[COUNT.newest] + 1 if counts[COUNT.kept] else 0
@@ -251,7 +251,7 @@ def clone(rows: Rows, i: int, J: np.ndarray, first: int) -> None:
     J[:, first + state : first + state + CLONED] = J[:, first : first + CLONED]
 
 
-@portable
+@inlined
 def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, float, int]:
     """Return the state at `t_s` as it is known now, with the errors that it has.
 
@@ -275,7 +275,7 @@ def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, f
     return (past[0], p, v, past[3], past[4], past[5], past[6]), lag, state
 
 
-@portable
+@inlined
 def move_columns(H: np.ndarray, at: int, size: int, state: int) -> None:
     """Make rows of a Jacobian by the present position and velocity rows by those of a clone, whose place is `state`."""
     for r in range(at, at + size if state > 0 else at):
@@ -284,7 +284,7 @@ def move_columns(H: np.ndarray, at: int, size: int, state: int) -> None:
             H[r, k] = 0.0
 
 
-@portable
+@inlined
 def recall(counts: np.ndarray, history: np.ndarray, longest: int, t_s: float, now: Moment) -> Moment:
     """Return the state at `t_s` as `now` sees it, later corrections included.
 
@@ -312,7 +312,7 @@ def recall(counts: np.ndarray, history: np.ndarray, longest: int, t_s: float, no
     return _as_seen(later, now)
 
 
-@portable
+@inlined
 def _as_seen(past: Moment, now: Moment) -> Moment:
     """Return a past state with the corrections since then."""
     p = subtract(add(past[1], now[5]), past[5])
@@ -320,14 +320,14 @@ def _as_seen(past: Moment, now: Moment) -> Moment:
     return past[0], p, v, past[3], past[4], now[5], now[6]
 
 
-@portable
+@inlined
 def _ahead(now: Moment, dt: float) -> Moment:
     t_s, p, v, q, w, p_corrected, v_corrected = now
     turned = multiply(q, rotation_vector_quaternion(scaled(w, dt)))
     return t_s + dt, axpy(p, dt, v), v, turned, w, p_corrected, v_corrected
 
 
-@portable
+@inlined
 def _between(a: Moment, b: Moment, t_s: float) -> Moment:
     """Interpolate linearly; quaternions of neighbouring instants are never opposite."""
     part = (t_s - a[0]) / (b[0] - a[0])
@@ -341,6 +341,6 @@ def _between(a: Moment, b: Moment, t_s: float) -> Moment:
     return t_s, _mix(a[1], b[1], part), _mix(a[2], b[2], part), q, _mix(a[4], b[4], part), b[5], b[6]
 
 
-@portable
+@inlined
 def _mix(a: Vector, b: Vector, part: float) -> Vector:
     return axpy(a, part, subtract(b, a))
