@@ -7,7 +7,6 @@ and pressure_pa is that of the standard atmosphere at `environment.height_m` + a
 """
 
 import math
-import struct
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -315,14 +314,12 @@ class Fleet:
         self.boards.setpoint[i, SETPOINT.kind] = firmware.NONE
 
     def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
-        boards = self.boards
-        if boards.memory.item(i, MEMORY.mode) not in _TAKES_SETPOINT:
+        if self._mode(i) not in _TAKES_SETPOINT:
             return self._state_refusal(i, "setpoint")
         if not math.isfinite(sum(values)):
             return f"{self.names[i]} was sent a setpoint with {list(values)}; must be finite"
-        place = (i * SETPOINT.size + SETPOINT.kind) * boards.setpoint.itemsize
-        struct.pack_into(f"={1 + len(values)}d", boards.setpoint.data, place, kind, *values)  # 4 times as fast as numpy
-        boards.set_tick[i] = self._tick
+        self.boards.setpoint[i, SETPOINT.kind : SETPOINT.value + len(values)] = (kind, *values)
+        self.boards.set_tick[i] = self._tick
         return None
 
     def _mode(self, i: int) -> int:

@@ -5,7 +5,7 @@ It keeps the world's own messages and those of the participants, those of dead o
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import msgspec
 
@@ -35,17 +35,9 @@ class _ReplayArgs(msgspec.Struct):
     page: Count = 0
 
 
-class _Entry(NamedTuple):
-    """Messages that passed together: the world's clock then, their stamp, keys and payloads, bytes of the latter.
-
-    `foreign` are those of strangers.
-    """
-
-    now_ns: int
-    t_ns: int
-    messages: Pairs
-    size: int
-    foreign: bool = False
+_Entry = tuple[int, int, Pairs, int, bool]
+"""Messages that passed together: the world's clock then, their stamp, keys and payloads, bytes of the latter, and
+whether they are of strangers."""
 
 
 class MessageHistory:
@@ -82,7 +74,7 @@ class MessageHistory:
             self._now_ns = t_ns
         if key in self._last or len(self._last) < LAST_MAX:
             self._last[key] = payload
-        self._keep(_Entry(self._now_ns, t_ns, [(key, payload)], len(payload)))
+        self._keep(t_ns, [(key, payload)], len(payload))
 
     def add_foreign(self, key: str, payload: bytes) -> None:
         """Keep, for recorders, a message that is none of the contract or was refused; it is nobody's last value.
@@ -91,22 +83,23 @@ class MessageHistory:
         """
         if self._foreign_bytes + len(payload) <= FOREIGN_BYTES:
             self._foreign_bytes += len(payload)
-            self._keep(_Entry(self._now_ns, self._now_ns, [(key, payload)], len(payload), foreign=True))
+            self._keep(self._now_ns, [(key, payload)], len(payload), foreign=True)
 
     def add_all(self, published: Pairs, t_ns: int) -> None:
         """Keep what the world itself publishes, all stamped t_ns, its newest gate."""
         self._now_ns = t_ns
         self._last.update(published)
-        self._keep(_Entry(t_ns, t_ns, published, sum([len(payload) for _, payload in published])))
+        self._keep(t_ns, published, sum([len(payload) for _, payload in published]))
 
-    def _keep(self, entry: _Entry) -> None:
-        self._recent.append(entry)
-        self._bytes += entry.size
-        while self._bytes > self._keep_bytes or self._recent[0].now_ns < self._now_ns - KEEP_NS:
-            oldest = self._recent.popleft()
-            self._bytes -= oldest.size
-            self._foreign_bytes -= oldest.size * oldest.foreign
-            self._forgotten += len(oldest.messages)
+    def _keep(self, t_ns: int, passed: Pairs, size: int, foreign: bool = False) -> None:
+        recent, now_ns = self._recent, self._now_ns
+        recent.append((now_ns, t_ns, passed, size, foreign))
+        self._bytes += size
+        while self._bytes > self._keep_bytes or recent[0][0] < now_ns - KEEP_NS:
+            _, _, oldest, its_size, was_foreign = recent.popleft()
+            self._bytes -= its_size
+            self._foreign_bytes -= its_size * was_foreign
+            self._forgotten += len(oldest)
 
     def last(self, expression: str) -> list[tuple[str, bytes]]:
         """Return the last value of every key that an expression takes."""
@@ -142,9 +135,9 @@ class MessageHistory:
         return passed, None
 
     def _each(self) -> Iterator[tuple[int, str, bytes]]:
-        for entry in self._recent:
-            for key, payload in entry.messages:
-                yield entry.t_ns, key, payload
+        for _, t_ns, passed, _, _ in self._recent:
+            for key, payload in passed:
+                yield t_ns, key, payload
 
     def replay(self, args: dict[str, Any], readable: Sequence[str]) -> ControlAnswer:
         """Answer a request for a replay with a page of the history.

@@ -38,6 +38,7 @@ CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while ti
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 HEALTH = keys.process(WORLD, "health")
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
+SERVE_NS = 5_000_000  # wall time after which a world that never waits looks at requests, losses and its own stop
 
 
 class WorldProcess:
@@ -94,6 +95,7 @@ class WorldProcess:
         self._over = threading.Event()
         self._clock_wall_ns = 0
         self._turn_wall_ns = 0  # when the present turn began; 0 when there is none
+        self._served_wall_ns = 0  # when others than participants were served last; 0 once the world has waited
         self._view_wall_ns = 0
         self._view_seq = 0
         self._resumes = False
@@ -175,7 +177,9 @@ class WorldProcess:
     def _turn(self) -> None:
         self._turn_wall_ns = time.monotonic_ns()
         self._take_in()
-        self._serve_others()
+        if self._turn_wall_ns - self._served_wall_ns >= SERVE_NS:
+            self._serve_others()
+            self._served_wall_ns = self._turn_wall_ns
         self._intake.recover_lost()
         wall_ns = time.monotonic_ns()
         if self._world.ended is None and self._world.may_advance() and not self._pipelining.delays(wall_ns):
@@ -185,6 +189,7 @@ class WorldProcess:
             else:
                 self._outputs.flush()
                 self._inputs.wait(left_ns / 1e9)
+                self._served_wall_ns = 0
         else:
             self._stand_still(wall_ns)
 
@@ -212,6 +217,7 @@ class WorldProcess:
         self._pipelining.pause(wall_ns)
         self._publish_clock(wall_ns, self._world.waiting_for)
         self._inputs.wait_for(self._required_dones())
+        self._served_wall_ns = 0
 
     def _publish_clock(self, wall_ns: int, waiting_for: Callable[[int], tuple[run_messages.Waiting, ...]]) -> None:
         """Publish once a second whom the world waits for."""
