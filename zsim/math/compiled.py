@@ -171,7 +171,7 @@ def hold(content: Any) -> Held:
 
 @cache
 def _holder(module: str) -> Callable[[Any], Held]:
-    """Return `hold` for the tuples of a module: kept by its sources, as numba finds kept code by the tuples' classes."""
+    """Return `hold` for the tuples of a module, kept by its sources: numba finds kept code by the tuples' classes."""
 
     def holder(content: Any) -> Held:
         return _make_held(content)
