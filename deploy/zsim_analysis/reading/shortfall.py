@@ -34,6 +34,7 @@ SAME = 1e-3  # m or rad within which the reference is the plan's: both are compu
 CONTROLLER, CONSOLE = "controller.", "console"  # how names begin: of who flies by the plan, and of operators' programs
 INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  # events of drones
 CRASHES = ("emergency", "flip", "impact", "touchdown")  # of them those by which a drone comes down
+ONE_HIT_NS = 500_000_000  # chosen: a touchdown is part of an impact that is found as near as this
 LEADS = ("hold", "land", "target", "trajectory")  # requests by which a formation leaves its plan
 
 
@@ -103,6 +104,9 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
             by_drone.setdefault(event.subject, []).append(event)
     for drone, events in by_drone.items():
         first = {event.kind: event for event in reversed(events)}
+        hit, touch = first.get("impact"), first.get("touchdown")
+        if hit and touch and abs(hit.t_ns - touch.t_ns) <= ONE_HIT_NS:
+            del first["touchdown"]
         parts = [_incident_text(event) for event in sorted(first.values(), key=lambda event: (event.t_ns, event.seq))]
         text = f"{drone}: {', '.join(parts)}{_active_faults(drone, events[0], flight)}"
         fails = any(not _is_silence_of_others(event) for event in events)

@@ -229,6 +229,9 @@ def test_a_touchdown_in_flight_is_one_and_a_crash_of_a_sweep() -> None:
     assert (line.kind, line.subject, line.t_s, line.fails) == ("touchdown", "drone1", 31.5, True)
     assert has_terms(line.text, "drone1", "the ground", "in flight", "31.5 s")
     assert "touchdown" in CRASHES
+    impact = event(31.52, "impact", "drone1", other="the ground", speed_m_s=2.0)
+    (line,) = found(lambda t_s: {"phase": "engaged"}, events=(touchdown, impact))
+    assert (line.kind, "in flight" in line.text, "2.0 m/s" in line.text) == ("touchdown", False, True)
 
 
 @pytest.mark.parametrize(
