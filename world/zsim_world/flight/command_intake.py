@@ -19,7 +19,7 @@ from zsim_world.flight.command_queue import CommandQueue, QueuedCommand
 from zsim_world.flight.run_clock import Operation, RunClock, number, refused_argument
 from zsim_world.flight.run_outbox import Refusal, RunOutbox, too_many
 
-MISSION_STATES = ("started", "finished", "aborted")
+MISSION_STATES = ("active", "finished", "aborted")
 MISSION_ITEMS_MAX, MISSION_REASON_MAX = 1_000_000, 80  # chosen: far more than autopilots keep; a line
 
 LinkFaultsAt = Callable[[int], Sequence[Fault]]
@@ -258,7 +258,7 @@ class CommandIntake:
         if args.get("state") not in MISSION_STATES:
             return refused_argument(request, "state", f"one of {', '.join(MISSION_STATES)}")
         for name in ("items", "done"):
-            if not isinstance(args.get(name), int) or not 0 <= args[name] <= MISSION_ITEMS_MAX:
+            if type(args.get(name)) is not int or not 0 <= args[name] <= MISSION_ITEMS_MAX:
                 return refused_argument(request, name, f"a whole number from 0 to {MISSION_ITEMS_MAX}")
         drone, reason = self.fleet.names[index], str(args.get("reason", ""))[:MISSION_REASON_MAX]
         data = {name: args[name] for name in ("state", "items", "done")}

@@ -63,7 +63,7 @@ class MissionReport(NamedTuple):
         failsafe: whether the vehicle itself aborted it, and no client.
     """
 
-    state: Literal["started", "finished", "aborted"]
+    state: Literal["active", "finished", "aborted"]
     items: int
     done: int
     reason: str = ""
@@ -141,13 +141,13 @@ class Mission:
         """Report that it is flown from now on, unless it is flown already."""
         if self._reported is None:
             self._reported = self._index
-            self.reports.append(MissionReport("started", len(self.items), self._index))
+            self.reports.append(MissionReport("active", len(self.items), self._index))
 
     def note_progress(self) -> None:
         """Report what more of it has been flown; a jump back is none."""
         if self._reported is not None and self._index > self._reported:
             self._reported = self._index
-            self.reports.append(MissionReport("started", len(self.items), self._index))
+            self.reports.append(MissionReport("active", len(self.items), self._index))
 
     def finish(self) -> None:
         """Report that all of it has been flown."""

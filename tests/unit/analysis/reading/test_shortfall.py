@@ -237,10 +237,10 @@ def test_a_touchdown_in_flight_is_one_and_a_crash_of_a_sweep() -> None:
 @pytest.mark.parametrize(
     ("reports", "fails", "terms"),
     [
-        ([{"state": "started", "done": 0}, {"state": "finished", "done": 5}], None, ()),
-        ([{"state": "started", "done": 3}], False, ("flew 3 of 5 mission items", "the run ended")),
+        ([{"state": "active", "done": 0}, {"state": "finished", "done": 5}], None, ()),
+        ([{"state": "active", "done": 3}], False, ("flew 3 of 5 mission items", "the run ended")),
         (
-            [{"state": "started", "done": 3}, {"state": "aborted", "done": 3, "reason": "geofence", "failsafe": True}],
+            [{"state": "active", "done": 3}, {"state": "aborted", "done": 3, "reason": "geofence", "failsafe": True}],
             True,
             ("flew 3 of 5 mission items", "geofence", "at 11 s"),
         ),

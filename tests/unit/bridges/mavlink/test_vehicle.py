@@ -232,7 +232,7 @@ def test_a_mission_takes_off_visits_its_waypoints_and_lands() -> None:
     assert abs(drone.position[1] - 8.0) < 1.2
     drone.step()
     progress = [(each.state, each.done) for each in drone.vehicle.flight.mission.reports]
-    assert (progress[0], progress[-1]) == (("started", 0), ("finished", 5))
+    assert (progress[0], progress[-1]) == (("active", 0), ("finished", 5))
     assert {each.items for each in drone.vehicle.flight.mission.reports} == {5}
 
 
@@ -295,7 +295,7 @@ def test_a_mission_that_a_client_resumes_is_finished_where_its_return_ends_on_th
     drone.until(lambda: drone.state == "landed", 20_000)
     drone.step()
     reports = drone.vehicle.flight.mission.reports
-    assert [each.state for each in reports if each.state != "started"] == ["aborted", "finished"]
+    assert [each.state for each in reports if each.state != "active"] == ["aborted", "finished"]
     assert (reports[-1].state, reports[-1].done) == ("finished", 4)
 
 
