@@ -1,4 +1,4 @@
-"""A run with cameras and detectors: what they see agrees with the truth, and nothing that befalls them touches it."""
+"""A run with cameras and detectors: what they see agrees with the truth, and no failure of theirs changes it."""
 
 from pathlib import Path
 from typing import Any

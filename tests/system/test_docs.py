@@ -587,7 +587,7 @@ def test_the_protocol_names_every_message_and_field(shape: str) -> None:
 
 def test_the_protocol_names_every_event() -> None:
     code = "".join(path.read_text() for path in sorted((ROOT / "world/zsim_world").rglob("*.py")))
-    kinds = set(re.findall(r"\b(?:event|notice|Mishap)\((?:i, )?\s*\"(\w+)\"", code)) | {
+    kinds = set(re.findall(r"\b(?:event|notice|Incident)\((?:i, )?\s*\"(\w+)\"", code)) | {
         "join",
         "restart",
         "superseded",

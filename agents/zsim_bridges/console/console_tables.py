@@ -38,6 +38,7 @@ EVENT_COLOURS = {
     "emergency": RED,
     "flip": RED,
     "impact": RED,
+    "touchdown": RED,
     "battery": RED,
     "landing": AMBER,
     "fault": AMBER,

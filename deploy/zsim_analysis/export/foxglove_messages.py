@@ -71,6 +71,7 @@ LEVELS = {  # of events; the others are information
     "emergency": LogLevel.Error,
     "flip": LogLevel.Error,
     "impact": LogLevel.Error,
+    "touchdown": LogLevel.Error,
     "battery": LogLevel.Error,
     "diverged": LogLevel.Error,
 }

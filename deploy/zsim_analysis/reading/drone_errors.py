@@ -1,4 +1,4 @@
-"""How well each drone is estimated, and how well it flies what it is told to: both against its truth. Pure."""
+"""How well each drone is estimated, and how well it flies its commands: both against its truth. Pure."""
 
 from typing import NamedTuple
 

@@ -1,6 +1,6 @@
-"""What a flight did not do of its plan, and what befell its drones: so that no report hides it.
+"""What a flight did not do of its plan, and the incidents of its drones: so that no report hides them.
 
-Pure. Order of this file: what is judged; drones (falls, landings of their own, who else flew them); formations
+Pure. Order of this file: what is judged; drones (incidents, missions, collisions, overrides); formations
 (engagement, holds, requests, the target and the trajectory of the plan, the window).
 """
 
@@ -28,12 +28,13 @@ from zsim_analysis.reading.window_text import percent_text, seconds_text, span_t
 ENGAGES_S = 20.0  # chosen: a formation engages 4 to 12 s after its take-off; a run may end before
 MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second, and m or rad by which a reference at rest never moves
 HELD_MAX_S = 2.0  # chosen: four times what a formation waits after a fault; held for longer, it has left its plan
-LATE_MAX_S = 1.0  # chosen: two tries of a step of the plan; more of a reference is not left out unsaid
+LATE_MAX_S = 1.0  # chosen: two tries of a step of the plan; what more is missing of a reference is reported
 SAMPLE_NS = 100_000_000  # of a reference that is compared with the plan's
 SAME = 1e-3  # m or rad within which the reference is the plan's: both are computed by the same formulas
 CONTROLLER, CONSOLE = "controller.", "console"  # how names begin: of who flies by the plan, and of operators' programs
-FATES = ("emergency", "flip", "impact", "battery", "landing")  # events of what befell a drone
-CRASHES = ("emergency", "flip", "impact")  # of them those that no drone flies on after
+INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  # events of drones
+CRASHES = ("emergency", "flip", "impact", "touchdown")  # of them those by which a drone comes down
+ONE_HIT_NS = 500_000_000  # chosen: a touchdown is part of an impact that is found as near as this
 LEADS = ("hold", "land", "target", "trajectory")  # requests by which a formation leaves its plan
 
 
@@ -41,12 +42,12 @@ class Shortfall(Struct, frozen=True):
     """One thing that a flight did not do, or that happened to it.
 
     Attributes:
-        kind: of a drone: emergency, flip, impact, battery, landing (what befell it first), hand (others flew it);
-            of a cluster: plan (a step refused to the end, or flown in part), engagement (never), held (for long),
-            request (others led it), early (the run ended before it was due), window (it holds instants at which a
-            cluster was not engaged); collision; process (one that was expected died, failed, or never came); record
-            (not all of it is there).
-        subject: the cluster, the drone, the process, or "record".
+        kind: of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (not flown
+            to its end), override (others flew it); of a cluster: plan (a step refused to the end, or flown in part),
+            engagement (never), held (for long), request (others led it), early (the run ended before it was due),
+            window (it holds instants at which a cluster was not engaged); collision; process (one that was expected
+            died, failed, or never came); record (not all of it is there).
+        subject: the cluster, the drone, the process, or "record"; of a collision both, as "drone1, drone2".
         t_s: since when, simulated time.
         fails: the flight is no example of its plan; the command ends with code 1.
     """
@@ -60,9 +61,9 @@ class Shortfall(Struct, frozen=True):
 
 def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Shortfall]:
     """Return what a flight did not do, what matters most first; empty for one that flew its plan."""
-    lines = [*_fates(flight), *_collisions(flight)]
+    lines = [*_incidents(flight), *_collisions(flight), *_missions(flight)]
     lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
-    lines += [*_hands(flight), *_of_processes(flight), *_of_record(flight)]
+    lines += [*_overrides(flight), *_of_processes(flight), *_of_record(flight)]
     return sorted(lines, key=lambda line: not line.fails)
 
 
@@ -92,38 +93,32 @@ def _of_processes(flight: RecordedFlight) -> Iterator[Shortfall]:
             yield Shortfall("process", event.subject, t_s, text, True)
 
 
-def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    contacts = [event for event in flight.events if event.kind == "collision"]
-    if contacts:
-        first = contacts[0]
-        more = f" ({len(contacts)} contacts in all)" if len(contacts) > 1 else ""
-        t_s = first.t_ns / 1e9
-        yield Shortfall("collision", first.subject, t_s, f"{first.text} at {t_s:.2f} s{more}", True)
-
-
 # Drones
 
 
-def _fates(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield a line for each drone that something befell, with all of it in the order of time."""
+def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield a line for each drone that had an incident, with the first one of each kind in the order of time."""
     by_drone: dict[str, list[Event]] = {}
     for event in flight.events:
-        if event.kind in FATES:
+        if event.kind in INCIDENTS:
             by_drone.setdefault(event.subject, []).append(event)
     for drone, events in by_drone.items():
         first = {event.kind: event for event in reversed(events)}
-        parts = [_fate(event) for event in sorted(first.values(), key=lambda event: (event.t_ns, event.seq))]
-        text = f"{drone}: {', '.join(parts)}{_acting(drone, events[0], flight)}"
+        hit, touch = first.get("impact"), first.get("touchdown")
+        if hit and touch and abs(hit.t_ns - touch.t_ns) <= ONE_HIT_NS:
+            del first["touchdown"]
+        parts = [_incident_text(event) for event in sorted(first.values(), key=lambda event: (event.t_ns, event.seq))]
+        text = f"{drone}: {', '.join(parts)}{_active_faults(drone, events[0], flight)}"
         fails = any(not _is_silence_of_others(event) for event in events)
         yield Shortfall(events[0].kind, drone, events[0].t_ns / 1e9, text, fails)
-    told = {*by_drone, *(event.subject for event in flight.events if event.data.get("mode") == "emergency")}
+    reported = {*by_drone, *(event.subject for event in flight.events if event.data.get("mode") == "emergency")}
     for track in flight.tracks:  # a record of a version that has no such events
-        if track.name not in told and not track.external and track.states and track.states[-1] == "emergency":
+        if track.name not in reported and not track.external and track.states and track.states[-1] == "emergency":
             t_s = float(track.status_t_ns[-1]) / 1e9
             yield Shortfall("emergency", track.name, t_s, f"{track.name} ended in an emergency", True)
 
 
-def _fate(event: Event) -> str:
+def _incident_text(event: Event) -> str:
     at, data = f"at {seconds_text(event.t_ns / 1e9)} s", event.data
     if event.kind == "emergency":
         if data.get("cause") == "command":
@@ -136,6 +131,8 @@ def _fate(event: Event) -> str:
         charge = data.get("charge_percent")
         why = f"{data.get('commander') or 'its commander'} fell silent"
         return f"landed by itself {at} ({why if charge is None else f'{charge:.1f} % of charge left'})"
+    if event.kind == "touchdown":
+        return f"touched {data.get('other', 'something')} in flight {at}"
     return f"upside down {at}" if event.kind == "flip" else f"no charge left {at}"
 
 
@@ -146,31 +143,55 @@ def _is_silence_of_others(event: Event) -> bool:
     return silent and not commander.startswith(CONTROLLER)
 
 
-def _acting(drone: str, event: Event, flight: RecordedFlight) -> str:
-    """Return which injected faults of a drone, or of all, had begun when something befell it, and had not ended."""
-    acting: dict[object, str] = {}
+def _active_faults(drone: str, event: Event, flight: RecordedFlight) -> str:
+    """Return which injected faults of a drone, or of all, were active at an incident."""
+    active: dict[object, str] = {}
     for each in flight.events:
         if (each.t_ns, each.seq) > (event.t_ns, event.seq):
             break
         if each.kind == "fault" and each.data.get("target") in (drone, "world"):
             source = each.data.get("source") or "somebody"
             whose = "the scenario's" if source == "scenario" else f"{source}'s"
-            acting[each.data.get("id")] = (
+            active[each.data.get("id")] = (
                 f"{whose} fault {each.data.get('kind')} since {seconds_text(each.t_ns / 1e9)} s"
             )
         elif each.kind in ("fault_end", "fault_clear"):
-            acting.pop(each.data.get("id"), None)
-    return f"; {', '.join(acting.values())}" if acting else ""
+            active.pop(each.data.get("id"), None)
+    return f"; {', '.join(active.values())}" if active else ""
 
 
-def _hands(flight: RecordedFlight) -> Iterator[Shortfall]:
+def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield a line for each pair of drones, or of a drone and an obstacle, that touched."""
+    pairs: dict[frozenset[object], list[Event]] = {}
+    for event in flight.events:
+        if event.kind == "collision":
+            pairs.setdefault(frozenset((event.subject, event.data.get("other"))), []).append(event)
+    for first, *others in pairs.values():
+        t_s, more = first.t_ns / 1e9, f" ({1 + len(others)} contacts in all)" if others else ""
+        pair = f"{first.subject}, {first.data.get('other', 'something')}"
+        yield Shortfall("collision", pair, t_s, f"{first.text} at {seconds_text(t_s)} s{more}", True)
+
+
+def _missions(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield for each drone that its newest mission, of those that a bridge reported, was not flown to its end."""
+    newest = {event.subject: event for event in flight.events if event.kind == "mission"}
+    for drone, event in newest.items():
+        data, t_s = event.data, event.t_ns / 1e9
+        if data.get("state") == "finished":
+            continue
+        why = f"{data.get('reason')}, at {seconds_text(t_s)} s" if data.get("reason") else "the run ended"
+        text = f"{drone}: flew {data.get('done')} of {data.get('items')} mission items; {why}"
+        yield Shortfall("mission", drone, t_s, text, bool(data.get("failsafe")))
+
+
+def _overrides(flight: RecordedFlight) -> Iterator[Shortfall]:
     """Yield for each drone of a cluster who beside its controller flew it, or had it land."""
     members = {drone for states in flight.clusters for drone in states.drones if _plan(flight.scenario, states.name)}
     for drone in sorted(members):
         parts = list(_interventions(drone, flight))
         if parts:
             more = f" (and {len(parts) - 1} more)" if len(parts) > 1 else ""
-            yield Shortfall("hand", drone, parts[0].from_ns / 1e9, f"{drone}: {parts[0].text}{more}", False)
+            yield Shortfall("override", drone, parts[0].from_ns / 1e9, f"{drone}: {parts[0].text}{more}", False)
 
 
 class _Intervention(NamedTuple):

@@ -137,7 +137,7 @@ def _planned(summary: RunSummary) -> str:
     kinds = {each.kind for each in summary.shortfalls}
     parts = {
         "as far as the run went": "early" in kinds,
-        "but for what others asked or flew": bool(kinds & {"hand", "request"}),
+        "but for what others asked or flew": bool(kinds & {"override", "request"}),
         "but for a short hold": "held" in kinds,
     }
     return ", ".join(part for part, holds in parts.items() if holds) or "yes"

@@ -216,8 +216,8 @@ def make_plan(
     texts, vary_faults = _parsed(vary, document)
     faults = [*earlier_faults, *vary_faults]
     source = source.encode(errors="surrogateescape").decode(errors="replace")  # a file's name may be any bytes
-    told = None if changed is None else tuple(changed)
-    plan = SweepPlan(source=source, document=document, vary=tuple(texts), runs=runs or 1, records=records, changed=told)
+    sets = None if changed is None else tuple(changed)
+    plan = SweepPlan(source=source, document=document, vary=tuple(texts), runs=runs or 1, records=records, changed=sets)
     design = SweepDesign(plan)
     given = len(design.seeds.values) if design.seeds else 0
     plan = msgspec.structs.replace(plan, runs=runs or design.points * max(given, 1))

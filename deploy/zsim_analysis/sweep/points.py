@@ -17,7 +17,6 @@ from zsim_analysis.sweep.metrics import metric_columns, metrics_function
 from zsim_analysis.sweep.sweep_run import FIXED, Row, engaged_column
 from zsim_analysis.sweep.sweep_summary import Distribution, FormationParameter, GridPoint, SweepSummary
 
-PLANNED_ONLY = ("min_separation_m", "errors.", "clusters.")  # columns, or their beginnings, of `flown`
 STATISTICS = ("est_std", "true_std", "true_rms", "true_mean")
 _FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # in a text, but not in a name such as drone1
 _COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # start of a column: its cluster's name, and its own
@@ -51,14 +50,8 @@ class SweepResults:
         return np.array([np.nan if cell is None else cell for cell in cells], np.float64)
 
     def flown(self, column: str, point: int | None = None) -> NDArray[np.float64]:
-        """Return `values`, of errors and separations NaN where a run did not do what its plan says.
-
-        A flight that was not flown, or fell early, would make their means look better.
-        """
-        values = self.values(column, point)
-        if not column.startswith(PLANNED_ONLY):
-            return values
-        return np.where(self.values("as_planned", point) == 0, np.nan, values)
+        """Return `values`, NaN where a run did not do what its plan says: statistics would look better by it."""
+        return np.where(self.values("as_planned", point) == 0, np.nan, self.values(column, point))
 
     def differences(self, column: str, point: int) -> NDArray[np.float64]:
         """Return value − value at the first point of each pair of runs with one seed that are both of `flown`.
@@ -157,7 +150,7 @@ class SweepResults:
         spreads = {column: each for column in columns if (each := distribution(self.flown(column, point)))}
         compared = (*self.metrics, "min_separation_m", *(each for each in self.errors if each.endswith(".true_rms")))
         differences = {column: each for column in compared if (each := distribution(self.differences(column, point)))}
-        separations = self.values("min_separation_m", point)
+        separations, (planned, judged) = self.values("min_separation_m", point), self.as_planned(point)
         return GridPoint(
             label=self.label(point),
             values=self.design.at(point),
@@ -166,7 +159,8 @@ class SweepResults:
             ended_well=share_interval(well, runs) if runs else None,
             without_collision=share_interval(*self.without_collision(point)) if well else None,
             engaged=engaged if of else None,
-            as_planned=share_interval(*planned) if (planned := self.as_planned(point))[1] else None,
+            as_planned=share_interval(planned, judged) if judged else None,
+            excluded=judged - planned,
             spreads=spreads,
             least_separation_m=float(np.nanmin(separations)) if np.isfinite(separations).any() else None,
             differences=differences,

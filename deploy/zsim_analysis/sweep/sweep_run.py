@@ -59,7 +59,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
         ended: the reason that the world gave.
         wall_s: wall time of the flight.
         collisions: contacts between drones, and with obstacles.
-        crashed: whether a drone was stopped in the air, turned over, or hit something hard.
+        crashed: whether a drone was stopped in the air, flipped, hit something hard, or touched the ground in flight.
         engaged: whether every cluster was engaged at some instant of the judged window, None without a cluster.
         engaged_throughout: whether every cluster was engaged at every instant of it, None without a cluster.
         as_planned: whether the flight did what its plan says.
@@ -227,7 +227,7 @@ def _row(
         real_time_factor=summary.real_time_factor,
         min_separation_m=summary.min_separation_m,
         collisions=sum(event.kind == "collision" for event in flight.events),
-        crashed=any(each.kind in CRASHES for each in summary.shortfalls),
+        crashed=any(event.kind in CRASHES for event in flight.events),
         engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
         engaged_throughout=all(_is_engaged_throughout(summary, name) for name in clusters) if clusters else None,
         as_planned=summary.as_planned,

@@ -64,8 +64,8 @@ class GridPoint(Struct, frozen=True):
         engaged: runs that ended well and had every cluster engaged at some instant of the judged window; None where
             no run has a cluster.
         as_planned: share of those that ended well that did what their plan says.
-        spreads: by column of the table, of those that ended well; of the separation and the errors, of those among them
-            that did what their plan says.
+        excluded: runs that ended well and did not do what their plan says: they are in no spread and no difference.
+        spreads: by column of the table, of those that ended well and did what their plan says.
         least_separation_m: of all that ended well, None where no run has any.
         differences: by column, of its value less that at the first point in the run with the same seed, over the pairs
             of runs of which both are in the spreads; empty at the first point, and where seeds are not paired.
@@ -80,6 +80,7 @@ class GridPoint(Struct, frozen=True):
     engaged: int | None
     as_planned: ConfidenceInterval | None
     spreads: dict[str, Distribution]
+    excluded: int = 0
     least_separation_m: float | None = None
     differences: dict[str, Distribution] = {}
 

@@ -27,7 +27,7 @@ from zsim.vehicles.vehicle import Vehicle
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
-from zsim_world.fleet.flight_watch import FlightWatch, Mishap
+from zsim_world.fleet.flight_watch import FlightWatch, Incident
 from zsim_world.fleet.initial_state import arrays
 from zsim_world.physics.air import WIND
 from zsim_world.sensors.noise import NoiseTable
@@ -120,9 +120,7 @@ class Fleet:
         self.touching = np.zeros(self.count, dtype=bool)
         self._hull_m = float(self.bodies.vehicle[:, VEHICLE.hull_radius].max())
         self._integrate(0)
-        gate_s, boards = scenario.time.gate_ms / 1e3, self.boards
-        self._watch = FlightWatch(self.bodies, boards.memory, boards.setting, self.names, [*self.external], gate_s)
-        self._befell = False
+        self._watch = FlightWatch(self._w, self.names, [each.name for each in scenario.environment.obstacles])
         self._rehearse()
 
     def _rehearse(self) -> None:
@@ -163,7 +161,6 @@ class Fleet:
             self._noise.refill()
         self._gates += 1
         self._integrate(self._ticks)
-        self._befell = self._watch.look()
 
     def snapshot(self) -> State:
         """Return all from which the flight goes on to the same bits."""
@@ -172,7 +169,6 @@ class Fleet:
             "gates": self._gates,
             "least_m": self._least,
             "touching": self.touching,
-            "watch": self._watch.snapshot(),
             "arrays": list(state_arrays(self._w)),
             "streams": self._noise.streams,
             "sampler": self._sampler.snapshot(),
@@ -187,7 +183,6 @@ class Fleet:
         """
         self._tick, self._gates, self._least = state["tick"], state["gates"], state["least_m"]
         self.touching[:] = state["touching"]
-        self._watch.restore(state["watch"])
         for array, saved in zip(state_arrays(self._w), state["arrays"], strict=True):
             array[...] = saved
         self.bodies.near.origin.fill(math.inf)  # the near pairs are found anew
@@ -230,9 +225,9 @@ class Fleet:
             return []
         return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
 
-    def mishaps(self) -> list[Mishap]:
-        """Return what befell drones in the last gate."""
-        return self._watch.mishaps(self.touching) if self._befell else []
+    def incidents(self) -> list[Incident]:
+        """Return the incidents of drones in the last gate."""
+        return self._watch.incidents() if self._has_incidents else []
 
     def takeoff(self, i: int) -> str | None:
         """Start a take-off; return None, or why not."""
@@ -330,10 +325,10 @@ class Fleet:
 
     def _enter(self, i: int, mode: int) -> None:
         kernel.enter(self.boards.memory[i], self.boards.belief[i], mode)
-        self._watch.ask(i, mode)
+        self._watch.note_command(i, mode)
 
     def _integrate(self, ticks: int) -> None:
-        logged, least, diverged = kernel.advance(self._held, ticks)
+        logged, least, diverged, self._has_incidents = kernel.advance(self._held, ticks)
         if diverged >= 0:
             raise DivergedError(self.names[diverged], (self._tick + ticks) * self._tick_ns / 1e9)
         self._tick += ticks

@@ -1,7 +1,7 @@
-"""What befalls drones: the firmware stops or lands one by itself, one turns over, hits something, has no charge left.
+"""Incidents of drones: one stops or lands by itself, flips, hits something, touches the ground, has no charge left.
 
-Found once a gate on the arrays of the fleet by one compiled pass, which reads and compares and changes nothing of the
-flight; what is found is put into words only then.
+Found on the arrays of the fleet in every step of the firmware (5 ms), whatever the length of a gate, by a part of the
+kernel which reads and compares and changes nothing of the flight; incidents are described in words once a gate.
 """
 
 import math
@@ -11,35 +11,46 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.snapshot import State
 from zsim.math.columns import Field, columns
-from zsim.math.compiled import Held, hold, kernel
+from zsim.math.compiled import inlined
+from zsim.math.rotation import add, rotate
 from zsim.schema.quantities import G_M_S2
-from zsim_world.state.fleet_arrays import STATE, VEHICLE, Bodies
-from zsim_world.vehicles.firmware import EMERGENCY, LANDING, MEMORY
+from zsim_world.physics.ground import POINTS, contact_point
+from zsim_world.physics.obstacle_contact import FEET, nearest
+from zsim_world.physics.rigid_body import four, vector
+from zsim_world.state.fleet_arrays import STATE, VEHICLE, Arrays, Bodies, Watched
+from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, TAKING_OFF
 from zsim_world.vehicles.firmware_settings import SETTING
+from zsim_world.vehicles.observer import STEP_S
 
-IMPACT_G = 5.0  # chosen: twice what rotors and drag give a drone, on average over a gate; a fall from 0.4 m has it
-UPRIGHT_AGAIN = 0.5  # chosen: cosine of the tilt below which one that was upside down may turn over again
-QUIET_S = 1.0  # chosen: contacts that follow one sooner are its bounces
-MODE, FLIP, IMPACT, EMPTY = 1, 2, 4, 8  # bits of what befell a drone
+IMPACT_STEPS = 4  # over which a change of velocity is measured: 20 ms, about half of a contact on the feet
+IMPACT_G = 5.0  # chosen: twice what rotors and drag give a drone, on average over these; a fall from 0.4 m has it
+IMPACT_M_S = IMPACT_G * G_M_S2 * IMPACT_STEPS * STEP_S  # m/s, greatest change of velocity without an impact
+UPRIGHT_AGAIN = 0.5  # chosen: cosine of the tilt below which one that was upside down may flip again
+QUIET_STEPS = round(1.0 / STEP_S)  # chosen: contacts that follow an impact within 1 s are its bounces
+MODE, FLIP, IMPACT, EMPTY, TOUCHDOWN = 1, 2, 4, 8, 16  # bits of the incidents of a drone
+NOTHING, GROUND, FIRST_OBSTACLE = 0, 1, 2  # what a drone touches; then the obstacles, then the drones
 
 SEEN = columns(
     "SeenColumns",
     (
-        Field("mode", "1"),  # that it was asked for, or that was found
+        Field("mode", "1"),  # the last one that was commanded, or that was found
         Field("flipped", "1"),
         Field("empty", "1"),
-        Field("quiet", "gates"),  # in which no impact is found any more
+        Field("quiet", "steps"),  # in which no impact is found any more
         Field("external", "1"),  # its body is
-        Field("v_WB", "m/s", 3),  # at the last gate
-        Field("speed", "m/s"),  # at the gate before that, as a contact may last for two; from an impact on: of it
+        Field("airborne", "1"),  # out of reach of the ground and of obstacles since it last touched one
+        Field("grounded", "1"),  # its touchdown in flight has been found
+        Field("surface", "see NOTHING"),  # on which that was
+        Field("touched", "see NOTHING"),  # what it touched last
+        Field("speed", "m/s"),  # before its last impact
+        Field("v_WB", "m/s", 3 * IMPACT_STEPS),  # in the last steps, each in the place of the oldest
     ),
 )
 
 
-class Mishap(NamedTuple):
-    """What befell a drone, as an event: `data` has its cause or its figures."""
+class Incident(NamedTuple):
+    """An incident of a drone, as an event: `data` has its cause or its figures."""
 
     drone: int
     kind: str
@@ -47,103 +58,64 @@ class Mishap(NamedTuple):
     data: dict[str, Any]
 
 
-class WatchedArrays(NamedTuple):
-    """What of N drones is compared from gate to gate."""
-
-    state: NDArray[np.float64]  # of Bodies
-    memory: NDArray[np.float64]  # of the firmware
-    energy: NDArray[np.float64]  # of Bodies
-    seen: NDArray[np.float64]  # (N, SEEN.size), written
-    found: NDArray[np.int64]  # (N,), bits of what befell each, written
-
-
 class FlightWatch:
-    """Watches the drones of a fleet from gate to gate.
+    """Describes the incidents of a fleet's drones.
 
     Args:
-        bodies, memory, setting: arrays of the fleet; `memory` and `setting` are the firmware's.
-        names: of the drones.
-        external: those whose bodies are external, which are not watched.
-        gate_s: between two gates.
+        arrays: of the fleet.
+        drones, obstacles: their names.
     """
 
-    def __init__(
-        self,
-        bodies: Bodies,
-        memory: NDArray[np.float64],
-        setting: NDArray[np.float64],
-        names: Sequence[str],
-        external: Sequence[int],
-        gate_s: float,
-    ) -> None:
-        self._bodies, self._memory, self._setting, self._names = bodies, memory, setting, names
-        self._seen = np.zeros((len(names), SEEN.size))
-        self._seen[:, SEEN.external] = [i in external for i in range(len(names))]
-        self._found = np.zeros(len(names), np.int64)
-        self._change_m_s = IMPACT_G * G_M_S2 * gate_s
-        self._quiet_gates = math.ceil(QUIET_S / gate_s)
-        self._held = hold(WatchedArrays(bodies.state, memory, bodies.energy, self._seen, self._found))
-        self.look()  # loads or compiles it
+    def __init__(self, arrays: Arrays, drones: Sequence[str], obstacles: Sequence[str]) -> None:
+        self._bodies, self._boards = arrays.bodies, arrays.boards
+        self._seen, self._found = arrays.watched
+        self._names = drones
+        self._others = ("", "the ground", *obstacles, *drones)  # by what `SEEN.touched` holds
 
-    def snapshot(self) -> State:
-        """Return what was seen."""
-        return {"seen": self._seen}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._seen[:] = state["seen"]
-
-    def ask(self, i: int, mode: int) -> None:
-        """Note that a drone was asked to enter a mode: that is no mishap."""
+    def note_command(self, i: int, mode: int) -> None:
+        """Note that a drone was commanded to enter a mode: that is no incident."""
         self._seen[i, SEEN.mode] = mode
 
-    def look(self) -> bool:
-        """Compare the drones with what was seen at the last gate; return whether anything befell one."""
-        return find(self._held, self._change_m_s, self._quiet_gates) > 0
-
-    def mishaps(self, touching: NDArray[np.bool_]) -> list[Mishap]:
-        """Return what befell drones in the last gate; `touching` (N,) are those whose hulls touch another body."""
+    def incidents(self) -> list[Incident]:
+        """Return the incidents of the last gate."""
         found = []
         for i in np.flatnonzero(self._found).tolist():
-            bits, name = int(self._found[i]), self._names[i]
+            bits, name, seen = int(self._found[i]), self._names[i], self._seen[i]
             if bits & EMPTY:
-                found.append(Mishap(i, "battery", f"{name} has no charge left", {"charge_percent": 0.0}))
+                found.append(Incident(i, "battery", f"{name} has no charge left", {"charge_percent": 0.0}))
             if bits & MODE:
                 found.append(self._own_mode(i, name))
             if bits & FLIP:
-                found.append(Mishap(i, "flip", f"{name} turns upside down", {}))
+                found.append(Incident(i, "flip", f"{name} turns upside down", {}))
             if bits & IMPACT:
-                speed_m_s, what = float(self._seen[i, SEEN.speed]), "another body" if touching[i] else "the ground"
-                data = {"speed_m_s": round(speed_m_s, 3), "other": what}
-                found.append(Mishap(i, "impact", f"{name} hits {what} at {speed_m_s:.1f} m/s", data))
+                speed_m_s, other = float(seen[SEEN.speed]), self._others[int(seen[SEEN.touched])]
+                data = {"speed_m_s": round(speed_m_s, 3), "other": other}
+                found.append(Incident(i, "impact", f"{name} hits {other} at {speed_m_s:.1f} m/s", data))
+            if bits & TOUCHDOWN:
+                other = self._others[int(seen[SEEN.surface])]
+                text = f"{name} touches {other} in flight: nobody has commanded a landing"
+                found.append(Incident(i, "touchdown", text, {"other": other}))
         return found
 
-    def _own_mode(self, i: int, name: str) -> Mishap:
+    def _own_mode(self, i: int, name: str) -> Incident:
         """Return the mode that the firmware of a drone entered by itself, with its reason."""
-        if self._memory[i, MEMORY.mode] == EMERGENCY:
-            tilt_deg = math.degrees(math.acos(self._setting[i, SETTING.tilt_cut]))
+        if self._boards.memory[i, MEMORY.mode] == EMERGENCY:
+            tilt_deg = math.degrees(math.acos(self._boards.setting[i, SETTING.tilt_cut]))
             text = f"{name} stops its rotors: it finds itself tilted by more than {tilt_deg:.0f} deg"
-            return Mishap(i, "emergency", text, {"cause": "tilt"})
+            return Incident(i, "emergency", text, {"cause": "tilt"})
         charge = 100.0 * float(self._bodies.energy[i] / self._bodies.vehicle[i, VEHICLE.capacity])
-        if charge < self._setting[i, SETTING.low_battery]:
+        if charge < self._boards.setting[i, SETTING.low_battery]:
             data = {"cause": "battery", "charge_percent": round(charge, 2)}
-            return Mishap(i, "landing", f"{name} lands by itself: it has {charge:.1f} % of charge", data)
-        return Mishap(i, "landing", f"{name} lands by itself: nobody has commanded it for long", {"cause": "silence"})
+            return Incident(i, "landing", f"{name} lands by itself: it has {charge:.1f} % of charge", data)
+        return Incident(i, "landing", f"{name} lands by itself: nobody has commanded it for long", {"cause": "silence"})
 
 
-@kernel()
-def find(held: Held, change_m_s: float, quiet_gates: int) -> int:
-    """Set what befell each of N drones since the last call (bits, (N,)); return how many it befell.
-
-    Args:
-        held: WatchedArrays, by `hold`.
-        change_m_s: greatest change of velocity over a gate without an impact.
-        quiet_gates: after an impact, gates in which no other one is found.
-    """
-    state, memory, energy, seen, found = held.content
-    count = 0
+@inlined
+def watch(bodies: Bodies, memory: NDArray, watched: Watched, step: int) -> None:
+    """Add the incidents (bits) of N drones in a step of the firmware to those of the gate; `step` counts them."""
+    seen, found = watched
+    oldest = SEEN.v_WB + 3 * (step % IMPACT_STEPS)
     for i in range(found.size):
-        found[i] = 0
         if seen[i, SEEN.external] != 0.0:
             continue
         bits, mode = 0, memory[i, MEMORY.mode]
@@ -151,7 +123,8 @@ def find(held: Held, change_m_s: float, quiet_gates: int) -> int:
             seen[i, SEEN.mode] = mode
             if mode in (EMERGENCY, LANDING):
                 bits |= MODE
-        x, y = state[i, STATE.q_WB + 1], state[i, STATE.q_WB + 2]
+        bits |= _touchdown(bodies, seen, i, mode)
+        x, y = bodies.state[i, STATE.q_WB + 1], bodies.state[i, STATE.q_WB + 2]
         up = 1.0 - 2.0 * (x * x + y * y)
         if up < 0.0 and seen[i, SEEN.flipped] == 0.0:
             seen[i, SEEN.flipped] = 1.0
@@ -160,22 +133,62 @@ def find(held: Held, change_m_s: float, quiet_gates: int) -> int:
             seen[i, SEEN.flipped] = 0.0
         change, former = 0.0, 0.0
         for k in range(3):
-            was, now = seen[i, SEEN.v_WB + k], state[i, STATE.v_WB + k]
+            was, now = seen[i, oldest + k], bodies.state[i, STATE.v_WB + k]
             change += (now - was) * (now - was)
             former += was * was
-            seen[i, SEEN.v_WB + k] = now
-        former = math.sqrt(former)
+            seen[i, oldest + k] = now
         if seen[i, SEEN.quiet] > 0.0:
             seen[i, SEEN.quiet] -= 1.0
-        elif change > change_m_s * change_m_s:
-            seen[i, SEEN.speed] = max(seen[i, SEEN.speed], former)
-            seen[i, SEEN.quiet] = quiet_gates
+        elif change > IMPACT_M_S * IMPACT_M_S:
+            seen[i, SEEN.speed], seen[i, SEEN.quiet] = math.sqrt(former), QUIET_STEPS
             bits |= IMPACT
-        if seen[i, SEEN.quiet] <= 0.0:
-            seen[i, SEEN.speed] = former
-        if energy[i] <= 0.0 and seen[i, SEEN.empty] == 0.0:
+        if bodies.energy[i] <= 0.0 and seen[i, SEEN.empty] == 0.0:
             seen[i, SEEN.empty] = 1.0
             bits |= EMPTY
-        found[i] = bits
-        count += bits != 0
-    return count
+        found[i] |= bits
+
+
+@inlined
+def _touchdown(bodies: Bodies, seen: NDArray, i: int, mode: float) -> int:
+    """Note what drone i touches; return TOUCHDOWN where it is in flight and touches the ground or a solid at first."""
+    if bodies.braced[i] == 0 and bodies.state[i, STATE.p_WB + 2] > bodies.vehicle[i, VEHICLE.contact_reach]:
+        seen[i, SEEN.airborne], seen[i, SEEN.grounded] = 1.0, 0.0
+        return 0
+    surface = _surface(bodies, i)
+    touched, obstacles = surface, bodies.obstacle.shape[0]
+    if bodies.braced[i] != 0:
+        for m in range(obstacles):
+            if bodies.bumping[i, m] != 0:
+                touched = FIRST_OBSTACLE + m
+        for j in range(bodies.state.shape[0]):
+            if bodies.touching[min(i, j), max(i, j)] != 0:
+                touched = FIRST_OBSTACLE + obstacles + j
+    if touched != NOTHING:
+        seen[i, SEEN.touched] = touched
+    if surface == NOTHING:
+        return 0
+    left = mode == TAKING_OFF and seen[i, SEEN.airborne] != 0.0  # until then it may stand
+    seen[i, SEEN.airborne] = 0.0
+    if seen[i, SEEN.grounded] != 0.0 or not (left or mode in (HOVERING, FLYING)):
+        return 0
+    seen[i, SEEN.grounded], seen[i, SEEN.surface] = 1.0, surface
+    return TOUCHDOWN
+
+
+@inlined
+def _surface(bodies: Bodies, i: int) -> int:
+    """Return whether any contact point of drone i is in the ground, or a foot in an obstacle: see NOTHING."""
+    row, state = bodies.vehicle[i], bodies.state[i]
+    p_WB, q_WB = vector(state, STATE.p_WB), four(state, STATE.q_WB)
+    if p_WB[2] <= row[VEHICLE.contact_reach]:
+        for k in range(POINTS):
+            if p_WB[2] + rotate(q_WB, contact_point(row, k))[2] < 0.0:
+                return GROUND
+    for s in range(bodies.solid.shape[1]):
+        m = bodies.solid[i, s]
+        if m >= 0:
+            for k in range(FEET):
+                x = add(p_WB, rotate(q_WB, contact_point(row, k)))
+                if nearest(bodies.obstacle[m], x[0], x[1], x[2])[0] < 0.0:
+                    return FIRST_OBSTACLE + m
+    return NOTHING

@@ -10,6 +10,7 @@ from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario import obstacle
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.vehicles.vehicle import Vehicle
+from zsim_world.fleet.flight_watch import SEEN
 from zsim_world.physics import rigid_body
 from zsim_world.physics.air import WIND
 from zsim_world.physics.ground import contact_points
@@ -31,6 +32,7 @@ from zsim_world.state.fleet_arrays import (
     NearPairs,
     NoiseRows,
     Senses,
+    Watched,
     aero_row,
     rotor_row,
     rotor_slots,
@@ -55,7 +57,9 @@ def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensor
     numbers = NoiseRows(table=noise.table, at=noise.at, width=noise.width, cursor=noise.cursor)
     bodies, boards = _bodies(scenario, row, rotors, dt), _boards(scenario, vehicles, row, rotors)
     senses = _senses(scenario, sensors, noise)
-    return Arrays(time, bodies, boards, numbers, senses, _wind(scenario), noise.gust)
+    watched = Watched(seen=np.zeros((len(drones), SEEN.size)), found=np.zeros(len(drones), dtype=np.int64))
+    watched.seen[bodies.external, SEEN.external] = 1.0
+    return Arrays(time, bodies, boards, numbers, senses, _wind(scenario), noise.gust, watched)
 
 
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:

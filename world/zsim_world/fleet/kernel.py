@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import Held, apart, inlined, kernel
 from zsim.math.rotation import norm
+from zsim_world.fleet.flight_watch import watch
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.air import WIND, blow
 from zsim_world.physics.contacts import meet_drones
@@ -259,26 +260,27 @@ def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
 
 
 @kernel()
-def advance(held: Held, ticks: int) -> tuple[int, float, int]:
+def advance(held: Held, ticks: int) -> tuple[int, float, int, bool]:
     """Integrate so many physics ticks; 0 ticks: take the samples of the present instant.
 
     Args:
         held: the arrays, by `zsim.math.compiled.hold`.
 
     Returns:
-        number of samples logged, least distance of two drones [m], diverged drone or -1.
+        number of samples logged, least distance of two drones [m], diverged drone or -1, whether there was an incident.
     """
     return _advance(held.content, ticks)
 
 
 @inlined
-def _advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
+def _advance(w: Arrays, ticks: int) -> tuple[int, float, int, bool]:
     """Do as `advance` says."""
-    time, bodies, boards, noise, senses, wind, gust = w
+    time, bodies, boards, noise, senses, wind, gust, watched = w
     clock, device = time.clock, boards.device
     logged, least = 0, math.inf
     bodies.touched.fill(0)
     bodies.bumped.fill(0)
+    watched.found.fill(0)
     senses.exposed_count[0] = 0
     line_up(bodies)
     for _ in range(max(ticks, 1)):
@@ -295,5 +297,10 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
         least = min(least, _meet(wind, gust, bodies))
         if step:
             accelerate(bodies)
+            if ticks > 0:
+                watch(bodies, boards.memory, watched, clock[CLOCK.tick] // clock[CLOCK.ticks_per_step])
         logged = _sense(clock[CLOCK.tick], step, logged, bodies, device, noise, senses)
-    return logged, least, _diverged(bodies.state)
+    incidents = 0
+    for i in range(watched.found.size):
+        incidents |= watched.found[i]
+    return logged, least, _diverged(bodies.state), incidents != 0

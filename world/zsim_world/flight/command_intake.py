@@ -19,6 +19,9 @@ from zsim_world.flight.command_queue import CommandQueue, QueuedCommand
 from zsim_world.flight.run_clock import Operation, RunClock, number, refused_argument
 from zsim_world.flight.run_outbox import Refusal, RunOutbox, too_many
 
+MISSION_STATES = ("active", "finished", "aborted")
+MISSION_ITEMS_MAX, MISSION_REASON_MAX = 1_000_000, 80  # chosen: far more than autopilots keep; a line
+
 LinkFaultsAt = Callable[[int], Sequence[Fault]]
 """Returns the faults of links and radios that act in a gate."""
 
@@ -226,7 +229,7 @@ class CommandIntake:
 
     def operations(self) -> dict[str, Operation]:
         """Return what each `op` on `world/control` that is about commanders does."""
-        return {"acquire": self._acquire, "release": self._release}
+        return {"acquire": self._acquire, "release": self._release, "mission": self._report_mission}
 
     def _acquire(self, request: ControlRequest) -> Refusal | None:
         index, priority = self._requested(request), number(request.args.get("priority", 0))
@@ -246,6 +249,23 @@ class CommandIntake:
         if refusal is None:
             self._release_drone(index)
         return refusal
+
+    def _report_mission(self, request: ControlRequest) -> Refusal | None:
+        """Publish how far a mission was flown by whoever commands a drone."""
+        args, index = request.args, self._requested(request)
+        if index is None:
+            return refused_argument(request, "drone", f"one of {', '.join(self._index)}")
+        if args.get("state") not in MISSION_STATES:
+            return refused_argument(request, "state", f"one of {', '.join(MISSION_STATES)}")
+        for name in ("items", "done"):
+            if type(args.get(name)) is not int or not 0 <= args[name] <= MISSION_ITEMS_MAX:
+                return refused_argument(request, name, f"a whole number from 0 to {MISSION_ITEMS_MAX}")
+        drone, reason = self.fleet.names[index], str(args.get("reason", ""))[:MISSION_REASON_MAX]
+        data = {name: args[name] for name in ("state", "items", "done")}
+        data |= {"reason": reason, "failsafe": args.get("failsafe") is True}
+        text = f"{drone}: mission {data['state']}, {data['done']} of {data['items']} items flown"
+        self.outbox.notice("mission", drone, f"{text}: {reason}" if reason else text, data, request.source)
+        return None
 
     def _requested(self, request: ControlRequest) -> int | None:
         name = request.args.get("drone")

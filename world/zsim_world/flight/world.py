@@ -202,7 +202,7 @@ class World(Coordinator):
             self.clock.advance(self.fleet.t_ns)
             self.statistics.separation(self.fleet.closest_m())
             self._publish_collisions()
-            self._publish_mishaps()
+            self._publish_incidents()
         self._publish_gate(gate, wall_ns)
         if self.now_ns >= self._last_ns:
             self.clock.complete(DURATION_OVER)
@@ -234,8 +234,8 @@ class World(Coordinator):
             name, other = self.names[i], self.scenario.environment.obstacles[m].name
             self.outbox.notice("collision", name, f"{name} runs into {other}", {"other": other})
 
-    def _publish_mishaps(self) -> None:
-        for each in self.fleet.mishaps():
+    def _publish_incidents(self) -> None:
+        for each in self.fleet.incidents():
             data = {**each.data, "commander": self.queue.commanders()[each.drone]}
             self.outbox.notice(each.kind, self.names[each.drone], each.text, data)
 

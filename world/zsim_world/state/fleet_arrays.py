@@ -184,6 +184,13 @@ class Senses(NamedTuple):
     exposed: NDArray  # (user samples, EXPOSED.size)
 
 
+class Watched(NamedTuple):
+    """What is kept of N drones to find their incidents, see fleet/flight_watch.py."""
+
+    seen: NDArray  # (N, flight_watch.SEEN.size)
+    found: NDArray  # int64 (N,), bits of the incidents of each in the last gate
+
+
 class Arrays(NamedTuple):
     """All that a fleet is."""
 
@@ -194,6 +201,7 @@ class Arrays(NamedTuple):
     senses: Senses
     wind: NDArray  # (air.WIND.size,)
     gust: NDArray  # (N, 3), m/s
+    watched: Watched
 
 
 def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:

@@ -12,13 +12,13 @@ EVENTS_KEPT = 200  # the newest, each by itself
 ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # of unequal events; of the console's own requests
 OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds by which an operator's request is answered
 ALL, OWN = "all", "own actions"
-FALLS = frozenset({"emergency", "flip", "impact", "battery"})  # what befell a drone
+INCIDENTS = frozenset({"emergency", "flip", "impact", "touchdown", "battery"})  # of drones
 KINDS: dict[str, frozenset[str]] = {
     ALL: frozenset(),
     OWN: frozenset(),
     "refused": frozenset({"refused"}),
-    "faults": frozenset({"fault", "fault_end", "fault_clear", "collision", "diverged", *FALLS}),
-    "flight": frozenset({"mode", "state", "commander", "release", "collision", "landing", *FALLS}),
+    "faults": frozenset({"fault", "fault_end", "fault_clear", "collision", "diverged", *INCIDENTS}),
+    "flight": frozenset({"mode", "state", "commander", "release", "collision", "landing", "mission", *INCIDENTS}),
     "processes": frozenset(
         {
             "join",

@@ -5,7 +5,7 @@ Source of the items: https://mavlink.io/en/messages/common.html#mav_commands and
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.autopilot import ned_axes
@@ -53,6 +53,23 @@ class PlanItem(NamedTuple):
         return bool(self.x or self.y) and math.isfinite(self.x) and math.isfinite(self.y)
 
 
+class MissionReport(NamedTuple):
+    """How far a mission was flown, for the record of the run.
+
+    Attributes:
+        items: of the mission, without ArduPilot's item 0.
+        done: how many of them were flown.
+        reason: why it was aborted, "" where it was not.
+        failsafe: whether the vehicle itself aborted it, and no client.
+    """
+
+    state: Literal["active", "finished", "aborted"]
+    items: int
+    done: int
+    reason: str = ""
+    failsafe: bool = False
+
+
 class MissionStep(NamedTuple):
     """What a mission asks for now."""
 
@@ -88,6 +105,7 @@ class Mission:
     Attributes:
         items: of the mission, without ArduPilot's item 0.
         reached: numbers of items that have been reached, to be reported.
+        reports: of how far it was flown, to be sent to the world.
     """
 
     def __init__(self, first: int = 0, turns: bool = True) -> None:
@@ -95,6 +113,8 @@ class Mission:
         self._turns = turns
         self.items: list[PlanItem] = []
         self.reached: list[int] = []
+        self.reports: list[MissionReport] = []
+        self._reported: int | None = None  # how many items were flown at the last report; None while it is not flown
         self._index = 0
         self._since_ns: int | None = None  # at this item
         self._speed_m_s: float | None = None
@@ -110,6 +130,36 @@ class Mission:
         """Replace the items, and begin anew."""
         self.items = list(items)
         self.rewind()
+
+    @property
+    def is_landing(self) -> bool:
+        """Whether the present item ends on the ground."""
+        item = self.items[self._index] if self._index < len(self.items) else None
+        return item is not None and item.command in (Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH)
+
+    def start(self) -> None:
+        """Report that it is flown from now on, unless it is flown already."""
+        if self._reported is None:
+            self._reported = self._index
+            self.reports.append(MissionReport("active", len(self.items), self._index))
+
+    def note_progress(self) -> None:
+        """Report what more of it has been flown; a jump back is none."""
+        if self._reported is not None and self._index > self._reported:
+            self._reported = self._index
+            self.reports.append(MissionReport("active", len(self.items), self._index))
+
+    def finish(self) -> None:
+        """Report that all of it has been flown."""
+        if self._reported is not None:
+            self.reports.append(MissionReport("finished", len(self.items), len(self.items)))
+            self._reported = None
+
+    def abort(self, reason: str, failsafe: bool) -> None:
+        """Report that it is flown no longer, unless it has ended already."""
+        if self._reported is not None:
+            self.reports.append(MissionReport("aborted", len(self.items), self._reported, reason, failsafe))
+            self._reported = None
 
     def rewind(self) -> None:
         """Go back to the first item."""

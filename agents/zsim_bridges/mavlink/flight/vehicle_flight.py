@@ -53,6 +53,7 @@ class Flight:
         self._stream = SetpointStream(settings, state)
         self._return = ReturnCourse(settings, state, self._control)
         self.mode = personality.first_mode
+        self._mission_returns = False  # that its return is an item of the mission
         self.mission = Mission(first=0 if personality.needs_stream else 1, turns=personality.needs_stream)
 
     # What clients ask
@@ -105,6 +106,7 @@ class Flight:
 
     def terminate(self) -> None:
         """Stop the rotors at once, whoever flies it."""
+        self.mission.abort("a client stopped its rotors", failsafe=False)
         self._output.mode("emergency")
         self._stand("Emergency: rotors stopped")
 
@@ -180,6 +182,7 @@ class Flight:
     def step(self) -> None:
         """Do what is due at a gate, after the state has been updated."""
         self._output.advance(self._state.t_ns)
+        self._follow_mission()
         self._follow_drone()
         if self.foreign_commander:
             self._control.let_go()
@@ -190,14 +193,26 @@ class Flight:
         elif self._control.is_takeoff_overdue():
             self._control.let_go()
             self._report(Severity.ERROR, "Take-off refused by the drone")
+            self.mission.abort("the drone refused the take-off", failsafe=True)
+
+    def _follow_mission(self) -> None:
+        """Notice what has been flown of the mission, and that a client has chosen another mode."""
+        self.mission.note_progress()
+        if self.mode is not FlightMode.MISSION and not (self.mode is FlightMode.RETURN and self._mission_returns):
+            self.mission.abort(f"a client chose {self.mode.name}", failsafe=False)
 
     def _follow_drone(self) -> None:
         """Notice what the drone does of itself."""
         state, airborne = self._state.state, self._state.is_airborne
         if state == "emergency":
+            self.mission.abort("its rotors were stopped", failsafe=True)
             self._control.let_go()
             self._is_armed = False
         elif self._was_airborne and not airborne:
+            if self.mission.is_landing:
+                self.mission.finish()
+            else:
+                self.mission.abort("it landed by itself", failsafe=True)
             self._stand("Landed; disarmed")
         elif self._is_armed and not airborne and not self._control.is_asking:
             self._disarm_idle()
@@ -209,6 +224,7 @@ class Flight:
     def _disarm_idle(self) -> None:
         delay_s = self._settings["disarm_s"]
         if delay_s > 0 and self._state.t_ns - self._armed_ns > delay_s * 1e9:
+            self.mission.abort("no take-off", failsafe=True)
             self._stand("Disarmed: no take-off")
 
     def _fly(self) -> None:
@@ -239,10 +255,12 @@ class Flight:
             self._control.climb(step.climb_to_m)
         elif step.returns:
             self._enter(FlightMode.RETURN)
+            self._mission_returns = True
         elif step.target is not None and step.target != self.target:
             self._control.hold(step.target)
         if step.is_over:
             self._report(Severity.INFO, "Mission finished")
+            self.mission.finish()
             self._enter(FlightMode.HOLD)
 
     def _watch_stream(self) -> None:
@@ -266,7 +284,7 @@ class Flight:
             return "no mission"
         if mode is FlightMode.TAKEOFF:
             return self.take_off(self._settings["takeoff_altitude_m"])
-        self.mode = mode
+        self.mode, self._mission_returns = mode, False
         self._return.rewind()
         if self._state.is_airborne:
             self._is_armed = True
@@ -276,6 +294,8 @@ class Flight:
         return None
 
     def _begin_in_air(self, mode: FlightMode) -> None:
+        if mode is FlightMode.MISSION:
+            self.mission.start()
         if mode is FlightMode.LAND:
             self._control.ask("land")
         elif mode in HOLDING or (mode is FlightMode.OFFBOARD and not self._personality.needs_stream):
@@ -284,6 +304,7 @@ class Flight:
             self._control.stop_climb()
 
     def _begin_mission_on_ground(self) -> None:
+        self.mission.start()
         z_m = self.mission.takeoff_height_m(self._state)
         self._control.climb(self._state.home_z_m + self._settings["takeoff_altitude_m"] if z_m is None else z_m)
 

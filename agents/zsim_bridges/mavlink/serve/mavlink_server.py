@@ -5,6 +5,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
@@ -28,6 +29,7 @@ from zsim_bridges.vehicle_links.command_sender import CommandSender
 from zsim_bridges.vehicle_links.run_pace import set_pace
 
 POLL_S = 0.1  # how often a stop is looked for
+ANSWER_S = 1.0  # wall time for which an answer of the world is waited for, aside from the traffic
 TICK_S = 0.1  # wall time between two looks at what wall time brings
 SWITCH_S = 5e-4  # s after which the thread that takes in a gate lets a setpoint pass; Python's own is 5 ms
 SYSTEM_IDS = 254  # 255 is the ground station's by custom
@@ -105,6 +107,7 @@ class MavlinkServer:
         self._options = options
         self._signing = Signing(options.key) if options.key else None
         self._counted: dict[str, int] = {}
+        self._requests = ThreadPoolExecutor(1)  # one after the other
         drones = scenario_file.from_text(info.scenario).drones
         if len(drones) > SYSTEM_IDS:
             raise RunError(f"{observer.name}: the run has {len(drones)} drones; MAVLink has {SYSTEM_IDS} system ids")
@@ -148,6 +151,7 @@ class MavlinkServer:
                 self._observer.tick()
         finally:
             ticking.cancel()
+            self._requests.shutdown(wait=False, cancel_futures=True)
             intake.close()
             for served in self._served.values():
                 served.ports.close(loop)
@@ -175,8 +179,17 @@ class MavlinkServer:
                     self._on_event(payload)
         for served in self._updated(newest):
             served.vehicle.step()
+            self._report_mission(served)
             self._flush(served)
             await asyncio.sleep(0)  # setpoints that have come meanwhile go first
+
+    def _report_mission(self, served: Served) -> None:
+        """Let the world know how far a mission was flown, so that the record has it; no gate waits for it."""
+        vehicle = served.vehicle
+        for report in vehicle.flight.mission.reports:
+            args = {"drone": vehicle.name, **report._asdict()}
+            self._requests.submit(self._link.request, keys.CONTROL, "mission", self._observer.name, args, ANSWER_S)
+        vehicle.flight.mission.reports.clear()
 
     def _updated(self, newest: dict[str, bytes]) -> list[Served]:
         """Bring the states of the drones up to date; return those that have reached a gate."""

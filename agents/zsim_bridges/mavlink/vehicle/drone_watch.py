@@ -1,4 +1,4 @@
-"""What a pilot is told of a drone: sensors, battery, fence, faults, refusals, collisions."""
+"""What is reported to the pilot of a drone: sensors, battery, fence, faults, refusals, collisions."""
 
 from zsim.contract.run_messages import Event
 from zsim_bridges.mavlink.autopilot.enums import Severity
@@ -44,8 +44,8 @@ class DroneWatch:
         if event.kind in FAULTS and event.data.get("target") == self._drone:
             severity = Severity.CRITICAL if event.kind == "fault" else Severity.NOTICE
             self._report(severity, f"Fault {event.data.get('kind')}{FAULTS[event.kind]}")
-        elif event.kind == "collision" and self._drone in (event.subject, *map(str, event.data.values())):
-            self._report(Severity.CRITICAL, "Collision")
+        elif event.kind == "collision" and self._drone in (pair := (event.subject, event.data.get("other"))):
+            self._report(Severity.CRITICAL, f"Collision with {pair[1] if pair[0] == self._drone else pair[0]}")
         elif self._is_refusal(event):
             self._report(Severity.WARNING, f"Refused: {event.data.get('reason', event.text)}")
 
@@ -85,5 +85,6 @@ class DroneWatch:
             seen.breach_ns = seen.state.t_ns
             self._report(Severity.CRITICAL, f"Geofence breached: {action.name.lower()}")
             if action in MODE_OF and not seen.flight.foreign_commander:
+                seen.flight.mission.abort("it left its geofence", failsafe=True)
                 seen.flight.set_mode(MODE_OF[action])
         seen.breach = breach

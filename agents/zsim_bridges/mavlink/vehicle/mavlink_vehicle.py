@@ -54,12 +54,13 @@ class MavlinkVehicle:
         options: how it shows itself.
 
     Attributes:
+        name: of the drone.
         state: of the drone, to be kept up to date.
         outbox: messages for its clients, to be taken.
     """
 
     def __init__(self, drone: Drone, origin: Origin, sender: CommandSender, options: Options) -> None:
-        self._drone = drone
+        self._drone, self.name = drone, drone.name
         self._options = options
         person = options.personality
         self.outbox: list[WireMessage] = []
@@ -236,6 +237,7 @@ class MavlinkVehicle:
 
     def _on_mission(self, type_: int, items: list[PlanItem]) -> None:
         if type_ == MISSION:
+            self.flight.mission.abort("a client replaced it", failsafe=False)
             self.flight.mission.load(items)
         elif type_ == FENCE:
             self._fence.load(items, self.state)

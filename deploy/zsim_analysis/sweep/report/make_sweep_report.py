@@ -176,7 +176,8 @@ def overview(point: GridPoint) -> list[str]:
     engaged = "–" if point.engaged is None else str(point.engaged)
     well, planned, apart = map(_share, (point.ended_well, point.as_planned, point.without_collision))
     mean = _noted(_spread(separation), point.count("min_separation_m"))
-    return [str(point.runs), well, planned, engaged, apart, mean, least]
+    excluded = f"{point.excluded} excluded" if point.excluded else ""
+    return [str(point.runs), well, _noted(planned, excluded), engaged, apart, mean, least]
 
 
 def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: dict[str, float]) -> list[list[str]]:

@@ -94,14 +94,14 @@ def overview(summary: SweepSummary) -> PointTable:
     columns = (
         _column(summary, "runs", lambda point: str(point.runs)),
         _column(summary, "ended well", lambda point: _percent(point.ended_well)),
-        _column(summary, "as planned", lambda point: _percent(point.as_planned)),
+        _column(summary, "as planned", _planned),
         _column(summary, "engaged", lambda point: "–" if point.engaged is None else str(point.engaged)),
         _column(summary, "no collision", lambda point: _percent(point.without_collision)),
         _column(summary, "separation (m)", lambda point: _mean(point, "min_separation_m", 2)),
         _column(summary, "least (m)", _least),
     )
     intervals = f"{100 * summary.level:g} % intervals are in the report"
-    caption = f"separation: mean of the runs as planned, least of all; {intervals}\n"
+    caption = f"means are of the runs as planned, not of those excluded; least of all; {intervals}\n"
     return PointTable(title, caption, columns)
 
 
@@ -114,7 +114,7 @@ def errors(summary: SweepSummary) -> PointTable:
         _column(summary, each.name, lambda point, prefix=prefix: _mean(point, f"{prefix}.true_rms"))
         for prefix, each in names.items()
     ]
-    title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs"
+    title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs as planned"
     return PointTable(title, "in m; angles in rad\n", tuple(columns))
 
 
@@ -125,7 +125,7 @@ def own_figures(summary: SweepSummary) -> PointTable:
         for name in summary.metrics
         if name in summary.known
     ]
-    return PointTable("Figures of your own, means over the runs", "", tuple(columns))
+    return PointTable("Figures of your own, means over the runs as planned", "", tuple(columns))
 
 
 def differences(summary: SweepSummary) -> PointTable:
@@ -159,6 +159,11 @@ def _column(summary: SweepSummary, head: str, text: Callable[[GridPoint], str]) 
 
 def _percent(share: ConfidenceInterval | None) -> str:
     return "–" if share is None else f"{100 * share.value:.3g} %"
+
+
+def _planned(point: GridPoint) -> str:
+    excluded = f" ({point.excluded} excluded)" if point.excluded else ""
+    return f"{_percent(point.as_planned)}{excluded}"
 
 
 def _mean(point: GridPoint, column: str, digits: int = 3) -> str:

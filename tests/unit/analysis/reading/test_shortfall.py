@@ -25,7 +25,7 @@ from zsim_agents.formation.trajectory import WaypointTrajectory
 from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.reading.shortfall import Shortfall, shortfalls
+from zsim_analysis.reading.shortfall import CRASHES, Shortfall, shortfalls
 from zsim_analysis.reading.verdict import NOT_AS_PLANNED, marks_of, verdict
 from zsim_analysis.report.figures.figure_mark import mark_figure
 from zsim_analysis.report.figures.report_figures import figures
@@ -184,10 +184,20 @@ def test_the_mark_of_a_figure_is_whole_and_covers_nothing(reason: str) -> None:
         assert middle.y0 >= below.y1
 
 
-def test_a_collision_is_one() -> None:
-    contacts = [Event(k * 10**9, k, "collision", "world", "drone1", "drone1 and drone2 collide") for k in (7, 8)]
-    (line,) = found(lambda t_s: {"phase": "engaged"}, events=contacts)
-    assert (line.kind, line.t_s, line.fails) == ("collision", 7.0, True)
+def test_a_collision_is_one_of_each_pair_with_both_names() -> None:
+    contacts = numbered(
+        event(7, "collision", "drone1", other="drone2"),
+        event(8, "collision", "drone2", other="drone1"),
+        event(9, "collision", "drone3", other="drone1"),
+        event(9.5, "collision", "drone3", other="mast"),
+    )
+    lines = found(lambda t_s: {"phase": "engaged"}, events=contacts)
+    assert [(line.kind, line.subject, line.t_s, line.fails) for line in lines] == [
+        ("collision", "drone1, drone2", 7.0, True),
+        ("collision", "drone3, drone1", 9.0, True),
+        ("collision", "drone3, mast", 9.5, True),
+    ]
+    assert has_terms(lines[0].text, "at 7 s", "2 contacts")
 
 
 def event(t_s: float, what: str, subject: str, by: str = "world", /, **data: Any) -> Event:
@@ -213,13 +223,46 @@ def test_a_fall_is_one_line_with_the_drone_the_times_and_the_fault() -> None:
     assert has_terms(line.text, "10.3 s", "10.36 s", "10.5 m/s", "11.86 s", "scenario's", "rotor_efficiency since 10 s")
 
 
+def test_a_touchdown_in_flight_is_one_and_a_crash_of_a_sweep() -> None:
+    touchdown = event(31.5, "touchdown", "drone1", other="the ground", commander="controller.main")
+    (line,) = found(lambda t_s: {"phase": "engaged"}, events=(touchdown,))
+    assert (line.kind, line.subject, line.t_s, line.fails) == ("touchdown", "drone1", 31.5, True)
+    assert has_terms(line.text, "drone1", "the ground", "in flight", "31.5 s")
+    assert "touchdown" in CRASHES
+    impact = event(31.52, "impact", "drone1", other="the ground", speed_m_s=2.0)
+    (line,) = found(lambda t_s: {"phase": "engaged"}, events=(touchdown, impact))
+    assert (line.kind, "in flight" in line.text, "2.0 m/s" in line.text) == ("touchdown", False, True)
+
+
+@pytest.mark.parametrize(
+    ("reports", "fails", "terms"),
+    [
+        ([{"state": "active", "done": 0}, {"state": "finished", "done": 5}], None, ()),
+        ([{"state": "active", "done": 3}], False, ("flew 3 of 5 mission items", "the run ended")),
+        (
+            [{"state": "active", "done": 3}, {"state": "aborted", "done": 3, "reason": "geofence", "failsafe": True}],
+            True,
+            ("flew 3 of 5 mission items", "geofence", "at 11 s"),
+        ),
+        ([{"state": "aborted", "done": 2, "reason": "HOLD", "failsafe": False}], False, ("2 of 5", "HOLD")),
+    ],
+)
+def test_a_mission_that_was_not_flown_to_its_end_is_one_and_fails_by_a_failsafe(
+    reports: list[dict[str, Any]], fails: bool | None, terms: tuple[str, ...]
+) -> None:
+    events = [event(10 + k, "mission", "drone2", "mavlink.main", items=5, **each) for k, each in enumerate(reports)]
+    lines = found(lambda t_s: {"phase": "engaged"}, events=numbered(*events))
+    assert [(line.kind, line.subject, line.fails) for line in lines] == [("mission", "drone2", fails)] * bool(terms)
+    assert all(has_terms(line.text, "drone2", *terms) for line in lines)
+
+
 def test_a_fault_that_is_over_is_not_blamed() -> None:
     over = event(10.2, "fault_end", "drone1", id=1, kind="rotor_efficiency", target="drone1")
     (line,) = found(lambda t_s: {"phase": "engaged"}, events=(FALL[0], over, *FALL[1:]))
     assert "rotor_efficiency" not in line.text
 
 
-def test_an_operator_s_emergency_is_told_as_such_and_is_no_flight_as_planned(tmp_path: Path) -> None:
+def test_an_operator_s_emergency_is_reported_as_such_and_is_no_flight_as_planned(tmp_path: Path) -> None:
     stop = event(21.0, "emergency", "drone2", "console.1", cause="command")
     write(tmp_path / "run.mcap", lambda t_s: {"phase": "engaged"}, numbered(stop))
     summary = judge(tmp_path / "run.mcap")[-1]
@@ -241,15 +284,15 @@ def test_a_landing_that_nobody_asked_for_fails_unless_its_pilot_let_it_be(
     assert (line.kind, line.subject, line.t_s, line.fails) == ("landing", "drone3", 12.0, fails)
 
 
-def test_who_flew_a_drone_by_hand_is_told_and_does_not_fail() -> None:
-    hand = (event(8, "commander", "drone2", "console.1"), event(9.5, "release", "drone2", "console.1"))
-    (line,) = found(lambda t_s: {"phase": "engaged"}, events=hand)
-    assert (line.kind, line.subject, line.fails) == ("hand", "drone2", False)
+def test_who_overrode_the_controller_is_reported_and_does_not_fail() -> None:
+    flown = (event(8, "commander", "drone2", "console.1"), event(9.5, "release", "drone2", "console.1"))
+    (line,) = found(lambda t_s: {"phase": "engaged"}, events=flown)
+    assert (line.kind, line.subject, line.fails) == ("override", "drone2", False)
     assert has_terms(line.text, "console.1", "8 to 9.5 s")
 
 
 @pytest.mark.parametrize(("length_s", "fails"), [(1.0, False), (6.0, True)])
-def test_a_formation_that_a_fault_held_is_told_and_fails_if_it_was_for_long(length_s: float, fails: bool) -> None:
+def test_a_formation_that_a_fault_held_is_reported_and_fails_if_it_was_for_long(length_s: float, fails: bool) -> None:
     def held(t_s: float) -> dict[str, Any]:
         return {"phase": "held", "reason": "drone2 is late"} if 9.99 < t_s < 9.99 + length_s else {"phase": "engaged"}
 
@@ -268,7 +311,7 @@ def test_a_formation_that_a_fault_held_is_told_and_fails_if_it_was_for_long(leng
         ((event(9.9, "commander", "other", "console.1"), event(14, "release", "other", "console.1")), True),
     ],
 )
-def test_a_hold_while_others_fly_or_land_a_drone_of_the_formation_is_told(
+def test_a_hold_while_others_fly_or_land_a_drone_of_the_formation_is_reported(
     events: tuple[Event, ...], fails: bool
 ) -> None:
     def held(t_s: float) -> dict[str, Any]:
@@ -278,7 +321,7 @@ def test_a_hold_while_others_fly_or_land_a_drone_of_the_formation_is_told(
     assert (line.subject, line.fails) == ("main", fails)
 
 
-def test_what_others_asked_of_a_formation_is_told_and_a_hold_on_request_is_no_fault() -> None:
+def test_what_others_asked_of_a_formation_is_reported_and_a_hold_on_request_is_no_fault() -> None:
     def state(t_s: float) -> dict[str, Any]:
         return {"phase": "held", "reason": HELD_ON_REQUEST} if t_s > 20 else {"phase": "engaged"}
 
@@ -299,7 +342,7 @@ TRAJECTORY = (
 )
 
 
-def test_a_trajectory_that_was_interrupted_is_told_with_all_that_was_flown() -> None:
+def test_a_trajectory_that_was_interrupted_is_reported_with_all_that_was_flown() -> None:
     led = along(10.0)
 
     def broken(t_s: float) -> dict[str, Any]:
@@ -343,7 +386,7 @@ def test_a_trajectory_that_was_left_is_one_unless_others_asked_for_it() -> None:
     assert {line.kind: line.fails for line in shortfalls(flight, (4.0, 30.0))} == {"plan": False, "request": False}
 
 
-def test_a_run_that_ends_within_its_trajectory_is_told() -> None:
+def test_a_run_that_ends_within_its_trajectory_is_reported() -> None:
     (line,) = found(along(10.0), overrides=TRAJECTORY, duration_s=14.0)
     assert (line.kind, line.fails) == ("early", False)
     assert "4 of 10 s" in line.text

@@ -21,7 +21,7 @@ from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.report.field_names import field_name
-from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report, without_data
+from zsim_analysis.sweep.report.make_sweep_report import OVERVIEW, make_sweep_report, overview, without_data
 from zsim_analysis.sweep.report.sweep_figures import BEYOND_AXIS, NEVER_AS_PLANNED, figures, slices
 from zsim_analysis.sweep.report.terminal_tables import terminal_text
 from zsim_analysis.sweep.sweep_folder import locked, read_table
@@ -246,10 +246,10 @@ def beyond(axes: Axes) -> list[tuple[str, float]]:
 def test_a_mean_does_not_profit_from_runs_that_fell_or_were_not_flown(tmp_path: Path) -> None:
     """Four of ten runs fall in the same way, at other times: they err by less and keep farther apart."""
     of = plan("seed", runs=10)
-    rows = [
-        {**well(of, run), "errors.x_c.true_rms": 0.2, "min_separation_m": 3.0, "as_planned": True} for run in range(6)
-    ]
-    fall = {"as_planned": False, "crashed": True, "errors.x_c.true_rms": 0.1, "min_separation_m": 9.0}
+    flown = {"errors.x_c.true_rms": 0.2, "min_separation_m": 3.0, "metrics.effort": 2.0, "as_planned": True}
+    rows = [{**well(of, run), **flown} for run in range(6)]
+    better = {"errors.x_c.true_rms": 0.1, "min_separation_m": 9.0, "metrics.effort": 1.0}
+    fall = {"as_planned": False, "crashed": True, **better}
     cut = {"window_note": "The run ended at 60 s, before the window 120 to 320 s."}
     for run in range(6, 10):
         text = f"drone1: emergency at {20 + run}.5 s (tilted too far)"
@@ -260,7 +260,14 @@ def test_a_mean_does_not_profit_from_runs_that_fell_or_were_not_flown(tmp_path: 
     (point,) = summary.points
     assert point.spreads["errors.x_c.true_rms"].mean.value == pytest.approx(0.2)
     assert point.spreads["min_separation_m"].mean.value == pytest.approx(3.0)
-    assert point.count("errors.x_c.true_rms") == "n = 6"
+    effort = point.spreads["metrics.effort"]
+    assert (effort.mean.value, effort.least, effort.p5, effort.median) == (2.0, 2.0, 2.0, 2.0)
+    assert point.count("errors.x_c.true_rms") == point.count("metrics.effort") == "n = 6"
+    assert point.excluded == 4
+    assert "4 excluded" in dict(zip(OVERVIEW, overview(point), strict=True))["as planned"]
+    console = Console(file=io.StringIO(), width=120)
+    console.print(terminal_text(summary))
+    assert "4 excluded" in console.file.getvalue()  # type: ignore[attr-defined]
     assert point.least_separation_m == 1.0
     assert point.without_collision is not None
     assert point.without_collision.value == pytest.approx(0.6)

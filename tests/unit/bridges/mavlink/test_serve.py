@@ -9,9 +9,12 @@ from typing import Any
 
 import pytest
 import typer
+from mavlink_drone import ORIGIN, SCENARIO
 
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import RunError
+from zsim_bridges.mavlink.flight.mission import MissionReport
+from zsim_bridges.mavlink.serve.mavlink_server import MavlinkOptions, MavlinkServer
 from zsim_bridges.mavlink.serve.peers import LEARNT_MAX, SILENT_S, Peers
 from zsim_bridges.mavlink.serve.vehicle_ports import DATAGRAM_MAX, VehiclePort, VehiclePorts
 from zsim_bridges.mavlink.wire import dialect
@@ -119,6 +122,25 @@ def test_a_port_that_is_taken_is_told() -> None:
         port = other.getsockname()[1]
         with pytest.raises(RunError, match=f"127.0.0.1:{port}"):
             VehiclePort(("127.0.0.1", port), GCS, None, lambda _: None)
+
+
+def test_how_far_a_mission_was_flown_is_reported_to_the_world_in_order() -> None:
+    asked: list[tuple[Any, ...]] = []
+    link = SimpleNamespace(request=lambda *arguments: asked.append(arguments), put=lambda *_: None)
+    info = SimpleNamespace(scenario=SCENARIO, origin=ORIGIN)
+    options = MavlinkOptions("px4", "normal", "127.0.0.1", GCS, 0, GCS, 0, None, 2, None)
+    observer: Any = SimpleNamespace(name="mavlink.main")
+    server = MavlinkServer(link, info, observer, lambda _: None, options)  # type: ignore[arg-type]
+    served = server._served["drone1"]
+    reports = [MissionReport("active", 5, 3), MissionReport("aborted", 5, 3, "it left its geofence", failsafe=True)]
+    served.vehicle.flight.mission.reports += reports
+    server._report_mission(served)
+    server._requests.shutdown()
+    for port in served.ports._ports:
+        port._socket.close()
+    assert [(key, op, source) for key, op, source, *_ in asked] == [("world/control", "mission", "mavlink.main")] * 2
+    assert [args for *_, args, _ in asked] == [{"drone": "drone1", **each._asdict()} for each in reports]
+    assert served.vehicle.flight.mission.reports == []
 
 
 def run(mode: str, rate: float) -> Any:

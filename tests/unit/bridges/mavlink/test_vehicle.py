@@ -1,6 +1,7 @@
 """A vehicle as its clients see it: arming, modes, setpoints, missions, fence, parameters, what is refused."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -229,6 +230,73 @@ def test_a_mission_takes_off_visits_its_waypoints_and_lands() -> None:
     drone.until(lambda: drone.state == "landed" and drone.position[1] > 5.0)
     assert [reached.seq for reached in drone.all(dialect.MissionItemReached)] == [1, 3]
     assert abs(drone.position[1] - 8.0) < 1.2
+    drone.step()
+    progress = [(each.state, each.done) for each in drone.vehicle.flight.mission.reports]
+    assert (progress[0], progress[-1]) == (("active", 0), ("finished", 5))
+    assert {each.items for each in drone.vehicle.flight.mission.reports} == {5}
+
+
+def on_mission(*last: dialect.MissionItemInt) -> FlownDrone:
+    """Return a vehicle that flies on to the second of two waypoints, 30 m away, before the last items."""
+    drone = FlownDrone()
+    way = [item(0, Cmd.NAV_TAKEOFF, 0, 3), item(1, Cmd.NAV_WAYPOINT, 2, 4), item(2, Cmd.NAV_WAYPOINT, 30, 4)]
+    assert upload(drone, [*way, *last]) == 0
+    drone.command(Cmd.COMPONENT_ARM_DISARM, 1)
+    assert drone.command(Cmd.MISSION_START, 0, 0) == Result.ACCEPTED
+    drone.until(lambda: bool(drone.all(dialect.MissionItemReached)))
+    drone.step(50)
+    return drone
+
+
+def leave_fence(drone: FlownDrone) -> None:
+    drone.receive(dialect.ParamSet(1, 1, "GF_MAX_HOR_DIST", 5.0, 9))
+    drone.step(500)
+
+
+def land_by_itself(drone: FlownDrone) -> None:
+    drone.state = "landing"
+    drone.until(lambda: drone.state == "landed")
+    drone.step()
+
+
+def stop_rotors(drone: FlownDrone) -> None:
+    drone.state = "emergency"
+    drone.step()
+
+
+def choose_hold(drone: FlownDrone) -> None:
+    set_mode(drone, PX4_MODES[FlightMode.HOLD])
+    drone.step()
+
+
+@pytest.mark.parametrize(
+    ("abort", "reason", "failsafe"),
+    [
+        (leave_fence, "geofence", True),
+        (land_by_itself, "landed by itself", True),
+        (stop_rotors, "rotors", True),
+        (choose_hold, "HOLD", False),
+    ],
+)
+def test_a_mission_that_is_not_flown_to_its_end_is_reported_with_its_progress_and_the_reason(
+    abort: Callable[[FlownDrone], None], reason: str, failsafe: bool
+) -> None:
+    drone = on_mission()
+    abort(drone)
+    last = drone.vehicle.flight.mission.reports[-1]
+    assert (last.state, last.items, last.done, last.failsafe) == ("aborted", 3, 2, failsafe)
+    assert reason in last.reason
+
+
+def test_a_mission_that_a_client_resumes_is_finished_where_its_return_ends_on_the_ground() -> None:
+    drone = on_mission(item(3, Cmd.NAV_RETURN_TO_LAUNCH))
+    choose_hold(drone)
+    assert set_mode(drone, PX4_MODES[FlightMode.MISSION]) == Result.ACCEPTED
+    drone.until(lambda: drone.state == "landed", 20_000)
+    drone.step()
+    reports = drone.vehicle.flight.mission.reports
+    assert [each.state for each in reports if each.state != "active"] == ["aborted", "finished"]
+    assert (reports[-1].state, reports[-1].done) == ("finished", 4)
 
 
 def test_a_mission_is_downloaded_as_it_was_uploaded() -> None:
@@ -374,7 +442,7 @@ def test_events_about_the_drone_are_texts() -> None:
     refused = Event(0, 0, "refused", "mavlink.main", "drone/drone1/cmd/mode", "", {"reason": "it is cold"})
     drone.vehicle.on_event(refused)
     drone.sent += drone.vehicle.take()
-    assert drone.texts()[:2] == ["Fault rotor_efficiency", "Collision"]
+    assert drone.texts()[:2] == ["Fault rotor_efficiency", "Collision with drone2"]
     assert "cold" in drone.texts()[2]
 
 

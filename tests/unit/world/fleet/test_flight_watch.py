@@ -1,4 +1,4 @@
-"""What befalls drones becomes an event with its figures; a flight as usual, with a landing, has none."""
+"""An incident of a drone becomes an event with its figures; a usual flight, with a landing, has none."""
 
 from typing import Any, Literal
 
@@ -17,21 +17,22 @@ def scenario(count: int = 2, drone: Any = None, **top: Any):
     return resolve({"name": "t", "duration_s": 60, "drones": drones, "sensors": {"preset": "paper"}, **top})
 
 
-def befallen(fleet: Fleet, seconds: float) -> list[tuple[str, int, dict[str, Any]]]:
-    """Advance; return kind, drone and data of all that befell drones."""
+def incidents_of(fleet: Fleet, seconds: float) -> list[tuple[str, int, dict[str, Any]]]:
+    """Advance; return kind, drone and data of all incidents."""
     found = []
-    for _ in range(round(seconds * 50)):
+    until_ns = fleet.t_ns + round(seconds * 1e9)
+    while fleet.t_ns < until_ns:
         fleet.advance()
-        found += [(each.kind, each.drone, each.data) for each in fleet.mishaps()]
+        found += [(each.kind, each.drone, each.data) for each in fleet.incidents()]
     return found
 
 
-def airborne(drone: Any = None) -> Fleet:
+def airborne(drone: Any = None, **top: Any) -> Fleet:
     """Return two drones that hover."""
-    fleet = Fleet(scenario(drone=drone))
+    fleet = Fleet(scenario(drone=drone, **top))
     for i in range(fleet.count):
         assert fleet.takeoff(i) is None
-    assert befallen(fleet, 6.0) == []
+    assert incidents_of(fleet, 6.0) == []
     return fleet
 
 
@@ -39,7 +40,7 @@ def test_a_flight_with_a_landing_that_was_asked_for_has_none():
     fleet = airborne()
     for i in range(fleet.count):
         assert fleet.land(i) is None
-    assert befallen(fleet, 8.0) == []
+    assert incidents_of(fleet, 8.0) == []
     assert fleet.status(0)[0] == "landed"
 
 
@@ -50,26 +51,83 @@ def test_a_fall_is_an_impact_at_the_speed_before_it_and_its_bounces_are_none():
     for _ in range(50):
         fastest = max(fastest, float(-fleet.truth().velocity_m_s[1, 2]))
         fleet.advance()
-        found += [(each.kind, each.drone, each.data) for each in fleet.mishaps()]
+        found += [(each.kind, each.drone, each.data) for each in fleet.incidents()]
     ((kind, drone, data),) = found
     assert (kind, drone, data["other"]) == ("impact", 1, "the ground")
     assert data["speed_m_s"] == pytest.approx(fastest, rel=0.1)
 
 
+@pytest.mark.parametrize("gate_ms", [5, 100, 500])
+def test_an_impact_is_found_whatever_the_length_of_a_gate(gate_ms: int):
+    """A gate of 500 ms holds the fall, the impact and its bounces: its mean acceleration tells none of them."""
+    found = {}
+    for gate in (20, gate_ms):
+        fleet = airborne(time={"gate_ms": gate})
+        fleet.emergency(1)
+        found[gate] = incidents_of(fleet, 1.0)
+    ((kind, drone, data),) = found[gate_ms]
+    assert (kind, drone, data["other"]) == ("impact", 1, "the ground")
+    assert data["speed_m_s"] == pytest.approx(found[20][0][2]["speed_m_s"], rel=0.05)
+
+
+def descend(fleet: Fleet, seconds: float) -> list[tuple[str, int, dict[str, Any]]]:
+    """Fly drone 0 down at 0.3 m/s, be there ground or not; return the incidents."""
+    found = []
+    for _ in range(round(seconds)):
+        assert fleet.set_velocity(0, (0.0, 0.0, -0.3)) is None
+        found += incidents_of(fleet, 1.0)
+    return found
+
+
+def test_a_drone_that_is_flown_onto_the_ground_touches_it_in_flight_once_until_it_is_in_the_air_again():
+    fleet = airborne()
+    assert descend(fleet, 6.0) == [("touchdown", 0, {"other": "the ground"})]
+    assert fleet.status(0)[0] == "hovering"  # its commander is silent
+    assert fleet.set_velocity(0, (0.0, 0.0, 0.5)) is None
+    assert incidents_of(fleet, 1.5) == []
+    assert descend(fleet, 6.0) == [("touchdown", 0, {"other": "the ground"})]
+    assert fleet.land(0) is None
+    assert incidents_of(fleet, 4.0) == []
+
+
+def test_a_drone_that_is_flown_onto_an_obstacle_touches_it_in_flight():
+    box = {"name": "box", "shape": "box", "position_m": [10, 0, 0], "size_m": [2, 2, 0.5]}
+    fleet = airborne(environment={"obstacles": [box]})
+    fleet.bodies.state[0, STATE.p_WB : STATE.p_WB + 3] = 10.0, 0.0, 1.5
+    assert ("touchdown", 0, {"other": "box"}) in descend(fleet, 5.0)
+
+
+def test_a_hard_hit_on_an_obstacle_names_it():
+    box = {"name": "box", "shape": "box", "position_m": [10, 0, 0], "size_m": [2, 2, 0.5]}
+    fleet = airborne(environment={"obstacles": [box]})
+    fleet.bodies.state[0, STATE.p_WB : STATE.p_WB + 3] = 10.0, 0.0, 2.0
+    fleet.emergency(0)
+    ((kind, drone, data),) = incidents_of(fleet, 1.0)
+    assert (kind, drone, data["other"]) == ("impact", 0, "box")
+
+
+def test_two_drones_that_hit_each_other_are_both_named():
+    fleet = airborne()
+    fleet.bodies.state[0, STATE.p_WB : STATE.p_WB + 3] = fleet.truth().position_m[1] + (0.0, 0.0, 2.0)
+    fleet.emergency(0)
+    hits = {drone: data["other"] for kind, drone, data in incidents_of(fleet, 0.7) if kind == "impact"}
+    assert hits == {0: "d1", 1: "d0"}
+
+
 def test_a_drone_that_is_turned_over_flips_once_and_its_firmware_stops_it():
     fleet = airborne()
     fleet.bodies.state[0, STATE.w_WB_B] = 20.0  # rad/s, about its x axis
-    found = befallen(fleet, 0.5)
+    found = incidents_of(fleet, 0.5)
     assert {"flip", "emergency"} <= {kind for kind, _, _ in found}
     assert {drone for _, drone, _ in found} == {0}
     (emergency,) = [data for kind, _, data in found if kind == "emergency"]
     assert emergency["cause"] == "tilt"
 
 
-def test_an_empty_battery_and_the_landing_before_it_are_told():
+def test_an_empty_battery_and_the_landing_before_it_are_found():
     fleet = airborne()
     fleet.bodies.energy[0] = 1.0  # J, which lasts for a few gates
-    found = befallen(fleet, 0.2)
+    found = incidents_of(fleet, 0.2)
     assert ("landing", 0) in [(kind, drone) for kind, drone, _ in found]
     (data,) = [data for kind, _, data in found if kind == "landing"]
     assert data["cause"] == "battery"
@@ -79,7 +137,7 @@ def test_an_empty_battery_and_the_landing_before_it_are_told():
 def test_a_drone_whose_commander_falls_silent_lands_and_says_why():
     fleet = airborne()
     fleet.set_velocity(1, (0.0, 0.0, 0.0))
-    ((kind, drone, data),) = befallen(fleet, 3.0)
+    ((kind, drone, data),) = incidents_of(fleet, 3.0)
     assert (kind, drone, data["cause"]) == ("landing", 1, "silence")
 
 
@@ -87,7 +145,7 @@ def test_the_watch_goes_on_from_its_snapshot():
     fleet, other = airborne(), Fleet(scenario())
     fleet.emergency(0)
     other.restore(fleet.snapshot())
-    assert befallen(other, 1.0) == befallen(fleet, 1.0) != []
+    assert incidents_of(other, 1.0) == incidents_of(fleet, 1.0) != []
 
 
 def ask(world: World, drone: str, mode: Literal["takeoff", "emergency"]) -> None:

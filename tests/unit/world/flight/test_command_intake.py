@@ -1,4 +1,4 @@
-"""How old a command may be: in realtime an older one is refused; in lockstep none is too old."""
+"""How old a command may be: in realtime older ones are refused; and what a bridge reports of a mission is an event."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from refused import has_terms
 
 from zsim.contract import keys
 from zsim.contract.flight_messages import Mode, Velocity
-from zsim.contract.run_messages import Event
+from zsim.contract.run_messages import ControlRequest, Event
 from zsim.scenario import scenario_file
 from zsim_world.flight.world import World
 
@@ -45,3 +45,32 @@ def test_the_greatest_age_is_allowed():
 
 def test_lockstep_judges_no_age():
     assert refusals("lockstep", 10 * AGE_MAX_MS) == []
+
+
+MISSION = {"drone": "d1", "state": "aborted", "items": 5, "done": 3, "reason": "it left its geofence", "failsafe": True}
+
+
+def reported(**changed: Any) -> tuple[str, list[Event]]:
+    """Report a mission; return the refusal and the events of missions."""
+    world = World(scenario_file.from_text(SCENARIO), "realtime", run_id="run1")
+    world.advance(0)
+    answer = world.control(ControlRequest("mission", MISSION | changed, "mavlink.main"))
+    events = [message for _, message in world.outbox.take() if isinstance(message, Event)]
+    return answer.error, [event for event in events if event.kind == "mission"]
+
+
+def test_a_mission_that_is_reported_is_an_event_of_its_drone():
+    error, (event,) = reported()
+    assert (error, event.subject, event.source) == ("", "d1", "mavlink.main")
+    assert event.data == {name: value for name, value in MISSION.items() if name != "drone"}
+    assert has_terms(event.text, "3 of 5 items", "geofence")
+
+
+@pytest.mark.parametrize(
+    "changed", [{"drone": "d9"}, {"state": "lost"}, {"items": -1}, {"done": "3"}, {"done": 10**9}, {"items": True}]
+)
+def test_a_report_of_a_mission_that_is_none_is_refused_and_is_no_event(changed: dict[str, Any]):
+    error, events = reported(**changed)
+    ((name, value),) = changed.items()
+    assert error.startswith(f"{name} is {value!r}; must be ")
+    assert events == []

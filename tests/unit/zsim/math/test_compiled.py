@@ -99,3 +99,26 @@ def test_a_kernel_is_known_to_be_kept_once_it_was_compiled(monkeypatch: pytest.M
     assert not is_kept(made)
     assert made(2.0) == 4.0
     assert is_kept(made)
+
+
+HELD = """
+from typing import NamedTuple
+import numpy as np
+from zsim.math.compiled import hold
+
+class {name}(NamedTuple):
+    row: np.ndarray
+
+hold({name}(np.ones(3)))
+"""
+
+
+def test_tuples_are_held_after_their_class_was_renamed(tmp_path: Path):
+    """Numba's index of kept code names the classes: one that is no more would make all of it unreadable."""
+    pytest.importorskip("numba")
+    cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    for name in ("Former", "Present"):
+        (tmp_path / "held_rows.py").write_text(HELD.format(name=name))
+        run = [sys.executable, "-c", "import held_rows; print('held')"]
+        made = subprocess.run(run, env={**os.environ, **cache}, capture_output=True, text=True, check=False)
+        assert (made.stdout.strip(), made.stderr) == ("held", "")
