@@ -17,6 +17,7 @@ from zsim.record import Recorded
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
 from zsim.runtime.group import AgentGroup
+from zsim.runtime.inbox import output_hold_ns
 from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
@@ -143,10 +144,11 @@ class AgentsWithRequests(AgentGroup):
     Args:
         agents: all of them as one.
         requests: by the first gate that they affect: control key, request.
+        hold_ns: as of a group.
     """
 
-    def __init__(self, agents: Agent, requests: Requests) -> None:
-        super().__init__([agents])
+    def __init__(self, agents: Agent, requests: Requests, hold_ns: int) -> None:
+        super().__init__([agents], hold_ns)
         self._requests = requests
 
     def step(self, t_ns: int) -> list[Output]:
@@ -172,8 +174,10 @@ class RerunBus(Bus):
 
     def __init__(self, world: World, agents: RecordedAgents, info: messages.Info, scenario: Scenario) -> None:
         requests = _by_gate(agents.requests)
+        hold_ns = output_hold_ns(info)
         groups = [
-            AgentsWithRequests(hosted(info, scenario, process.members), dict(requests)) for process in agents.processes
+            AgentsWithRequests(hosted(info, scenario, process.members), dict(requests), hold_ns)
+            for process in agents.processes
         ]
         super().__init__(world, groups, lambda: 0, self._compare_output, self._keep_truth)
         self._world = world

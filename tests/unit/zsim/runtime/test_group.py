@@ -14,6 +14,7 @@ from zsim.runtime.agent import Agent, Output
 from zsim.runtime.group import AgentGroup
 
 GATE_NS = 20_000_000
+HOLD_NS = 2 * GATE_NS  # with a command delay of a gate
 CLUSTER = keys.cluster_control("main")
 
 
@@ -67,7 +68,7 @@ def team() -> tuple[Member, Member, AgentGroup]:
     first.serves = ("estimator.d2",)
     first.counted = ("d1",)
     last = Asked("controller.main", [keys.status("d1"), keys.estimate("d1")], keys.cluster_state("main"))
-    return first, last, AgentGroup([first, last])
+    return first, last, AgentGroup([first, last], HOLD_NS)
 
 
 def test_a_group_reads_what_its_members_do_not_tell_each_other():
@@ -134,9 +135,9 @@ def test_members_of_different_periods_are_refused():
     fast = Member("estimator.d1", [], "b")
     pattern = r"period_ns of a group's members is estimator\.d1 20000000, controller\.main 40000000; must be the same"
     with pytest.raises(RunError, match=pattern):
-        AgentGroup([fast, slow])
+        AgentGroup([fast, slow], HOLD_NS)
 
 
 def test_nobody_is_no_group():
     with refused(RunError, "group", "members", "one"):
-        AgentGroup([])
+        AgentGroup([], HOLD_NS)
