@@ -188,8 +188,9 @@ def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
     try:
         return tuple(members[place] for place in TopologicalSorter(waits_for).static_order())
     except CycleError as error:
-        names = ", ".join(members[place].name for place in error.args[1][1:])
-        raise RunError(f"gate_keys of {names} wait for each other's outputs; leave them out of one's gate_keys") from None
+        names = ", ".join(members[place].name for place in sorted(set(error.args[1])))
+        found = f"gate_keys of a group's members {names} are outputs of each other"
+        raise RunError(f"{found}; must not wait for each other: leave one of them to `reads` alone") from None
 
 
 def _check(members: Sequence[Agent]) -> None:

@@ -45,7 +45,9 @@ class RunnerInputs:
         self._blocking: Subscription | None = None  # where `wait` waits
         self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         of_drivers = [key for key in agent.gate_keys if keys.parts(key)[1] in self._external]
-        self.inbox = Inbox(agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers, output_hold_ns(info))
+        self.inbox = Inbox(
+            agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers, output_hold_ns(info)
+        )
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}
