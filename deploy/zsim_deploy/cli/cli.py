@@ -12,7 +12,15 @@ import typer
 from typer.main import get_command
 
 from zsim import __version__, extras
-from zsim.errors import BehindError, RunFailedError, SupersededError, UserCodeError, ZsimError, printable
+from zsim.errors import (
+    BehindError,
+    RequestRefusedError,
+    RunFailedError,
+    SupersededError,
+    UserCodeError,
+    ZsimError,
+    printable,
+)
 from zsim_deploy import INTERRUPTED, USER_FAULT
 from zsim_deploy.arguments import (
     CONSOLE_NEEDS,
@@ -56,7 +64,13 @@ app = typer.Typer(
 
 UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
 UNREAD = 128 + 13  # exit code of a command whose output nobody reads any more: that of SIGPIPE
-EXIT_CODES = {SupersededError: 3, BehindError: 1, RunFailedError: 1, UserCodeError: 1}  # of what is no wrong input
+EXIT_CODES = {  # of what is no wrong input
+    SupersededError: 3,
+    BehindError: 1,
+    RequestRefusedError: 1,
+    RunFailedError: 1,
+    UserCodeError: 1,
+}
 
 
 @app.command(rich_help_panel=RUN)
