@@ -623,6 +623,26 @@ def test_a_fault_that_all_drones_share_is_told_once():
             {"drones": [drone("a", thrust_n_s2=0.01)]},
             ("drones[0].thrust_n_s2", "0.01", "0.042 %", "0.5", "90 %", "N s^2"),
         ),
+        (  # revolutions per minute
+            {"drones": [drone("a", rotor_max_rad_s=4803)]},
+            ("drones[0].rotor_max_rad_s", "4803", "480 m/s", "3403", "sound", "rad/s", "rpm"),
+        ),
+        (
+            {"drones": [drone("a", model="crazyflie2", rotor_max_rad_s=21706)]},
+            ("drones[0].rotor_max_rad_s", "21706", "501 m/s", "14732"),
+        ),
+        (  # a hundred times the AR.Drone's
+            {"drones": [drone("a", drag_n_s_m=24.9)]},
+            ("drones[0].drag_n_s_m", "24.9", "2 m/s", "49.8 N", "4.21 N", "2.1", "N s/m"),
+        ),
+        (
+            {"drones": [drone("a", aerodynamics={"quadratic_drag_n_s2_m2": [0.1, 0.1, 5]})]},
+            ("drones[0].aerodynamics.quadratic_drag_n_s2_m2", "[0.1, 0.1, 5]", "20 N", "1.05", "N s^2/m^2"),
+        ),
+        (
+            {"drones": [drone("a", aerodynamics={"rotor_drag_n_s2_m": 0.0119})]},  # for 1.19e-4
+            ("drones[0].aerodynamics.rotor_drag_n_s2_m", "0.0119", "N s^2/m"),
+        ),
         (  # ampere-hours
             {"drones": [drone("a", battery_mah=1)]},
             ("drones[0].battery_mah", "0.72 s", "10", "86400 s", "mAh"),
