@@ -15,7 +15,7 @@ from zsim.scenario import fault_check
 from zsim.scenario.fault_kinds import kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.role_table import AGENTS
-from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, space_name
+from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
 from zsim.scenario.sighting_check import sighting_faults
 from zsim.schema.checker import Fault, show
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
@@ -69,6 +69,25 @@ def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fau
     yield from _process_faults(scenario.processes, drones, clusters)
     yield from _injected_faults(scenario, drones, clusters, vehicles)
     yield from _window_faults(scenario.report)
+
+
+def unflown_plans(scenario: Scenario) -> list[str]:
+    """Return a line for each cluster of a resolved scenario whose plan begins, or goes on, after the end of the run.
+
+    No fault: a run may be cut short, and somebody else may fly the drones.
+    """
+    lines = []
+    for index, cluster in enumerate(scenario.clusters):
+        plan, flies = cluster.plan, cluster.plan.takeoff_s is not None
+        trajectory_s = plan.trajectory.start_s if flies and plan.trajectory else None
+        times = {"take-off": plan.takeoff_s, "trajectory": trajectory_s, "landing": plan.land_s}
+        planned = {step: at_s for step, at_s in times.items() if at_s is not None}
+        late = [f"its {step} at {at_s:g} s" for step, at_s in planned.items() if at_s >= scenario.duration_s]
+        if late:
+            what = "nothing of it is flown" if "take-off" in late[0] or len(late) == len(planned) else "not flown"
+            line = f"the run ends at {scenario.duration_s:g} s, before {' and '.join(late)}: {what}"
+            lines.append(f"clusters[{index}].plan: {line} (cluster {cluster.name!r})")
+    return lines
 
 
 _Entries = list[tuple[int, Any]]

@@ -191,11 +191,14 @@ def _refuse_to_change(
 def validate(scenario: ScenarioPath, set_: Set = None) -> None:
     """Check a scenario and print what it resolves to; every fault is a line."""
     from zsim.scenario import scenario_file
+    from zsim.scenario.consistency import unflown_plans
     from zsim_agents.hosting import check_plans
 
     loaded = load_scenario(scenario, set_)
     check_plans(loaded, scenario.name)
-    print(printable(scenario_file.to_text(loaded)), end="")
+    print(printable(scenario_file.to_text(loaded)), end="", flush=True)
+    for line in unflown_plans(loaded):
+        print(printable(f"{scenario.name}: {line}"), file=sys.stderr)
 
 
 def _version(wanted: bool) -> None:

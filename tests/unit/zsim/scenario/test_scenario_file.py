@@ -17,6 +17,7 @@ from refused import has_terms
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
+from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import DRONES_MAX, Scenario
 from zsim.schema.checker import FAULTS_MAX
@@ -971,3 +972,28 @@ def test_a_fault_of_the_shared_vehicle_is_told_once_by_its_path(vehicle: Any, pa
 def test_a_field_of_the_shared_vehicle_is_set_by_its_path():
     scenario = scenario_file.load(SCENARIOS / "step.yaml", ["vehicle.mass_kg=0.5"])
     assert [each.mass_kg for each in scenario.drones] == [0.5] * 3
+
+
+@pytest.mark.parametrize(
+    ("plan", "duration_s", "terms"),
+    [
+        ({"takeoff_s": 20}, 20, ("clusters[0].plan", "20 s", "take-off at 20 s", "nothing", "'c'")),
+        ({"takeoff_s": 20, "land_s": 90}, 5, ("5 s", "take-off at 20 s and its landing at 90 s", "nothing")),
+        ({"land_s": 90}, 50, ("landing at 90 s", "nothing")),
+        ({"takeoff_s": 2, "land_s": 90}, 50, ("before its landing at 90 s: not flown",)),
+        (
+            {"takeoff_s": 2, "trajectory": {"start_s": 60, "expressions": {"x_c": "t"}}},
+            50,
+            ("before its trajectory at 60 s: not flown",),
+        ),
+        ({"takeoff_s": 20, "land_s": 90}, 91, ()),
+        ({"trajectory": {"start_s": 60, "expressions": {"x_c": "t"}}}, 50, ()),
+        ({}, 5, ()),
+    ],
+)
+def test_what_of_a_plan_begins_after_the_end_of_the_run_is_named(plan: Any, duration_s: float, terms: tuple[str, ...]):
+    cluster = {"name": "c", "drones": ["drone1", "drone2"], "plan": plan}
+    scenario = scenario_file.resolve(document(clusters=[cluster], duration_s=duration_s), "step.yaml")
+    lines = unflown_plans(scenario)
+    assert len(lines) == bool(terms)
+    assert all(has_terms(line, *terms) for line in lines)
