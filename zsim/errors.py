@@ -11,6 +11,7 @@ ZsimError
 ├── RunError           a run that could not start or did not end well
 │   ├── SupersededError   another process of the same name has taken over
 │   ├── BehindError       a participant that cannot catch up any more
+│   ├── RequestRefusedError   a request that the world, or whoever else was asked, refuses
 │   └── RunFailedError    a run that a failure ended before its time
 │       └── UserCodeError    a class of a user's own raised, or returned what cannot be used
 ├── HostsError         a host that cannot be reached, or lacks what it needs; a line per host
@@ -85,6 +86,10 @@ class SupersededError(RunError):
 
 class BehindError(RunError):
     """A participant lacks what nobody keeps any more; a new incarnation of it can go on."""
+
+
+class RequestRefusedError(RunError):
+    """Whoever was asked has refused the request."""
 
 
 class RunFailedError(RunError):

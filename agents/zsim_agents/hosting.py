@@ -9,6 +9,7 @@ from zsim.contract.messages import Info
 from zsim.errors import DocumentError, RunError, ScenarioError
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
+from zsim.runtime.inbox import output_hold_ns
 from zsim.scenario.role_table import AGENTS, agent_names
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
@@ -117,9 +118,8 @@ def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
     """
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
     by_role = {role: [thing for each, _, thing in split if each == role] for role in AGENTS}
-    return AgentGroup(
-        [agent for role, names in by_role.items() if names for agent in made(role, info, scenario, names)]
-    )
+    members = [agent for role, names in by_role.items() if names for agent in made(role, info, scenario, names)]
+    return AgentGroup(members, output_hold_ns(info))
 
 
 def made(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> list[Agent]:

@@ -35,6 +35,7 @@ class RerunResult(NamedTuple):
         until: why the comparison ended before the record, empty if it did not.
         refused: requests that were carried out on record and are refused now.
         first_output: the first output of an agent that differs, empty if none does.
+        failure: of a user's code, empty if none failed.
     """
 
     compared: TruthComparison
@@ -42,6 +43,7 @@ class RerunResult(NamedTuple):
     until: str
     refused: list[str]
     first_output: str
+    failure: str
 
 
 def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
@@ -71,13 +73,24 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
         say(f"run again: world, {', '.join(map(str, agents.processes))}")
         again = _fly(record, agents)
         fault = _judge(agents.truth_sha256, again, _state(record.reader), say)
+        if not fault and (agents.failure or again.failure):
+            fault = _judge_failure(agents.failure, again.failure, say)
         if again.compared.first is not None:
             _find_cause(again.first_output, _fly(record, _without_agents(agents)), say)
         return fault
 
 
+def _judge_failure(recorded: str, failure: str, say: Say) -> str:
+    """Print whether a user's code that ended the run has failed again; return why it has not, empty if it has."""
+    if failure == recorded:
+        say(f"ended as on record: {failure}")
+        return ""
+    say(f"on record {recorded or 'no class of a user failed'}")
+    return f"flown again, {failure or 'it does not fail'}"
+
+
 def _without_agents(agents: RecordedAgents) -> RecordedAgents:
-    return agents._replace(processes=(), requests=())
+    return agents._replace(processes=(), requests=(), failure="")
 
 
 def _warn(info: messages.Info, agents: RecordedAgents, note: Say) -> None:
@@ -107,9 +120,11 @@ def _fly(record: RecordedRun, agents: RecordedAgents) -> RerunResult:
             compared.add(gate.t_ns, gate.truth, bus.truth)
             due_ns += world.clock.gate_ns
             show(gate.t_ns)
+    if agents.failure and not bus.failure:
+        bus.answer_last()
     if not compared.instants:
         raise RecordError(f"{reader.path}: {until or 'holds no truth'}; a run is flown again from its start")
-    return RerunResult(compared, world.result()["truth_sha256"], until, bus.refused, bus.outputs.first)
+    return RerunResult(compared, world.result()["truth_sha256"], until, bus.refused, bus.outputs.first, bus.failure)
 
 
 def _fault(gate: GateInputs, due_ns: int, names: list[str]) -> str:

@@ -12,11 +12,12 @@ from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.camera_messages import Sightings
 from zsim.contract.framing import GateMessages
 from zsim.contract.run_messages import ControlRequest
-from zsim.errors import RunError
+from zsim.errors import RunError, RunFailedError
 from zsim.record import Recorded
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
 from zsim.runtime.group import AgentGroup
+from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
 from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
@@ -143,10 +144,11 @@ class AgentsWithRequests(AgentGroup):
     Args:
         agents: all of them as one.
         requests: by the first gate that they affect: control key, request.
+        hold_ns: as of a group.
     """
 
-    def __init__(self, agents: Agent, requests: Requests) -> None:
-        super().__init__([agents])
+    def __init__(self, agents: Agent, requests: Requests, hold_ns: int) -> None:
+        super().__init__([agents], hold_ns)
         self._requests = requests
 
     def step(self, t_ns: int) -> list[Output]:
@@ -172,8 +174,10 @@ class RerunBus(Bus):
 
     def __init__(self, world: World, agents: RecordedAgents, info: messages.Info, scenario: Scenario) -> None:
         requests = _by_gate(agents.requests)
+        hold_ns = output_hold_ns(info)
         groups = [
-            AgentsWithRequests(hosted(info, scenario, process.members), dict(requests)) for process in agents.processes
+            AgentsWithRequests(hosted(info, scenario, process.members), dict(requests), hold_ns)
+            for process in agents.processes
         ]
         super().__init__(world, groups, lambda: 0, self._compare_output, self._keep_truth)
         self._world = world
@@ -189,6 +193,7 @@ class RerunBus(Bus):
 
         Raises:
             RunError: an agent does not answer, since what it waits for is not on record.
+            RunFailedError: or since a user's code fails, which at this gate it did not on record.
         """
         self._admitted = _admitted(gate.inputs) if gate.t_ns else None
         for recorded in gate.inputs:
@@ -196,6 +201,8 @@ class RerunBus(Bus):
         while self._round():
             pass
         waiting = [p.name for p in self._world.blocking() if p.name in self._rerun]
+        if waiting and self.failure:
+            raise RunFailedError(f"flown again, {self.failure}")
         if waiting and self._world.clock.state != "waiting":
             at = f"before {gate.t_ns / 1e9:.2f} s"
             raise RunError(
@@ -207,6 +214,20 @@ class RerunBus(Bus):
         if self._world.now_ns != gate.t_ns:
             reason = self._world.ended or "the gates are not those of the record"
             raise RunError(f"flown again, the run ends at {self._world.now_ns / 1e9:.2f} s: {reason}")
+
+    @property
+    def failure(self) -> str:
+        """Return how a user's code has failed first, empty if none has."""
+        return next((str(failure) for failure in self._failures.values()), "")
+
+    def answer_last(self) -> None:
+        """Let the agents answer the last gate of the record, to which nothing answers there."""
+        while self._round():
+            pass
+
+    def _leave_failed(self, agent: Agent, inbox: Inbox) -> None:
+        """Hand an agent nothing any more; the world goes on as far as it went on record."""
+        inbox.start_after(NEVER_NS)
 
     def _compare_output(self, key: str, message: Any) -> None:
         if isinstance(message, (*messages.RELAYED, flight_messages.Command)):

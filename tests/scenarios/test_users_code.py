@@ -7,7 +7,7 @@ from shutil import move
 
 import pytest
 
-from zsim.errors import DocumentError, UserCodeError
+from zsim.errors import DocumentError, RunFailedError, UserCodeError
 from zsim.scenario import scenario_file
 from zsim.schema import plugin
 from zsim_analysis.in_process import fly
@@ -204,6 +204,40 @@ def test_the_scenario_may_let_a_run_go_on_without_who_fails(folder: Path) -> Non
 def test_a_run_of_a_sweep_that_fails_has_the_line_in_its_row(folder: Path) -> None:
     row = sweep_run.fly(Task(0, 0, {}, scenario_file.load(folder / "pair.yaml", [ESTIMATOR])))
     assert all(term in row["failure"] for term in FAILURES["estimator"][1])
+
+
+@pytest.mark.parametrize("name", ["nan", "raises", "estimator"])
+def test_flown_again_it_fails_at_the_same_gate_with_the_same_line(folder: Path, name: str) -> None:
+    with pytest.raises(UserCodeError) as raised:
+        fly(scenario_file.load(folder / "pair.yaml", FAILURES[name][0]), folder / "run.mcap")
+    forget(folder)
+    said: list[str] = []
+    assert rerun_record(folder, False, said.append, said.append) == ""
+    assert said[0].startswith("run again: world, ")
+    assert said[-2].startswith("truth_sha256 is the same: ")
+    assert said[-1] == f"ended as on record: {raised.value}"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "terms"),
+    [
+        ("1 / number", "1.0", ("does not fail",)),
+        ("calls > 100", "calls > 50", ("ZeroDivisionError", f"users_code.py:{line_of('# raised')}")),
+    ],
+)
+def test_with_another_class_it_is_told_that_it_fails_otherwise(
+    folder: Path, old: str, new: str, terms: tuple[str, ...]
+) -> None:
+    with pytest.raises(UserCodeError):
+        fly(scenario_file.load(folder / "pair.yaml", FAILURES["raises"][0]), folder / "run.mcap")
+    forget(folder)
+    (folder / "users_code.py").write_text(MODULE.replace(old, new))
+    faults: list[str] = []
+    try:
+        faults.append(rerun_record(folder, False, lambda text: None, lambda text: None))
+    except RunFailedError as error:
+        faults.append(str(error))
+    assert all(term in faults[0] for term in ("flown again, ", *terms)), faults
 
 
 def flown(folder: Path) -> Path:

@@ -8,10 +8,10 @@ from msgspec import Struct
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Event, Join
-from zsim.transport.session import FarEnd, RawSample, ReceivedSample
+from zsim.transport.session import FarEnd, RawSample, ReceivedSample, Unanswered
 
 PATIENCE_S = 120.0  # after which a test that waits for ever fails
-UNANSWERED = ControlAnswer(False, "nobody answered")
+UNANSWERED = Unanswered(False, "nobody answered")
 BAD_UTF8 = b"\x83\xa4t_ns\x00\xa3seq\x00\xa6source\xa1\xff"
 NESTED = b"\x83\xa4t_ns\x00\xa3seq\x00\xa1x" + b"\x91" * 5000 + b"\xc0"
 """A map with t_ns, seq and a field that nobody knows, of 5000 lists in each other."""

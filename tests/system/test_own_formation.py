@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from deployment import STEP, in_process
-from federation import Federation
+from federation import PAIR, Federation
 from forked_commands import ROOT
 
 EXAMPLES = str(ROOT / "examples")
@@ -71,3 +71,42 @@ def test_a_class_that_is_not_there_is_one_line(federation: Federation, field: st
     run.ends(with_code=2)
     assert "cluster 'main'" in run.line("nowhere.at_all:Missing").text
     assert "Traceback" not in run.text()
+
+
+DYING = """
+import os
+
+import numpy as np
+from zsim_agents.formation.control_law import ControlLaw
+
+
+class Dies(ControlLaw):
+    calls = 0
+
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        self.calls += 1
+        if self.calls > 100:
+            os._exit(0) if DIES_WELL else os.kill(os.getpid(), 9)
+        return np.zeros(self.space.size)
+"""
+DIES = "clusters.main.law=dying:Dies"
+
+
+@pytest.mark.parametrize(("dies_well", "code"), [(False, -9), (True, 0)])
+def test_a_law_that_ends_its_process_leaves_a_record_without_an_end(
+    federation: Federation, dies_well: bool, code: int
+) -> None:
+    """In one process nothing can catch it; what was recorded until then can be read, and the report says so."""
+    (federation.folder / "dying.py").write_text(DYING.replace("DIES_WELL", str(dies_well)))
+    federation.run(PAIR, "--in-process", "--set", DIES).ends(with_code=code)
+    report = federation.start("report", str(federation.out))
+    report.ends(with_code=0)
+    assert "incomplete: the end of the run is not on record" in report.text()
+    assert federation.record().all("drone/drone1/truth")[-1]["t_ns"] > 2e9
+
+
+def test_a_law_that_ends_its_process_with_0_is_a_death_that_ends_the_run(federation: Federation) -> None:
+    (federation.folder / "dying.py").write_text(DYING.replace("DIES_WELL", "True"))
+    run = federation.run(PAIR, "--set", DIES, "--set", "processes.on_death={controller: end}")
+    run.ends(with_code=1)
+    assert "controller.main" in run.text().splitlines()[-1]

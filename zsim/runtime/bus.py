@@ -14,7 +14,7 @@ from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.inbox import NEVER_NS, Inbox
+from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
 from zsim.runtime.routing import RoutingTable
 from zsim.scenario.fault_kinds import PROCESS_KILL
 
@@ -116,9 +116,9 @@ class Bus:
             join = join_of(agent.name, host, run_id, 0, seq, period_ns=agent.period_ns, serves=agent.serves)
             self._to_world(keys.process(agent.name, "join"), join)
         if any(agent.overhears for agent, _ in self._agents):
-            info = self._coordinator.info()
+            hold_ns = output_hold_ns(self._coordinator.info())
             for _, inbox in self._agents:
-                inbox.hold_ns = info.command_delay_ns + info.gate_ns
+                inbox.hold_ns = hold_ns
 
     def turn(self) -> bool:
         """Let the world go as far as it may, and every agent answer; return whether the run goes on.

@@ -6,17 +6,32 @@ the numbers of a status.
 """
 
 from bisect import bisect_right, insort
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from operator import itemgetter
 from typing import Any
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages
+from zsim.contract.messages import Info
+from zsim.runtime.routing import canonical
 
 GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
 UNHEARD_NS = ALWAYS_NS - 1  # before whatever was taken last
+
+
+def output_hold_ns(info: Info) -> int:
+    """Return how long after its stamp an output that closes no gate of its reader is handed out: see `Inbox.hold_ns`.
+
+    In realtime outputs are handed out as they come.
+    """
+    return 0 if info.mode == "realtime" else info.command_delay_ns + info.gate_ns
+
+
+def is_held(key: str, gate_keys: Container[str], uncounted: Container[str]) -> bool:
+    """Tell whether a key is one of others' outputs that its reader receives after the hold."""
+    return key not in gate_keys and key not in uncounted and messages.is_output(key)
 
 
 class Inbox:
@@ -69,6 +84,7 @@ class Inbox:
         self._uncounted = frozenset(uncounted)
         self.hold_ns = hold_ns
         self._hold_of: dict[str, int] = {}
+        self._holds = False
         self._belated: dict[tuple[str, int], tuple[str, Any]] = {}
         self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
         self.duplicates = 0
@@ -117,8 +133,9 @@ class Inbox:
         return True
 
     def _find_hold(self, key: str) -> int:
-        is_held = key not in self._closing and key not in self._uncounted and messages.is_output(key)
-        self._hold_of[key] = hold_ns = self.hold_ns if is_held else 0
+        held = is_held(key, self._closing, self._uncounted)
+        self._hold_of[key] = hold_ns = self.hold_ns if held else 0
+        self._holds = self._holds or hold_ns > 0
         return hold_ns
 
     def _find_came(self, key: str) -> list[int] | None:
@@ -218,6 +235,8 @@ class Inbox:
         for stamp in _cut(self._stamps, t_ns):
             stamped = self._waiting.pop(stamp)
             ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
+        if self._holds:
+            ready.sort(key=canonical)
         if self._keep_late or self._belated:
             ready = self._with_belated(ready)
         for gate_ns in _cut(self._gates, t_ns):

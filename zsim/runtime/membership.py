@@ -18,6 +18,7 @@ from zsim.contract.snapshot import VERSION, pack, unpack
 from zsim.contract.world_events import ProcessEntry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
+from zsim.runtime.inbox import output_hold_ns
 from zsim.transport.connection import read_info
 from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import replay
@@ -339,8 +340,7 @@ class Membership:
         self.ask_faults()
         try:
             wanted = (*self._agent.reads, *self._agent.repeats, keys.FAULTS)
-            holds = self._agent.overhears and self._info.mode == "lockstep"  # its inbox, see RunnerInputs
-            held_ns = self._info.command_delay_ns + self._info.gate_ns if holds else 0
+            held_ns = output_hold_ns(self._info) if self._agent.overhears else 0
             for key, payload in replay(self._link, self._agent.name, max(-1, since_ns - held_ns), wanted, REPLAY_S):
                 self._take_in(ReceivedSample(key, payload))
         except NoWorldError:

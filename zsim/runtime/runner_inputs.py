@@ -14,7 +14,7 @@ from zsim.contract.world_events import WorldEvent
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Agent
 from zsim.runtime.health import HealthMeter
-from zsim.runtime.inbox import Inbox
+from zsim.runtime.inbox import Inbox, output_hold_ns
 from zsim.runtime.routing import RoutingTable
 from zsim.transport.session import Query, RawSample, ReceivedSample, Session, Subscription
 
@@ -45,8 +45,9 @@ class RunnerInputs:
         self._blocking: Subscription | None = None  # where `wait` waits
         self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         of_drivers = [key for key in agent.gate_keys if keys.parts(key)[1] in self._external]
-        hold_ns = 0 if self._is_realtime else info.command_delay_ns + info.gate_ns
-        self.inbox = Inbox(agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers, hold_ns)
+        self.inbox = Inbox(
+            agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers, output_hold_ns(info)
+        )
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}

@@ -4,7 +4,7 @@ Works on what is sound of a document (`checker.sound`): a check whose fields are
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -15,10 +15,10 @@ from zsim.scenario import fault_check
 from zsim.scenario.fault_kinds import kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.role_table import AGENTS
-from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, space_name
+from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
 from zsim.scenario.sighting_check import sighting_faults
 from zsim.schema.checker import Fault, show
-from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
+from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations, own_sections
 from zsim.vehicles.vehicle import Vehicle, lift_shares
@@ -34,6 +34,10 @@ TILT_FREE_DEG = 30.0  # deg, allowed to whatever is light enough to fly
 # Chosen, a decade or more beyond what flies: 60 to 400 W/kg from racers' hover to large rotors; 3 min to 2 h
 HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power for the rotors
 HOVER_S = (10.0, 86_400.0)  # s on a full battery
+TIP_MAX_M_S = 340.3  # m/s, speed of sound at 15 deg C, ISO 2533; propellers lose their thrust near it
+# m/s, chosen: no multirotor falls so slowly. Falls of those of 20 g to 1 kg are tested at 7 to 24 m/s (Svaty et al.,
+# PLoS ONE 20 (2025) e0320073); by its drag an AR.Drone falls at 17 m/s, a Crazyflie at 43 m/s.
+AIR_M_S = 2.0
 INERTIA_MAX_MR2 = (
     10.0  # of mass times arm_m squared, chosen: that of the AR.Drone about z is 0.35, of a ring of rotors 1
 )
@@ -65,6 +69,25 @@ def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fau
     yield from _process_faults(scenario.processes, drones, clusters)
     yield from _injected_faults(scenario, drones, clusters, vehicles)
     yield from _window_faults(scenario.report)
+
+
+def unflown_plans(scenario: Scenario) -> list[str]:
+    """Return a line for each cluster of a resolved scenario whose plan begins, or goes on, after the end of the run.
+
+    No fault: a run may be cut short, and somebody else may fly the drones.
+    """
+    lines = []
+    for index, cluster in enumerate(scenario.clusters):
+        plan, flies = cluster.plan, cluster.plan.takeoff_s is not None
+        trajectory_s = plan.trajectory.start_s if flies and plan.trajectory else None
+        times = {"take-off": plan.takeoff_s, "trajectory": trajectory_s, "landing": plan.land_s}
+        planned = {step: at_s for step, at_s in times.items() if at_s is not None}
+        late = [f"its {step} at {at_s:g} s" for step, at_s in planned.items() if at_s >= scenario.duration_s]
+        if late:
+            what = "nothing of it is flown" if "take-off" in late[0] or len(late) == len(planned) else "not flown"
+            line = f"the run ends at {scenario.duration_s:g} s, before {' and '.join(late)}: {what}"
+            lines.append(f"clusters[{index}].plan: {line} (cluster {cluster.name!r})")
+    return lines
 
 
 _Entries = list[tuple[int, Any]]
@@ -176,8 +199,12 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
         yield "rotor_min_rad_s", f"is {low:g}; must be < rotor_max_rad_s ({high:g})"
     gravity = scenario.environment and scenario.environment.gravity_m_s2
     vehicle = vehicles.get(drone.model) if drone.model else None
-    if vehicle and _known(drone.mass_kg, drone.thrust_n_s2, high, gravity):
+    if vehicle and _known(drone.thrust_n_s2, high) and (fault := _tip_fault(drone, vehicle)):
+        yield "rotor_max_rad_s", fault
+    elif vehicle and _known(drone.mass_kg, drone.thrust_n_s2, high, gravity):
         yield from _hover_faults(drone, vehicle, scenario.environment)
+    if vehicle and _known(drone.mass_kg, drone.thrust_n_s2):
+        yield from _drag_faults(drone, len(vehicle.rotors))
     if _known(drone.mass_kg, drone.arm_m, drone.inertia_kg_m2) and None not in drone.inertia_kg_m2:
         greatest = INERTIA_MAX_MR2 * drone.mass_kg * drone.arm_m**2
         if max(drone.inertia_kg_m2) > greatest:
@@ -186,6 +213,45 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
     yield from _height_faults(drone, scenario.environment and scenario.environment.height_m)
     if drone.sensors is not None:
         yield from ((f"sensors.{path}", text) for path, text in _sensor_faults(drone.sensors))
+
+
+def _tip_fault(drone: Any, vehicle: Vehicle) -> str | None:
+    """Return what is wrong where the tips of the rotors would outrun sound: a speed in rpm."""
+    scale = (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25  # of a rotor; larger may be a wrong unit of that
+    radius_m, high = vehicle.rotor_radius_m * min(1.0, scale), drone.rotor_max_rad_s
+    if radius_m * high <= TIP_MAX_M_S:
+        return None
+    tip = f"so that the tip of a rotor of {radius_m:.3g} m moves at {radius_m * high:.0f} m/s"
+    most = f"sane: at most {TIP_MAX_M_S / radius_m:.0f}, the speed of sound"
+    return f"is {high:g}, {tip}; {most}; check its unit, rad/s: rpm over 9.55"
+
+
+def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
+    """Yield the coefficients by each of which slow air would push as hard as its weight: they are in a wrong unit.
+
+    One that is too small is not to be told from one that is left out.
+    """
+    weight, v = drone.mass_kg * G_M_S2, AIR_M_S
+    of_rotors = rotors * math.sqrt(weight / (rotors * drone.thrust_n_s2))  # rad/s, the speeds of all in a hover
+    speeds = {
+        "drag_n_s_m": (v, "N s/m"),
+        "aerodynamics.linear_drag_n_s_m": (v, "N s/m"),
+        "aerodynamics.quadratic_drag_n_s2_m2": (v**2, "N s^2/m^2"),
+        "aerodynamics.rotor_drag_n_s2_m": (of_rotors * v, "N s^2/m"),
+        "aerodynamics.rotor_inflow_n_s2_m": (of_rotors * v, "N s^2/m"),
+        "aerodynamics.rotor_lift_n_s2_m2": (rotors * v**2, "N s^2/m^2"),
+    }
+    for path, (factor, unit) in speeds.items():
+        section, _, name = path.rpartition(".")
+        given = getattr(getattr(drone, section, None) if section else drone, name, None)
+        coefficients = given if isinstance(given, Sequence) else [given]
+        greatest = max((each for each in coefficients if each is not None), default=0.0)
+        if greatest * factor >= weight:
+            found = f"is {show(given)}, so that air at {v:g} m/s pushes with {greatest * factor:.3g} N"
+            yield (
+                path,
+                f"{found}; sane: less than {weight:.3g} N, its weight: {weight / factor:.3g}; check its unit, {unit}",
+            )
 
 
 def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fault]:

@@ -210,6 +210,10 @@ class Query:
             self._raw = None
 
 
+class Unanswered(ControlAnswer, frozen=True):
+    """In place of an answer where none came: why."""
+
+
 class Session:
     """A Zenoh session, open until whoever opened it closes it.
 
@@ -479,7 +483,7 @@ class Session:
     def request(
         self, key: str, op: str, source: str, args: dict[str, Any] | None = None, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Send a request to `key` and return its answer; without one, an answer with the reason.
+        """Send a request to `key` and return its answer; without one, or where we may not ask, `Unanswered`.
 
         Raises:
             SessionError: it is no key, or something among the arguments fits into no message.
@@ -491,14 +495,14 @@ class Session:
             raise SessionError(f"{key}: {op} cannot be sent ({error}); {allowed}") from error
         with key_errors(key):
             if fault := self._refusal("ask", key):
-                return ControlAnswer(ok=False, error=fault)
+                return Unanswered(ok=False, error=fault)
         start_s = time.monotonic()
         for reply in self.query(key, payload=payload, timeout_s=timeout_s):
             if reply.kind != "ERROR":
                 return messages.decode_as(ControlAnswer, reply.payload, key)
         late = time.monotonic() - start_s >= timeout_s
         what = f"no answer came within {timeout_s:g} s" if late else "nobody answers there"
-        return ControlAnswer(ok=False, error=f"{key}: {what}; is it running?")
+        return Unanswered(ok=False, error=f"{key}: {what}; is it running?")
 
     def declare_queryable(self, expression: str, callback: Callable[[Query], None], complete: bool = False) -> None:
         """Call back, in a thread of Zenoh's, for every query on an expression.

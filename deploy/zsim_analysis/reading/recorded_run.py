@@ -126,6 +126,7 @@ class RecordedAgents(NamedTuple):
         requests: to their controllers, in order.
         fingerprints: numeric, of these processes.
         truth_sha256: as the world reported it at the end of the run, None if the record has no end.
+        failure: of a user's code in one of these processes, which ended the run; empty if none did.
     """
 
     processes: tuple[AgentProcess, ...]
@@ -133,6 +134,7 @@ class RecordedAgents(NamedTuple):
     requests: tuple[tuple[str, run_messages.ClusterRequest], ...]
     fingerprints: frozenset[str]
     truth_sha256: str | None
+    failure: str
 
     @property
     def names(self) -> frozenset[str]:
@@ -153,7 +155,8 @@ def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenari
     requests = tuple(_read(reader, "cluster/*/request"))
     fingerprints = frozenset(join.fingerprint for _, join in ours)
     sha256 = next((event.data.get("truth_sha256") for event in reversed(events) if event.kind == "end"), None)
-    return RecordedAgents(() if why_not else processes, why_not, requests, fingerprints, sha256)
+    failure = next((event.text for event in events if _is_end_by_failure(event, names)), "")
+    return RecordedAgents(() if why_not else processes, why_not, requests, fingerprints, sha256, failure)
 
 
 def _by_role(process: AgentProcess) -> tuple[int, str]:
@@ -176,7 +179,7 @@ def _reason(
     if any(fault.get("kind") == PROCESS_KILL for fault in scenario.faults):
         return f"a {PROCESS_KILL} was planned"
     for event in events:
-        if event.kind == "end":
+        if event.kind == "end" or _is_end_by_failure(event, names):
             break
         if event.kind in ABSENCES and event.subject in names:
             return f"{event.kind} of {event.subject} at {event.t_ns / 1e9:.2f} s"
@@ -187,6 +190,11 @@ def _reason(
         if event.kind == "control" and event.data.get("ok") and _is_kill_request(event):
             return f"a {PROCESS_KILL} was asked for at {event.t_ns / 1e9:.2f} s"
     return ""
+
+
+def _is_end_by_failure(event: run_messages.Event, names: frozenset[str]) -> bool:
+    """Return whether a user's code in one of these agents has failed, and the run ended by that."""
+    return event.kind == "failure" and event.subject in names and event.data.get("on_death") == "end"
 
 
 def _is_kill_request(event: run_messages.Event) -> bool:

@@ -12,7 +12,15 @@ import typer
 from typer.main import get_command
 
 from zsim import __version__, extras
-from zsim.errors import BehindError, RunFailedError, SupersededError, UserCodeError, ZsimError, printable
+from zsim.errors import (
+    BehindError,
+    RequestRefusedError,
+    RunFailedError,
+    SupersededError,
+    UserCodeError,
+    ZsimError,
+    printable,
+)
 from zsim_deploy import INTERRUPTED, USER_FAULT
 from zsim_deploy.arguments import (
     CONSOLE_NEEDS,
@@ -56,7 +64,13 @@ app = typer.Typer(
 
 UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
 UNREAD = 128 + 13  # exit code of a command whose output nobody reads any more: that of SIGPIPE
-EXIT_CODES = {SupersededError: 3, BehindError: 1, RunFailedError: 1, UserCodeError: 1}  # of what is no wrong input
+EXIT_CODES = {  # of what is no wrong input
+    SupersededError: 3,
+    BehindError: 1,
+    RequestRefusedError: 1,
+    RunFailedError: 1,
+    UserCodeError: 1,
+}
 
 
 @app.command(rich_help_panel=RUN)
@@ -177,11 +191,14 @@ def _refuse_to_change(
 def validate(scenario: ScenarioPath, set_: Set = None) -> None:
     """Check a scenario and print what it resolves to; every fault is a line."""
     from zsim.scenario import scenario_file
+    from zsim.scenario.consistency import unflown_plans
     from zsim_agents.hosting import check_plans
 
     loaded = load_scenario(scenario, set_)
     check_plans(loaded, scenario.name)
-    print(printable(scenario_file.to_text(loaded)), end="")
+    print(printable(scenario_file.to_text(loaded)), end="", flush=True)
+    for line in unflown_plans(loaded):
+        print(printable(f"{scenario.name}: {line}"), file=sys.stderr)
 
 
 def _version(wanted: bool) -> None:

@@ -120,7 +120,7 @@ def ask(
     op: Annotated[str, typer.Argument(help="E.g. pause, resume, step, stop; engage, hold, land, target.")],
     args: Annotated[str, typer.Argument(help="JSON map, e.g. '{\"gates\": 50}'.")] = "{}",
 ) -> None:
-    """Send a request to the world or a controller and print the answer."""
+    """Send a request to the world or a controller and print the answer. Exit code 1 where it is refused."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
@@ -196,7 +196,7 @@ def add(
     for_: For = None,
     at: At = None,
 ) -> None:
-    """Inject a fault, e.g. `zsim fault add drone2 gps_dropout --for 10s`."""
+    """Inject a fault, e.g. `zsim fault add drone2 gps_dropout --for 10s`. Exit code 1 where the world refuses it."""
     times = {"for_s": seconds(for_), "at_s": seconds(at)}
     args = {"kind": kind, "target": target, **times, **_values(parameters or ())}
     with connected(reach) as (link, _):
@@ -309,9 +309,7 @@ def _values(parameters: Sequence[str]) -> dict[str, Any]:
 
 def _ask(link: "Session", op: str, args: dict[str, Any]) -> dict[str, Any]:
     from zsim.contract import keys
-    from zsim.errors import RunError
+    from zsim_deploy.cli import inspection
 
-    answer = link.request(keys.CONTROL, op, SOURCE, {name: value for name, value in args.items() if value is not None})
-    if not answer.ok:
-        raise RunError(answer.error)
-    return answer.result
+    given = {name: value for name, value in args.items() if value is not None}
+    return inspection.result_of(link.request(keys.CONTROL, op, SOURCE, given))

@@ -13,8 +13,8 @@ import msgspec
 
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.framing import pairs_of
-from zsim.errors import DecodeError, RunError
-from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription, check_expression
+from zsim.errors import DecodeError, RequestRefusedError, RunError
+from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription, Unanswered, check_expression
 
 LISTEN_S = 1.0  # wall time that `keys` listens: every live key of the contract has a message at least once a second
 PACKET_S = 0.05  # wait between two looks into an empty subscription
@@ -353,13 +353,22 @@ def ask(link: Session, key: str, op: str, text: str) -> Any:
     """Send a request with the arguments in a JSON text; return its result as JSON can hold it.
 
     Raises:
-        RunError: no JSON, nobody answers, or the answer is a refusal.
+        RunError: no JSON, nobody answers, or (RequestRefusedError) the answer is a refusal.
     """
     _refuse_wildcards(key, "ask")
-    answer = link.request(key, op, ASK, _map(f"{op}: args", text, '{"gates": 50}'))
-    if not answer.ok:
-        raise RunError(answer.error)
+    result = result_of(link.request(key, op, ASK, _map(f"{op}: args", text, '{"gates": 50}')))
     with suppress(DecodeError):  # a replay is the only result that holds messages
-        pairs = pairs_of(answer.result)
-        return [{"key": key, "message": readable(ReceivedSample(key, payload))} for key, payload in pairs]
-    return msgspec.to_builtins(answer.result, str_keys=True)
+        return [{"key": key, "message": readable(ReceivedSample(key, payload))} for key, payload in pairs_of(result)]
+    return msgspec.to_builtins(result, str_keys=True)
+
+
+def result_of(answer: run_messages.ControlAnswer) -> Any:
+    """Return the result of a request.
+
+    Raises:
+        RequestRefusedError: the answer is a refusal.
+        RunError: no answer came.
+    """
+    if answer.ok:
+        return answer.result
+    raise (RunError if isinstance(answer, Unanswered) else RequestRefusedError)(answer.error)

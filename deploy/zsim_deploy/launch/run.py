@@ -16,6 +16,7 @@ from zsim.record import repair
 from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
+from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.external_bodies import driver_lines
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
@@ -213,7 +214,7 @@ def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
     scenario, listen = options.scenario, options.listen
     if not options.continued:
         _write_scenario(options, in_process=False)
-    screen.say(_headline(options))
+    _say_headline(options, screen)
     if options.camera_children() and not options.rate and not scenario.gates("camera"):
         screen.say("as fast as it goes, a lockstep run is faster than its cameras; --rate 1 leaves them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
@@ -222,9 +223,11 @@ def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
         return _run_on_free_port(options, screen, launcher, signals)
 
 
-def _headline(options: RunOptions) -> str:
+def _say_headline(options: RunOptions, screen: Screen) -> None:
     scenario = options.scenario
-    return f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}"
+    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
+    for line in unflown_plans(scenario):
+        screen.say(line)
 
 
 def _interrupt(number: int, _: object) -> None:
@@ -288,7 +291,7 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
 
     if not options.continued:
         _write_scenario(options, in_process=True)
-    screen.say(_headline(options))
+    _say_headline(options, screen)
     with EndSignals(options.out / "run.log", screen.hang_up) as signals:
         stop = StopChannel()
 

@@ -82,6 +82,7 @@ class Supervisor:
         self._until_s: float | None = None
         self._silent_s: float | None = None  # when a world without a line of its own is to be named (monotonic)
         self._dead: set[str] = set()
+        self._lost: dict[str, int | None] = {}  # pid of who has ended without a bye
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
         self._gone: list[RunProcess] = []  # nobody waits for them any more
         self._world_watch = WorldWatch()
@@ -154,7 +155,7 @@ class Supervisor:
         elif event["kind"] == "death" and event["data"].get("on_death") == "end":
             self._fail(f"{event['subject']} died")
         elif event["kind"] == "death" and event["data"].get("on_death") == "restart":
-            self.submit(lambda: self._restart_superseded(event["subject"]))
+            self.submit(lambda: self._on_death(event["subject"], event["data"].get("pid")))
 
     def _on_overdue(self, event: dict[str, Any]) -> None:
         """End what has not come back in its time, if the run goes on without it."""
@@ -284,7 +285,7 @@ class Supervisor:
 
     def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
         """Apply on_death to a role that ended while the world runs."""
-        if child.code in (0, SUPERSEDED):
+        if child.code == SUPERSEDED or (child.code == 0 and self._lost.get(child.name) != child.pid):
             self._dead.add(child.name)
             if child.code == SUPERSEDED:
                 self._show.say(child.last_log_line())
@@ -300,10 +301,16 @@ class Supervisor:
             self._fail(f"{child.name} ended: {child.outcome()}")
             world.request_stop(self._reason)
 
-    def _restart_superseded(self, name: str) -> None:
-        """Start a process again that has left its place to one that is dead now, and that nobody else would start."""
+    def _on_death(self, name: str, pid: int | None) -> None:
+        """Take it from the world that a process has died, if nobody else would start it again.
+
+        It has left its place to the one that is dead now, or has ended with 0 without a bye, as by `os._exit(0)`.
+        """
         for child in self.members:
-            if child.name == name and child.code == SUPERSEDED and name in self._dead:
+            if child.name == name and child.pid == pid and child.code in (0, None):
+                self._lost[name] = pid
+                self._dead.discard(name)
+            elif child.name == name and child.code == SUPERSEDED and name in self._dead:
                 self._show.say(f"{name} is started again, since who took its place is dead")
                 self._dead.discard(name)
                 child.restarts += 1

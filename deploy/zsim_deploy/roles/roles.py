@@ -17,6 +17,7 @@ from zsim.contract.messages import Info
 from zsim.errors import NoWorldError, SessionError, SupersededError, UserCodeError, ZsimError, printable
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
+from zsim.runtime.inbox import output_hold_ns
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, ROUTER
@@ -106,7 +107,7 @@ def agent_of(role: str, names: Sequence[str]) -> Callable[[messages.Info, Scenar
     def build(info: messages.Info, scenario: Scenario) -> Agent:
         wanted = chosen(f"{role}: {AGENTS[role].about}", names, things(role, scenario))
         agents = made(role, info, scenario, wanted)
-        return agents[0] if len(agents) == 1 else AgentGroup(agents)
+        return agents[0] if len(agents) == 1 else AgentGroup(agents, output_hold_ns(info))
 
     return build
 

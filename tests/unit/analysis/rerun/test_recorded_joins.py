@@ -17,7 +17,7 @@ VISITOR = "tester.one"
 SCENARIO = scenario_file.from_text(
     "{name: one, duration_s: 1, drones: [{name: d1, position_m: [0, 0, 0]}], processes: {expect: []}}"
 )
-ALONE = RecordedAgents((), "none", (), frozenset(), None)
+ALONE = RecordedAgents((), "none", (), frozenset(), None, "")
 
 
 def recorded(key: str, message: Any) -> Recorded:

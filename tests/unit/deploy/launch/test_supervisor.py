@@ -136,6 +136,24 @@ def test_who_has_left_its_place_takes_it_back_when_its_successor_is_dead():
     assert team.others[0].restarts == 1
 
 
+@pytest.mark.parametrize("codes", [(0, None), (0,) * (RESTARTS_MAX + 2)])
+def test_who_ends_with_0_without_a_bye_has_died(codes: tuple[int | None, ...]):
+    """As by `os._exit(0)`; again and again, it ends the run."""
+    team = Team(Member("estimator.d1", *codes), looks=60)
+
+    def look() -> None:
+        member = team.others[0]
+        data = {"on_death": "restart", "pid": member.pid}
+        if member.code == 0:
+            death = {"event": {"kind": "death", "subject": "estimator.d1", "text": "", "data": data}}
+            team.watch.handle_line(json.dumps(death))
+
+    outcome = team.go(look)
+    assert outcome.failed == (len(codes) > 2)
+    assert team.others[0].restarts == min(len(codes) - 1, RESTARTS_MAX)
+    assert not outcome.failed or has_terms(outcome.reason, "estimator.d1", "exit code 0")
+
+
 def test_nobody_is_started_twice_for_one_death():
     team = Team(Member("estimator.d1", None))
     death = {"event": {"kind": "death", "subject": "estimator.d1", "text": "", "data": {"on_death": "restart"}}}

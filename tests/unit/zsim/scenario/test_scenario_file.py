@@ -17,6 +17,7 @@ from refused import has_terms
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
+from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import DRONES_MAX, Scenario
 from zsim.schema.checker import FAULTS_MAX
@@ -623,6 +624,26 @@ def test_a_fault_that_all_drones_share_is_told_once():
             {"drones": [drone("a", thrust_n_s2=0.01)]},
             ("drones[0].thrust_n_s2", "0.01", "0.042 %", "0.5", "90 %", "N s^2"),
         ),
+        (  # revolutions per minute
+            {"drones": [drone("a", rotor_max_rad_s=4803)]},
+            ("drones[0].rotor_max_rad_s", "4803", "480 m/s", "3403", "sound", "rad/s", "rpm"),
+        ),
+        (
+            {"drones": [drone("a", model="crazyflie2", rotor_max_rad_s=21706)]},
+            ("drones[0].rotor_max_rad_s", "21706", "501 m/s", "14732"),
+        ),
+        (  # a hundred times the AR.Drone's
+            {"drones": [drone("a", drag_n_s_m=24.9)]},
+            ("drones[0].drag_n_s_m", "24.9", "2 m/s", "49.8 N", "4.21 N", "2.1", "N s/m"),
+        ),
+        (
+            {"drones": [drone("a", aerodynamics={"quadratic_drag_n_s2_m2": [0.1, 0.1, 5]})]},
+            ("drones[0].aerodynamics.quadratic_drag_n_s2_m2", "[0.1, 0.1, 5]", "20 N", "1.05", "N s^2/m^2"),
+        ),
+        (
+            {"drones": [drone("a", aerodynamics={"rotor_drag_n_s2_m": 0.0119})]},  # for 1.19e-4
+            ("drones[0].aerodynamics.rotor_drag_n_s2_m", "0.0119", "N s^2/m"),
+        ),
         (  # ampere-hours
             {"drones": [drone("a", battery_mah=1)]},
             ("drones[0].battery_mah", "0.72 s", "10", "86400 s", "mAh"),
@@ -951,3 +972,28 @@ def test_a_fault_of_the_shared_vehicle_is_told_once_by_its_path(vehicle: Any, pa
 def test_a_field_of_the_shared_vehicle_is_set_by_its_path():
     scenario = scenario_file.load(SCENARIOS / "step.yaml", ["vehicle.mass_kg=0.5"])
     assert [each.mass_kg for each in scenario.drones] == [0.5] * 3
+
+
+@pytest.mark.parametrize(
+    ("plan", "duration_s", "terms"),
+    [
+        ({"takeoff_s": 20}, 20, ("clusters[0].plan", "20 s", "take-off at 20 s", "nothing", "'c'")),
+        ({"takeoff_s": 20, "land_s": 90}, 5, ("5 s", "take-off at 20 s and its landing at 90 s", "nothing")),
+        ({"land_s": 90}, 50, ("landing at 90 s", "nothing")),
+        ({"takeoff_s": 2, "land_s": 90}, 50, ("before its landing at 90 s: not flown",)),
+        (
+            {"takeoff_s": 2, "trajectory": {"start_s": 60, "expressions": {"x_c": "t"}}},
+            50,
+            ("before its trajectory at 60 s: not flown",),
+        ),
+        ({"takeoff_s": 20, "land_s": 90}, 91, ()),
+        ({"trajectory": {"start_s": 60, "expressions": {"x_c": "t"}}}, 50, ()),
+        ({}, 5, ()),
+    ],
+)
+def test_what_of_a_plan_begins_after_the_end_of_the_run_is_named(plan: Any, duration_s: float, terms: tuple[str, ...]):
+    cluster = {"name": "c", "drones": ["drone1", "drone2"], "plan": plan}
+    scenario = scenario_file.resolve(document(clusters=[cluster], duration_s=duration_s), "step.yaml")
+    lines = unflown_plans(scenario)
+    assert len(lines) == bool(terms)
+    assert all(has_terms(line, *terms) for line in lines)
