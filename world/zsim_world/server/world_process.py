@@ -38,7 +38,7 @@ CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while ti
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 HEALTH = keys.process(WORLD, "health")
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
-SERVE_NS = 5_000_000  # wall time after which a world that never waits looks at requests, losses and its own stop
+SERVE_NS = 5_000_000  # wall time after which a world that never waits looks at requests and losses
 
 
 class WorldProcess:
@@ -47,7 +47,7 @@ class WorldProcess:
     Args:
         link: a listening session.
         world: what to run.
-        stopped: asked every TICK_S; a text ends the run with it as the reason.
+        stopped: asked at every gate, and every TICK_S; a text ends the run with it as the reason.
         progress: shows progress.
         journal: of the run; from the one that a world before has left, this one goes on.
         health: of this process.
@@ -177,6 +177,8 @@ class WorldProcess:
     def _turn(self) -> None:
         self._turn_wall_ns = time.monotonic_ns()
         self._take_in()
+        if reason := self._stopped():
+            self._clock.stop(reason)
         if self._turn_wall_ns - self._served_wall_ns >= SERVE_NS:
             self._serve_others()
             self._served_wall_ns = self._turn_wall_ns
@@ -285,9 +287,6 @@ class WorldProcess:
         self._progress("event", event, self._intake.phase)
 
     def _serve_others(self) -> None:
-        reason = self._stopped()
-        if reason:
-            self._clock.stop(reason)
         while self._queries:
             self._service.serve(self._queries.popleft())
             self._outputs.flush()

@@ -395,7 +395,7 @@ def test_times_and_keys_beyond_the_format_are_held_in_bounds(tmp_path, monkeypat
         writer.add("c", b"3", "", 3, 3)
         writer.add("a", b"4", "", 4, 4)
     assert [(message.key, message.t_ns) for message in read(path)] == [("a", 0), ("a", 4), ("b", 2**64 - 1)]
-    assert (writer.messages, writer.refused) == (3, 1)
+    assert writer.refused == 1
 
 
 @pytest.mark.parametrize("wanted", [None, {"clock"}])

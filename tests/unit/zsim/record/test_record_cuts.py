@@ -147,7 +147,7 @@ def test_whatever_is_cut_off_a_writer_goes_on_behind_the_rest(
         cut.write_bytes(data[:at])
         before = by_key(cut) if at else {}
         with RecordWriter(cut, goes_on=True) as writer:
-            assert writer.messages == sum(map(len, before.values()))
+            assert writer.has_former == any(before.values())
             for each in added:
                 writer.add(each.key, each.payload, messages.encoding(each.key), each.t_ns, each.wall_ns)
         after = by_key(cut)
