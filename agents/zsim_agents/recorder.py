@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.framing import GateMessages, run_key_table
+from zsim.contract.framing import run_key_table
 from zsim.errors import RecordError, RunError, SupersededError
 from zsim.record import RecordWriter
 from zsim.record.completeness import GateCount
@@ -297,7 +297,10 @@ class Recorder:
         self.health.refused += 1
 
     def _write_passed(self, passed: Passed) -> None:
-        if isinstance(passed, GateMessages) and not self._known:
+        if isinstance(passed, ReceivedSample):
+            self._write(passed.key, passed.payload)
+            return
+        if not self._known:
             self.health.received += len(passed)
             self._now_ns = passed.t_ns
             self._writer.add_gate(passed, time.time_ns())

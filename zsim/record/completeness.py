@@ -4,7 +4,7 @@ The world numbers what it publishes without gaps, so what is missing shows in th
 is not counted: a number that is missing there may never have reached the world, and what did not is not missing here.
 """
 
-from collections.abc import Container
+from collections.abc import Callable, Container
 from contextlib import suppress
 from pathlib import Path
 
@@ -190,18 +190,31 @@ class _Numbers:
         return int(number[is_last].sum() + is_last.sum() - is_new.sum())
 
 
-def completeness(reader: RecordReader) -> Completeness:
-    """Return whether a record has everything: all of it is read, and every check sum compared."""
+def completeness(
+    reader: RecordReader,
+    keys_beside: Container[str] = (),
+    take: Callable[[str, bytes], None] = lambda key, payload: None,
+) -> Completeness:
+    """Return whether a record has everything: all of it is read, and every check sum compared.
+
+    Args:
+        keys_beside: of messages that are wanted as well, which saves reading the record twice.
+        take: called with key and payload of each of these, in the order in which they were written.
+    """
     info = _info(reader)
     is_replay, external = info is not None and bool(info.replay_of), _external(info)
     numbered = {n for n, key in reader.channels().items() if not is_replay and _is_numbered(key, external)}
     of_clock = {n for n, key in reader.channels().items() if key == keys.CLOCK}
+    beside = {n: key for n, key in reader.channels().items() if key in keys_beside}
     numbers = _Numbers()
     clocks: list[run_messages.Clock] = []
     decode = msgspec.msgpack.Decoder(run_messages.Clock).decode
-    for spans in reader.spans(numbered | of_clock):
+    for spans in reader.spans(numbered | of_clock | beside.keys()):
         is_clock = np.isin(spans.channel, list(of_clock))
-        numbers.add(spans, ~is_clock)
+        numbers.add(spans, np.isin(spans.channel, list(numbered)))
+        wanted = np.flatnonzero(np.isin(spans.channel, list(beside)))
+        for m in wanted[np.argsort(spans.start[wanted])].tolist():
+            take(beside[spans.channel.item(m)], spans.content[spans.start.item(m) : spans.end.item(m)])
         for start, end in zip(spans.start[is_clock].tolist(), spans.end[is_clock].tolist(), strict=True):
             with suppress(*messages.REFUSALS):  # garbage by somebody else, recorded as it came
                 clocks.append(decode(spans.content[start:end]))

@@ -177,10 +177,14 @@ def _length_inside(source: Source, place: RecordSpan) -> int | None:
     return content - place.body + SIZE.unpack_from(source, content - SIZE.size)[0]
 
 
-def groups(source: Source) -> Iterator[RecordGroup]:
-    """Yield schemas, channels and chunks of the data section in order."""
+def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterator[RecordGroup]:
+    """Yield schemas, channels and chunks of the data section in order.
+
+    Args:
+        found: the places of the records, if somebody looks through them already.
+    """
     pending: list[RecordSpan] = []
-    for place in places(source):
+    for place in found or places(source):
         if place.opcode == Opcode.DATA_END:
             break
         if place.opcode == Opcode.MESSAGE_INDEX:
@@ -199,7 +203,7 @@ def _group(source: Source, pending: list[RecordSpan]) -> Iterator[RecordGroup]:
 
 
 def _index(source: Source, place: RecordSpan) -> Index:
-    channel, size = INDEX_HEAD.unpack_from(source, place.body)
+    channel, size = INDEX_HEAD.unpack_from(source, place.start + HEAD.size)
     return Index(channel, size // INDEX_ENTRY, place.start)
 
 

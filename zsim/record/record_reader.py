@@ -93,7 +93,8 @@ class RecordReader:
         check_magic(self._source, self.path)
         self.complete = is_complete(self._source)
         self._keys: dict[int, str] = {}
-        self._rest = self._damaged_rest()
+        self._data_end: RecordSpan | None = None
+        self._rest: int | None = None  # from where on nothing can be read, if so
         self._damaged: set[RecordSpan] = set()  # chunks
         self._chunks = list(self._scan())
 
@@ -177,11 +178,10 @@ class RecordReader:
 
         Names of keys, and indexes, have no check sum of their own.
         """
-        for place in places(self._source) if self.complete else ():
-            if place.opcode == Opcode.DATA_END:
-                stated = CRC.unpack_from(self._source, place.body)[0]
-                return stated not in (0, zlib.crc32(memoryview(self._source)[: place.start]))
-        return False
+        if not self.complete or self._data_end is None:
+            return False
+        stated = CRC.unpack_from(self._source, self._data_end.body)[0]
+        return stated not in (0, zlib.crc32(memoryview(self._source)[: self._data_end.start]))
 
     def last(self, key: str) -> Recorded | None:
         """Return the message of a key that was written last, None if there is none."""
@@ -216,20 +216,26 @@ class RecordReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _damaged_rest(self) -> int | None:
-        """Return from where on nothing can be read, if so; note the channels, which may be in the summary only."""
+    def _places(self) -> Iterator[RecordSpan]:
+        """Yield all records, and note the channels, which may be in the summary only, and where the data ends."""
         opcode, end = 0, len(MAGIC)
         for place in places(self._source):
             opcode, end = place.opcode, place.end
             if opcode == Opcode.CHANNEL:
                 channel = unpacked(Channel, self._source, place)
                 self._keys[channel.id] = channel.topic
-        is_damaged = opcode != Opcode.FOOTER and (self.complete or not is_cut(self._source, end))
-        return end if is_damaged else None
+            elif opcode == Opcode.DATA_END:
+                self._data_end = self._data_end or place
+            yield place
+        if opcode != Opcode.FOOTER and (self.complete or not is_cut(self._source, end)):
+            self._rest = end
 
     def _scan(self) -> Iterator[_Chunk]:
         known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
-        chunk_groups = [group for group in groups(self._source) if group.place.opcode == Opcode.CHUNK]
+        found = self._places()
+        chunk_groups = [group for group in groups(self._source, found) if group.place.opcode == Opcode.CHUNK]
+        for _ in found:  # of the summary
+            continue
         for group in chunk_groups:
             cut = group is chunk_groups[-1] and not self.complete
             counts = self._counted(group) if cut else {index.channel: index.messages for index in group.indexes}

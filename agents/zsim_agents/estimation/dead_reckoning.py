@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from zsim.math.compiled import inlined, portable
+from zsim.math.compiled import inlined
 from zsim.math.rotation import (
     Matrix,
     Quaternion,

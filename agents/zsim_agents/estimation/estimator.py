@@ -96,10 +96,11 @@ class Estimator(Agent):
         if self._external:  # nothing is known of one whose driver has been silent since the last gate
             named = [each for each in named if each[0] not in self._silent]
             self._silent = set(self._external)
-        source, next_seq = self.source, self.next_seq
-        made = [(d, key, flight_messages.Estimate(t_ns, next_seq(key), *values, source)) for d, key, values in named]
-        self._last = {drone: message for drone, _, message in made}
-        return [Output(key, message) for _, key, message in made]
+        make, source, self._last, outputs = flight_messages.Estimate, self.source, {}, []
+        for drone, key, estimate in named:
+            self._last[drone] = message = make(t_ns, self.next_seq(key), *estimate, source=source)
+            outputs.append(Output(key, message))
+        return outputs
 
     def views(self, t_ns: int) -> list[Output]:
         shown = tuple(estimate_view(drone, estimate) for drone, estimate in self._last.items())

@@ -7,7 +7,7 @@ Quaternions are Hamilton, w first, body to world; the world is z up, so a body a
 
 import math
 
-from zsim.math.compiled import inlined, portable
+from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, dot, multiply, norm, normalised, scaled
 
 # Mean of a unit vector in the plane along a small offset e under noise s per axis: slope * e/s.

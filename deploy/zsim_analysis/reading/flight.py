@@ -1,8 +1,10 @@
 """A flight as arrays: read in one pass from its record, or from the messages themselves while it is flown here."""
 
 from array import array
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
+from sys import intern
 from typing import Any
 
 import msgspec
@@ -14,7 +16,7 @@ from zsim.contract.flight_messages import Quaternion
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Bye, ClusterRequest, Event, Join
-from zsim.record import Completeness, Recorded, RecordReader, completeness
+from zsim.record import Completeness, RecordReader, completeness
 from zsim.schema.message import Vector3
 from zsim_analysis.reading.drone_answers import DroneAnswers, EstimateFields, VelocityFields
 from zsim_analysis.reading.recorded_flight import (
@@ -54,6 +56,51 @@ class _State(Struct):
     reason: str = ""
 
 
+class _StateTable:
+    """The states of a cluster as columns: those of a large formation repeat its names, which outweigh all numbers."""
+
+    def __init__(self) -> None:
+        self._names: tuple[str, ...] = ()
+        self._drones: tuple[str, ...] = ()
+        self._clear()
+
+    def _clear(self) -> None:
+        self._times, self._value, self._desired = array("q"), array("d"), array("d")
+        self._phases: list[str] = []
+        self._reasons: list[str] = []
+
+    def add(self, state: _State) -> None:
+        """Add a state; one with another number of variables than those before replaces them."""
+        count = len(state.names)
+        if not len(state.value) == len(state.desired) == count > 0:
+            return
+        if count != len(self._names):
+            self._clear()
+        self._names, self._drones = state.names, state.drones
+        self._times.append(state.t_ns)
+        self._value.extend(state.value)
+        self._desired.extend(state.desired)
+        self._phases.append(intern(state.phase))
+        self._reasons.append(intern(state.reason))
+
+    def states(self, name: str, drones: tuple[str, ...], requests: list[ClusterRequest]) -> ClusterStates:
+        """Return all states by time, of several of an instant the last."""
+        count = len(self._times)
+        t_ns, places = np.unique(np.array(self._times, np.int64)[::-1], return_index=True)
+        last = count - 1 - places
+        return ClusterStates(
+            name=name,
+            drones=drones or self._drones,
+            names=self._names,
+            t_ns=t_ns,
+            value=np.array(self._value).reshape(count, len(self._names))[last],
+            desired=np.array(self._desired).reshape(count, len(self._names))[last],
+            phases=[self._phases[i] for i in last],
+            reasons=[self._reasons[i] for i in last],
+            requests=requests,
+        )
+
+
 def read_flight(path: Path, answers: bool = False, motion: bool = True) -> RecordedFlight:
     """Return the flight of a record.
 
@@ -68,14 +115,17 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
     with RecordReader(path) as reader:
         flight = FlightReader(answers)
         wanted = [key for key in reader.topics() if flight.handler(key)]
-        if not motion:
-            ends = [reader.last(key) for key in wanted if keys.leaf(key) in ("truth", "status")]
-            wanted = [key for key in wanted if keys.parts(key)[0] != "drone"]
+        if motion:
+            for message in reader.messages(wanted, by_time=False):
+                flight.add(message.key, message.payload, message.wall_ns)
+            whole = completeness(reader)
+        else:
+            of_drones = [key for key in wanted if keys.parts(key)[0] == "drone"]
+            ends = [reader.last(key) for key in of_drones if keys.leaf(key) in ("truth", "status")]
             for message in filter(None, ends):
-                flight.add(message)
-        for message in reader.messages(wanted, by_time=False):
-            flight.add(message)
-        recorded = flight.flight(sum(reader.topics().values()), completeness(reader))
+                flight.add(message.key, message.payload, message.wall_ns)
+            whole = completeness(reader, set(wanted).difference(of_drones), flight.add)
+        recorded = flight.flight(sum(reader.topics().values()), whole)
         search_modules(path, recorded.info)
         return recorded
 
@@ -93,7 +143,7 @@ class FlightReader:
         self._events: list[Event] = []
         self._truth: dict[str, tuple[array[int], array[float]]] = {}
         self._status: dict[str, tuple[array[int], list[str], array[float]]] = {}
-        self._states: dict[str, list[_State]] = {}
+        self._states: defaultdict[str, _StateTable] = defaultdict(_StateTable)
         self._requests: dict[str, list[ClusterRequest]] = {}
         self._processes: dict[str, RecordedProcess] = {}
         self._first_wall_ns: int | None = None
@@ -112,7 +162,7 @@ class FlightReader:
                 "process/bye": (Bye, self._store_process),
                 "drone/truth": (_Truth, self._store_truth),
                 "drone/sensor/status": (_Status, self._store_status),
-                "cluster/state": (_State, lambda name, message: self._states.setdefault(name, []).append(message)),
+                "cluster/state": (_State, lambda name, message: self._states[name].add(message)),
                 "cluster/request": (
                     ClusterRequest,
                     lambda name, message: self._requests.setdefault(name, []).append(message),
@@ -125,22 +175,26 @@ class FlightReader:
             self._handlers[key] = (msgspec.msgpack.Decoder(kind), store) if kind and store else None
         return self._handlers[key]
 
-    def add(self, recorded: Recorded) -> None:
-        """Add a message of a record; one that cannot be decoded is counted."""
-        handler = self.handler(recorded.key)
+    def add(self, key: str, payload: bytes, wall_ns: int = 0) -> None:
+        """Add a message of a record; one that cannot be decoded is counted.
+
+        Args:
+            wall_ns: when it was recorded; only of truth needed.
+        """
+        handler = self.handler(key)
         if handler is None:
             return
         decoder, store = handler
         try:
-            message = decoder.decode(recorded.payload)
+            message = decoder.decode(payload)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             self._undecoded += 1
             return
         if isinstance(message, _Truth):
             if self._first_wall_ns is None:
-                self._first_wall_ns = recorded.wall_ns
-            self._last_wall_ns = recorded.wall_ns
-        store(keys.parts(recorded.key)[1], message)
+                self._first_wall_ns = wall_ns
+            self._last_wall_ns = wall_ns
+        store(keys.parts(key)[1], message)
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
         """Add a message of a flight in this process; it has not been encoded."""
@@ -191,7 +245,7 @@ class FlightReader:
             scenario=scenario_of(info),
             tracks=[self._track(name, name in external) for name in names],
             clusters=[
-                _states(name, drones, self._states.get(name, []), self._requests.get(name, []))
+                self._states[name].states(name, drones, self._requests.get(name, []))
                 for name, drones in members.items()
             ],
             events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
@@ -222,24 +276,3 @@ class FlightReader:
 
 
 _Handler = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
-
-
-def _states(name: str, drones: tuple[str, ...], states: list[_State], requests: list[ClusterRequest]) -> ClusterStates:
-    """Return the states of a cluster that have as many variables as the last one, by time."""
-    if not states:
-        return ClusterStates(name, drones, requests=requests)
-    names = states[-1].names
-    fit = [s for s in states if len(s.names) == len(s.value) == len(s.desired) == len(names) > 0]
-    by_time = {state.t_ns: state for state in sorted(fit, key=lambda state: state.t_ns)}
-    kept = list(by_time.values())
-    return ClusterStates(
-        name=name,
-        drones=drones or states[-1].drones,
-        names=names,
-        t_ns=np.array(list(by_time), np.int64),
-        value=np.array([state.value for state in kept]).reshape(-1, len(names)),
-        desired=np.array([state.desired for state in kept]).reshape(-1, len(names)),
-        phases=[state.phase for state in kept],
-        reasons=[state.reason for state in kept],
-        requests=requests,
-    )
