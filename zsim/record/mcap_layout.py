@@ -53,6 +53,7 @@ CHUNK_MAX = 1 << 27  # bytes of a chunk's content; ours have a megabyte and a me
 SMALL_MAX = 1 << 20  # bytes of a schema, a channel or a part of the summary; statistics of 65 535 channels take 0.7 MB
 LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # bytes that are always read
 
+PIECE_BYTES = 1 << 24  # of a file that are mapped at most while all of it is read, chosen: they count as memory in use
 Source = bytes | mmap
 Known = TypeVar("Known", Schema, Channel)
 
@@ -249,6 +250,24 @@ def content_of(source: Source, place: RecordSpan) -> bytes | None:
             return None
     unchecked = head.crc == 0 and not is_ours(source)  # MCAP has 0 where a tool computes none
     return content if unchecked or head.crc == zlib.crc32(content) else None
+
+
+def crc_until(source: Source, end: int) -> int:
+    """Return the check sum of the first bytes of a file."""
+    crc = 0
+    for start in range(0, end, PIECE_BYTES):
+        with memoryview(source) as whole, whole[start : min(end, start + PIECE_BYTES)] as piece:
+            crc = zlib.crc32(piece, crc)
+        unmap(source)
+    return crc
+
+
+def unmap(source: Source) -> None:
+    """Let go of the pages of a file that were read; they are read again when they are needed."""
+    if isinstance(source, mmap) and hasattr(source, "madvise"):  # Windows has none
+        from mmap import MADV_DONTNEED
+
+        source.madvise(MADV_DONTNEED)
 
 
 def is_ours(source: Source) -> bool:

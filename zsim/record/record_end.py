@@ -24,6 +24,7 @@ from zsim.record.mcap_layout import (
     Source,
     chunk_head,
     content_of,
+    crc_until,
     groups,
     indexes_of,
     is_complete,
@@ -107,7 +108,7 @@ def finish(file: FileIO) -> None:
     summary = RecordSummary()
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary.take(source)
-        data_end = packed(DataEnd(zlib.crc32(source)))
+        data_end = packed(DataEnd(crc_until(source, len(source))))
     start = file.seek(0, 2) + len(data_end)
     write_all(file, data_end + b"".join(_ending(summary, start)))
 

@@ -1,7 +1,6 @@
 """Reads a record, whole or cut at any byte, from a file or the folder of a run."""
 
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from mmap import ACCESS_READ, mmap
@@ -21,18 +20,21 @@ from zsim.record.mcap_layout import (
     INDEX_HEAD,
     MAGIC,
     MESSAGE,
+    PIECE_BYTES,
     Index,
     RecordGroup,
     RecordSpan,
     Source,
     chunk_head,
     content_of,
+    crc_until,
     groups,
     heads_at,
     indexes_of,
     is_complete,
     is_cut,
     places,
+    unmap,
     unpacked,
 )
 from zsim.record.record_end import check_magic
@@ -134,6 +136,7 @@ class RecordReader:
         Raises:
             RecordError: compressed by another tool in a way that is not ours.
         """
+        mapped = 0
         for chunk in self._chunks:
             if chunk.channels.isdisjoint(wanted):
                 continue
@@ -142,6 +145,10 @@ class RecordReader:
                 self._damaged.add(chunk.place)
                 continue
             channel, places = self._indexed(chunk, content)
+            mapped += chunk.place.end - chunk.place.start
+            if mapped > PIECE_BYTES:
+                unmap(self._source)
+                mapped = 0
             rows = np.isin(channel, list(wanted))
             starts = places[rows]
             ends = starts + HEAD.size + heads_at(content, starts)["length"].astype(np.int64)
@@ -181,7 +188,7 @@ class RecordReader:
         if not self.complete or self._data_end is None:
             return False
         stated = CRC.unpack_from(self._source, self._data_end.body)[0]
-        return stated not in (0, zlib.crc32(memoryview(self._source)[: self._data_end.start]))
+        return stated not in (0, crc_until(self._source, self._data_end.start))
 
     def last(self, key: str) -> Recorded | None:
         """Return the message of a key that was written last, None if there is none."""
