@@ -136,6 +136,7 @@ _WIDTH[:0x80] = 0
 _WIDTH[[0xCC, 0xCD, 0xCE, 0xCF]] = 1, 2, 4, 8
 _T_NS, _SEQ = (np.frombuffer(msgspec.msgpack.encode(name), np.uint8) for name in ("t_ns", "seq"))
 _MAP_16 = 0xDE  # of more than 15 fields
+SECOND_NS = 1_000_000_000
 _LOOKED_AT = 1 << 5  # bytes from the beginning of a message in which both of its first fields end
 
 
@@ -193,28 +194,32 @@ class _Numbers:
 def completeness(
     reader: RecordReader,
     keys_beside: Container[str] = (),
+    keys_sampled: Container[str] = (),
     take: Callable[[str, bytes], None] = lambda key, payload: None,
 ) -> Completeness:
     """Return whether a record has everything: all of it is read, and every check sum compared.
 
     Args:
         keys_beside: of messages that are wanted as well, which saves reading the record twice.
+        keys_sampled: of messages of which the first in every simulated second and the last are wanted; there may be
+            more.
         take: called with key and payload of each of these, in the order in which they were written.
     """
     info = _info(reader)
     is_replay, external = info is not None and bool(info.replay_of), _external(info)
     numbered = {n for n, key in reader.channels().items() if not is_replay and _is_numbered(key, external)}
     of_clock = {n for n, key in reader.channels().items() if key == keys.CLOCK}
-    beside = {n: key for n, key in reader.channels().items() if key in keys_beside}
+    beside = {n for n, key in reader.channels().items() if key in keys_beside}
+    sampled, names = {n for n, key in reader.channels().items() if key in keys_sampled}, reader.channels()
     numbers = _Numbers()
     clocks: list[run_messages.Clock] = []
     decode = msgspec.msgpack.Decoder(run_messages.Clock).decode
-    for spans in reader.spans(numbered | of_clock | beside.keys()):
+    for spans in reader.spans(numbered | of_clock | beside | sampled):
         is_clock = np.isin(spans.channel, list(of_clock))
         numbers.add(spans, np.isin(spans.channel, list(numbered)))
-        wanted = np.flatnonzero(np.isin(spans.channel, list(beside)))
+        wanted = np.flatnonzero(np.isin(spans.channel, list(beside)) | _one_each_second(spans, sampled))
         for m in wanted[np.argsort(spans.start[wanted])].tolist():
-            take(beside[spans.channel.item(m)], spans.content[spans.start.item(m) : spans.end.item(m)])
+            take(names[spans.channel.item(m)], spans.content[spans.start.item(m) : spans.end.item(m)])
         for start, end in zip(spans.start[is_clock].tolist(), spans.end[is_clock].tolist(), strict=True):
             with suppress(*messages.REFUSALS):  # garbage by somebody else, recorded as it came
                 clocks.append(decode(spans.content[start:end]))
@@ -230,6 +235,16 @@ def completeness(
         last_ns=max((clock.t_ns for clock in clocks), default=0),
         damaged=reader.damaged or (("the name of a key, or an index",) if reader.differs() else ()),
     )
+
+
+def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool_]:
+    """Return which messages (M,) are the first of a channel in a second, or its first or last here."""
+    second, last = spans.t_ns // SECOND_NS, len(spans.channel) - 1
+    changes = np.ones(last + 2, bool)  # before each message, and behind all
+    changes[1:-1] = spans.channel[1:] != spans.channel[:-1]
+    begins = changes[:-1].copy()
+    begins[1:] |= second[1:] != second[:-1]
+    return (begins | changes[1:]) & np.isin(spans.channel, list(channels))
 
 
 def record_completeness(path: Path) -> Completeness:

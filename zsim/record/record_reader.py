@@ -61,6 +61,7 @@ class MessageSpans(NamedTuple):
     channel: NDArray[np.int64]  # number of each one's channel, (M,)
     start: NDArray[np.int64]  # where its payload begins in the content, (M,)
     end: NDArray[np.int64]  # where it ends, (M,)
+    t_ns: NDArray[np.int64]  # its stamp, (M,)
 
 
 class _Chunk(NamedTuple):
@@ -151,8 +152,9 @@ class RecordReader:
                 mapped = 0
             rows = np.isin(channel, list(wanted))
             starts = places[rows]
-            ends = starts + HEAD.size + heads_at(content, starts)["length"].astype(np.int64)
-            yield MessageSpans(content, channel[rows], starts + MESSAGE.size, ends)
+            heads = heads_at(content, starts)
+            ends = starts + HEAD.size + heads["length"].astype(np.int64)
+            yield MessageSpans(content, channel[rows], starts + MESSAGE.size, ends, heads["log_time"].astype(np.int64))
 
     def _indexed(self, chunk: _Chunk, content: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return channel and place of every message of a chunk: by its indexes, if they lead to all of its content."""

@@ -107,7 +107,7 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
     Args:
         path: of the record.
         answers: with the drones' estimates and velocity commands.
-        motion: with all of truth and status, not the last of each drone alone.
+        motion: with all of truth and status, not those of an instant in every second alone.
 
     Raises:
         RecordError: no such record.
@@ -120,11 +120,9 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
                 flight.add(message.key, message.payload, message.wall_ns)
             whole = completeness(reader)
         else:
-            of_drones = [key for key in wanted if keys.parts(key)[0] == "drone"]
-            ends = [reader.last(key) for key in of_drones if keys.leaf(key) in ("truth", "status")]
-            for message in filter(None, ends):
-                flight.add(message.key, message.payload, message.wall_ns)
-            whole = completeness(reader, set(wanted).difference(of_drones), flight.add)
+            sampled = {key for key in wanted if keys.leaf(key) in ("truth", "status")}
+            beside = {key for key in wanted if keys.parts(key)[0] != "drone"}
+            whole = completeness(reader, beside, sampled, flight.add)
         recorded = flight.flight(sum(reader.topics().values()), whole)
         search_modules(path, recorded.info)
         return recorded

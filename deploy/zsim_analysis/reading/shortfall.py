@@ -13,6 +13,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.contract.run_messages import Event
+from zsim.record.completeness import SECOND_NS
 from zsim.scenario.rights import WORLD
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Cluster, ClusterPlan, Processes, Scenario
@@ -30,6 +31,8 @@ MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second, and m or rad b
 HELD_MAX_S = 2.0  # chosen: four times what a formation waits after a fault; held for longer, it has left its plan
 LATE_MAX_S = 1.0  # chosen: two tries of a step of the plan; what more is missing of a reference is reported
 SAMPLE_NS = 100_000_000  # of a reference that is compared with the plan's
+STRAYED_M, STRAYED_S = 5.0, 3  # chosen: twice the least distance of drones, and successive seconds so far away
+SETTLED_S = 10.0  # chosen: from its engagement a formation may take so long until its drones are in their places
 SAME = 1e-3  # m or rad within which the reference is the plan's: both are computed by the same formulas
 CONTROLLER, CONSOLE = "controller.", "console"  # how names begin: of who flies by the plan, and of operators' programs
 INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  # events of drones
@@ -43,10 +46,10 @@ class Shortfall(Struct, frozen=True):
 
     Attributes:
         kind: of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (not flown
-            to its end), override (others flew it); of a cluster: plan (a step refused to the end, or flown in part),
-            engagement (never), held (for long), request (others led it), early (the run ended before it was due),
-            window (it holds instants at which a cluster was not engaged); collision; process (one that was expected
-            died, failed, or never came); record (not all of it is there).
+            to its end), strayed (far from its place), override (others flew it); of a cluster: plan (a step refused to
+            the end, or flown in part), engagement (never), held (for long), request (others led it), early (the run
+            ended before it was due), window (it holds instants at which a cluster was not engaged); collision; process
+            (one that was expected died, failed, or never came); record (not all of it is there).
         subject: the cluster, the drone, the process, or "record"; of a collision both, as "drone1, drone2".
         t_s: since when, simulated time.
         fails: the flight is no example of its plan; the command ends with code 1.
@@ -108,7 +111,7 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
         if hit and touch and abs(hit.t_ns - touch.t_ns) <= ONE_HIT_NS:
             del first["touchdown"]
         parts = [_incident_text(event) for event in sorted(first.values(), key=lambda event: (event.t_ns, event.seq))]
-        text = f"{drone}: {', '.join(parts)}{_active_faults(drone, events[0], flight)}"
+        text = f"{drone}: {', '.join(parts)}{_active_faults(drone, (events[0].t_ns, events[0].seq), flight)}"
         fails = any(not _is_silence_of_others(event) for event in events)
         yield Shortfall(events[0].kind, drone, events[0].t_ns / 1e9, text, fails)
     reported = {*by_drone, *(event.subject for event in flight.events if event.data.get("mode") == "emergency")}
@@ -143,11 +146,11 @@ def _is_silence_of_others(event: Event) -> bool:
     return silent and not commander.startswith(CONTROLLER)
 
 
-def _active_faults(drone: str, event: Event, flight: RecordedFlight) -> str:
-    """Return which injected faults of a drone, or of all, were active at an incident."""
+def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> str:
+    """Return which injected faults of a drone, or of all, were active at an instant: (t_ns, number of the event)."""
     active: dict[object, str] = {}
     for each in flight.events:
-        if (each.t_ns, each.seq) > (event.t_ns, event.seq):
+        if (each.t_ns, each.seq) > at:
             break
         if each.kind == "fault" and each.data.get("target") in (drone, "world"):
             source = each.data.get("source") or "somebody"
@@ -227,6 +230,7 @@ def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[f
     refused = [*_refused(states)]
     yield from refused
     if "engaged" in states.phases:
+        yield from _strayed(states, flight)
         yield from _held(states, flight)
         yield from _requests(states, flight.scenario)
         yield from _not_begun(states, flight)
@@ -252,6 +256,41 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
         if engaged and (last or states.phases[place + 1] == "landing"):
             text = f"{states.name}: the {op} of the plan was refused to the end: {why}"
             yield Shortfall("plan", states.name, begun[1], text, True)
+
+
+def _strayed(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield which drones truly were far from where their engaged formation wanted them, and for how long.
+
+    Their estimates may say otherwise, and the controller believes these. What others flew meanwhile was theirs to
+    decide.
+    """
+    cluster = _cluster(flight.scenario, states.name)
+    if flight.scenario is None or cluster is None:
+        return
+    engaged = np.array([phase == "engaged" for phase in states.phases], bool)
+    settled = states.t_ns >= states.t_ns[engaged][0] + round(SETTLED_S * 1e9)
+    rows = _sampled(states, np.flatnonzero(engaged & settled), SECOND_NS)
+    try:
+        space = scenario_space(flight.scenario, cluster)
+        places_W = np.array([space.inverse(c)[0] for c in states.desired[rows]] if space.names == states.names else [])
+    except (*REFUSALS, ValueError):
+        return
+    tracks = {track.name: track for track in flight.tracks if not track.external}
+    for i, drone in enumerate(states.drones if len(places_W) else ()):
+        track = tracks.get(drone)
+        if track is None:
+            continue
+        t_ns, at, mine = np.intersect1d(states.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True)
+        away_m = np.linalg.norm(track.p_W[mine] - places_W[at, i], axis=1)
+        for act in _interventions(drone, flight):
+            away_m[(act.from_ns <= t_ns) & (t_ns <= act.until_ns)] = 0.0
+        stretches = np.split(np.arange(len(t_ns)), np.flatnonzero(np.diff(away_m > STRAYED_M)) + 1)
+        long = [each for each in stretches if len(each) >= STRAYED_S and away_m[each[0]] > STRAYED_M]
+        if long:
+            from_ns, most_m = int(t_ns[long[0][0]]), max(float(away_m[each].max()) for each in long)
+            text = f"{drone}: up to {most_m:.0f} m from its place in the formation, from {from_ns / 1e9:.0f} s on"
+            text += _active_faults(drone, (from_ns, 0), flight)
+            yield Shortfall("strayed", drone, from_ns / 1e9, text, True)
 
 
 def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
@@ -423,9 +462,9 @@ def _target_reached(states: ClusterStates, planned: PlannedReference, plan: Clus
         )
 
 
-def _sampled(states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return of these rows the first in every SAMPLE_NS."""
-    return rows[np.unique(states.t_ns[rows] // SAMPLE_NS, return_index=True)[1]]
+def _sampled(states: ClusterStates, rows: NDArray[np.intp], every_ns: int = SAMPLE_NS) -> NDArray[np.intp]:
+    """Return of these rows the first in every so many nanoseconds."""
+    return rows[np.unique(states.t_ns[rows] // every_ns, return_index=True)[1]]
 
 
 def _waits(states: ClusterStates, op: str, from_s: float) -> tuple[float, float, str] | None:

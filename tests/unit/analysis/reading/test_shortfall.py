@@ -22,7 +22,7 @@ from zsim_agents.formation.flight_data import HELD_ON_REQUEST
 from zsim_agents.formation.flight_plan import WAITS, waiting_step
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import WaypointTrajectory
-from zsim_analysis.reading.flight import FlightReader
+from zsim_analysis.reading.flight import FlightReader, read_flight
 from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.reading.shortfall import CRASHES, Shortfall, shortfalls
@@ -319,6 +319,32 @@ def test_a_hold_while_others_fly_or_land_a_drone_of_the_formation_is_reported(
 
     line = next(line for line in found(held, events=events) if line.kind == "held")
     assert (line.subject, line.fails) == ("main", fails)
+
+
+@pytest.mark.parametrize(
+    ("away_m", "span_s", "others", "strayed"),
+    [
+        ((4.0, 3.5, 0.0), (16.0, 30.0), False, True),
+        ((4.0, 2.5, 0.0), (16.0, 30.0), False, False),  # nearer than 5 m
+        ((0.0, 0.0, 40.0), (16.0, 17.9), False, False),  # too short
+        ((0.0, 0.0, 40.0), (3.0, 11.0), False, False),  # on the way to its place
+        ((0.0, 0.0, 40.0), (16.0, 30.0), True, False),  # flown by others
+    ],
+)
+def test_a_drone_that_is_truly_far_from_its_place_is_one(
+    away_m: tuple[float, float, float], span_s: tuple[float, float], others: bool, strayed: bool, tmp_path: Path
+) -> None:
+    events = [Event(2_000_000_000, 0, "commander", "joystick" if others else "controller.main", "drone2", "")]
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in traffic(lambda t_s: {"phase": "engaged" if t_s > 4 else "assembling"}, events):
+            if key == keys.truth("drone2") and span_s[0] <= message.t_ns / 1e9 <= span_s[1]:
+                moved = tuple(np.add(message.position_m, away_m).tolist())
+                message = msgspec.structs.replace(message, position_m=moved)
+            writer.add_message(key, message, wall_ns)
+    for motion in (True, False):
+        lines = shortfalls(read_flight(tmp_path / "run.mcap", motion=motion), (4.0, 30.0))
+        found = [line for line in lines if line.kind == "strayed"]
+        assert [(line.subject, line.t_s, line.fails) for line in found] == [("drone2", 16.0, True)] * strayed
 
 
 def test_what_others_asked_of_a_formation_is_reported_and_a_hold_on_request_is_no_fault() -> None:
