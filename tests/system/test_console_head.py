@@ -52,7 +52,8 @@ class Head:
             "level": "running", "title": "running 7.0 s", "detail": "step", "t_s": 7.0, "age_s": 0.0,
             "refusals": refusals, "alarms": [],
         }  # fmt: skip
-        html = importlib.resources.files("zsim_bridges.console.frame").joinpath("head_bar.html").read_text("utf-8")
+        frame = importlib.resources.files("zsim_bridges.console.frame")
+        html = "".join(frame.joinpath(f"{part}.html").read_text("utf-8") for part in ("orders", "head_bar"))
         page.set_default_timeout(PATIENCE_MS)
         page.add_init_script(AUDIO_JS)
         page.route(f"{ADDRESS}**", lambda route: route.fulfill(body=html, content_type="text/html"))

@@ -13,7 +13,14 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals, is_held_by_fault
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
-from zsim_bridges.console.page.run_forms import refusal_lines, set_refusals
+from zsim_bridges.console.page.run_forms import (
+    ORDERS,
+    OrderButton,
+    heard,
+    order_refusals,
+    refusal_lines,
+    set_refusals,
+)
 from zsim_bridges.console.page.variable_slider import VariableSlider
 from zsim_bridges.console.scene.picture import SHAPED_PHASES
 
@@ -24,9 +31,7 @@ LABELS = {**{op: label for label, op in OPERATIONS.items()}, "target": "sliders"
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
     "engage": viser.Icon.TRIANGLE,
-    "hold": viser.Icon.HAND_STOP,
     "rejoin": viser.Icon.ARROWS_JOIN,
-    "land": viser.Icon.PLANE_ARRIVAL,
 }
 EXAMPLES = {
     "expressions": "x_c = 5 + 3*cos(0.1*t)\nyaw = 90 + 6*t",
@@ -79,7 +84,8 @@ class FormationForm:
 
     def offer(self, run: RunCondition) -> None:
         """Grey out what the controller would refuse, with its reason; a slider shows all the same where it stands."""
-        refusals = formation_refusals(run, self._cluster.name)
+        name = self._cluster.name
+        refusals = {**formation_refusals(run, name), **order_refusals(formation_refusals(heard(run), name))}
         set_refusals(self._controls, refusals)
         for op, control in self._others:
             set_refusals({op: control}, refusals)
@@ -123,12 +129,14 @@ class FormationForm:
             self._report(RequestOutcome(f"{self._cluster.name}: target", "; ".join(refusals)))
             return False
         values = {name: self._ranges[name].to_si(value) for name, value in shown.items()}
-        lasting = {"over_s": float(self._over.value)} if self._over.value > 0 else {}
+        lasting: dict[str, Any] = {"over_s": float(self._over.value)} if self._over.value > 0 else {}
         text = ", ".join(f"{name} {value:g} {self._ranges[name].unit}" for name, value in shown.items())
         self._client.request_cluster(self._cluster.name, "target", shown=text, values=values, **lasting)
         return True
 
     def _button(self, gui: viser.GuiApi, label: str, op: str) -> Any:
+        if op in ORDERS:
+            return OrderButton(gui, label, op, {"cluster": self._cluster.name})
         button = gui.add_button(label, icon=ICONS[op], color="blue" if op in ("takeoff", "engage") else "gray")
         button.on_click(lambda _: self._client.request_cluster(self._cluster.name, op))
         return button

@@ -18,6 +18,7 @@ from zsim_bridges.console.page import operator_input
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
 """The row of tabs below stands 9 px higher than what is above it ends."""
 
+HELD_HINT = "hold it for 0.6 s, by hand or by Space or Enter"  # as long as HOLD_MS of orders.html
 DURATION_S = 30.0  # of a fault, unless another time is typed
 WEAK_THRUST_SHARE = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
 GUST_M_S = (4.0, 0.0, 0.0)  # about what the drones of the formation can still hold against
@@ -115,10 +116,26 @@ def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> No
     """
     for op, control in controls.items():
         reason = refusals.get(op, "")
+        if isinstance(control, OrderButton):
+            control.lock(reason)
+            continue
         if control.disabled != bool(reason):
             control.disabled = bool(reason)
         if control.hint != (reason or None):
             control.hint = reason or None
+
+
+ORDERS = ("hold", "land", "emergency")  # operations whose buttons are those of orders
+
+
+def heard(run: RunCondition) -> RunCondition:
+    """Return the condition as if the world answered: an order is given to one that is silent, too."""
+    return run._replace(silent_s=0.0)
+
+
+def order_refusals(refusals: Mapping[str, str]) -> dict[str, str]:
+    """Return those of the refusals that concern orders; an emergency is never kept back."""
+    return {op: "" if op == "emergency" else reason for op, reason in refusals.items() if op in ORDERS}
 
 
 def refusal_lines(labels: Mapping[str, str], refusals: Mapping[str, str]) -> str:
@@ -129,6 +146,54 @@ def refusal_lines(labels: Mapping[str, str], refusals: Mapping[str, str]) -> str
             by_reason.setdefault(refusals[op], []).append(label)
     lines = [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()]
     return f"<div style='{REASON_STYLE}'>{'<br>'.join(map(escape, lines))}</div>" if lines else ""
+
+
+class OrderButton:
+    """A button whose order the page repeats until it is confirmed: it is the page's own, not one of viser's.
+
+    Args:
+        gui: viser's, in the folder where it is to be.
+        label: of the button.
+        op: see `OrderRequest`.
+        of: whom it concerns: {"drone": name} or {"cluster": name}.
+        held: whether it is to be held for a while.
+
+    Attributes:
+        visible: always.
+        disabled: whether it is off.
+    """
+
+    visible = True
+
+    def __init__(self, gui: viser.GuiApi, label: str, op: str, of: dict[str, str], *, held: bool = False) -> None:
+        self._label, self._op, self._of, self._held = label, op, of, held
+        self._hint = HELD_HINT if held else ""
+        self.disabled = False
+        self._content = self._drawn()
+        self._html = gui.add_html(self._content)
+
+    def name(self, label: str, of: dict[str, str]) -> None:
+        """Give it another label, and let it concern somebody else."""
+        self._label, self._of = label, of
+        self._draw()
+
+    def lock(self, reason: str) -> None:
+        """Switch it off for a reason; on where that is empty."""
+        self.disabled, self._hint = bool(reason), reason or (HELD_HINT if self._held else "")
+        self._draw()
+
+    def _draw(self) -> None:
+        """Viser sends an assigned property always: what has not changed is left alone."""
+        content = self._drawn()
+        if content != self._content:
+            self._content = self._html.content = content
+
+    def _drawn(self) -> str:
+        data = {"data-zsim-order": self._op, **{f"data-{key}": name for key, name in self._of.items()}}
+        data |= {"title": self._hint, **({"data-zsim-hold": "1", "class": "stop"} if self._held else {})}
+        attributes = " ".join(f'{key}="{escape(value)}"' for key, value in data.items())
+        off = " disabled" if self.disabled else ""
+        return f'<div class="zsim-order"><button type="button" {attributes}{off}>{escape(self._label)}</button></div>'
 
 
 FLEET = {"Take off all": "takeoff", "Reset all": "reset"}  # an operation of formations, and a mode of drones
@@ -171,9 +236,9 @@ class RunForm:
 
 
 class FleetForm:
-    """Take-off and reset of all drones; their landing and emergency, too, for the head of the page.
+    """Take-off and reset of all drones; their landing and emergency are orders of the head of the page.
 
-    Formations take off and land by their controllers, drones of none each by itself.
+    Formations take off by their controllers, drones of none each by itself.
 
     Args:
         gui: viser's, in the folder where they are to be.
@@ -206,10 +271,8 @@ class FleetForm:
         self._reasons.content = refusal_lines({"takeoff": "Take off all"}, refusals)
 
     def request_all(self, operation: str) -> None:
-        """Request takeoff or land of all formations and single drones, emergency of all, reset of those in one."""
-        if operation == "emergency":
-            self._client.send_mode(self._drones, operation)
-        elif operation == "reset":
+        """Request takeoff of all formations and single drones, or reset of those in an emergency."""
+        if operation == "reset":
             self._client.send_mode([d for d in self._drones if self._run.drones.get(d) == "emergency"], operation)
         else:
             for name in self._formations:
@@ -219,12 +282,7 @@ class FleetForm:
 
 
 DRONE_MODES = {"takeoff": "Take off", "land": "Land", "emergency": "Emergency", "reset": "Reset"}
-DRONE_ICONS = {
-    "takeoff": viser.Icon.PLANE_DEPARTURE,
-    "land": viser.Icon.PLANE_ARRIVAL,
-    "emergency": viser.Icon.ALERT_TRIANGLE,
-    "reset": viser.Icon.REFRESH,
-}
+DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "reset": viser.Icon.REFRESH}
 
 
 class DroneForm:
@@ -243,8 +301,11 @@ class DroneForm:
         self.choice = gui.add_dropdown("drone", list(names))
         self._buttons: dict[str, Any] = {}
         for mode, label in DRONE_MODES.items():
-            colour = "red" if mode == "emergency" else "gray"
-            button = gui.add_button(f"{label} {self.chosen}", icon=DRONE_ICONS[mode], color=colour)
+            if mode in ORDERS:
+                of, held = {"drone": self.chosen}, mode == "emergency"
+                self._buttons[mode] = OrderButton(gui, f"{label} {self.chosen}", mode, of, held=held)
+                continue
+            button = gui.add_button(f"{label} {self.chosen}", icon=DRONE_ICONS[mode], color="gray")
             button.on_click(lambda _, mode=mode: client.send_mode([self.chosen], mode))
             self._buttons[mode] = button
         self._reasons = gui.add_html("")
@@ -263,11 +324,15 @@ class DroneForm:
     def refresh(self, run: RunCondition) -> None:
         """Offer what would not be refused."""
         self._run = run
-        refusals = drone_refusals(run, self.chosen)
+        refusals = {**drone_refusals(run, self.chosen), **order_refusals(drone_refusals(heard(run), self.chosen))}
         set_refusals(self._buttons, refusals)
         self._reasons.content = refusal_lines(DRONE_MODES, refusals)
 
     def _rename(self) -> None:
         for mode, button in self._buttons.items():
-            button.label = f"{DRONE_MODES[mode]} {self.chosen}"
+            label = f"{DRONE_MODES[mode]} {self.chosen}"
+            if isinstance(button, OrderButton):
+                button.name(label, {"drone": self.chosen})
+            else:
+                button.label = label
         self.refresh(self._run)

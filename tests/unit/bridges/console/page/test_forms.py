@@ -1,6 +1,7 @@
 """The console's forms: what each control of the page asks for. The page is one that notes its controls."""
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,6 +81,35 @@ class Control:
         return
 
 
+class OrderHtml(Control):
+    """A button of an order: HTML, of which the page makes the order when it is pressed."""
+
+    @property
+    def order(self) -> dict[str, str]:
+        return dict(re.findall(r'data-([\w-]+)="([^"]*)"', self.content))
+
+    @property
+    def label(self) -> str:
+        return re.findall(r">([^<>]+)</button>", self.content)[0] if self.content else ""
+
+    @label.setter
+    def label(self, _: str) -> None: ...
+
+    @property
+    def hint(self) -> str | None:
+        return re.findall(r'title="([^"]*)"', self.content)[0] or None
+
+    @hint.setter
+    def hint(self, _: str | None) -> None: ...
+
+    @property
+    def disabled(self) -> bool:
+        return " disabled>" in self.content
+
+    @disabled.setter
+    def disabled(self, _: bool) -> None: ...
+
+
 class Gui:
     """A page that notes its controls by their label."""
 
@@ -120,13 +150,19 @@ class Gui:
     def add_folder(self, label: str | None, **_: Any) -> Control:
         return Control()
 
-    def add_html(self, _: str) -> Control:
-        return Control()
+    def add_html(self, content: str) -> Control:
+        if "data-zsim-order" not in content:
+            return Control()
+        button = OrderHtml()
+        button.content = content
+        self.at[button.label] = button
+        return button
 
     def add_uplot(self, *_: Any, **__: Any) -> Control:
         return Control()
 
-    add_markdown = add_html
+    def add_markdown(self, _: str) -> Control:
+        return Control()
 
     def add_tab_group(self) -> Control:
         return Control()
@@ -215,12 +251,7 @@ def test_the_run_is_asked_for_what_the_button_says(bench: Bench, label: str, ask
 
 @pytest.mark.parametrize(
     ("label", "mode"),
-    [
-        ("Take off", "takeoff"),
-        ("Land", "land"),
-        ("Emergency", "emergency"),
-        ("Reset", "reset"),
-    ],
+    [("Take off", "takeoff"), ("Reset", "reset")],
 )
 def test_the_chosen_drone_alone_gets_its_mode(bench: Bench, label: str, mode: str):
     form = DroneForm(bench.gui, bench.client, bench.names)
@@ -232,14 +263,10 @@ def test_the_chosen_drone_alone_gets_its_mode(bench: Bench, label: str, mode: st
     assert bench.client.asked == [((bench.names[1],), mode)]
 
 
-@pytest.mark.parametrize(("label", "what"), [("Take off all", "takeoff"), ("Land all", "land")])
-def test_all_formations_and_all_drones_of_none_take_off_and_land(bench: Bench, label: str, what: str):
-    form = FleetForm(bench.gui, bench.client, mixed())
-    if what == "takeoff":
-        bench.gui.press(label)
-    else:
-        form.request_all(what)
-    assert bench.client.asked == [("main", what, {}), ("other", what, {}), (("d5", "d6"), what)]
+def test_all_formations_and_all_drones_of_none_take_off(bench: Bench):
+    FleetForm(bench.gui, bench.client, mixed())
+    bench.gui.press("Take off all")
+    assert bench.client.asked == [("main", "takeoff", {}), ("other", "takeoff", {}), (("d5", "d6"), "takeoff")]
 
 
 @pytest.mark.parametrize("alone", [True, False])
@@ -247,10 +274,39 @@ def test_all_drones_are_in_formations_or_none_is(bench: Bench, alone: bool):
     scenario = mixed()
     clusters, drones = ([], scenario.drones[4:]) if alone else (scenario.clusters, scenario.drones[:4])
     FleetForm(bench.gui, bench.client, msgspec.structs.replace(scenario, clusters=clusters, drones=drones)).request_all(
-        "land"
+        "takeoff"
     )
-    formations = [("main", "land", {}), ("other", "land", {})]
-    assert bench.client.asked == ([(("d5", "d6"), "land")] if alone else formations)
+    formations = [("main", "takeoff", {}), ("other", "takeoff", {})]
+    assert bench.client.asked == ([(("d5", "d6"), "takeoff")] if alone else formations)
+
+
+@pytest.mark.parametrize(("label", "op", "held"), [("Land", "land", False), ("Emergency", "emergency", True)])
+def test_the_chosen_drone_alone_is_ordered_to_land_or_stop(bench: Bench, label: str, op: str, held: bool):
+    DroneForm(bench.gui, bench.client, bench.names)
+    button: Any = bench.gui.at[f"{label} {bench.names[0]}"]
+    bench.gui.at["drone"].put(bench.names[1])
+    assert button.label == f"{label} {bench.names[1]}"
+    hold = {"zsim-hold": "1"} if held else {}
+    assert button.order == {"zsim-order": op, "drone": bench.names[1], **hold}
+
+
+@pytest.mark.parametrize("op", ["hold", "land"])
+def test_a_formation_is_ordered_to_hold_and_to_land(bench: Bench, op: str):
+    bench.formation()
+    button: Any = bench.gui.at[op.capitalize()]
+    assert button.order == {"zsim-order": op, "cluster": bench.cluster.name}
+
+
+def test_an_order_is_given_to_a_world_that_is_silent(bench: Bench):
+    bench.formation().offer(flown(silent_s=79.0))
+    form = DroneForm(bench.gui, bench.client, bench.names)
+    form.refresh(flown(silent_s=79.0))
+    name = bench.names[0]
+    locked = {label: bench.gui.at[label].disabled for label in ("Hold", "Land", f"Land {name}", f"Emergency {name}")}
+    assert not any(locked.values())
+    form.refresh(flown(ended="the run ended"))
+    assert bench.gui.at[f"Land {name}"].disabled
+    assert not bench.gui.at[f"Emergency {name}"].disabled
 
 
 def mixed() -> Scenario:
@@ -281,7 +337,7 @@ def flown(phase: str = "engaged", reason: str = "", **more: Any) -> RunCondition
             flown("held", "drone2 is in state landed", drones={"drone2": "landed"}, members={"main": ("drone2",)}),
             {"Take off", "Engage", "Hold", "Rejoin"},
         ),
-        (flown(silent_s=79.0), {"Take off", "Engage", "Hold", "Land"}),
+        (flown(silent_s=79.0), {"Take off", "Engage"}),
         (flown(ended="the run ended"), {"Take off", "Engage", "Hold", "Land"}),
         (flown(replayed=True), {"Take off", "Engage", "Hold", "Land"}),
     ],
@@ -380,9 +436,9 @@ def test_the_choice_of_one_page_is_not_that_of_another(bench: Bench):
     mine = DroneForm(bench.gui, bench.client, bench.names)
     DroneForm(other, bench.client, bench.names)  # type: ignore[arg-type]
     other.at["drone"].put(bench.names[2])
-    bench.gui.press(f"Emergency {bench.names[0]}")
+    bench.gui.press(f"Reset {bench.names[0]}")
     assert mine.chosen == bench.names[0]
-    assert bench.client.asked == [((bench.names[0],), "emergency")]
+    assert bench.client.asked == [((bench.names[0],), "reset")]
 
 
 def test_a_drone_is_offered_what_its_state_takes_and_always_its_emergency(bench: Bench):
@@ -547,9 +603,7 @@ def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name
 # A formation
 
 
-@pytest.mark.parametrize(
-    ("label", "op"), [("Take off", "takeoff"), ("Engage", "engage"), ("Hold", "hold"), ("Land", "land")]
-)
+@pytest.mark.parametrize(("label", "op"), [("Take off", "takeoff"), ("Engage", "engage")])
 def test_a_formation_is_asked_for_its_phase(bench: Bench, label: str, op: str):
     bench.formation()
     bench.gui.press(label)
@@ -675,14 +729,12 @@ def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
 # The page
 
 
-def test_emergency_stops_everybody_and_switches_change_the_scene(bench: Bench):
+def test_switches_change_the_scene(bench: Bench):
     shown: list[tuple[str, bool]] = []
     spaces = {bench.cluster.name: bench.space}
     show = lambda *switched: shown.append(switched)  # noqa: E731
     page = ConsolePage(bench.gui, bench.scenario, spaces, bench.client, bench.outcomes.append, show, 2.0)
     assert bench.gui.at["rate"].value == 2.0
-    page.fleet.request_all("emergency")
-    assert bench.client.asked == [(bench.names, "emergency")]
     assert page.chosen == bench.cluster.name
     for what, label in SWITCHES.items():
         bench.gui.at[label].put(False)
