@@ -14,12 +14,14 @@ from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, drone_refusals, fleet_refusals, run_refusals
 from zsim_bridges.console.page import operator_input
+from zsim_bridges.console.page.operator_input import range_refusal
 
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
 """The row of tabs below stands 9 px higher than what is above it ends."""
 
+LIMITS_STYLE = "font-size:11px;line-height:1.2;color:#868e96;padding:0 12px 4px;text-align:right"
 HELD_HINT = "hold it for 0.6 s, by hand or by Space or Enter"  # as long as HOLD_MS of orders.html
-DURATION_S = 30.0  # of a fault, unless another time is typed
+DURATION_S, DURATION_MAX_S = 30.0, 1e5  # of a fault, unless another time is typed; longer than any run
 WEAK_THRUST_SHARE = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
 GUST_M_S = (4.0, 0.0, 0.0)  # about what the drones of the formation can still hold against
 LOSS_PROBABILITY = 0.3
@@ -51,7 +53,9 @@ class FaultForm:
         self._kinds = kinds_of(declarations(scenario.drones))
         names = [drone.name for drone in scenario.drones]
         self._drone = gui.add_dropdown("drone", names)
-        self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=1e5, step=1.0, hint="0: until it is cleared")
+        hint = "0: until it is cleared"
+        self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=DURATION_MAX_S, step=1.0, hint=hint)
+        gui.add_html(limits_line(f"for: 0 to {DURATION_MAX_S:g} s; {hint}"))
         self._button(gui, "GPS lost", lambda: self._on_drone("gps_dropout"))
         self._button(gui, "Motor weak", self._weaken)
         self._button(gui, "Gust", lambda: self._add("gust", "world", velocity_m_s=list(GUST_M_S)))
@@ -76,9 +80,12 @@ class FaultForm:
         self._add(kind, self._drone.value, **parameters)
 
     def _add(self, kind: str, target: str, **parameters: Any) -> None:
-        duration = (
-            {"for_s": float(self._for.value)} if self._for.value > 0 and self._kinds[kind].lasts != "once" else {}
-        )
+        lasts_s, lasts = float(self._for.value), self._kinds[kind].lasts != "once" and "for_s" not in parameters
+        refusal = range_refusal("for", lasts_s, 0.0, DURATION_MAX_S, "s") if lasts else None
+        if refusal:
+            self._report(RequestOutcome(f"fault_add {kind} of {target}", refusal))
+            return
+        duration = {"for_s": lasts_s} if lasts and lasts_s > 0 else {}
         self._client.request_world("fault_add", kind=kind, target=target, **{**duration, **parameters})
 
     def _any_fault(self, gui: viser.GuiApi, names: list[str]) -> None:
@@ -107,6 +114,11 @@ def _help(fault: FaultKind) -> str:
     """Return a kind's effect and parameters."""
     lines = [f"`{p.name}` {p.description}{f' [{p.unit}]' if p.unit else ''}" for p in fault.parameters]
     return f"<sub>{fault.description}; strikes a {fault.strikes}. {'; '.join(lines)}</sub>"
+
+
+def limits_line(text: str) -> str:
+    """Return the limits of a number, to stand below its field, as HTML."""
+    return f"<div style='{LIMITS_STYLE}'>{escape(text)}</div>"
 
 
 def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> None:
@@ -199,6 +211,11 @@ class OrderButton:
 FLEET = {"Take off all": "takeoff", "Reset all": "reset"}  # an operation of formations, and a mode of drones
 
 
+def _whole(value: float) -> float:
+    """Return a whole number as an integer, and any other one as it is: the world refuses it."""
+    return int(value) if value == int(value) else value
+
+
 class RunForm:
     """Pause or resume, single steps, rate.
 
@@ -214,11 +231,13 @@ class RunForm:
         resume = gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY, visible=False)
         resume.on_click(lambda _: client.request_world("resume"))
         gates = gui.add_number("gates", 1, min=1, max=GATES_MAX, step=1)
+        gui.add_html(limits_line(f"gates: 1 to {GATES_MAX}"))
         step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
-        step.on_click(lambda _: client.request_world("step", gates=int(gates.value)))
+        step.on_click(lambda _: client.request_world("step", gates=_whole(gates.value)))
         wanted = gui.add_number(
             "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
         )
+        gui.add_html(limits_line(f"rate: 0 to {RATE_MAX:g} × real time"))
         set_rate = gui.add_button("Set rate")
         set_rate.on_click(lambda _: client.request_world("rate", value=float(wanted.value)))
         self._controls = {"pause": pause, "resume": resume, "step": step, "rate": set_rate}

@@ -96,7 +96,7 @@ class OrderHtml(Control):
     def label(self, _: str) -> None: ...
 
     @property
-    def hint(self) -> str | None:
+    def hint(self) -> str | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         return re.findall(r'title="([^"]*)"', self.content)[0] or None
 
     @hint.setter
@@ -655,23 +655,45 @@ def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0}, "over_s": 20.0})]
 
 
-@pytest.mark.parametrize("left_s", [0.0, LATER_S])
-def test_a_number_out_of_range_is_not_flown_to_the_limit_when_its_box_is_left(bench: Bench, left_s: float):
+def test_a_number_out_of_range_is_refused_and_its_limit_is_flown_when_it_is_typed(bench: Bench):
     form = bench.formation()
     box = bench.gui.at["y_c [m]"]
     limit = form._ranges["y_c"].high
     box.put(500.0)
-    form.send(left_s)
-    box.put(limit)  # the page does, when its box is left
     form.send(LATER_S)
     assert bench.client.asked == []
     (outcome,) = bench.outcomes
     assert has_terms(outcome.refusal, "y_c", "500 m")
-    form.refresh(bench.view(y_c=-5.0), LATER_S)
-    assert box.value == -5.0
-    box.put(limit)  # somebody means it
+    box.put(limit)
     form.send(LATER_S)
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"y_c": limit}})]
+
+
+@pytest.mark.parametrize("over_s", [-5.0, 3601.0])
+def test_a_time_out_of_range_is_refused_with_the_move(bench: Bench, over_s: float):
+    form = bench.formation()
+    bench.gui.at["over [s]"].value = over_s
+    form.send(LATER_S)
+    assert bench.outcomes == []  # nothing was asked for
+    form.request_target({"p": 5.0})
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, "over", f"{over_s:g} s", "0 to 3600")
+
+
+def test_what_is_typed_for_the_run_is_asked_for_as_it_is(bench: Bench):
+    RunForm(bench.gui, bench.client, 1.0)
+    bench.gui.at["rate"].value, bench.gui.at["gates"].value = -1.0, 2.5
+    bench.gui.press("Set rate")
+    bench.gui.press("Step")
+    assert bench.client.asked == [("world", "rate", {"value": -1.0}), ("world", "step", {"gates": 2.5})]
+
+
+def test_a_fault_of_no_time_is_refused(bench: Bench):
+    bench.faults()
+    bench.gui.at["for [s]"].value = -1.0
+    bench.gui.press("GPS lost")
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, "for", "-1 s", "from 0")
 
 
 def test_a_value_out_of_range_is_told_and_not_sent(bench: Bench):
@@ -686,9 +708,9 @@ def test_of_many_variables_the_others_are_moved_one_at_a_time():
     hidden = next(name for name in bench.space.names if f"{name} [m]" not in bench.gui.at and name.startswith("w"))
     value = next(control for label, control in bench.gui.at.items() if label.startswith("value ["))
     bench.gui.at["variable"].put(next(name for name in bench.space.names if name.startswith("phi")))
-    assert value.label == "value [deg]"
+    assert value.label == "value [deg], -180 to 180"
     bench.gui.at["variable"].put(hidden)
-    assert value.label == "value [m]"
+    assert value.label == "value [m], -5 to 5"
     value.value = 0.5
     bench.gui.press("Move it")
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}})]
