@@ -16,7 +16,7 @@ POLL_S = 0.25  # wall; rarely, since a message of each gate costs the world time
 ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
 BEAT_S = 0.1  # wall; between two beats of this process
 BEAT_MAX_S = 0.5  # wall; that count between two beats: a busy machine delays a thread by less
-STALL_S = 1.0  # wall; without a beat for so long this process stood still
+STALL_S = 2.0  # wall; without a beat for so long this process stood still, and says so
 SILENT_S = 1.7  # wall; without an answer for so long what is shown may be long past: a stop is shown within 2 s
 
 

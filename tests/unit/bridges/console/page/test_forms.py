@@ -15,7 +15,9 @@ from zsim.contract.views import ViewCluster
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import KINDS
 from zsim.scenario.scenario import Scenario
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, REJOINING
+from zsim_agents.formation.engagement_setup import gains_of
+from zsim_agents.formation.flight_check import place_fault
+from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, REJOINING, EngagementLimits
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, fleet_refusals
@@ -96,11 +98,11 @@ class OrderHtml(Control):
     def label(self, _: str) -> None: ...
 
     @property
-    def hint(self) -> str | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def hint(self) -> str | None:
         return re.findall(r'title="([^"]*)"', self.content)[0] or None
 
     @hint.setter
-    def hint(self, _: str | None) -> None: ...
+    def hint(self, _: str | None) -> None: ...  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @property
     def disabled(self) -> bool:
@@ -667,6 +669,19 @@ def test_a_number_out_of_range_is_refused_and_its_limit_is_flown_when_it_is_type
     box.put(limit)
     form.send(LATER_S)
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"y_c": limit}})]
+
+
+@pytest.mark.parametrize("side", ["p", "q"])
+def test_the_least_side_that_a_slider_offers_is_no_refusal_of_rounding(bench: Bench, side: str):
+    low = next(each.low for each in slider_ranges(bench.space, bench.cluster, bench.scenario) if each.name == side)
+    gains, shape = gains_of(bench.cluster.gains), EngagementLimits().shape
+    c = bench.space.specimen(4.0)
+    c[bench.space.index(side)], c[bench.space.index("z_c")] = low, 8.0
+    refused = []
+    for step in range(200):
+        c[bench.space.index("x_c")], c[bench.space.index("yaw")] = -50.0 + 0.5 * step, 0.03 * step
+        refused.append(place_fault(bench.space, c, gains, shape))
+    assert set(refused) == {None}
 
 
 @pytest.mark.parametrize("over_s", [-5.0, 3601.0])
