@@ -86,6 +86,7 @@ class StagedRun:
         t_s: simulated time of the newest picture.
         clock_state: what the run's clock says.
         stands: whether time stands.
+        commander: who flies each drone.
     """
 
     def __init__(
@@ -106,6 +107,7 @@ class StagedRun:
         self.link.timeline = timeline or {}
         self.t_s, self.clock_state, self.stands = 0.0, "running", False
         self._performed_s = 0.0  # wall
+        self.commander: str | None = None
         self._present = threading.Event()  # once the past has been performed
         self.percent = 73.0  # of each battery
         drones = tuple(DroneInfo(drone.name, "ardrone2") for drone in self._scenario.drones)
@@ -139,8 +141,9 @@ class StagedRun:
         phase = math.tau * self.t_s / SWAY_S
         sway = SWAY_M * np.array([(math.sin(phase + k), math.cos(phase + 2 * k), 0.0) for k in range(len(names))])
         true_W, believed_W = p_W + sway, p_W + 0.8 * sway
+        who = self.commander
         views = tuple(
-            DroneView(name, tuple(p), LEVEL, ROTORS, self._state, self.percent - self._drain_percent_s * self.t_s)
+            DroneView(name, tuple(p), LEVEL, ROTORS, self._state, self.percent - self._drain_percent_s * self.t_s, who)
             for name, p in zip(names, true_W.tolist(), strict=True)
         )
         self.link.publish(keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((1.0, 0.5, 0.0),)))

@@ -52,7 +52,8 @@ class Head:
             "level": "running", "title": "running 7.0 s", "detail": "step", "t_s": 7.0, "age_s": 0.0,
             "refusals": refusals, "alarms": [],
         }  # fmt: skip
-        html = importlib.resources.files("zsim_bridges.console.frame").joinpath("head_bar.html").read_text("utf-8")
+        frame = importlib.resources.files("zsim_bridges.console.frame")
+        html = "".join(frame.joinpath(f"{part}.html").read_text("utf-8") for part in ("orders", "head_bar"))
         page.set_default_timeout(PATIENCE_MS)
         page.add_init_script(AUDIO_JS)
         page.route(f"{ADDRESS}**", lambda route: route.fulfill(body=html, content_type="text/html"))
@@ -238,6 +239,122 @@ def test_the_next_run_on_a_console_s_port_has_none_of_these_copies(head: Head, t
     assert not head.copied
     head.show(level="ended")
     assert head.page.locator(".files a").get_attribute("href") == "/report"
+
+
+HOLD_MS = 600  # of orders.html
+STALL_MS = 5000  # of the page: more than what is called lost
+STALL_JS = "ms => { const until = performance.now() + ms; while (performance.now() < until); }"
+
+
+class OrderDesk:
+    """What the console makes of the orders of a page.
+
+    Attributes:
+        orders: that it was sent, with repetitions.
+        state: of each; empty where it does not answer.
+    """
+
+    def __init__(self, head: Head) -> None:
+        self.orders: list[dict[str, Any]] = []
+        self.state = ""
+        head.page.unroute(f"{ADDRESS}command")
+        head.page.route(f"{ADDRESS}command", self._take)
+
+    def _take(self, route: Any) -> None:
+        order = route.request.post_data_json
+        self.orders.append(order)
+        if not self.state:
+            route.abort()
+            return
+        row = {
+            **order,
+            "subject": "",
+            "state": self.state,
+            "reason": "drone1: not now",
+            "waiting": ["drone2"],
+            "t_s": 41.2,
+        }
+        route.fulfill(body=json.dumps({"order": row}), content_type="application/json")
+
+
+def row(head: Head, state: str, *terms: str) -> None:
+    """Wait for the row of an order in a state, with terms."""
+    found = head.page.locator(f"#zsim-orders [data-state={state}]")
+    for term in terms:
+        found = found.filter(has_text=term)
+    found.wait_for()
+
+
+def test_an_emergency_is_repeated_until_the_console_has_it_and_the_world_has_confirmed_it(head: Head) -> None:
+    desk = OrderDesk(head)
+    head.show(run_id="r7")
+    gone(head)
+    head.page.locator("[data-level=gone]").wait_for()
+    button = head.page.locator(".emergency")
+    assert button.is_enabled()
+    assert head.page.locator(".land").is_enabled()
+    button.hover()
+    head.page.mouse.down()
+    row(head, "sent", "EMERGENCY all", "not confirmed", "the console does not answer")
+    head.page.mouse.up()
+    while len(desk.orders) < LOOKS:
+        head.page.wait_for_timeout(POLL_MS)
+    desk.state = "sent"
+    row(head, "sent", "EMERGENCY all", "not confirmed", "drone1: not now")
+    for size in SCREENS:
+        head.page.set_viewport_size(size)
+        assert head.page.evaluate(IN_SIGHT)
+        assert overflow(head.page) == []
+    desk.state = "confirmed"
+    row(head, "confirmed", "EMERGENCY all", "confirmed at 41.2 s")
+    sent = len(desk.orders)
+    assert {(order["op"], order["run"]) for order in desk.orders} == {("emergency", "r7")}
+    assert len({order["id"] for order in desk.orders}) == 1
+    head.page.wait_for_timeout(LOOKS * HOLD_MS)
+    assert len(desk.orders) == sent
+
+
+def test_what_the_world_refuses_is_told_until_it_is_clicked(head: Head) -> None:
+    desk = OrderDesk(head)
+    desk.state = "refused"
+    head.page.locator(".land").click()
+    row(head, "refused", "Land all", "REFUSED", "not now")
+    head.page.locator("#zsim-orders [data-state=refused]").click()
+    head.page.locator("#zsim-orders [data-state=refused]").wait_for(state="detached")
+
+
+@pytest.mark.parametrize("key", ["Enter", "Space"])
+def test_an_emergency_is_held_by_the_keyboard_too_and_a_short_press_is_none(head: Head, key: str) -> None:
+    desk = OrderDesk(head)
+    desk.state = "confirmed"
+    head.page.locator(".emergency").focus()
+    head.page.keyboard.press(key)
+    head.page.locator("#zsim-notes").get_by_text("hold it").wait_for()
+    head.page.locator(".emergency").click()
+    assert desk.orders == []
+    head.page.keyboard.down(key)
+    row(head, "confirmed", "EMERGENCY all")
+    head.page.keyboard.up(key)
+    assert len(desk.orders) == 1
+
+
+def test_a_page_that_stood_still_says_so_and_blames_no_console(head: Head) -> None:
+    head.show()
+    head.page.evaluate(STALL_JS, STALL_MS)
+    head.page.locator("#zsim-notes").get_by_text("this page stood still").wait_for()
+    assert head.page.locator("#zsim-head").get_attribute("data-level") == "running"
+    assert head.page.locator(".emergency").is_enabled()
+
+
+def test_what_is_old_is_pale_and_then_lost(head: Head) -> None:
+    head.show()
+    head.show(heard_s=1.5)
+    assert head.page.locator("body").get_attribute("data-zsim-age") == "old"
+    head.show(heard_s=0.1)
+    assert head.page.locator("body").get_attribute("data-zsim-age") == ""
+    gone(head)
+    head.page.locator("body[data-zsim-age=old]").wait_for()
+    head.page.locator("body[data-zsim-age=lost]").wait_for()
 
 
 def serve(text: str, route: Any) -> None:

@@ -12,6 +12,7 @@ from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateIn
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
 
 FAR = 1e6  # m or rad: beyond it a value is a slip
+ROUNDING_M = 1e-9  # of a place that is computed from variables: 1e-14 at 50 m; a limit itself is allowed
 VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # state of an estimate
 
 
@@ -227,12 +228,12 @@ def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: Sh
     if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
         return None
     distance, i, j = closest_pair(p_W)
-    if distance < gains.separation_min_m:
+    if distance < gains.separation_min_m - ROUNDING_M:
         pair = f"robots {i + 1} and {j + 1}"
         return f"{pair} are {distance:.3f} m apart; allowed: {gains.separation_min_m:g} m or more"
     heights = p_W[:, 2].tolist()
     lowest = min(heights)
-    if lowest < limits.height_min_m:
+    if lowest < limits.height_min_m - ROUNDING_M:
         low = heights.index(lowest)
         return f"robot {low + 1} is at z = {lowest:.2f} m; allowed: {limits.height_min_m:g} m or more"
     return None
@@ -241,7 +242,7 @@ def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: Sh
 @portable
 def well_placed(p_W: Array, separation_min_m: float, height_min_m: float) -> bool:
     """Return whether robots at p_W (n, 3) are neither too near to each other nor too low."""
-    fit = closest_pair(p_W)[0] >= separation_min_m
+    fit = closest_pair(p_W)[0] >= separation_min_m - ROUNDING_M
     for i in range(p_W.shape[0]):
-        fit = fit and p_W[i, 2] >= height_min_m
+        fit = fit and p_W[i, 2] >= height_min_m - ROUNDING_M
     return fit

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract import flight_messages, keys
 from zsim.errors import ZsimError
-from zsim.transport.session import Session
+from zsim.transport.session import Session, Unanswered
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
 
 Task = Callable[[], None]
@@ -97,6 +97,7 @@ PRIORITY = 10  # contract: of operators
 PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
 THREADS_PER_POOL = 8  # in each pool: requests without an answer must not delay modes
 ANSWER_TIMEOUT_S = 5.0  # the world and controllers answer within a gate
+EMERGENCY_TIMEOUT_S = 1.0  # of a drone that is taken to stop it: after this the mode is sent without an answer
 OVERTAKEN = "an emergency was asked for after it"
 ACCEPTANCE_TIMEOUT_S = 1.0  # how long the world may take to accept a command, before the drone is released
 
@@ -107,6 +108,8 @@ class RequestOutcome(NamedTuple):
     Attributes:
         subject: the formation or drone; empty for the run.
         op, args: what was asked of it.
+        order: id of the order that it is an attempt at; empty for none.
+        unanswered: whether it is not known what became of it, so that it may be carried out yet.
     """
 
     request: str
@@ -114,6 +117,14 @@ class RequestOutcome(NamedTuple):
     subject: str = ""
     op: str = ""
     args: Mapping[str, Any] = {}
+    order: str = ""
+    unanswered: bool = False
+
+
+class NoAnswer(str):
+    """Why nobody has answered a request."""
+
+    __slots__ = ()
 
 
 class CommandClient:
@@ -174,13 +185,13 @@ class CommandClient:
                 return answer.result
         return {}
 
-    def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
+    def request_cluster(self, cluster: str, op: str, shown: str = "", order: str = "", **args: Any) -> None:
         """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""
         text = f"{cluster}: {op} {shown or _format_arguments(args)}".strip()
-        what = RequestOutcome(text, "", cluster, op, args)
+        what = RequestOutcome(text, "", cluster, op, args, order)
         self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
 
-    def send_mode(self, drones: Sequence[str], mode: str) -> None:
+    def send_mode(self, drones: Sequence[str], mode: str, order: str = "") -> None:
         """Let drones take off, land, stop at once or leave the emergency, whoever commands them.
 
         Modes of one drone are sent in the order of the requests; an emergency waits for none of them, and none that
@@ -188,7 +199,7 @@ class CommandClient:
         """
         for drone in drones:
             self._modes[drone] += 1
-            what = RequestOutcome(f"{drone}: {mode}", "", drone, mode)
+            what = RequestOutcome(f"{drone}: {mode}", "", drone, mode, order=order)
             if mode == "emergency":
                 with self._lock:
                     self._emergencies[drone] += 1
@@ -227,16 +238,18 @@ class CommandClient:
         self, begin: Callable[[Callable[[], None]], Any], what: RequestOutcome, act: Callable[..., str], *args: Any
     ) -> None:
         def done() -> None:
-            self._report(what._replace(refusal=_refusal_of(act, *args)))
+            refusal = _refusal_of(act, *args)
+            self._report(what._replace(refusal=str(refusal), unanswered=isinstance(refusal, NoAnswer)))
 
         try:
             begin(done)
         except RuntimeError:  # closed; a page of the run may still be open
             self._report(what._replace(refusal="the run has ended"))
 
-    def _request(self, key: str, op: str, args: dict[str, Any]) -> str:
-        answer = self._link.request(key, op, self._name, args, ANSWER_TIMEOUT_S)
-        return "" if answer.ok else answer.error or "refused without a reason"
+    def _request(self, key: str, op: str, args: dict[str, Any], timeout_s: float = ANSWER_TIMEOUT_S) -> str:
+        answer = self._link.request(key, op, self._name, args, timeout_s)
+        refusal = "" if answer.ok else answer.error or "refused without a reason"
+        return NoAnswer(refusal) if isinstance(answer, Unanswered) else refusal
 
     def _seek(self, t_s: float, step: bool) -> str:
         refusal = self._request(keys.CONTROL, "seek", {"t_s": t_s})
@@ -250,12 +263,13 @@ class CommandClient:
 
     def _send_emergency(self, drone: str, mode: str) -> str:
         """Send the mode even if the drone could not be acquired: the world may accept it all the same."""
-        refusal = _refusal_of(self._acquire, drone, PRIORITY_EMERGENCY)
+        refusal = _refusal_of(self._acquire, drone, PRIORITY_EMERGENCY, EMERGENCY_TIMEOUT_S)
         self._send(drone, mode)
-        return refusal and f"{refusal}; {mode} was sent all the same"
+        told = refusal and f"{refusal}; {mode} was sent all the same"
+        return NoAnswer(told) if isinstance(refusal, NoAnswer) else told
 
-    def _acquire(self, drone: str, priority: int) -> str:
-        return self._request(keys.CONTROL, "acquire", {"drone": drone, "priority": priority})
+    def _acquire(self, drone: str, priority: int, timeout_s: float = ANSWER_TIMEOUT_S) -> str:
+        return self._request(keys.CONTROL, "acquire", {"drone": drone, "priority": priority}, timeout_s)
 
     def _send(self, drone: str, mode: str, stops: int | None = None) -> str:
         """Send a mode, unless more emergencies than `stops` were requested; release the drone afterwards."""

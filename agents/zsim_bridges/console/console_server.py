@@ -13,6 +13,7 @@ from zsim.contract.messages import Info
 from zsim.transport.session import Session
 from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.monitoring.page_head import no_run_head
+from zsim_bridges.console.orders import OrderRequest
 from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.console.scene.camera_follow import CameraFollow
@@ -136,8 +137,10 @@ class Console:
     def _head(self) -> dict[str, Any]:
         return self._run_page.head() if self._run_page else no_run_head(self._world, self._ended)
 
-    def _command(self, op: str) -> str:
-        return self._run_page.command(op) if self._run_page else "there is no run yet"
+    def _command(self, request: OrderRequest) -> dict[str, Any]:
+        if self._run_page:
+            return self._run_page.command(request)
+        return {"id": request.id, "op": request.op, "state": "refused", "reason": "there is no run yet"}
 
 
 def _show_text(gui: viser.GuiApi, text: str) -> None:

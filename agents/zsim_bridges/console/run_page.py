@@ -29,6 +29,7 @@ from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 from zsim_bridges.console.monitoring.run_monitor import RunMonitor
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
+from zsim_bridges.console.orders import OrderBook, OrderRequest
 from zsim_bridges.console.page.console_page import ConsolePage
 from zsim_bridges.console.page.page_forms import PageForms
 from zsim_bridges.console.record_player import RecordPlayer
@@ -75,6 +76,7 @@ class RunPage:
         cameras: of the drones.
         record: what is played, of a replay.
         flying: what pages may do with single drones.
+        orders: of the operators, until they are confirmed.
     """
 
     def __init__(
@@ -101,6 +103,11 @@ class RunPage:
         self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command)
         self._monitor = RunMonitor(self.views, self._time_monitor, self._scenario, bool(info.replay_of), world)
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
+        members = {cluster.name: tuple(cluster.drones) for cluster in self._scenario.clusters}
+        unflyable, silent_s = self._monitor.unflyable, lambda: self._time_monitor.silent_s
+        whose = self._client, info.run_id, members, names
+        self.orders = OrderBook(*whose, unflyable, lambda: observer.now_ns, silent_s, self.views.external)
+        self.views.on_own_event = self.orders.on_event
         self.record = RecordPlayer(self._client, self._time_monitor, bool(info.replay_of))
         hats = self._scenario.environment.hats
         self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
@@ -158,17 +165,17 @@ class RunPage:
 
     def head(self) -> dict[str, Any]:
         """Return the head of the page, as plain data."""
-        return self._monitor.head(time.monotonic())
+        head, stall = self._monitor.head(time.monotonic()), self._time_monitor.stall
+        stood = stall and {"lasted_s": stall.lasted_s, "ago_s": time.monotonic() - stall.ended_s}
+        ages = {"heard_s": self._time_monitor.heard_s, "stall": stood}
+        return {**head, **ages, "run_id": self._info.run_id, "orders": self.orders.rows()}
 
-    def command(self, op: str) -> str:
-        """Do what a button of the page's head asks for; return why it is refused, empty where it is not."""
-        if op == "acknowledge":
+    def command(self, request: OrderRequest) -> dict[str, Any]:
+        """Do what a button of the page asks for; return what becomes of it, as plain data with its `state`."""
+        if request.op == "acknowledge":
             self._monitor.board.acknowledge()
-            return ""
-        refusal = self.head()["refusals"][op]
-        if not refusal:
-            self._page.fleet.request_all(op)
-        return refusal
+            return {"id": request.id, "op": request.op, "state": "confirmed", "reason": ""}
+        return self.orders.place(request)
 
     # A picture
 
@@ -200,9 +207,15 @@ class RunPage:
                 self._update_tables(wall_s)
 
     def _update_monitor(self, wall_s: float) -> None:
-        """Keep up with the run's condition, and note among the events what is done that was accepted before."""
+        """Keep up with the run's condition and with orders, and note what is done that was accepted before."""
         for done in self._monitor.update(wall_s):
             self._note("done", done.subject, f"{done.text}: done")
+        self._update_orders()
+
+    def _update_orders(self) -> None:
+        run, drones = self._monitor.condition, self.views.drones
+        states = {**run.drones, **{name: phase for name, (phase, _) in run.phases.items()}}
+        self.orders.update(states, drones.t_ns if drones else -1, paused=run.clock != "running")
 
     def _on_click(self, event: viser.SceneClickEvent) -> None:
         drone = self._scene.clicked(event)
@@ -216,6 +229,7 @@ class RunPage:
         if self._observer.end_reason or self.views.end:
             self._monitor.end(self._observer.end_reason)
         self._monitor.update(time.monotonic())
+        self._update_orders()
         with self._server.atomic():
             if self.views.drones is not None:
                 self._draw()
@@ -275,6 +289,8 @@ class RunPage:
 
         The world publishes an event of what it has done, but not of requests to formations, which are only accepted.
         """
+        if outcome.order and not self.orders.note(outcome):
+            return
         if outcome.refusal:
             self._note("refused", outcome.subject, f"{outcome.request}: {outcome.refusal}")
             self._notify(outcome.request, outcome.refusal)

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from zsim.math.rotation import Vector
 from zsim_bridges.console.flying.flown_velocity import DronePose
 
 RATE_MAX = 5.0  # × real time; chosen: faster, nobody steers by hand, and the firmware takes the pauses for silence
@@ -26,6 +27,7 @@ class RunSight(NamedTuple):
 
     Attributes:
         off: why nothing can be flown; empty where something can.
+        silence: that the world does not answer, in words; empty where it does. A drone is taken all the same.
         rate: simulated per wall second, as measured.
         paused: whether it stands still.
     """
@@ -33,6 +35,7 @@ class RunSight(NamedTuple):
     off: str = ""
     rate: float = 1.0
     paused: bool = False
+    silence: str = ""
 
 
 class FlightAnswer(NamedTuple):
@@ -43,12 +46,18 @@ class FlightAnswer(NamedTuple):
         state: none, taking or flying.
         text: why it is not flown, or what it does.
         over: whether it may be taken over from who flies it.
+        commander: who that is.
+        id: of the page's request to take it.
+        goal: the place to which it flies [m; W]; None for none.
     """
 
     drone: str = ""
     state: str = "none"
     text: str = ""
     over: bool = False
+    commander: str = ""
+    id: str = ""
+    goal: Vector | None = None
 
 
 def too_fast(rate: float) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 from zsim.contract.state_rules import state_refusal
 from zsim.vehicles.vehicle import Limits
-from zsim_bridges.console.command_client import CommandClient
+from zsim_bridges.console.command_client import CommandClient, NoAnswer
 from zsim_bridges.console.flying.flight_conditions import DroneSight, FlightAnswer, RunSight, too_fast
 from zsim_bridges.console.flying.flown_velocity import (
     HOVER,
@@ -29,6 +29,7 @@ from zsim_bridges.console.flying.geofence import Geofence
 PERIOD_S = 0.05  # wall; of commands: at 5 × real time ten of them within a drone's silence of 0.5 s
 STALE_S = 0.5  # wall; a page that was silent for so long does not fly any more: as the firmware's silence
 GONE_S = 5.0  # wall; after which the drone of a page that is gone is given back: a page may be loaded anew meanwhile
+REPEAT_S = 1.0  # wall; after which a drone is asked for again of a world that has not answered
 SETTLED_S = 1.5  # wall; after which a view shows who has taken a drone; views come 20 times a second
 
 
@@ -43,6 +44,9 @@ class _Flight:
         sent_s: when it was commanded last [s; wall].
         stick: that is held; None: hover, or on the way to `place_W`.
         lost: whether the page's connection is gone.
+        id: of the page's request.
+        begun_s: when the page wanted it [s; wall].
+        asked_s, asking: when the world was asked for the drone last [s; wall], and whether its answer is awaited.
     """
 
     drone: str
@@ -53,6 +57,10 @@ class _Flight:
     stick: Stick | None = None
     place_W: Vector | None = None
     lost: bool = False
+    id: str = ""
+    begun_s: float = 0.0
+    asked_s: float = 0.0
+    asking: bool = False
 
 
 class ManualFlight:
@@ -92,6 +100,7 @@ class ManualFlight:
         self._flights: dict[Any, _Flight] = {}
         self._texts: dict[Any, FlightAnswer] = {}  # why a page flies no more
         self._released: dict[str, float] = {}  # drones that were given back, and when that is looked at again [s; wall]
+        self._ticked_s = wall_s()
         self._wake = threading.Event()  # something has to be sent at once
 
     @contextmanager
@@ -110,21 +119,37 @@ class ManualFlight:
                 self.leave(page)
             self._give_back(self._wall_s())
 
-    def take(self, page: Any, drone: str, over: bool) -> FlightAnswer:
-        """Take a drone for a page; `over` from whoever flies it, with an operator's priority."""
+    def take(self, page: Any, drone: str, over: bool, request: str = "") -> FlightAnswer:
+        """Take a drone for a page; `over` from whoever flies it, with an operator's priority.
+
+        A request that is repeated, with its id, is carried out once; a page that has connected anew has its drone back.
+        """
         with self._lock:
+            if request and self._texts.get(page, FlightAnswer()).id == request:
+                return self._texts[page]
+            known = next((key for key, flight in self._flights.items() if request and flight.id == request), None)
+            if known is not None:
+                flight = self._flights[page] = self._flights.pop(known)
+                flight.seen_s, flight.lost = self._wall_s(), False
+                return self.answer(page)
             if page in self._flights:
                 self.leave(page)
             self._texts.pop(page, None)
-            refusal = self._take_refusal(drone)
-            who = self._sight_of(drone).commander
-            if not refusal and not over and who not in (None, self._name):
-                return FlightAnswer(drone, text=f"{drone} is flown by {who}", over=True)
-            if refusal:
-                return FlightAnswer(drone, text=refusal)
-            self._flights[page] = flight = _Flight(drone, self._client.modes_requested(drone), self._wall_s())
-        self._client.take(drone, partial(self._on_taken, page, flight))
+            refusal, who = self._take_refusal(drone), self._sight_of(drone).commander
+            may_be_over = not refusal and not over and who not in (None, self._name)
+            if refusal or may_be_over:
+                text = refusal or f"{drone} is flown by {who}"
+                self._texts[page] = FlightAnswer(drone, text=text, over=may_be_over, commander=who or "", id=request)
+                return self._texts[page]
+            flight = _Flight(drone, self._client.modes_requested(drone), self._wall_s(), id=request)
+            flight.begun_s = self._wall_s()
+            self._flights[page] = flight
+        self._ask(flight)
         return self.answer(page)
+
+    def _ask(self, flight: _Flight) -> None:
+        flight.asked_s, flight.asking = self._wall_s(), True
+        self._client.take(flight.drone, partial(self._on_taken, flight))
 
     def steer(self, page: Any, stick: Stick | None) -> FlightAnswer:
         """Fly the page's drone by a stick; None: its dead-man key is not held, so hover, or go on to a place."""
@@ -138,8 +163,8 @@ class ManualFlight:
                 flight.stick, flight.seen_s = stick, self._wall_s()
         return self.answer(page)
 
-    def go(self, page: Any, x_m: float, y_m: float) -> FlightAnswer:
-        """Fly the page's drone to a place, at the height that it has."""
+    def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None) -> FlightAnswer:
+        """Fly the page's drone to a place, at the height that it has unless another one is given."""
         with self._lock:
             flight = self._flights.get(page)
             if flight is None:
@@ -147,7 +172,8 @@ class ManualFlight:
             pose, refusal = self._sight_of(flight.drone).pose, self._fence.refusal(x_m, y_m)
             if refusal or pose is None:
                 return self.answer(page)._replace(text=refusal or f"no estimate of {flight.drone}")
-            flight.stick, flight.place_W, flight.seen_s = None, (x_m, y_m, pose.p_W[2]), self._wall_s()
+            height_m = pose.p_W[2] if z_m is None else z_m
+            flight.stick, flight.place_W, flight.seen_s = None, (x_m, y_m, height_m), self._wall_s()
         return self.answer(page)
 
     def leave(self, page: Any, text: str = "") -> FlightAnswer:
@@ -158,7 +184,7 @@ class ManualFlight:
                 self._released[flight.drone] = -math.inf
                 self._wake.set()
                 if not flight.lost:
-                    self._texts[page] = FlightAnswer(flight.drone, text=text)
+                    self._texts[page] = FlightAnswer(flight.drone, text=text, id=flight.id)
         return self.answer(page)
 
     def lose(self, page: Any) -> None:
@@ -177,8 +203,10 @@ class ManualFlight:
             if flight is None:
                 return self._texts.get(page, FlightAnswer())
             if flight.owned_s is None:
-                return FlightAnswer(flight.drone, "taking")
-            return FlightAnswer(flight.drone, "flying", self._text(flight))
+                silence = self._run_sight().silence
+                text = f"asked for {self._wall_s() - flight.begun_s:.1f} s ago, not confirmed"
+                return FlightAnswer(flight.drone, "taking", f"{text}: {silence}" if silence else text, id=flight.id)
+            return FlightAnswer(flight.drone, "flying", self._text(flight), id=flight.id, goal=flight.place_W)
 
     def tick(self) -> None:
         """Command every drone that is due; give back those that may not be flown any more.
@@ -186,10 +214,15 @@ class ManualFlight:
         All is sent from here, in one thread: no command follows a newer one, or comes after the drone was given back.
         """
         wall_s, run = self._wall_s(), self._run_sight()
+        stood_s, self._ticked_s = wall_s - self._ticked_s, wall_s
+        stall = f"the console stood still for {stood_s:.0f} s" if stood_s > GONE_S else ""
         for page, flight in list(self._flights.items()):
-            reason = self._end_reason(flight, run, wall_s)
+            reason = stall or self._end_reason(flight, run, wall_s)
             if reason:
                 self.leave(page, reason)
+            elif flight.owned_s is None:
+                if not flight.asking and not run.silence and wall_s - flight.asked_s >= REPEAT_S:
+                    self._ask(flight)
             elif flight.owned_s is not None and not run.paused and wall_s - flight.sent_s >= self._period_s(run):
                 flight.sent_s = wall_s
                 flown = self._velocity(flight, wall_s)
@@ -225,15 +258,19 @@ class ManualFlight:
             return f"{drone} is flown from another page"
         return run.off or too_fast(run.rate) or state_refusal(drone, sight.state or "unseen", "velocity") or ""
 
-    def _on_taken(self, page: Any, flight: _Flight, refusal: str) -> None:
+    def _on_taken(self, flight: _Flight, refusal: str) -> None:
         with self._lock:
-            if self._flights.get(page) is not flight:
-                if not refusal:  # the page has given it up meanwhile
+            flight.asking = False
+            page = next((key for key, each in self._flights.items() if each is flight), None)
+            if page is None:
+                if not refusal or isinstance(refusal, NoAnswer):  # the page has given it up meanwhile
                     self._released[flight.drone] = -math.inf
+            elif isinstance(refusal, NoAnswer):
+                return  # it is asked for again
             elif refusal:
                 del self._flights[page]
                 if not flight.lost:
-                    self._texts[page] = FlightAnswer(flight.drone, text=refusal)
+                    self._texts[page] = FlightAnswer(flight.drone, text=refusal, id=flight.id)
             else:
                 flight.owned_s = self._wall_s()
 
@@ -245,7 +282,8 @@ class ManualFlight:
             return f"another mode of {drone} was asked for"
         if flight.owned_s is not None and wall_s - flight.owned_s > SETTLED_S and sight.commander != self._name:
             return f"{drone} is flown by {sight.commander or 'nobody'} now"
-        return run.off or too_fast(run.rate / 2.0) or state_refusal(drone, sight.state, "velocity") or ""
+        off = run.off or (run.silence if flight.owned_s is not None else "")
+        return off or too_fast(run.rate / 2.0) or state_refusal(drone, sight.state, "velocity") or ""
 
     def _velocity(self, flight: _Flight, wall_s: float) -> FlownVelocity:
         pose, limits = self._sight_of(flight.drone).pose, self._limits[flight.drone]

@@ -106,4 +106,6 @@ class PageFlying:
     def _run_sight(self) -> RunSight:
         clock = self._time_monitor.clock
         run = self._monitor.condition._replace(silent_s=self._time_monitor.silent_s)
-        return RunSight(run.grounded(), clock.rate if clock else 1.0, clock is not None and clock.state != "running")
+        silence, off = run.off() if run.silent_s else "", run._replace(silent_s=0.0).grounded()
+        stands = clock is not None and clock.state != "running"
+        return RunSight(off, clock.rate if clock else 1.0, stands, "" if off else silence)

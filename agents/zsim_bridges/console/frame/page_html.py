@@ -6,8 +6,9 @@ Viewers see its controls disabled.
 import gzip
 import importlib.resources
 
-PARTS = (  # of the page beside viser's; of the last three, each uses those before it
+PARTS = (  # of the page beside viser's; orders.html is used by all that follow, each of the last three by the next
     "layout.html",
+    "orders.html",
     "head_bar.html",
     "camera_windows.html",
     "scene_tools.html",
@@ -16,7 +17,8 @@ PARTS = (  # of the page beside viser's; of the last three, each uses those befo
     "map_view.html",
 )
 VIEW_STYLE = (
-    "<style>.mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"
+    "<style>.mantine-Button-root,.mantine-Slider-root,.mantine-Input-input,.zsim-order"
+    "{pointer-events:none;opacity:.4}</style>"
 )
 
 

@@ -56,6 +56,10 @@ class RunMonitor:
         """Note that the run is over."""
         self._ended = self._views.end or reason
 
+    def unflyable(self) -> str:
+        """Return why nobody can be flown, as long as this run is shown; empty where somebody can, or may again."""
+        return self.condition._replace(silent_s=0.0, ended=self._ended).grounded()
+
     def update(self, wall_s: float) -> list[PendingRequest]:
         """Look at the newest views; return the requests that were done meanwhile."""
         views, clock = self._views, self._time_monitor.clock

@@ -72,6 +72,7 @@ class ViewBuffer:
         log: events as they are shown; events: newest first.
         losses: the newest event about each process or drone that is lost.
         end: why the run ended, by its last event; empty while it goes on.
+        on_own_event: called, in a thread of Zenoh's, with each event that a command of this console has caused.
     """
 
     def __init__(
@@ -104,6 +105,7 @@ class ViewBuffer:
         self.events = self.log.newest
         self.losses: dict[str, Event] = {}
         self.end = ""
+        self.on_own_event: Callable[[Event], None] = lambda _: None
 
     def open(self) -> None:
         """Subscribe, and read the last values of before."""
@@ -216,8 +218,10 @@ class ViewBuffer:
             self.end = event.text
         if event.kind != "command":  # an event of a mode or of a refusal follows, with more in it
             self.log.add(event)
-        if event.kind == "refused" and event.source == self._observer.name:
-            self._refused(event)
+        if event.source == self._observer.name:
+            self.on_own_event(event)
+            if event.kind == "refused":
+                self._refused(event)
 
 
 def _drone(event: Event) -> str:

@@ -12,8 +12,16 @@ from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals, is_held_by_fault
 from zsim_bridges.console.page import operator_input
-from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
-from zsim_bridges.console.page.run_forms import refusal_lines, set_refusals
+from zsim_bridges.console.page.operator_input import SliderRange, primary_variables, range_refusal
+from zsim_bridges.console.page.run_forms import (
+    ORDERS,
+    OrderButton,
+    heard,
+    limits_line,
+    order_refusals,
+    refusal_lines,
+    set_refusals,
+)
 from zsim_bridges.console.page.variable_slider import VariableSlider
 from zsim_bridges.console.scene.picture import SHAPED_PHASES
 
@@ -24,9 +32,7 @@ LABELS = {**{op: label for label, op in OPERATIONS.items()}, "target": "sliders"
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
     "engage": viser.Icon.TRIANGLE,
-    "hold": viser.Icon.HAND_STOP,
     "rejoin": viser.Icon.ARROWS_JOIN,
-    "land": viser.Icon.PLANE_ARRIVAL,
 }
 EXAMPLES = {
     "expressions": "x_c = 5 + 3*cos(0.1*t)\nyaw = 90 + 6*t",
@@ -71,6 +77,7 @@ class FormationForm:
         hint = "Duration of a move; 0: as fast as the robots' limits let it"
         self._others: list[tuple[str, Any]] = []  # further controls, each with the operation that it requests
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
+        gui.add_html(limits_line(f"over: 0 to {OVER_MAX_S:g} s"))
         shown = primary_variables(space.names)
         self._sliders = {name: VariableSlider(gui, self._ranges[name]) for name in shown}
         if len(shown) < space.size:
@@ -79,7 +86,8 @@ class FormationForm:
 
     def offer(self, run: RunCondition) -> None:
         """Grey out what the controller would refuse, with its reason; a slider shows all the same where it stands."""
-        refusals = formation_refusals(run, self._cluster.name)
+        name = self._cluster.name
+        refusals = {**formation_refusals(run, name), **order_refusals(formation_refusals(heard(run), name))}
         set_refusals(self._controls, refusals)
         for op, control in self._others:
             set_refusals({op: control}, refusals)
@@ -118,17 +126,21 @@ class FormationForm:
 
     def request_target(self, shown: dict[str, float]) -> bool:
         """Request values in the units of the page; return whether they are within their ranges."""
-        refusals = [refusal for name, value in shown.items() if (refusal := self._ranges[name].refusal(value))]
-        if refusals:
+        over_s = float(self._over.value)
+        asked = [self._ranges[name].refusal(value) for name, value in shown.items()]
+        refusals = [each for each in (*asked, range_refusal("over", over_s, 0.0, OVER_MAX_S, "s")) if each]
+        if refusals and shown:
             self._report(RequestOutcome(f"{self._cluster.name}: target", "; ".join(refusals)))
             return False
         values = {name: self._ranges[name].to_si(value) for name, value in shown.items()}
-        lasting = {"over_s": float(self._over.value)} if self._over.value > 0 else {}
+        lasting: dict[str, Any] = {"over_s": over_s} if over_s > 0 else {}
         text = ", ".join(f"{name} {value:g} {self._ranges[name].unit}" for name, value in shown.items())
         self._client.request_cluster(self._cluster.name, "target", shown=text, values=values, **lasting)
         return True
 
     def _button(self, gui: viser.GuiApi, label: str, op: str) -> Any:
+        if op in ORDERS:
+            return OrderButton(gui, label, op, {"cluster": self._cluster.name})
         button = gui.add_button(label, icon=ICONS[op], color="blue" if op in ("takeoff", "engage") else "gray")
         button.on_click(lambda _: self._client.request_cluster(self._cluster.name, op))
         return button
@@ -141,7 +153,8 @@ class FormationForm:
             self._other_button(gui, "target", "Move it", lambda: self._move(name.value, float(value.value)))
 
     def _value_label(self, name: str) -> str:
-        return f"value [{self._ranges[name].unit}]"
+        allowed = self._ranges[name]
+        return f"value [{allowed.unit}], {allowed.low:g} to {allowed.high:g}"
 
     def _move(self, name: str, shown: float) -> None:
         self.request_target({name: shown})

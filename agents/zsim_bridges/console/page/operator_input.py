@@ -21,6 +21,14 @@ STEPS = {"m": 0.1, "deg": 1.0}
 SHOWN_MAX = 16  # variables that a page shows one by one; of more, those of the whole formation
 
 
+def range_refusal(name: str, value: float, low: float, high: float, unit: str = "") -> str | None:
+    """Return why a number that was typed may not be requested, None if it may; it is never changed to a limit."""
+    if low <= value <= high:
+        return None
+    in_unit = f" {unit}" if unit else ""
+    return f"{name} is {value:g}{in_unit}; must be from {low:g} to {high:g}{in_unit}"
+
+
 class SliderRange(NamedTuple):
     """A cluster variable on a slider.
 
@@ -74,9 +82,7 @@ class SliderRange(NamedTuple):
 
     def refusal(self, shown: float) -> str | None:
         """Return why a value may not be requested, None if it may."""
-        if not self.low <= shown <= self.high:
-            return f"{self.name} is {shown:g} {self.unit}; must be from {self.low:g} to {self.high:g}"
-        return None
+        return range_refusal(self.name, shown, self.low, self.high, self.unit)
 
 
 def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[SliderRange]:

@@ -14,11 +14,14 @@ from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, drone_refusals, fleet_refusals, run_refusals
 from zsim_bridges.console.page import operator_input
+from zsim_bridges.console.page.operator_input import range_refusal
 
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
 """The row of tabs below stands 9 px higher than what is above it ends."""
 
-DURATION_S = 30.0  # of a fault, unless another time is typed
+LIMITS_STYLE = "font-size:11px;line-height:1.2;color:#868e96;padding:0 12px 4px;text-align:right"
+HELD_HINT = "hold it for 0.6 s, by hand or by Space or Enter"  # as long as HOLD_MS of orders.html
+DURATION_S, DURATION_MAX_S = 30.0, 1e5  # of a fault, unless another time is typed; longer than any run
 WEAK_THRUST_SHARE = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
 GUST_M_S = (4.0, 0.0, 0.0)  # about what the drones of the formation can still hold against
 LOSS_PROBABILITY = 0.3
@@ -50,7 +53,9 @@ class FaultForm:
         self._kinds = kinds_of(declarations(scenario.drones))
         names = [drone.name for drone in scenario.drones]
         self._drone = gui.add_dropdown("drone", names)
-        self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=1e5, step=1.0, hint="0: until it is cleared")
+        hint = "0: until it is cleared"
+        self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=DURATION_MAX_S, step=1.0, hint=hint)
+        gui.add_html(limits_line(f"for: 0 to {DURATION_MAX_S:g} s; {hint}"))
         self._button(gui, "GPS lost", lambda: self._on_drone("gps_dropout"))
         self._button(gui, "Motor weak", self._weaken)
         self._button(gui, "Gust", lambda: self._add("gust", "world", velocity_m_s=list(GUST_M_S)))
@@ -75,9 +80,12 @@ class FaultForm:
         self._add(kind, self._drone.value, **parameters)
 
     def _add(self, kind: str, target: str, **parameters: Any) -> None:
-        duration = (
-            {"for_s": float(self._for.value)} if self._for.value > 0 and self._kinds[kind].lasts != "once" else {}
-        )
+        lasts_s, lasts = float(self._for.value), self._kinds[kind].lasts != "once" and "for_s" not in parameters
+        refusal = range_refusal("for", lasts_s, 0.0, DURATION_MAX_S, "s") if lasts else None
+        if refusal:
+            self._report(RequestOutcome(f"fault_add {kind} of {target}", refusal))
+            return
+        duration = {"for_s": lasts_s} if lasts and lasts_s > 0 else {}
         self._client.request_world("fault_add", kind=kind, target=target, **{**duration, **parameters})
 
     def _any_fault(self, gui: viser.GuiApi, names: list[str]) -> None:
@@ -108,6 +116,11 @@ def _help(fault: FaultKind) -> str:
     return f"<sub>{fault.description}; strikes a {fault.strikes}. {'; '.join(lines)}</sub>"
 
 
+def limits_line(text: str) -> str:
+    """Return the limits of a number, to stand below its field, as HTML."""
+    return f"<div style='{LIMITS_STYLE}'>{escape(text)}</div>"
+
+
 def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> None:
     """Grey out the controls of those operations that would be refused; the reason is their tooltip.
 
@@ -115,10 +128,26 @@ def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> No
     """
     for op, control in controls.items():
         reason = refusals.get(op, "")
+        if isinstance(control, OrderButton):
+            control.lock(reason)
+            continue
         if control.disabled != bool(reason):
             control.disabled = bool(reason)
         if control.hint != (reason or None):
             control.hint = reason or None
+
+
+ORDERS = ("hold", "land", "emergency")  # operations whose buttons are those of orders
+
+
+def heard(run: RunCondition) -> RunCondition:
+    """Return the condition as if the world answered: an order is given to one that is silent, too."""
+    return run._replace(silent_s=0.0)
+
+
+def order_refusals(refusals: Mapping[str, str]) -> dict[str, str]:
+    """Return those of the refusals that concern orders; an emergency is never kept back."""
+    return {op: "" if op == "emergency" else reason for op, reason in refusals.items() if op in ORDERS}
 
 
 def refusal_lines(labels: Mapping[str, str], refusals: Mapping[str, str]) -> str:
@@ -131,7 +160,60 @@ def refusal_lines(labels: Mapping[str, str], refusals: Mapping[str, str]) -> str
     return f"<div style='{REASON_STYLE}'>{'<br>'.join(map(escape, lines))}</div>" if lines else ""
 
 
+class OrderButton:
+    """A button whose order the page repeats until it is confirmed: it is the page's own, not one of viser's.
+
+    Args:
+        gui: viser's, in the folder where it is to be.
+        label: of the button.
+        op: see `OrderRequest`.
+        of: whom it concerns: {"drone": name} or {"cluster": name}.
+        held: whether it is to be held for a while.
+
+    Attributes:
+        visible: always.
+        disabled: whether it is off.
+    """
+
+    visible = True
+
+    def __init__(self, gui: viser.GuiApi, label: str, op: str, of: dict[str, str], *, held: bool = False) -> None:
+        self._label, self._op, self._of, self._held = label, op, of, held
+        self._hint = HELD_HINT if held else ""
+        self.disabled = False
+        self._content = self._drawn()
+        self._html = gui.add_html(self._content)
+
+    def name(self, label: str, of: dict[str, str]) -> None:
+        """Give it another label, and let it concern somebody else."""
+        self._label, self._of = label, of
+        self._draw()
+
+    def lock(self, reason: str) -> None:
+        """Switch it off for a reason; on where that is empty."""
+        self.disabled, self._hint = bool(reason), reason or (HELD_HINT if self._held else "")
+        self._draw()
+
+    def _draw(self) -> None:
+        """Viser sends an assigned property always: what has not changed is left alone."""
+        content = self._drawn()
+        if content != self._content:
+            self._content = self._html.content = content
+
+    def _drawn(self) -> str:
+        data = {"data-zsim-order": self._op, **{f"data-{key}": name for key, name in self._of.items()}}
+        data |= {"title": self._hint, **({"data-zsim-hold": "1", "class": "stop"} if self._held else {})}
+        attributes = " ".join(f'{key}="{escape(value)}"' for key, value in data.items())
+        off = " disabled" if self.disabled else ""
+        return f'<div class="zsim-order"><button type="button" {attributes}{off}>{escape(self._label)}</button></div>'
+
+
 FLEET = {"Take off all": "takeoff", "Reset all": "reset"}  # an operation of formations, and a mode of drones
+
+
+def _whole(value: float) -> float:
+    """Return a whole number as an integer, and any other one as it is: the world refuses it."""
+    return int(value) if value == int(value) else value
 
 
 class RunForm:
@@ -149,11 +231,13 @@ class RunForm:
         resume = gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY, visible=False)
         resume.on_click(lambda _: client.request_world("resume"))
         gates = gui.add_number("gates", 1, min=1, max=GATES_MAX, step=1)
+        gui.add_html(limits_line(f"gates: 1 to {GATES_MAX}"))
         step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
-        step.on_click(lambda _: client.request_world("step", gates=int(gates.value)))
+        step.on_click(lambda _: client.request_world("step", gates=_whole(gates.value)))
         wanted = gui.add_number(
             "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
         )
+        gui.add_html(limits_line(f"rate: 0 to {RATE_MAX:g} × real time"))
         set_rate = gui.add_button("Set rate")
         set_rate.on_click(lambda _: client.request_world("rate", value=float(wanted.value)))
         self._controls = {"pause": pause, "resume": resume, "step": step, "rate": set_rate}
@@ -171,9 +255,9 @@ class RunForm:
 
 
 class FleetForm:
-    """Take-off and reset of all drones; their landing and emergency, too, for the head of the page.
+    """Take-off and reset of all drones; their landing and emergency are orders of the head of the page.
 
-    Formations take off and land by their controllers, drones of none each by itself.
+    Formations take off by their controllers, drones of none each by itself.
 
     Args:
         gui: viser's, in the folder where they are to be.
@@ -206,10 +290,8 @@ class FleetForm:
         self._reasons.content = refusal_lines({"takeoff": "Take off all"}, refusals)
 
     def request_all(self, operation: str) -> None:
-        """Request takeoff or land of all formations and single drones, emergency of all, reset of those in one."""
-        if operation == "emergency":
-            self._client.send_mode(self._drones, operation)
-        elif operation == "reset":
+        """Request takeoff of all formations and single drones, or reset of those in an emergency."""
+        if operation == "reset":
             self._client.send_mode([d for d in self._drones if self._run.drones.get(d) == "emergency"], operation)
         else:
             for name in self._formations:
@@ -219,12 +301,7 @@ class FleetForm:
 
 
 DRONE_MODES = {"takeoff": "Take off", "land": "Land", "emergency": "Emergency", "reset": "Reset"}
-DRONE_ICONS = {
-    "takeoff": viser.Icon.PLANE_DEPARTURE,
-    "land": viser.Icon.PLANE_ARRIVAL,
-    "emergency": viser.Icon.ALERT_TRIANGLE,
-    "reset": viser.Icon.REFRESH,
-}
+DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "reset": viser.Icon.REFRESH}
 
 
 class DroneForm:
@@ -243,8 +320,11 @@ class DroneForm:
         self.choice = gui.add_dropdown("drone", list(names))
         self._buttons: dict[str, Any] = {}
         for mode, label in DRONE_MODES.items():
-            colour = "red" if mode == "emergency" else "gray"
-            button = gui.add_button(f"{label} {self.chosen}", icon=DRONE_ICONS[mode], color=colour)
+            if mode in ORDERS:
+                of, held = {"drone": self.chosen}, mode == "emergency"
+                self._buttons[mode] = OrderButton(gui, f"{label} {self.chosen}", mode, of, held=held)
+                continue
+            button = gui.add_button(f"{label} {self.chosen}", icon=DRONE_ICONS[mode], color="gray")
             button.on_click(lambda _, mode=mode: client.send_mode([self.chosen], mode))
             self._buttons[mode] = button
         self._reasons = gui.add_html("")
@@ -263,11 +343,15 @@ class DroneForm:
     def refresh(self, run: RunCondition) -> None:
         """Offer what would not be refused."""
         self._run = run
-        refusals = drone_refusals(run, self.chosen)
+        refusals = {**drone_refusals(run, self.chosen), **order_refusals(drone_refusals(heard(run), self.chosen))}
         set_refusals(self._buttons, refusals)
         self._reasons.content = refusal_lines(DRONE_MODES, refusals)
 
     def _rename(self) -> None:
         for mode, button in self._buttons.items():
-            button.label = f"{DRONE_MODES[mode]} {self.chosen}"
+            label = f"{DRONE_MODES[mode]} {self.chosen}"
+            if isinstance(button, OrderButton):
+                button.name(label, {"drone": self.chosen})
+            else:
+                button.label = label
         self.refresh(self._run)

@@ -31,7 +31,6 @@ class VariableSlider:
         self.range = range_
         self._lock = threading.Lock()
         self._moved: tuple[float, float] | None = None
-        self._out_of_range = False
         self._held: _HeldValue | None = None
         self._slider: Any = gui.add_slider(range_.label, range_.low, range_.high, range_.step, range_.start)
         self._slider.label = range_.label_unknown
@@ -91,11 +90,5 @@ class VariableSlider:
     def _on_update(self, event: viser.GuiEvent[Any]) -> None:
         if event.client_id is None:
             return  # set by `follow`
-        value = float(self._slider.value)
         with self._lock:
-            # A page accepts numbers beyond the limits, and sets them to the nearest limit when the field loses focus.
-            if self._out_of_range and value in (self._slider.min, self._slider.max):
-                self._out_of_range = False
-                return
-            self._out_of_range = self.range.refusal(value) is not None
-            self._moved = (value, time.monotonic())
+            self._moved = (float(self._slider.value), time.monotonic())

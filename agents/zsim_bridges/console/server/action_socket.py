@@ -115,9 +115,9 @@ class ActionSockets:
 
 def _fly(control: ManualFlight, page: Any, action: FlyDrone) -> FlightAnswer:
     if isinstance(action, TakeDrone):
-        return control.take(page, action.drone, action.over)
+        return control.take(page, action.drone, action.over, action.id)
     if isinstance(action, SteerDrone):
         return control.steer(page, action.stick())
     if isinstance(action, GoToPlace):
-        return control.go(page, action.x_m, action.y_m)
+        return control.go(page, action.x_m, action.y_m, action.z_m)
     return control.leave(page)

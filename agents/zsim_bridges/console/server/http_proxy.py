@@ -8,15 +8,15 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import msgspec
 from aiohttp import ClientError, ClientSession, WSMsgType, web
-from msgspec import Struct
 
 from zsim.errors import RunError
 from zsim_bridges.console.frame import page_html
+from zsim_bridges.console.orders import OrderRequest
 from zsim_bridges.console.server.page_tokens import OPERATOR, VIEW_PATH, VIEWER, PageRequest, PageTokens
 from zsim_bridges.console.server.run_files import RunFiles
 from zsim_bridges.web.web_server import ANY_PORT, ServedSite, open_on_thread, start_site, url_host
@@ -68,7 +68,7 @@ class ViserBackend(NamedTuple):
         serve_cameras: answers a page's request for a socket of pictures, until it closes.
         serve_actions: answers one for a socket of what is done in the scene, by the page's role, until it closes.
         head: returns what the head of the page shows, as plain data.
-        command: does what a button of the head asks for; returns why it is refused, empty where it is not.
+        command: takes an order; returns what has become of it so far, as plain data with its `state` and `reason`.
         files: what the run leaves behind.
     """
 
@@ -79,14 +79,8 @@ class ViserBackend(NamedTuple):
     serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]
     serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]
     head: Callable[[], dict[str, Any]]
-    command: Callable[[str], str]
+    command: Callable[[OrderRequest], dict[str, Any]]
     files: RunFiles
-
-
-class HeadCommand(Struct, frozen=True, forbid_unknown_fields=True):
-    """What a button of the page's head asks for."""
-
-    op: Literal["emergency", "land", "acknowledge"]
 
 
 class HttpProxy:
@@ -202,15 +196,16 @@ class HttpProxy:
         return web.FileResponse(path, headers={**HEADERS, **kept})
 
     async def _command(self, request: web.Request) -> web.Response:
-        """Do what an operator's button asks for; viewers have no such path."""
+        """Take an order of an operator; viewers have no such path."""
         if self._tokens.role_of(_page_request(request)) != OPERATOR:
             return _missing_token()
         try:
-            command = _HEAD_COMMANDS.decode(await request.read())
+            order = _ORDERS.decode(await request.read())
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             return _json_response({"refusal": f"body: {error}"}, 400)
-        refusal = self._backend.command(command.op)
-        return _json_response({"refusal": refusal}, 409 if refusal else 200)
+        became = self._backend.command(order)
+        refusal = became["reason"] if became["state"] == "refused" else ""
+        return _json_response({"refusal": refusal, "order": became}, 409 if refusal else 200)
 
     async def _cameras(self, request: web.Request) -> web.StreamResponse:
         """Serve a page's socket for pictures of cameras: viewers see them, too."""
@@ -268,7 +263,7 @@ class HttpProxy:
                 await viser.send_bytes(message.data)
 
 
-_HEAD_COMMANDS = msgspec.json.Decoder(HeadCommand)
+_ORDERS = msgspec.json.Decoder(OrderRequest)
 
 
 def _json_response(shown: dict[str, Any], status: int = 200) -> web.Response:

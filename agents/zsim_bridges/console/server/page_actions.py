@@ -52,10 +52,14 @@ class PlayRecord(_Action, frozen=True, tag="play"):
 
 
 class TakeDrone(_Action, frozen=True, tag="take"):
-    """Take a drone, to fly it; `over` from whoever flies it; of operators only, as all below."""
+    """Take a drone, to fly it; `over` from whoever flies it; of operators only, as all below.
+
+    To be repeated until it is answered; what has the same `id` is carried out once.
+    """
 
     drone: Name
     over: bool = False
+    id: Name = ""
 
 
 class SteerDrone(_Action, frozen=True, tag="steer"):
@@ -74,10 +78,11 @@ class SteerDrone(_Action, frozen=True, tag="steer"):
 
 
 class GoToPlace(_Action, frozen=True, tag="go"):
-    """Send the drone that was taken to a place, at the height that it has."""
+    """Send the drone that was taken to a place, at the height that it has unless `z_m` is given."""
 
     x_m: Metres
     y_m: Metres
+    z_m: Metres | None = None
 
 
 class LeaveDrone(_Action, frozen=True, tag="leave"):

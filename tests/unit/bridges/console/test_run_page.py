@@ -19,6 +19,7 @@ from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
+from zsim_bridges.console.orders import OrderRequest
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.console.scene import scene_nodes as stages
 from zsim_bridges.console.scene.camera_follow import CameraFollow
@@ -279,9 +280,10 @@ def test_a_world_that_is_gone_is_told_on_the_page(seen: Seen, monkeypatch: pytes
         *page.run_form._controls.values(),
     ]
     assert all(control.disabled for control in locked)
-    seen.link.asked.clear()
-    assert all(seen.show.command(op) for op in ("land", "emergency"))
-    assert seen.link.asked == []
+    order = seen.show.command(OrderRequest("land", id="one"))  # whoever is silent may hear it yet
+    assert order["state"] == "sent"
+    assert has_terms(order["reason"], "world", "12 s")
+    assert seen.show.head()["orders"][0]["id"] == "one"
 
 
 def test_a_run_that_is_over_is_told_with_its_reason(seen: Seen):
@@ -293,6 +295,9 @@ def test_a_run_that_is_over_is_told_with_its_reason(seen: Seen):
     assert head["level"] == "ended"
     assert has_terms(head["detail"], "330 s")
     assert head["refusals"]["emergency"]
+    order = seen.show.command(OrderRequest("emergency"))
+    assert order["state"] == "refused"
+    assert has_terms(order["reason"], "330 s")
 
 
 def test_an_emergency_is_in_the_head_of_the_page(seen: Seen):
@@ -305,7 +310,7 @@ def test_an_emergency_is_in_the_head_of_the_page(seen: Seen):
     assert alarms == {(NAMES[1], "emergency", "red"), (NAMES[1], "battery", "red")}
     assert seen.show._monitor.board.severity_of(NAMES[1]) == "red"
     assert seen.show._monitor.board.severity_of(NAMES[0]) is None
-    assert seen.show.command("acknowledge") == ""
+    assert seen.show.command(OrderRequest("acknowledge"))["state"] == "confirmed"
     assert all(alarm["acknowledged"] for alarm in seen.show.head()["alarms"])
 
 

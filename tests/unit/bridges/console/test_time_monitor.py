@@ -16,7 +16,7 @@ from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.monitoring.page_head import page_head
 from zsim_bridges.console.monitoring.run_condition import RunCondition
-from zsim_bridges.console.monitoring.time_monitor import SILENT_S, TimeMonitor
+from zsim_bridges.console.monitoring.time_monitor import BEAT_S, SILENT_S, TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ReceivedEstimate, ViewBuffer
 from zsim_bridges.console.run_state import console_state
 from zsim_bridges.observer_process import ObserverProcess
@@ -72,6 +72,12 @@ class MonitoredRun:
         self.views = ViewBuffer(self.link, info, self.observer, {}, self.refused.append, lambda: self.wall_s)
         self.words = TableRows(self.views, {})
         self.views.open()
+
+    def run_for(self, seconds: float) -> None:
+        """Let time go by while the console runs."""
+        for _ in range(round(seconds / BEAT_S)):
+            self.wall_s += BEAT_S
+            self.monitor._awake.beat()
 
     def deliver(self, *samples: tuple[str, Any]) -> None:
         for key, message in samples:
@@ -163,21 +169,37 @@ def test_the_end_of_a_run_is_heard():
 def test_silence_of_the_world_is_told_and_for_how_long():
     monitored = MonitoredRun()
     with monitored.monitor.polling():
-        monitored.wall_s += SILENT_S - 0.1
+        monitored.run_for(SILENT_S - 0.1)
         assert monitored.monitor.silent_s == 0.0
-        monitored.wall_s += 10.0
+        monitored.run_for(10.0)
         assert monitored.monitor.silent_s == pytest.approx(SILENT_S + 9.9)
         monitored.link.now = clock(1 * S)
         monitored.monitor.poll()
         assert monitored.monitor.silent_s == 0.0
         monitored.link.now = None
         monitored.monitor.poll()
-        monitored.wall_s += 5.0
+        monitored.run_for(5.0)
         shown = console_state("r1", monitored.views, monitored.monitor, {})
         assert shown["clock"] == "silent"
-        assert shown["silent_s"] >= 5.0
+        assert shown["silent_s"] == pytest.approx(5.0)
     assert monitored.monitor.silent_s == 0.0  # nobody is asked any more
     assert console_state("r1", monitored.views, monitored.monitor, {})["clock"] == "running"
+
+
+def test_a_console_that_stood_still_itself_does_not_call_the_world_silent():
+    monitored = MonitoredRun()
+    with monitored.monitor.polling():
+        monitored.run_for(0.5)
+        assert monitored.monitor.stall is None
+        monitored.wall_s += 12.0
+        assert monitored.monitor.silent_s == 0.0
+        monitored.run_for(0.1)
+        assert monitored.monitor.silent_s == 0.0
+        stall = monitored.monitor.stall
+        assert stall is not None
+        assert stall.lasted_s == pytest.approx(12.0, abs=2 * BEAT_S)
+        monitored.run_for(SILENT_S)
+        assert monitored.monitor.silent_s > SILENT_S
 
 
 def test_a_silent_world_is_not_called_running():

@@ -8,6 +8,7 @@ import pytest
 from refused import has_terms
 
 from zsim.vehicles.vehicle import Limits
+from zsim_bridges.console.command_client import NoAnswer
 from zsim_bridges.console.flying.flight_conditions import DroneSight, RunSight
 from zsim_bridges.console.flying.flown_velocity import DronePose, Stick
 from zsim_bridges.console.flying.geofence import Geofence
@@ -153,6 +154,65 @@ def test_what_the_world_refuses_is_not_flown():
     answer = cockpit.control.take(PAGE, "drone2", over=True)
     assert (answer.state, answer.text) == ("none", cockpit.client.refusal)
     assert cockpit.after(1.0) == []
+
+
+def test_a_request_that_is_repeated_is_carried_out_once():
+    cockpit = Cockpit()
+    cockpit.client.waiting = []
+    for _ in range(3):
+        assert cockpit.control.take(PAGE, "drone2", True, "one").state == "taking"
+    assert cockpit.client.taken == ["drone2"]
+    cockpit.client.waiting[0]("")
+    cockpit.see("drone2", commander=NAME)
+    assert cockpit.control.take(PAGE, "drone2", True, "one").state == "flying"
+    cockpit.control.leave(PAGE)
+    again = cockpit.control.take(PAGE, "drone2", True, "one")  # a repetition that was late takes it no more
+    assert (again.state, again.id) == ("none", "one")
+    assert cockpit.client.taken == ["drone2"]
+
+
+def test_a_page_that_has_connected_anew_has_its_drone_back_by_the_request():
+    cockpit = Cockpit()
+    assert cockpit.control.take(PAGE, "drone2", False, "one").state == "flying"
+    cockpit.control.lose(PAGE)
+    assert cockpit.control.take(OTHER, "drone2", False, "one").state == "flying"
+    assert cockpit.control.answer(PAGE).state == "none"
+
+
+def test_a_drone_is_asked_for_again_of_a_world_that_has_not_answered_and_says_for_how_long():
+    cockpit = Cockpit()
+    cockpit.client.waiting = []
+    cockpit.control.take(PAGE, "drone2", True, "one")
+    cockpit.run = RunSight(silence="the world has not answered for 5 s")
+    cockpit.client.waiting.pop()(NoAnswer("no answer came within 5 s"))
+    for _ in range(3):
+        cockpit.after(2.0)
+        cockpit.control.take(PAGE, "drone2", True, "one")  # the page is there
+    waits = cockpit.control.answer(PAGE)
+    assert waits.state == "taking"
+    assert has_terms(waits.text, "6.0 s", "not confirmed", "world", "5 s")
+    assert cockpit.client.taken == ["drone2"]
+    cockpit.run = RunSight()
+    cockpit.after(PERIOD_S)
+    assert cockpit.client.taken == ["drone2"] * 2
+    cockpit.client.waiting.pop()("")
+    assert cockpit.control.answer(PAGE).state == "flying"
+
+
+def test_a_console_that_stood_still_says_so_where_it_gives_a_drone_back():
+    cockpit = Cockpit().flying()
+    cockpit.control.steer(PAGE, FORWARD)
+    cockpit.after(0.5)
+    cockpit.now_s += 29.0
+    cockpit.control.tick()
+    assert has_terms(cockpit.control.answer(PAGE).text, "console", "29 s")
+
+
+def test_a_place_is_flown_to_at_the_height_that_was_confirmed():
+    cockpit = Cockpit().flying()
+    answer = cockpit.control.go(PAGE, 3.0, 0.0, 7.0)
+    assert answer.goal == (3.0, 0.0, 7.0)
+    assert cockpit.after(PERIOD_S)[0][2] > 0.0
 
 
 def test_one_drone_is_flown_from_one_page_and_a_page_flies_one_drone():

@@ -1,6 +1,7 @@
 """The console's forms: what each control of the page asks for. The page is one that notes its controls."""
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +15,9 @@ from zsim.contract.views import ViewCluster
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import KINDS
 from zsim.scenario.scenario import Scenario
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, REJOINING
+from zsim_agents.formation.engagement_setup import gains_of
+from zsim_agents.formation.flight_check import place_fault
+from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, REJOINING, EngagementLimits
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, fleet_refusals
@@ -80,6 +83,35 @@ class Control:
         return
 
 
+class OrderHtml(Control):
+    """A button of an order: HTML, of which the page makes the order when it is pressed."""
+
+    @property
+    def order(self) -> dict[str, str]:
+        return dict(re.findall(r'data-([\w-]+)="([^"]*)"', self.content))
+
+    @property
+    def label(self) -> str:
+        return re.findall(r">([^<>]+)</button>", self.content)[0] if self.content else ""
+
+    @label.setter
+    def label(self, _: str) -> None: ...
+
+    @property
+    def hint(self) -> str | None:
+        return re.findall(r'title="([^"]*)"', self.content)[0] or None
+
+    @hint.setter
+    def hint(self, _: str | None) -> None: ...  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    @property
+    def disabled(self) -> bool:
+        return " disabled>" in self.content
+
+    @disabled.setter
+    def disabled(self, _: bool) -> None: ...
+
+
 class Gui:
     """A page that notes its controls by their label."""
 
@@ -120,13 +152,19 @@ class Gui:
     def add_folder(self, label: str | None, **_: Any) -> Control:
         return Control()
 
-    def add_html(self, _: str) -> Control:
-        return Control()
+    def add_html(self, content: str) -> Control:
+        if "data-zsim-order" not in content:
+            return Control()
+        button = OrderHtml()
+        button.content = content
+        self.at[button.label] = button
+        return button
 
     def add_uplot(self, *_: Any, **__: Any) -> Control:
         return Control()
 
-    add_markdown = add_html
+    def add_markdown(self, _: str) -> Control:
+        return Control()
 
     def add_tab_group(self) -> Control:
         return Control()
@@ -215,12 +253,7 @@ def test_the_run_is_asked_for_what_the_button_says(bench: Bench, label: str, ask
 
 @pytest.mark.parametrize(
     ("label", "mode"),
-    [
-        ("Take off", "takeoff"),
-        ("Land", "land"),
-        ("Emergency", "emergency"),
-        ("Reset", "reset"),
-    ],
+    [("Take off", "takeoff"), ("Reset", "reset")],
 )
 def test_the_chosen_drone_alone_gets_its_mode(bench: Bench, label: str, mode: str):
     form = DroneForm(bench.gui, bench.client, bench.names)
@@ -232,14 +265,10 @@ def test_the_chosen_drone_alone_gets_its_mode(bench: Bench, label: str, mode: st
     assert bench.client.asked == [((bench.names[1],), mode)]
 
 
-@pytest.mark.parametrize(("label", "what"), [("Take off all", "takeoff"), ("Land all", "land")])
-def test_all_formations_and_all_drones_of_none_take_off_and_land(bench: Bench, label: str, what: str):
-    form = FleetForm(bench.gui, bench.client, mixed())
-    if what == "takeoff":
-        bench.gui.press(label)
-    else:
-        form.request_all(what)
-    assert bench.client.asked == [("main", what, {}), ("other", what, {}), (("d5", "d6"), what)]
+def test_all_formations_and_all_drones_of_none_take_off(bench: Bench):
+    FleetForm(bench.gui, bench.client, mixed())
+    bench.gui.press("Take off all")
+    assert bench.client.asked == [("main", "takeoff", {}), ("other", "takeoff", {}), (("d5", "d6"), "takeoff")]
 
 
 @pytest.mark.parametrize("alone", [True, False])
@@ -247,10 +276,39 @@ def test_all_drones_are_in_formations_or_none_is(bench: Bench, alone: bool):
     scenario = mixed()
     clusters, drones = ([], scenario.drones[4:]) if alone else (scenario.clusters, scenario.drones[:4])
     FleetForm(bench.gui, bench.client, msgspec.structs.replace(scenario, clusters=clusters, drones=drones)).request_all(
-        "land"
+        "takeoff"
     )
-    formations = [("main", "land", {}), ("other", "land", {})]
-    assert bench.client.asked == ([(("d5", "d6"), "land")] if alone else formations)
+    formations = [("main", "takeoff", {}), ("other", "takeoff", {})]
+    assert bench.client.asked == ([(("d5", "d6"), "takeoff")] if alone else formations)
+
+
+@pytest.mark.parametrize(("label", "op", "held"), [("Land", "land", False), ("Emergency", "emergency", True)])
+def test_the_chosen_drone_alone_is_ordered_to_land_or_stop(bench: Bench, label: str, op: str, held: bool):
+    DroneForm(bench.gui, bench.client, bench.names)
+    button: Any = bench.gui.at[f"{label} {bench.names[0]}"]
+    bench.gui.at["drone"].put(bench.names[1])
+    assert button.label == f"{label} {bench.names[1]}"
+    hold = {"zsim-hold": "1"} if held else {}
+    assert button.order == {"zsim-order": op, "drone": bench.names[1], **hold}
+
+
+@pytest.mark.parametrize("op", ["hold", "land"])
+def test_a_formation_is_ordered_to_hold_and_to_land(bench: Bench, op: str):
+    bench.formation()
+    button: Any = bench.gui.at[op.capitalize()]
+    assert button.order == {"zsim-order": op, "cluster": bench.cluster.name}
+
+
+def test_an_order_is_given_to_a_world_that_is_silent(bench: Bench):
+    bench.formation().offer(flown(silent_s=79.0))
+    form = DroneForm(bench.gui, bench.client, bench.names)
+    form.refresh(flown(silent_s=79.0))
+    name = bench.names[0]
+    locked = {label: bench.gui.at[label].disabled for label in ("Hold", "Land", f"Land {name}", f"Emergency {name}")}
+    assert not any(locked.values())
+    form.refresh(flown(ended="the run ended"))
+    assert bench.gui.at[f"Land {name}"].disabled
+    assert not bench.gui.at[f"Emergency {name}"].disabled
 
 
 def mixed() -> Scenario:
@@ -281,7 +339,7 @@ def flown(phase: str = "engaged", reason: str = "", **more: Any) -> RunCondition
             flown("held", "drone2 is in state landed", drones={"drone2": "landed"}, members={"main": ("drone2",)}),
             {"Take off", "Engage", "Hold", "Rejoin"},
         ),
-        (flown(silent_s=79.0), {"Take off", "Engage", "Hold", "Land"}),
+        (flown(silent_s=79.0), {"Take off", "Engage"}),
         (flown(ended="the run ended"), {"Take off", "Engage", "Hold", "Land"}),
         (flown(replayed=True), {"Take off", "Engage", "Hold", "Land"}),
     ],
@@ -380,9 +438,9 @@ def test_the_choice_of_one_page_is_not_that_of_another(bench: Bench):
     mine = DroneForm(bench.gui, bench.client, bench.names)
     DroneForm(other, bench.client, bench.names)  # type: ignore[arg-type]
     other.at["drone"].put(bench.names[2])
-    bench.gui.press(f"Emergency {bench.names[0]}")
+    bench.gui.press(f"Reset {bench.names[0]}")
     assert mine.chosen == bench.names[0]
-    assert bench.client.asked == [((bench.names[0],), "emergency")]
+    assert bench.client.asked == [((bench.names[0],), "reset")]
 
 
 def test_a_drone_is_offered_what_its_state_takes_and_always_its_emergency(bench: Bench):
@@ -547,9 +605,7 @@ def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name
 # A formation
 
 
-@pytest.mark.parametrize(
-    ("label", "op"), [("Take off", "takeoff"), ("Engage", "engage"), ("Hold", "hold"), ("Land", "land")]
-)
+@pytest.mark.parametrize(("label", "op"), [("Take off", "takeoff"), ("Engage", "engage")])
 def test_a_formation_is_asked_for_its_phase(bench: Bench, label: str, op: str):
     bench.formation()
     bench.gui.press(label)
@@ -601,23 +657,58 @@ def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0}, "over_s": 20.0})]
 
 
-@pytest.mark.parametrize("left_s", [0.0, LATER_S])
-def test_a_number_out_of_range_is_not_flown_to_the_limit_when_its_box_is_left(bench: Bench, left_s: float):
+def test_a_number_out_of_range_is_refused_and_its_limit_is_flown_when_it_is_typed(bench: Bench):
     form = bench.formation()
     box = bench.gui.at["y_c [m]"]
     limit = form._ranges["y_c"].high
     box.put(500.0)
-    form.send(left_s)
-    box.put(limit)  # the page does, when its box is left
     form.send(LATER_S)
     assert bench.client.asked == []
     (outcome,) = bench.outcomes
     assert has_terms(outcome.refusal, "y_c", "500 m")
-    form.refresh(bench.view(y_c=-5.0), LATER_S)
-    assert box.value == -5.0
-    box.put(limit)  # somebody means it
+    box.put(limit)
     form.send(LATER_S)
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"y_c": limit}})]
+
+
+@pytest.mark.parametrize("side", ["p", "q"])
+def test_the_least_side_that_a_slider_offers_is_no_refusal_of_rounding(bench: Bench, side: str):
+    low = next(each.low for each in slider_ranges(bench.space, bench.cluster, bench.scenario) if each.name == side)
+    gains, shape = gains_of(bench.cluster.gains), EngagementLimits().shape
+    c = bench.space.specimen(4.0)
+    c[bench.space.index(side)], c[bench.space.index("z_c")] = low, 8.0
+    refused = []
+    for step in range(200):
+        c[bench.space.index("x_c")], c[bench.space.index("yaw")] = -50.0 + 0.5 * step, 0.03 * step
+        refused.append(place_fault(bench.space, c, gains, shape))
+    assert set(refused) == {None}
+
+
+@pytest.mark.parametrize("over_s", [-5.0, 3601.0])
+def test_a_time_out_of_range_is_refused_with_the_move(bench: Bench, over_s: float):
+    form = bench.formation()
+    bench.gui.at["over [s]"].value = over_s
+    form.send(LATER_S)
+    assert bench.outcomes == []  # nothing was asked for
+    form.request_target({"p": 5.0})
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, "over", f"{over_s:g} s", "0 to 3600")
+
+
+def test_what_is_typed_for_the_run_is_asked_for_as_it_is(bench: Bench):
+    RunForm(bench.gui, bench.client, 1.0)
+    bench.gui.at["rate"].value, bench.gui.at["gates"].value = -1.0, 2.5
+    bench.gui.press("Set rate")
+    bench.gui.press("Step")
+    assert bench.client.asked == [("world", "rate", {"value": -1.0}), ("world", "step", {"gates": 2.5})]
+
+
+def test_a_fault_of_no_time_is_refused(bench: Bench):
+    bench.faults()
+    bench.gui.at["for [s]"].value = -1.0
+    bench.gui.press("GPS lost")
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, "for", "-1 s", "from 0")
 
 
 def test_a_value_out_of_range_is_told_and_not_sent(bench: Bench):
@@ -632,9 +723,9 @@ def test_of_many_variables_the_others_are_moved_one_at_a_time():
     hidden = next(name for name in bench.space.names if f"{name} [m]" not in bench.gui.at and name.startswith("w"))
     value = next(control for label, control in bench.gui.at.items() if label.startswith("value ["))
     bench.gui.at["variable"].put(next(name for name in bench.space.names if name.startswith("phi")))
-    assert value.label == "value [deg]"
+    assert value.label == "value [deg], -180 to 180"
     bench.gui.at["variable"].put(hidden)
-    assert value.label == "value [m]"
+    assert value.label == "value [m], -5 to 5"
     value.value = 0.5
     bench.gui.press("Move it")
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}})]
@@ -675,14 +766,12 @@ def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
 # The page
 
 
-def test_emergency_stops_everybody_and_switches_change_the_scene(bench: Bench):
+def test_switches_change_the_scene(bench: Bench):
     shown: list[tuple[str, bool]] = []
     spaces = {bench.cluster.name: bench.space}
     show = lambda *switched: shown.append(switched)  # noqa: E731
     page = ConsolePage(bench.gui, bench.scenario, spaces, bench.client, bench.outcomes.append, show, 2.0)
     assert bench.gui.at["rate"].value == 2.0
-    page.fleet.request_all("emergency")
-    assert bench.client.asked == [(bench.names, "emergency")]
     assert page.chosen == bench.cluster.name
     for what, label in SWITCHES.items():
         bench.gui.at[label].put(False)

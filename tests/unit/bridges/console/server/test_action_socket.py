@@ -91,9 +91,9 @@ class FakeFlying:
 
 
 FLYING = (
-    {"do": "take", "drone": "drone2", "over": True},
+    {"do": "take", "drone": "drone2", "over": True, "id": "one"},
     {"do": "steer", "held": True, "forward": 1.0},
-    {"do": "go", "x_m": 3.0, "y_m": -2.0},
+    {"do": "go", "x_m": 3.0, "y_m": -2.0, "z_m": 4.0},
     {"do": "leave"},
 )
 
@@ -111,7 +111,7 @@ def test_an_operator_flies_a_drone_and_is_answered():
         assert answer["flight"]["state"] == "flying"
     stick = Stick(1.0, 0.0, 0.0, 0.0, 1.0)
     assert flying.done == [
-        ("take", "here", "drone2", True), ("steer", "here", stick), ("go", "here", 3.0, -2.0), ("leave", "here"),
+        ("take", "here", "drone2", True, "one"), ("steer", "here", stick), ("go", "here", 3.0, -2.0, 4.0), ("leave", "here"),
     ]  # fmt: skip
     sockets.lose("here")
     assert flying.done[-1] == ("lose", "here")

@@ -1,0 +1,247 @@
+"""Orders that must not get lost, confirmations, ages and limits: in a real browser, with page, console or world stopped."""
+
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from chromium import needs_browser
+from console_browser import IN_SIGHT, PATIENCE_MS, BrowserPage, console
+from federation import Federation
+from page_overflow import overflow
+from staged_console import StagedRun, staged_console
+from test_console import TRIAD, states
+from test_console_flying import SEES, click_map
+
+pytestmark = needs_browser
+
+SIZES = ({"width": 1440, "height": 900}, {"width": 1024, "height": 768}, {"width": 390, "height": 844})
+HOLD_MS = 600  # as in orders.html
+LATE_MS, LOST_MS = 1000, 3000  # as there
+STALL_MS = 5000  # of the page; above LOST_MS
+REST_MS = 1500  # after which sliders that rest are sent; above REST_S
+STALL_JS = "ms => { const until = performance.now() + ms; while (performance.now() < until); }"
+ROW = "#zsim-orders [data-state={}]"
+BAR = "document.querySelector('#zsim-flight .bar').dataset.state"
+MARKER_JS = "() => JSON.parse(document.getElementById('zsim-map').dataset.marker || 'null')"
+PICTURES = os.environ.get("ZSIM_TEST_PICTURES")
+
+
+def picture(page: BrowserPage, name: str) -> None:
+    """Keep a picture of a page at all sizes, for people to look at, where a folder is given."""
+    if PICTURES:
+        for size in SIZES:
+            page.page.set_viewport_size(size)
+            page.page.wait_for_timeout(LATE_MS)
+            page.page.screenshot(path=f"{PICTURES}/{name}-{size['width']}.png", timeout=PATIENCE_MS)
+        page.page.set_viewport_size(SIZES[1])
+
+
+def hold(page: Any, selector: str) -> None:
+    """Hold a button by the mouse until it is confirmed."""
+    page.locator(selector).hover()
+    page.mouse.down()
+    page.wait_for_timeout(HOLD_MS + 200)
+    page.mouse.up()
+
+
+def note(page: BrowserPage, text: str) -> None:
+    """Wait for a note of the page."""
+    page.page.locator("#zsim-notes div").filter(has_text=text).first.wait_for()
+
+
+def row(page: BrowserPage, state: str, *terms: str) -> str:
+    """Wait for a row of an order in a state, with terms; return its text."""
+    found = page.page.locator(ROW.format(state))
+    for term in terms:
+        found = found.filter(has_text=term)
+    found.first.wait_for()
+    return str(found.first.text_content())
+
+
+@pytest.mark.slow
+def test_no_order_is_lost_where_page_console_or_world_stand_still(
+    federation: Federation, opened: Callable[..., BrowserPage]
+) -> None:
+    federation.run(TRIAD, "--rate", "2")
+    role, links = console(federation)
+    page = opened(links["steer"], SIZES[1])
+    head = page.page.locator("#zsim-head")
+    page.page.get_by_role("button", name="Take off", exact=True).and_(page.page.locator(":enabled")).click()
+    page.until("s.clusters[0].reason == 'ready to engage'")
+
+    # a drone of the controller's is taken over by a hold, which names it and who flies it
+    page.page.locator("#zsim-flight .fly").click()
+    page.page.locator("#zsim-flight .take").get_by_text("drone1").click()
+    over = page.page.locator("#zsim-flight .over")
+    over.wait_for()
+    assert "drone1" in str(over.text_content())
+    assert "controller.main" in str(over.text_content())
+    over.click()  # too short
+    note(page, "hold it")
+    hold(page.page, "#zsim-flight .over")
+    page.page.wait_for_function(f"() => {BAR} === 'flying'")
+
+    # a console that stands still: what is flown is not called alive, and the order waits, in red and with its age
+    role.signal(signal.SIGSTOP)
+    page.page.wait_for_function(f"() => {BAR} === 'old'")
+    head.locator(".land").click()
+    row(page, "sent", "Land all", "not confirmed", "the console does not answer")
+    page.page.wait_for_function(f"() => {BAR} === 'lost'")
+    page.page.locator("#zsim-head[data-level=gone]").wait_for()
+    assert head.locator(".land").is_enabled()
+    assert head.locator(".emergency").is_enabled()
+    page.page.locator("[data-zsim-order=hold]").and_(page.page.locator(":enabled")).wait_for()
+    picture(page, "stopped-console")
+    assert page.page.evaluate(IN_SIGHT)
+    role.signal(signal.SIGCONT)
+    note(page, "the console stood still")
+    assert "confirmed at" in row(page, "confirmed", "Land all")
+    page.until("s.events.some(e => e.text == 'main: land: accepted')")
+    landings = [event for event in page.state()["events"] if event["text"] == "main: land: accepted"]
+    assert len(landings) == 1
+    page.page.wait_for_function(f"() => !['held', 'flying', 'old', 'lost'].includes({BAR})")
+
+    # a page that stands still says so itself, and does not accuse the console
+    page.page.evaluate(STALL_JS, STALL_MS)
+    note(page, "this page stood still")
+    assert head.get_attribute("data-level") != "gone"
+    assert head.locator(".emergency").is_enabled()
+
+    # a world that stands still: the emergency by the keyboard
+    federation.kill("world", signal.SIGSTOP)
+    page.page.locator("#zsim-head[data-level=silent]").wait_for()
+    emergency = head.locator(".emergency")
+    emergency.focus()
+    page.page.keyboard.press("Enter")
+    note(page, "hold it")
+    assert page.page.locator(ROW.format("sent")).count() == 0
+    page.page.keyboard.down("Enter")
+    row(page, "sent", "EMERGENCY all", "not confirmed", "the world has not answered")
+    page.page.keyboard.up("Enter")
+    assert emergency.is_enabled()
+    picture(page, "stopped-world")
+    federation.kill("world", signal.SIGCONT)
+    assert "confirmed at" in row(page, "confirmed", "EMERGENCY all")
+    assert states(page.until("s.drones.every(d => d.state == 'emergency')")) == ["emergency"] * 3
+    picture(page, "confirmed")
+    assert page.outside() == set()
+    assert page.faults == []
+
+
+@pytest.fixture(scope="module")
+def staged() -> Iterator[tuple[StagedRun, str]]:
+    run = StagedRun()
+    with staged_console(run) as address:
+        yield run, address
+
+
+def asked(run: StagedRun, op: str) -> list[dict[str, Any]]:
+    return [args for each, args in run.link.asked if each == op]
+
+
+@pytest.mark.slow
+def test_what_is_typed_is_asked_for_or_refused_and_never_changed_to_a_limit(
+    staged: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
+) -> None:
+    run, address = staged
+    page = opened(address, SIZES[1])
+    page.wait_for_text("running")
+    for place, name, typed, limit in ((0, "x_c", "100", "50"), (2, "z_c", "300", "30")):
+        field = page.page.locator(".mantine-Slider-root + * input").nth(place)
+        field.fill(typed)
+        field.blur()
+        page.page.get_by_text(f"{name} is {typed} m; must be from").first.wait_for()
+        assert limit in str(page.page.get_by_text(f"{name} is {typed} m; must be from").first.text_content())
+    page.page.wait_for_timeout(REST_MS)
+    assert asked(run, "target") == []
+    field = page.page.locator(".mantine-Slider-root + * input").nth(0)
+    field.fill("7.5")
+    field.blur()
+    page.page.wait_for_timeout(REST_MS)
+    assert [args["values"] for args in asked(run, "target")] == [{"x_c": 7.5}]
+
+    page.select_tab("Run")
+    page.page.get_by_text("rate: 0 to").wait_for()
+    rate = page.page.get_by_label("rate", exact=True).or_(page.page.locator("input[inputmode]").nth(1)).last
+    rate.fill("-1")
+    rate.blur()
+    page.press("Set rate")
+    page.page.wait_for_timeout(LATE_MS)
+    assert asked(run, "rate") == [{"value": -1.0}]
+    picture(page, "limits")
+
+
+@pytest.mark.slow
+def test_a_confirmation_names_drone_place_and_height_and_its_marker_stays(
+    staged: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
+) -> None:
+    run, address = staged
+    page = opened(address, SIZES[1])
+    page.wait_for_text("running")
+    page.page.locator("#zsim-flight .map").click()
+    page.page.wait_for_function(SEES)
+    run.commander = "controller.main"
+    state = page.until("s.drones.length == 3")
+    x, y, z = state["drones"][0]["position_m"]
+    click_map(page, x + 1.7, y - 1.7)
+    there = page.page.locator("#zsim-map .there")
+    there.wait_for()
+    page.page.wait_for_function(MARKER_JS)
+    marker = page.page.evaluate(MARKER_JS)
+    assert marker["drone"] == "drone1"
+    text = str(there.locator("span").text_content()).replace("\N{MINUS SIGN}", "-")
+    assert all(part in text for part in ("drone1", f"x {marker['x']:.1f} m", f"y {marker['y']:.1f} m", "height"))
+    assert marker["z"] == pytest.approx(z, abs=0.2)
+    assert overflow(page.page) == []
+    picture(page, "confirm-place")
+    view = page.page.evaluate(SEES)
+    page.until(f"s.t_s > {state['t_s'] + 3.0}")  # the drones move
+    assert page.page.evaluate(MARKER_JS) == marker
+    assert page.page.evaluate(SEES) == view
+
+    # who flies it is named, and taken from by a hold alone
+    there.locator(".go").click()
+    there.get_by_text("controller.main").wait_for()
+    assert "drone1" in str(there.locator(".go").text_content())
+    there.locator(".go").click()
+    page.page.wait_for_timeout(LATE_MS)
+    assert asked(run, "acquire") == []
+    picture(page, "confirm-over")
+    hold(page.page, "#zsim-map .there .go")
+    run.commander = "console.1"
+    page.page.locator("#zsim-flight .text").get_by_text("goes to").wait_for()
+    assert [args["drone"] for args in asked(run, "acquire")] == ["drone1"]
+    flown = page.page.evaluate(MARKER_JS)
+    assert (flown["x"], flown["y"], flown["z"]) == (marker["x"], marker["y"], marker["z"])
+    page.page.locator("#zsim-flight .leave").click()
+    run.commander = None
+
+
+@pytest.mark.slow
+def test_an_order_that_a_page_repeats_is_carried_out_once(
+    staged: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
+) -> None:
+    run, address = staged
+    page = opened(address, SIZES[1])
+    page.wait_for_text("running")
+    bodies: list[dict[str, Any]] = []
+
+    def lose(route: Any) -> None:
+        """Let the console have an order, and the page no answer, three times."""
+        bodies.append(json.loads(route.request.post_data))
+        if len(bodies) <= 3:
+            route.fetch()
+            route.abort()
+        else:
+            route.continue_()
+
+    page.page.route("**/command", lose)
+    held = len(asked(run, "hold"))
+    page.page.locator("[data-zsim-order=hold]").click()
+    assert "confirmed at" in row(page, "confirmed", "Hold main")
+    assert len(bodies) > 1
+    assert len({body["id"] for body in bodies}) == 1
+    assert len(asked(run, "hold")) == held + 1
