@@ -249,9 +249,7 @@ class RunPage:
         page = self._page
         flown = self._monitor.flight.figures
         self._update_controls(flown)
-        page.phases.content = console_tables.formation_lines(
-            {n: (v.phase, v.reason) for n, v in self.views.clusters.items()}
-        )
+        page.phases.content = console_tables.formation_lines(self._monitor.condition.phases)
         page.drones.content = console_tables.drone_table(self._table_rows.drone_rows(), flown)
         page.faults.content = console_tables.fault_lines(self._table_rows.active_faults())
         if page.chosen:

@@ -16,7 +16,7 @@ from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample, Session
-from zsim_bridges.console.monitoring.alarms import BACK, LOST
+from zsim_bridges.console.monitoring.alarms import Losses
 from zsim_bridges.console.monitoring.event_log import EventLog
 from zsim_bridges.observer_process import ObserverProcess
 
@@ -36,6 +36,10 @@ class ReceivedEstimate(NamedTuple):
     t_ns: int
     estimate: EstimateView
     fresh: bool
+
+    @property
+    def yaw_sigma_deg(self) -> float:
+        return math.degrees(self.estimate.yaw_sigma_rad)
 
     @property
     def sigma_m(self) -> float:
@@ -70,7 +74,8 @@ class ViewBuffer:
         external: names of the drones whose bodies are external.
         faults: injected ones, planned and active.
         log: events as they are shown; events: newest first.
-        losses: the newest event about each process or drone that is lost.
+        losses: processes and drones that are lost.
+        failsafes: the event of a landing or stop of the rotors of each drone, until it is commanded another mode.
         end: why the run ended, by its last event; empty while it goes on.
     """
 
@@ -102,7 +107,8 @@ class ViewBuffer:
         self.faults: tuple[Fault, ...] = ()
         self.log = EventLog(observer.name)
         self.events = self.log.newest
-        self.losses: dict[str, Event] = {}
+        self.losses = Losses()
+        self.failsafes: dict[str, Event] = {}
         self.end = ""
 
     def open(self) -> None:
@@ -189,6 +195,7 @@ class ViewBuffer:
             self._links[key], self._received_s[key] = message, self._wall_s()
         elif isinstance(message, Health):
             self.healths[keys.thing(key)] = message
+            self.losses.note_health(keys.thing(key), message)
         elif isinstance(message, run_messages.Faults):
             self.faults = message.faults
 
@@ -208,10 +215,11 @@ class ViewBuffer:
             with self._arrived:
                 self._answers[_drone(event)] += 1
                 self._arrived.notify_all()
-        if event.kind in LOST:
-            self.losses = {**self.losses, event.subject: event}
-        elif event.kind in BACK:
-            self.losses = {name: lost for name, lost in self.losses.items() if name != event.subject}
+        self.losses.note(event)
+        if event.kind in ("landing", "emergency"):
+            self.failsafes = {**self.failsafes, event.subject: event}
+        elif event.kind == "mode" and event.data.get("mode") != "emergency":
+            self.failsafes = {name: each for name, each in self.failsafes.items() if name != event.subject}
         elif event.kind == "end":
             self.end = event.text
         if event.kind != "command":  # an event of a mode or of a refusal follows, with more in it

@@ -10,6 +10,7 @@ from zsim.contract.views import ViewCluster
 from zsim.scenario.scenario import Cluster, Trajectory
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.console_tables import preflight_lines
 from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals, is_held_by_fault
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
@@ -68,6 +69,7 @@ class FormationForm:
         self._edited = False
         self._controls = {op: self._button(gui, label, op) for label, op in OPERATIONS.items()}
         self._reasons = gui.add_html("")
+        self._checks = gui.add_html("")
         hint = "Duration of a move; 0: as fast as the robots' limits let it"
         self._others: list[tuple[str, Any]] = []  # further controls, each with the operation that it requests
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
@@ -88,6 +90,8 @@ class FormationForm:
             slider.lock(bool(refusals["target"]))
         shown = {op: label for op, label in LABELS.items() if op != "rejoin" or self._controls[op].visible}
         self._reasons.content = refusal_lines(shown, refusals)
+        landed = {name: run.checks[name] for name in self._cluster.drones if _is_before_takeoff(run, name)}
+        self._checks.content = preflight_lines(landed) if landed and not run.grounded() else ""
 
     def _offer_rejoin(self, run: RunCondition) -> None:
         """Let Rejoin be there only while a fault holds the formation."""
@@ -201,6 +205,10 @@ class FormationForm:
             self._report(RequestOutcome(f"{self._cluster.name}: trajectory", str(error)))
             return
         self._client.request_cluster(self._cluster.name, "trajectory", **args)
+
+
+def _is_before_takeoff(run: RunCondition, drone: str) -> bool:
+    return drone in run.checks and run.drones.get(drone) == "landed"
 
 
 def _planned_trajectory(trajectory: Trajectory) -> dict[str, Any]:

@@ -12,7 +12,14 @@ from zsim.scenario.fault_kinds import PROCESS_KILL, ROTORS, FaultKind, kinds_of
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
-from zsim_bridges.console.monitoring.run_condition import RunCondition, drone_refusals, fleet_refusals, run_refusals
+from zsim_bridges.console.console_tables import preflight_lines
+from zsim_bridges.console.monitoring.run_condition import (
+    RunCondition,
+    drone_refusals,
+    fleet_refusals,
+    preflight_refusal,
+    run_refusals,
+)
 from zsim_bridges.console.page import operator_input
 
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
@@ -183,7 +190,7 @@ class FleetForm:
 
     def __init__(self, gui: viser.GuiApi, client: CommandClient, scenario: Scenario) -> None:
         self._client = client
-        self._formations = [cluster.name for cluster in scenario.clusters]
+        self._formations = {cluster.name: cluster.drones for cluster in scenario.clusters}
         in_formation = {name for cluster in scenario.clusters for name in cluster.drones}
         self._drones = [drone.name for drone in scenario.drones]
         self._single = [name for name in self._drones if name not in in_formation]
@@ -212,10 +219,13 @@ class FleetForm:
         elif operation == "reset":
             self._client.send_mode([d for d in self._drones if self._run.drones.get(d) == "emergency"], operation)
         else:
+            fit = {name: not preflight_refusal(self._run, drones) for name, drones in self._formations.items()}
             for name in self._formations:
-                self._client.request_cluster(name, operation)
-            if self._single:
-                self._client.send_mode(self._single, operation)
+                if operation != "takeoff" or fit[name]:
+                    self._client.request_cluster(name, operation)
+            single = [d for d in self._single if operation != "takeoff" or not preflight_refusal(self._run, [d])]
+            if single:
+                self._client.send_mode(single, operation)
 
 
 DRONE_MODES = {"takeoff": "Take off", "land": "Land", "emergency": "Emergency", "reset": "Reset"}
@@ -265,7 +275,9 @@ class DroneForm:
         self._run = run
         refusals = drone_refusals(run, self.chosen)
         set_refusals(self._buttons, refusals)
-        self._reasons.content = refusal_lines(DRONE_MODES, refusals)
+        checks = run.checks.get(self.chosen, ()) if run.drones.get(self.chosen) == "landed" else ()
+        shown = preflight_lines({self.chosen: checks}) if checks and not run.grounded() else ""
+        self._reasons.content = refusal_lines(DRONE_MODES, refusals) + shown
 
     def _rename(self) -> None:
         for mode, button in self._buttons.items():
