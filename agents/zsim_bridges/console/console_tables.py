@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
-from zsim.contract.run_messages import Fault
 from zsim_bridges.console.monitoring.alarms import LATE_MS, Severity, battery_severity
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
@@ -224,11 +223,11 @@ def _times(times: int) -> str:
     return f"<b>{times} ×</b> " if times > 1 else ""
 
 
-def fault_lines(faults: Sequence[str]) -> str:
-    """Return the active faults."""
-    lines = "<br>".join(f"⚠ {escape(fault)}" for fault in faults)
-    style = f"{STYLE};{FEW_LINES};{BESIDE};color:{AMBER if faults else GREY}"
-    return f"<div style='{style}'>{lines or NO_FAULT}</div>"
+def fault_lines(active: Sequence[str], over: Sequence[str] = ()) -> str:
+    """Return the faults that act, and in grey those that are over."""
+    lines = [_coloured(f"⚠ {fault}", AMBER) for fault in active] or [_coloured(NO_FAULT, GREY)]
+    lines += [_coloured(f"over: {fault}", GREY) for fault in reversed(over)]
+    return f"<div style='{STYLE};{FEW_LINES};{BESIDE};overflow-wrap:anywhere'>{'<br>'.join(lines)}</div>"
 
 
 def _table(body: str) -> str:
@@ -299,10 +298,6 @@ class TableRows:
             rows.append(DroneRow(*row, link, sigma, self._severity_of(drone.name), cause))
         return rows
 
-    def active_faults(self) -> list[str]:
-        """Return kind and target of each active fault."""
-        return [f"{fault.kind} of {fault.target}{_end_text(fault)}" for fault in self._views.active_faults()]
-
     def sensor_table(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
         received, own_rates = self._views.estimates().get(drone), self._own_rates.get(drone, {})
@@ -311,10 +306,6 @@ class TableRows:
         estimate = received.estimate
         rates = self._rates.update(drone, received.t_ns, estimate.sensors) if received.fresh else {}
         return sensor_table(drone, estimate.sensors, rates, _uncertainty(received), own_rates)
-
-
-def _end_text(fault: Fault) -> str:
-    return "" if fault.until_ns is None else f" until {fault.until_ns / 1e9:.1f} s"
 
 
 def _uncertainty(received: ReceivedEstimate) -> str:

@@ -251,7 +251,8 @@ class RunPage:
         self._update_controls(flown)
         page.phases.content = console_tables.formation_lines(self._monitor.condition.phases)
         page.drones.content = console_tables.drone_table(self._table_rows.drone_rows(), flown)
-        page.faults.content = console_tables.fault_lines(self._table_rows.active_faults())
+        watch = self._monitor.fault_watch
+        page.faults.content = console_tables.fault_lines(watch.lines(), watch.lines(is_over=True))
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
             page.plots[page.chosen].draw()

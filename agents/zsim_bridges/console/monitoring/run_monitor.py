@@ -8,6 +8,7 @@ from zsim.contract.views import DroneView, ViewCluster
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.console.monitoring import alarms
 from zsim_bridges.console.monitoring.alarms import Alarm, AlarmBoard, DroneCondition
+from zsim_bridges.console.monitoring.fault_watch import FaultWatch
 from zsim_bridges.console.monitoring.flight_figures import FlightMeter
 from zsim_bridges.console.monitoring.page_head import page_head
 from zsim_bridges.console.monitoring.pending_requests import PendingRequest, PendingRequests
@@ -33,6 +34,7 @@ class RunMonitor:
         condition: of the run, at the last update.
         board: its alarms; `severity_of` a drone is for its colour.
         flight: figures of the drones.
+        fault_watch: what faults strike, and what they did.
         pending: requests that are not done yet.
         record_end_s: simulated time of the last gate on record, of a replay.
     """
@@ -54,6 +56,7 @@ class RunMonitor:
         self.flight = FlightMeter()
         self.pending = PendingRequests()
         self.record_end_s = math.inf
+        self.fault_watch = FaultWatch()
         self._t_ns = 0
 
     def end(self, reason: str) -> None:
@@ -79,6 +82,10 @@ class RunMonitor:
             state, silent_s, self._ended, self._replayed, at_end, drones, phases, self._members,
             checks=self._checks(conditions, foreign),
         )  # fmt: skip
+        states = {name: phase for name, (phase, _) in phases.items()}
+        wind_m_s = max((math.hypot(*each) for each in views.drones.wind_m_s), default=0.0) if views.drones else 0.0
+        seen_now = conditions, states, views.losses.now, wind_m_s
+        self.fault_watch.update(list(views.begun), views.active_faults(), *seen_now)
         self.board.update(self._alarms(conditions, foreign), wall_s)
         return self.pending.pop_done(views.clusters, drones)
 
@@ -93,6 +100,8 @@ class RunMonitor:
         """Forget alarms and losses of later times, where a replay has gone back."""
         if t_ns < self._t_ns:
             self.board.clear()
+            self.fault_watch.clear()
+            self._views.begun.clear()
             self._views.losses.now, self._views.failsafes = {}, {}
         self._t_ns = t_ns
 

@@ -3,10 +3,12 @@
 import math
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
+import msgspec
 from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
@@ -21,6 +23,8 @@ from zsim_bridges.console.monitoring.event_log import EventLog
 from zsim_bridges.observer_process import ObserverProcess
 
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
+
+FAULTS_KEPT = 8  # that have begun
 
 
 class ReceivedEstimate(NamedTuple):
@@ -75,6 +79,7 @@ class ViewBuffer:
         faults: injected ones, planned and active.
         log: events as they are shown; events: newest first.
         losses: processes and drones that are lost.
+        begun: the last injected faults that have begun.
         failsafes: the event of a landing or stop of the rotors of each drone, until it is commanded another mode.
         end: why the run ended, by its last event; empty while it goes on.
     """
@@ -109,6 +114,7 @@ class ViewBuffer:
         self.events = self.log.newest
         self.losses = Losses()
         self.failsafes: dict[str, Event] = {}
+        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)
         self.end = ""
 
     def open(self) -> None:
@@ -220,6 +226,9 @@ class ViewBuffer:
             self.failsafes = {**self.failsafes, event.subject: event}
         elif event.kind == "mode" and event.data.get("mode") != "emergency":
             self.failsafes = {name: each for name, each in self.failsafes.items() if name != event.subject}
+        elif event.kind == "fault":
+            with suppress(msgspec.ValidationError):  # an event as anybody may publish it
+                self.begun.append(msgspec.convert(event.data, Fault))
         elif event.kind == "end":
             self.end = event.text
         if event.kind != "command":  # an event of a mode or of a refusal follows, with more in it
