@@ -69,6 +69,7 @@ class ViewBuffer:
         variables: names of each formation's variables; views of other formations or variables are refused.
         refused: called, in a thread of Zenoh's, with the event of a command of the console's that the world refused.
         wall_s: monotonic.
+        asked: called, in a thread of Zenoh's, with a formation and what somebody else has asked it for, in words.
 
     Attributes:
         drones: the newest view of the drones.
@@ -92,12 +93,14 @@ class ViewBuffer:
         variables: Mapping[str, tuple[str, ...]],
         refused: Callable[[Event], None],
         wall_s: Callable[[], float] = time.monotonic,
+        asked: Callable[[str, str], None] = lambda *_: None,
     ) -> None:
         self._link = link
         self._names = frozenset(drone.name for drone in info.drones)
         self._observer = observer
         self._variables = variables
         self._refused = refused
+        self._asked = asked
         self._wall_s = wall_s
         self._received_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
         self._new: dict[str, bytes] = {}
@@ -122,6 +125,8 @@ class ViewBuffer:
         of_drivers = map(keys.link, sorted(self.external))
         for expression in ("view/**", keys.FAULTS, "process/*/health", *of_drivers):
             self._link.declare_subscriber(expression, self._on_publication)
+        for cluster in self._variables:
+            self._link.declare_subscriber(keys.cluster_request(cluster), self._on_request)
         self._link.declare_subscriber(keys.EVENT, self._on_event)
         samples = self._link.get(keys.FAULTS)
         with self._arrived:
@@ -212,6 +217,18 @@ class ViewBuffer:
         else:
             self._observer.health.refused += 1
 
+    def _on_request(self, sample: RawSample) -> None:
+        """Note what somebody else has asked a formation for, such as another console."""
+        try:
+            request: run_messages.ClusterRequest = messages.decode(sample.key, sample.payload)
+        except DecodeError:
+            return
+        if request.ok and request.source != self._observer.name:
+            cluster = keys.thing(sample.key)
+            text = f"{cluster}: {request.op} by {request.source or 'somebody'} {arguments_text(request.args)}".strip()
+            self.log.add(Event(request.t_ns, 0, "accepted", request.source, cluster, text))
+            self._asked(cluster, text)
+
     def _on_event(self, sample: RawSample) -> None:
         try:
             event = messages.decode(keys.EVENT, sample.payload)
@@ -235,6 +252,22 @@ class ViewBuffer:
             self.log.add(event)
         if event.kind == "refused" and event.source == self._observer.name:
             self._refused(event)
+
+
+def arguments_text(args: Mapping[str, Any]) -> str:
+    """Return the arguments of a request in words."""
+    return ", ".join(f"{name} {_value_text(value)}" for name, value in args.items())
+
+
+def _value_text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, dict):
+        return " ".join(f"{name}={_value_text(item)}" for name, item in value.items())[:120]
+    if isinstance(value, list):
+        of_figures = all(isinstance(item, int | float) for item in value)
+        return " ".join(map(_value_text, value))[:120] if of_figures else f"({len(value)})"
+    return str(value)[:120]
 
 
 def _drone(event: Event) -> str:

@@ -283,6 +283,7 @@ class FleetForm:
 
 
 DRONE_MODES = {"takeoff": "Take off", "land": "Land", "emergency": "Emergency", "reset": "Reset"}
+IN_CONTROL = ("takeoff", "reset")  # modes that need control; anybody may land a drone, or stop it
 DRONE_ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
     "land": viser.Icon.PLANE_ARRIVAL,
@@ -298,18 +299,28 @@ class DroneForm:
         gui: viser's of that page, in the folder where they are to be.
         client: sends requests.
         names: of the drones.
+        may: returns why this page may not let a drone take off or reset it, empty where it may; where it is asked in
+            order to do so, that puts the page in control.
 
     Attributes:
         choice: the control that chooses it.
     """
 
-    def __init__(self, gui: viser.GuiApi, client: CommandClient, names: Sequence[str]) -> None:
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        client: CommandClient,
+        names: Sequence[str],
+        may: Callable[[str, bool], str] = lambda *_: "",
+    ) -> None:
+        self._client = client
+        self._may = may
         self.choice = gui.add_dropdown("drone", list(names))
         self._buttons: dict[str, Any] = {}
         for mode, label in DRONE_MODES.items():
             colour = "red" if mode == "emergency" else "gray"
             button = gui.add_button(f"{label} {self.chosen}", icon=DRONE_ICONS[mode], color=colour)
-            button.on_click(lambda _, mode=mode: client.send_mode([self.chosen], mode))
+            button.on_click(lambda _, mode=mode: self._send(mode))
             self._buttons[mode] = button
         self._reasons = gui.add_html("")
         self._run = RunCondition()
@@ -328,10 +339,16 @@ class DroneForm:
         """Offer what would not be refused."""
         self._run = run
         refusals = drone_refusals(run, self.chosen)
+        for mode in IN_CONTROL:
+            refusals[mode] = refusals[mode] or self._may(self.chosen, False)
         set_refusals(self._buttons, refusals)
         checks = run.checks.get(self.chosen, ()) if run.drones.get(self.chosen) == "landed" else ()
         shown = preflight_lines({self.chosen: checks}) if checks and not run.grounded() else ""
         self._reasons.content = refusal_lines(DRONE_MODES, refusals) + shown
+
+    def _send(self, mode: str) -> None:
+        if mode not in IN_CONTROL or not self._may(self.chosen, True):
+            self._client.send_mode([self.chosen], mode)
 
     def _rename(self) -> None:
         for mode, button in self._buttons.items():
