@@ -124,9 +124,8 @@ class RunPage:
         self._told_s: dict[int, float] = {}  # wall; when a page was last told that it is not in control
         self._members = {cluster.name: cluster.drones for cluster in self._scenario.clusters}
         folders = page.control_folder, page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
-        self._page_forms = PageForms(
-            server, self._client, list(names), self._scene.nodes.radii_m, self.desk, self.part_of, *folders
-        )
+        control = self.desk, self.part_of, page.parts
+        self._page_forms = PageForms(server, self._client, list(names), self._scene.nodes.radii_m, *control, *folders)
         seen = self.views, self._time_monitor, self._monitor, self._scene, self._page_forms
         self.flying = PageFlying(info, self._scenario, self._spaces, self._client, observer.name, *seen)
 

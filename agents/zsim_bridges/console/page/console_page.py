@@ -112,7 +112,10 @@ class ConsolePage:
             name, space = cluster.name, self._spaces[cluster.name]
             limits = slider_ranges(space, cluster, self._scenario)
             with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder, self._part(gui, name):
-                self.forms[name] = FormationForm(gui, self._client, self._report, cluster, space, limits)
+                form = FormationForm(gui, self._client, self._report, cluster, space, limits)
+            self.forms[name] = form
+            for control in form.safe:
+                self.parts.pop(control._impl.uuid if hasattr(control, "_impl") else "", None)
             with plots, gui.add_folder(None, visible=name == self.chosen) as plot_folder:
                 self.plots[name] = VariablePlots(gui, cluster, limits, self.flights)
             self._folders[name] = [form_folder, plot_folder]

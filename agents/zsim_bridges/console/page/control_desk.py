@@ -1,7 +1,7 @@
 """Which page of the console is in control of what: a formation, or the run itself. One page at a time, all see it.
 
 A page that uses a control of what is free has it; another one asks for it, and has it when it is granted or the page in
-control is lost. An emergency and a landing need no control. Pure.
+control is closed or lost. An emergency, a landing and a hold need no control. Pure.
 """
 
 import threading
@@ -13,6 +13,7 @@ from typing import NamedTuple
 RUN = "run"  # the part of time, faults and drones of no formation; a formation of that name shares it
 EVERY = ""  # of a control that acts on all parts
 LOST_S = 10.0  # wall, without a look of a page that has looked before: its script stands, or its machine is gone
+HERE = ("", "127.0.0.1", "::1")  # addresses of pages on the console's machine
 OPERATOR, VIEWER = "operator", "viewer"
 Tell = Callable[[int, str], None]
 
@@ -37,7 +38,7 @@ class _Page:
 
     @property
     def name(self) -> str:
-        return f"{self.role} {self.number}{f' ({self.address})' if self.address else ''}"
+        return f"{self.role} {self.number}{f' ({self.address})' if self.address not in HERE else ''}"
 
 
 class ControlDesk:
@@ -71,7 +72,9 @@ class ControlDesk:
     def close(self, page: int) -> None:
         """Note that a page is gone: what it was in control of is free, or of who has asked for it."""
         with self._lock:
-            self._give_up(page, "is gone")
+            self._askers = {part: asker for part, asker in self._askers.items() if asker != page}
+            for part in [part for part, holder in self._holders.items() if holder == page]:
+                self._pass_on(part, f"{self.name_of(page)} is gone, and with it")
             self._pages.pop(page, None)
 
     def look(self, page: int, role: str, address: str) -> None:
@@ -82,12 +85,16 @@ class ControlDesk:
             known.role, known.address, known.looked_s = role, address, self._wall_s()
 
     def release_lost(self) -> None:
-        """Free what pages are in control of that look no longer."""
+        """Give what is asked for to who asks for it, where the page in control looks no longer.
+
+        A page whose socket is closed has released already. One that only stands still keeps what nobody wants.
+        """
         with self._lock:
-            for page in {*self._holders.values(), *self._askers.values()}:
-                if self._silent_s(page) > LOST_S:
-                    self._give_up(page, f"was silent for {LOST_S:.0f} s")
-                    self._tell(page, f"Control was released: this page was silent for more than {LOST_S:.0f} s")
+            for part in list(self._askers):
+                holder = self._holders[part]
+                if self._silent_s(holder) > LOST_S:
+                    self._pass_on(part, f"{self.name_of(holder)} was silent for {LOST_S:.0f} s and has lost")
+                    self._tell(holder, f"Control of {words(part)} was given away: this page was silent")
 
     def refusal(self, page: int, part: str) -> str:
         """Return why a page may not use a control of a part now; empty where it may."""
@@ -146,6 +153,12 @@ class ControlDesk:
             known = [each for number, each in self._pages.items() if number != page and each.looked_s is not None]
             return [each.name for each in sorted(known, key=lambda each: (each.role == VIEWER, each.number))]
 
+    def held_by_others(self, page: int) -> frozenset[str]:
+        """Return the parts of whose controls a page may use none, EVERY among them."""
+        with self._lock:
+            held = frozenset(part for part, holder in self._holders.items() if holder != page)
+        return held | {EVERY} if held else held
+
     def name_of(self, page: int) -> str:
         """Return the name of a page."""
         known = self._pages.get(page)
@@ -162,11 +175,6 @@ class ControlDesk:
     def _silent_s(self, page: int) -> float:
         known = self._pages.get(page)
         return 0.0 if known is None or known.looked_s is None else self._wall_s() - known.looked_s
-
-    def _give_up(self, page: int, why: str) -> None:
-        self._askers = {part: asker for part, asker in self._askers.items() if asker != page}
-        for part in [part for part, holder in self._holders.items() if holder == page]:
-            self._pass_on(part, f"{self.name_of(page)} {why}, and with it")
 
     def _pass_on(self, part: str, why: str) -> None:
         del self._holders[part]

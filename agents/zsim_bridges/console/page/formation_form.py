@@ -21,6 +21,7 @@ from zsim_bridges.console.scene.picture import SHAPED_PHASES
 REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
+SAFE = ("hold", "land")
 LABELS = {**{op: label for label, op in OPERATIONS.items()}, "target": "sliders", "trajectory": "Trajectory"}
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
@@ -48,6 +49,9 @@ class FormationForm:
         cluster: of the scenario.
         space: of the formation.
         ranges: of its variables.
+
+    Attributes:
+        safe: the controls that a page may use without being in control.
     """
 
     def __init__(
@@ -68,6 +72,7 @@ class FormationForm:
         self._written: tuple[float, ...] | None = None  # where the waypoints begin that the console wrote
         self._edited = False
         self._controls = {op: self._button(gui, label, op) for label, op in OPERATIONS.items()}
+        self.safe = [self._controls[op] for op in SAFE]
         self._reasons = gui.add_html("")
         self._checks = gui.add_html("")
         hint = "Duration of a move; 0: as fast as the robots' limits let it"

@@ -1,6 +1,6 @@
 """The controls that each page has for itself: the drone that it has chosen, and its theme."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from html import escape
 from itertools import zip_longest
@@ -42,6 +42,7 @@ class PageForms:
         names, radii_m: of the drones.
         desk: which page is in control.
         part_of: returns what a page must be in control of to let a drone take off.
+        controls: what it must be in control of to use a control of all pages, by the control's id.
         control_folder, drone_folder, figure_folder, event_folder, theme_folder: where they are to be.
     """
 
@@ -53,6 +54,7 @@ class PageForms:
         radii_m: Array,
         desk: ControlDesk,
         part_of: Callable[[str], str],
+        controls: Mapping[str, str],
         control_folder: Any,
         drone_folder: Any,
         figure_folder: Any,
@@ -65,6 +67,7 @@ class PageForms:
         self._radii_m = radii_m
         self._desk = desk
         self._part_of = part_of
+        self._controls = controls
         self._folders = control_folder, drone_folder, figure_folder, event_folder, theme_folder
         self._forms: dict[int, _PageForm] = {}
         self._closed = False
@@ -123,7 +126,7 @@ class PageForms:
         control_folder, drone_folder, figure_folder, event_folder, theme_folder = self._folders
         self._desk.open(page.client_id)
         with control_folder:
-            control = ControlForm(page.gui, self._desk, page.client_id)
+            control = ControlForm(page.gui, self._desk, page.client_id, self._controls)
         with drone_folder:
             may = partial(self._may, page.client_id)
             drone = DroneForm(page.gui, self._client, self._names, may)
@@ -158,9 +161,11 @@ class ControlForm:
         gui: viser's of that page, in the folder where it is to be.
         desk: which page is in control.
         page: viser's number of this one.
+        part_of: part of each control of all pages, by its id; viser gives the element on the page the same.
     """
 
-    def __init__(self, gui: viser.GuiApi, desk: ControlDesk, page: int) -> None:
+    def __init__(self, gui: viser.GuiApi, desk: ControlDesk, page: int, part_of: Mapping[str, str]) -> None:
+        self._part_of = part_of
         self._desk = desk
         self._page = page
         self._parts: list[str] = []
@@ -175,17 +180,24 @@ class ControlForm:
     def refresh(self, parts: list[str]) -> None:
         """Show who is in control of some parts."""
         self._parts = parts
-        holdings = self._desk.holdings(self._page, parts)
-        lines = [f"<b>Control</b> · you are {escape(self._desk.name_of(self._page))}", *map(_holding_line, holdings)]
-        others = self._desk.others(self._page)
-        lines += [f"also here: {escape(', '.join(others))}"] if others else []
-        content = f"<div style='{CONTROL_STYLE}'>{'<br>'.join(lines)}</div>"
+        holdings, others = self._desk.holdings(self._page, parts), self._desk.others(self._page)
+        here = f"you are {escape(self._desk.name_of(self._page))}"
+        lines = [f"<b>Control</b>: {here}, alone here"]
+        if others:
+            lines = [f"<b>Control</b>: {here}; also here: {escape(', '.join(others))}", *map(_holding_line, holdings)]
+        content = f"<div style='{CONTROL_STYLE}'>{'<br>'.join(lines)}</div>{self._greyed()}"
         if self._text.content != content:
             self._text.content = content
         for (first, second), holding in zip_longest(self._buttons, holdings):
-            label, asked = _offer(holding)
+            label, asked = _offer(holding) if others else ("", False)
             _show_button(first, label)
             _show_button(second, f"Keep {words(holding.part)}" if holding and asked else "")
+
+    def _greyed(self) -> str:
+        """Return the style that greys out, on this page, the controls of what others are in control of."""
+        held = self._desk.held_by_others(self._page)
+        rules = ",".join(f'[id="{control}"]' for control, part in self._part_of.items() if part in held)
+        return f"<style>{rules}{{opacity:.35}}</style>" if rules else ""
 
     def _press(self, place: int) -> None:
         for holding in self._desk.holdings(self._page, self._parts[place : place + 1]):
@@ -206,7 +218,7 @@ class ControlForm:
 def _holding_line(holding: Holding) -> str:
     name = escape(words(holding.part))
     if not holding.holder:
-        return f"{name}: free; who uses a control of it is in control"
+        return f"{name}: free"
     silent = f", silent for {holding.silent_s:.0f} s" if holding.silent_s > SILENT_SHOWN_S else ""
     who = "<b>you</b>" if holding.mine else f"<b>{escape(holding.holder)}</b>{silent}"
     asked = ""

@@ -67,18 +67,24 @@ class FaultForm:
         self._drone = gui.add_dropdown("drone", names)
         self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=1e5, step=1.0, hint="0: until it is cleared")
         share: dict[str, Any] = {"min": 0.0, "max": 100.0, "step": 1.0}
-        self._fixes = gui.add_number("GPS fixes lost [%]", FIXES_LOST_PERCENT, **share)
+        self._fixes = gui.add_number("fixes lost [%]", FIXES_LOST_PERCENT, **share)
+        self._button(gui, "GPS lost")
         self._thrust = gui.add_number("thrust left [%]", THRUST_LEFT_PERCENT, **share)
+        self._button(gui, "Motor weak")
         self._gust = gui.add_number("gust [m/s]", GUST_M_S, min=-100.0, max=100.0, step=0.5, hint="to the east")
-        self._messages = gui.add_number("messages lost [%]", MESSAGES_LOST_PERCENT, **share)
+        self._button(gui, "Gust")
+        self._messages = gui.add_number("msgs lost [%]", MESSAGES_LOST_PERCENT, **share)
+        self._button(gui, "Messages lost")
+        self._button(gui, "Kill estimator")
         self._strikes = gui.add_html("")
         for control in (self._drone, self._fixes, self._thrust, self._gust, self._messages):
             control.on_update(lambda _: self._describe())
-        for label in self._common():
-            gui.add_button(label, color="orange").on_click(lambda _, label=label: self._add(*self._common()[label][:3]))
         self._describe()
         self._any_fault(gui, names)
         gui.add_button("Clear all faults", color="green").on_click(lambda _: client.request_world("fault_clear"))
+
+    def _button(self, gui: viser.GuiApi, label: str) -> None:
+        gui.add_button(label, color="orange").on_click(lambda _: self._add(*self._common()[label][:3]))
 
     def _common(self) -> dict[str, tuple[str, str, dict[str, Any], str]]:
         """Return the common faults by their button: kind, target, parameters, and what they strike in words."""

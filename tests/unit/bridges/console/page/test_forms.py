@@ -458,7 +458,7 @@ def test_waypoints_stand_still_in_the_noise_of_an_estimate_and_end_where_the_for
 @pytest.mark.parametrize(
     ("label", "magnitude", "asked"),
     [
-        ("GPS lost", ("GPS fixes lost [%]", 40.0), ("gps_dropout", "drone2", {"probability": 0.4})),
+        ("GPS lost", ("fixes lost [%]", 40.0), ("gps_dropout", "drone2", {"probability": 0.4})),
         (
             "Motor weak",
             ("thrust left [%]", 80.0),
@@ -467,7 +467,7 @@ def test_waypoints_stand_still_in_the_noise_of_an_estimate_and_end_where_the_for
         ("Gust", ("gust [m/s]", -6.0), ("gust", "world", {"velocity_m_s": [-6.0, 0.0, 0.0]})),
         (
             "Messages lost",
-            ("messages lost [%]", 25.0),
+            ("msgs lost [%]", 25.0),
             ("link_loss", "world/estimator.drone2", {"probability": 0.25}),
         ),
         ("Kill estimator", None, ("process_kill", "estimator.drone2", {})),

@@ -65,7 +65,7 @@ class Pages:
 def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
     pages, folder = Pages(), MagicMock()
     server: Any = pages
-    forms = PageForms(server, MagicMock(), NAMES, MagicMock(), ControlDesk(["main"]), part_of, *[folder] * 5)
+    forms = PageForms(server, MagicMock(), NAMES, MagicMock(), ControlDesk(["main"]), part_of, {}, *[folder] * 5)
     pages.open(1)
     pages.open(2)
     pages.figures[1].removed = True
@@ -78,7 +78,7 @@ def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
 def test_the_ground_of_a_page_has_its_theme():
     pages, folder = Pages(), MagicMock()
     server: Any = pages
-    PageForms(server, MagicMock(), NAMES, MagicMock(), ControlDesk(["main"]), part_of, *[folder] * 5)
+    PageForms(server, MagicMock(), NAMES, MagicMock(), ControlDesk(["main"]), part_of, {}, *[folder] * 5)
     pages.open(1)
     page = pages.clients[1]
     theme = page.gui.add_checkbox.return_value
@@ -142,24 +142,33 @@ def test_control_is_asked_for_and_granted_or_kept():
     assert has_terms(desk.refusal(4, "main"), TWO)
 
 
-def test_a_page_that_is_closed_or_lost_releases_and_the_one_that_asks_has_it():
+def test_a_page_that_is_lost_loses_what_another_one_asks_for():
     desk = Desk()
     desk.use(4, "main")
     desk.use(4, RUN)
     desk.ask(7, "main")
     desk.wall_s += LOST_S
-    desk.look(7, "operator", "10.0.0.7")
     desk.release_lost()
     assert desk.holders() == [ONE, ONE]
     desk.wall_s += 0.1
     desk.release_lost()
-    assert desk.holders() == [TWO, ""]
+    assert desk.holders() == [TWO, ONE]
     assert {page for page, _ in desk.told[-2:]} == {4, 7}
+    assert desk.holdings(7, [RUN])[0].silent_s > LOST_S  # others see that it stands still
+
+
+def test_a_page_that_is_closed_releases_and_the_one_that_asks_has_it():
+    desk = Desk()
+    desk.use(4, "main")
+    desk.use(4, RUN)
+    desk.ask(7, "main")
+    desk.close(4)
+    assert desk.holders() == [TWO, ""]
     desk.close(7)
     assert desk.holders() == ["", ""]
 
 
-def test_a_page_that_asks_and_is_lost_is_not_given_control():
+def test_a_page_that_asks_and_is_closed_is_not_given_control():
     desk = Desk()
     desk.use(4, "main")
     desk.ask(7, "main")
@@ -201,7 +210,7 @@ def test_pages_ask_and_answer_by_their_buttons():
     desk, guis, forms = Desk(), {}, {}
     for page in (4, 7):
         gui: Any = ControlGui()
-        guis[page], forms[page] = gui, ControlForm(gui, desk, page)
+        guis[page], forms[page] = gui, ControlForm(gui, desk, page, {"a": "main", "b": RUN, "c": ""})
 
     def offered() -> list[list[str]]:
         for form in forms.values():
@@ -211,6 +220,8 @@ def test_pages_ask_and_answer_by_their_buttons():
     assert offered() == [[], []]
     desk.use(4, "main")
     assert offered() == [["Release main"], ["Ask for main"]]
+    styles = [guis[page].html[0].content.partition("<style>")[2] for page in (4, 7)]
+    assert styles == ["", '[id="a"],[id="c"]{opacity:.35}</style>']
     guis[7].buttons[0].press()
     assert offered() == [[f"Give main to {TWO}", "Keep main"], []]
     assert has_terms(without_tags(guis[7].html[0].content.replace("<br>", "\n")), "main", ONE, "you have asked")
