@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 from federation import free_port
 from wire import PATIENCE_S
@@ -87,6 +88,8 @@ class StagedRun:
         clock_state: what the run's clock says.
         stands: whether time stands.
         commander: who flies each drone.
+        changes: fields of single drones' views, by drone.
+        phase: of the formation.
     """
 
     def __init__(
@@ -106,6 +109,8 @@ class StagedRun:
         self.link = StagedLink()
         self.link.timeline = timeline or {}
         self.t_s, self.clock_state, self.stands = 0.0, "running", False
+        self.changes: dict[str, dict[str, Any]] = {}
+        self.phase = "engaged"
         self._performed_s = 0.0  # wall
         self.commander: str | None = None
         self._present = threading.Event()  # once the past has been performed
@@ -146,17 +151,19 @@ class StagedRun:
             DroneView(name, tuple(p), LEVEL, ROTORS, self._state, self.percent - self._drain_percent_s * self.t_s, who)
             for name, p in zip(names, true_W.tolist(), strict=True)
         )
+        views = tuple(msgspec.structs.replace(each, **self.changes.get(each.name, {})) for each in views)
         self.link.publish(keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((1.0, 0.5, 0.0),)))
         for name, p, psi in zip(names, believed_W.tolist(), yaw.tolist(), strict=True):
             estimate = EstimateView(name, tuple(p), COVARIANCE_M2, psi, 0.05, GPS)
             self.link.publish(keys.estimates_view(f"estimator.{name}"), ViewEstimates(t_ns, 0, (estimate,)))
         value = self._space.forward(believed_W, yaw)
-        cluster = ViewCluster(t_ns, 0, "engaged", self._space.names, tuple(value.tolist()), tuple(desired.tolist()), "")
+        shape = self._space.names, tuple(value.tolist()), tuple(desired.tolist())
+        cluster = ViewCluster(t_ns, 0, self.phase, *shape, "")  # type: ignore[arg-type]
         self.link.publish(keys.cluster_view(self._cluster.name), cluster)
 
-    def happen(self, kind: str, subject: str, text: str) -> None:
+    def happen(self, kind: str, subject: str, text: str, **data: Any) -> None:
         """Publish an event of the world."""
-        self.link.publish(keys.EVENT, Event(round(self.t_s * 1e9), 0, kind, "world", subject, text))
+        self.link.publish(keys.EVENT, Event(round(self.t_s * 1e9), 0, kind, "world", subject, text, data))
 
     def end(self) -> None:
         """End the run, as the world does."""

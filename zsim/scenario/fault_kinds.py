@@ -1,13 +1,16 @@
 """The faults that can be injected into a run: kinds, whom they strike, parameters with unit and limits. Pure.
 
-A fault is given as a map: `kind`, `target`, `at_s`, `for_s`, and the parameters of its kind.
+A fault is given as a map: `kind`, `target`, `at_s`, `for_s`, and the parameters of its kind. In a terminal and in the
+console it is typed: `drone2 gps_dropout probability=0.5 --for 10s`.
 """
 
 import re
-from collections.abc import Mapping
+import shlex
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 from zsim.contract.run_messages import Fault
+from zsim.schema import yaml_file
 from zsim.sensors.sensor import Channel, Declaration, SensorType
 from zsim.sensors.sensor_catalogue import STOCK
 
@@ -248,3 +251,95 @@ def _plain(value: Any, p: FaultParameter) -> Any:
 def acts(fault: Fault, gate_ns: int) -> bool:
     """Tell whether a fault acts in the gate that ends at `gate_ns`."""
     return fault.from_ns < gate_ns and (fault.until_ns is None or gate_ns <= fault.until_ns)
+
+
+# What people type
+
+DURATION_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "": 1.0}  # s
+OPTION_OF = {"target": "the argument TARGET", "kind": "the argument KIND", "for_s": "--for", "at_s": "--at"}
+_OPTIONS = {"--for": "for_s", "--at": "at_s"}
+
+
+def typed_duration_s(text: str) -> float:
+    """Return the duration in a text such as 10s, 500ms or 2min.
+
+    Raises:
+        ValueError: it is none.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(ms|s|min|)", text.strip())
+    if not match:
+        raise ValueError(f"is {text[:40]!r}; must be a duration such as 10s, 500ms or 2min")
+    return float(match[1]) * DURATION_UNITS[match[2]]
+
+
+def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
+    """Return the map that words NAME=VALUE make; values are YAML.
+
+    Raises:
+        ValueError: one is no such word, is given twice, or is given by an argument or option instead.
+    """
+    values: dict[str, Any] = {}
+    for text in words:
+        name, equals, value = text.partition("=")
+        if not equals or not re.fullmatch("[a-z][a-z0-9_]*", name):
+            raise ValueError(f"{text[:40]!r} is no parameter; must be NAME=VALUE, see `zsim fault kinds`")
+        if name in OPTION_OF:
+            raise ValueError(f"{name} is no parameter of a kind; give it by {OPTION_OF[name]}")
+        if name in values:
+            raise ValueError(f"{name} is given twice; must be given once")
+        try:
+            values[name] = yaml_file.value(value)
+        except ValueError as error:
+            raise ValueError(f"{name} {error}") from None
+    return values
+
+
+def typed_rest(text: str) -> dict[str, Any]:
+    """Return what stands behind TARGET KIND in `zsim fault add`, as the map of a fault has it.
+
+    A list or map needs no quotes here: there is no shell.
+
+    Raises:
+        ValueError: it is not NAME=VALUE NAME=VALUE … --for DURATION --at DURATION.
+    """
+    times: dict[str, float] = {}
+    words: list[str] = []
+    pending = iter(_words(text))
+    for word in pending:
+        option, equals, value = word.partition("=")
+        if option not in _OPTIONS:
+            words.append(word)
+            continue
+        try:
+            times[_OPTIONS[option]] = typed_duration_s(value if equals else next(pending, ""))
+        except ValueError as error:
+            raise ValueError(f"{option} {error}") from None
+    return {**typed_parameters(words), **times}
+
+
+def _words(text: str) -> list[str]:
+    """Return the words of a text; brackets that are open hold words together."""
+    words: list[str] = []
+    depth = 0
+    try:
+        parts = shlex.split(text)
+    except ValueError as error:
+        raise ValueError(f"{text[:40]!r}: {str(error).lower()}; must be NAME=VALUE NAME=VALUE …") from None
+    for part in parts:
+        if depth > 0:
+            words[-1] += f" {part}"
+        else:
+            words.append(part)
+        depth += sum(part.count(each) for each in "[{") - sum(part.count(each) for each in "]}")
+    return words
+
+
+def unstated(kind: FaultKind, parameters: Mapping[str, Any]) -> list[FaultParameter]:
+    """Return the magnitudes of a kind that a fault does not state: those too that have a default."""
+    return [
+        p
+        for p in kind.parameters
+        if p.shape in ("number", "vector", "choice")
+        and (p.required or p.default is not None)
+        and parameters.get(p.name) is None
+    ]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from zsim.contract import flight_messages, keys
 from zsim.errors import ZsimError
 from zsim.transport.session import Session, Unanswered
-from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
+from zsim_bridges.console.monitoring.view_buffer import ViewBuffer, arguments_text
 
 Task = Callable[[], None]
 
@@ -170,7 +170,7 @@ class CommandClient:
 
     def request_world(self, op: str, **args: Any) -> None:
         """Request an operation of the world."""
-        what = RequestOutcome(f"{op} {_format_arguments(args)}".strip(), "")
+        what = RequestOutcome(f"{op} {arguments_text(args)}".strip(), "")
         self._submit(self._requests.submit, what, self._request, keys.CONTROL, op, args)
 
     def seek(self, t_s: float, step: bool) -> None:
@@ -187,7 +187,7 @@ class CommandClient:
 
     def request_cluster(self, cluster: str, op: str, shown: str = "", order: str = "", **args: Any) -> None:
         """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""
-        text = f"{cluster}: {op} {shown or _format_arguments(args)}".strip()
+        text = f"{cluster}: {op} {shown or arguments_text(args)}".strip()
         what = RequestOutcome(text, "", cluster, op, args, order)
         self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
 
@@ -299,18 +299,3 @@ def _refusal_of(act: Callable[..., str], *args: Any) -> str:
         return str(error)
     except Exception as error:  # a pool's thread reports no exception itself
         return f"{type(error).__name__}: {error}"
-
-
-def _format_arguments(args: dict[str, Any]) -> str:
-    return ", ".join(f"{name} {_format_value(value)}" for name, value in args.items())
-
-
-def _format_value(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:g}"
-    if isinstance(value, dict):
-        return " ".join(f"{name}={_format_value(item)}" for name, item in value.items())[:120]
-    if isinstance(value, list):
-        of_figures = all(isinstance(item, int | float) for item in value)
-        return " ".join(map(_format_value, value))[:120] if of_figures else f"({len(value)})"
-    return str(value)[:120]

@@ -64,7 +64,7 @@ class Console:
         self._rate_hz = rate_hz
         self._say = say
         self._run_page: RunPage | None = None
-        self._viser = PrivateViser()
+        self._viser = PrivateViser(self._permits)
         self._camera_follow = CameraFollow(self._viser.server)
         self._frustums = CameraFrustums(self._viser.server)
         _show_text(self._viser.server.gui, f"Waiting for a world: {world}" if world else "Waiting for a world")
@@ -72,7 +72,7 @@ class Console:
         permits = partial(is_permitted, controls=controls)
         sockets = CameraSockets(lambda: self._run_page and self._run_page.cameras, self._frustums)
         actions = ActionSockets(self._frustums.client_id, self._camera_follow, self._record, self._flying)
-        answers = permits, sockets.respond, actions.respond, self._head, self._command, self._files
+        answers = permits, sockets.respond, actions.respond, self._head, self._command, self._files, self._looked
         backend = ViserBackend(self._viser.port, self._viser.secret, self._state, *answers)
         self._proxy = HttpProxy(address, token, backend)
 
@@ -127,6 +127,14 @@ class Console:
 
     def _flying(self) -> PageFlying | None:
         return self._run_page.flying if self._run_page else None
+
+    def _permits(self, client_id: int, control: str) -> bool:
+        return self._run_page is None or self._run_page.permits(client_id, control)
+
+    def _looked(self, key: str, role: str, address: str) -> None:
+        client_id = self._frustums.client_id(key)
+        if self._run_page and client_id is not None:
+            self._run_page.desk.look(client_id, role, address)
 
     def _pages(self) -> list[viser.GuiApi]:
         return [page.gui for page in self._viser.server.get_clients().values()]

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
-from zsim.contract.run_messages import Fault
 from zsim_bridges.console.monitoring.alarms import LATE_MS, Severity, battery_severity
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
+from zsim_bridges.console.monitoring.preflight import LINK_SILENT_S, Check
 from zsim_bridges.console.monitoring.sensor_rates import Counts, SensorRates
 from zsim_bridges.console.monitoring.view_buffer import ReceivedEstimate, ReceivedLink, ViewBuffer
 
@@ -46,7 +46,6 @@ EVENT_COLOURS = {
     "fault_clear": AMBER,
 }
 LINK_COLOURS = {"waiting": AMBER, "connected": BLUE, "armed": GREEN, "lost": RED}
-LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 SEVERITY_COLOURS = {"red": RED, "amber": AMBER}
 LEFT_MAX_S = 24 * 3600.0  # of a battery that lasts longer no time is shown
 COLUMNS = 7  # of the table of drones
@@ -72,6 +71,7 @@ class DroneRow(NamedTuple):
     link: tuple[str, str] = ("", "")  # of a driver, in words, and their colour
     sigma_m: float | None = None
     severity: Severity | None = None  # of its worst alarm
+    failsafe: str = ""  # why it has landed or stopped by itself
 
 
 def drone_table(rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures] | None = None) -> str:
@@ -113,7 +113,7 @@ def _drone_notes(row: DroneRow) -> str:
         f"{escape(row.commander or 'nobody')} · {_coloured(lag, AMBER if late else 'inherit')} · GPS {escape(row.gps)}"
     )
     faults = f"⚠ {', '.join(row.faults)}" if row.faults else ""
-    notes = [(escape(faults), AMBER), (escape(row.link[0]), row.link[1])]
+    notes = [(escape(row.failsafe), RED), (escape(faults), AMBER), (escape(row.link[0]), row.link[1])]
     return "".join(
         f"<tr><td colspan={COLUMNS} style='color:{colour};padding:0 4px 2px 12px;white-space:normal'>{note}</td></tr>"
         for note, colour in ((about, GREY), *notes)
@@ -182,6 +182,24 @@ def formation_lines(states: Mapping[str, tuple[str, str]]) -> str:
     return f"<div style='{STYLE};{FEW_LINES};{BESIDE}'>{'<br>'.join(lines) or 'no formation'}</div>"
 
 
+def preflight_lines(checks: Mapping[str, Sequence[Check]]) -> str:
+    """Return the checks of drones before a take-off: what is not as it should be, or that all are ready."""
+    lines = [
+        _coloured(f"✗ {drone}: {check.name} {check.text}", RED if check.blocks else AMBER)
+        for drone, each in checks.items()
+        for check in each
+        if not check.ok
+    ]
+    ready = [drone for drone, each in checks.items() if all(check.ok for check in each)]
+    if ready and len(checks) == 1:
+        points = ", ".join(f"{check.name} {check.text}" for check in checks[ready[0]])
+        lines.append(_coloured(f"✓ {ready[0]}: {points}", GREEN))
+    elif ready:
+        lines.append(_coloured(f"✓ ready: {', '.join(ready)}", GREEN))
+    title = "<b>Before take-off</b><br>" if lines else ""
+    return f"<div style='{STYLE};{FEW_LINES};{BESIDE};padding-bottom:8px'>{title}{'<br>'.join(lines)}</div>"
+
+
 def event_table(newest_first: Iterable[EventRow]) -> str:
     """Return the table of events, which are given newest first; the page unfolds what is longer than a few lines."""
     lines = map(_event_cells, newest_first)
@@ -205,11 +223,11 @@ def _times(times: int) -> str:
     return f"<b>{times} ×</b> " if times > 1 else ""
 
 
-def fault_lines(faults: Sequence[str]) -> str:
-    """Return the active faults."""
-    lines = "<br>".join(f"⚠ {escape(fault)}" for fault in faults)
-    style = f"{STYLE};{FEW_LINES};{BESIDE};color:{AMBER if faults else GREY}"
-    return f"<div style='{style}'>{lines or NO_FAULT}</div>"
+def fault_lines(active: Sequence[str], over: Sequence[str] = ()) -> str:
+    """Return the faults that act, and in grey those that are over."""
+    lines = [_coloured(f"⚠ {fault}", AMBER) for fault in active] or [_coloured(NO_FAULT, GREY)]
+    lines += [_coloured(f"over: {fault}", GREY) for fault in reversed(over)]
+    return f"<div style='{STYLE};{FEW_LINES};{BESIDE};overflow-wrap:anywhere'>{'<br>'.join(lines)}</div>"
 
 
 def _table(body: str) -> str:
@@ -274,12 +292,11 @@ class TableRows:
             external = drone.name in self._views.external
             link = link_note(self._views.link_of(drone.name)) if external else ("", "")
             sigma = received.sigma_m if received and received.fresh else None
-            rows.append(DroneRow(*row, link, sigma, self._severity_of(drone.name)))
+            failsafe = self._views.failsafes.get(drone.name)
+            is_down = drone.state in ("landing", "landed", "emergency")
+            cause = failsafe.text if failsafe and is_down else ""
+            rows.append(DroneRow(*row, link, sigma, self._severity_of(drone.name), cause))
         return rows
-
-    def active_faults(self) -> list[str]:
-        """Return kind and target of each active fault."""
-        return [f"{fault.kind} of {fault.target}{_end_text(fault)}" for fault in self._views.active_faults()]
 
     def sensor_table(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
@@ -289,10 +306,6 @@ class TableRows:
         estimate = received.estimate
         rates = self._rates.update(drone, received.t_ns, estimate.sensors) if received.fresh else {}
         return sensor_table(drone, estimate.sensors, rates, _uncertainty(received), own_rates)
-
-
-def _end_text(fault: Fault) -> str:
-    return "" if fault.until_ns is None else f" until {fault.until_ns / 1e9:.1f} s"
 
 
 def _uncertainty(received: ReceivedEstimate) -> str:

@@ -31,6 +31,7 @@ from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
 from zsim_bridges.console.orders import OrderBook, OrderRequest
 from zsim_bridges.console.page.console_page import ConsolePage
+from zsim_bridges.console.page.control_desk import RUN, ControlDesk
 from zsim_bridges.console.page.page_forms import PageForms
 from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.run_state import console_state
@@ -43,6 +44,7 @@ from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
 STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
+TOLD_S = 2.0  # wall; a slider that is dragged is refused many times
 NOTICE_S = 8.0  # wall; how long a refusal stays in the corner
 
 
@@ -77,6 +79,7 @@ class RunPage:
         record: what is played, of a replay.
         flying: what pages may do with single drones.
         orders: of the operators, until they are confirmed.
+        desk: which page is in control.
     """
 
     def __init__(
@@ -100,7 +103,8 @@ class RunPage:
         variables = {name: space.names for name, space in self._spaces.items()}
         age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
         self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
-        self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command)
+        told = partial(self._on_foreign_request, bool(info.replay_of))
+        self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command, asked=told)
         self._monitor = RunMonitor(self.views, self._time_monitor, self._scenario, bool(info.replay_of), world)
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
         members = {cluster.name: tuple(cluster.drones) for cluster in self._scenario.clusters}
@@ -123,8 +127,12 @@ class RunPage:
             server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones
         )
         page = self._page
-        folders = page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
-        self._page_forms = PageForms(server, self._client, list(names), self._scene.nodes.radii_m, *folders)
+        self.desk = ControlDesk(list(self._spaces), self._tell)
+        self._told_s: dict[int, float] = {}  # wall; when a page was last told that it is not in control
+        self._members = {cluster.name: cluster.drones for cluster in self._scenario.clusters}
+        folders = page.control_folder, page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
+        control = self.desk, self.part_of, page.parts
+        self._page_forms = PageForms(server, self._client, list(names), self._scene.nodes.radii_m, *control, *folders)
         seen = self.views, self._time_monitor, self._monitor, self._scene, self._page_forms
         self.flying = PageFlying(info, self._scenario, self._spaces, self._client, observer.name, *seen)
 
@@ -162,6 +170,19 @@ class RunPage:
         """Return what is shown, as plain data: for programs, and for tests."""
         state = console_state(self._info.run_id, self.views, self._time_monitor, dict(self._scene.shapes))
         return {**state, "cameras": self.cameras.state(), "timeline": self.record.state(self._monitor.condition)}
+
+    def part_of(self, drone: str) -> str:
+        """Return what a page must be in control of to let a drone take off, or to fly it."""
+        return next((name for name, drones in self._members.items() if drone in drones), RUN)
+
+    def permits(self, client_id: int, control: str) -> bool:
+        """Return whether a page may use a control of all pages; tell it why where it may not."""
+        part = self._page.parts.get(control)
+        refusal = "" if part is None else self.desk.use(client_id, part)
+        if refusal and time.monotonic() - self._told_s.get(client_id, -math.inf) > TOLD_S:
+            self._told_s[client_id] = time.monotonic()
+            self._tell(client_id, f"Refused: {refusal}")
+        return not refusal
 
     def head(self) -> dict[str, Any]:
         """Return the head of the page, as plain data."""
@@ -263,11 +284,10 @@ class RunPage:
         page = self._page
         flown = self._monitor.flight.figures
         self._update_controls(flown)
-        page.phases.content = console_tables.formation_lines(
-            {n: (v.phase, v.reason) for n, v in self.views.clusters.items()}
-        )
+        page.phases.content = console_tables.formation_lines(self._monitor.condition.phases)
         page.drones.content = console_tables.drone_table(self._table_rows.drone_rows(), flown)
-        page.faults.content = console_tables.fault_lines(self._table_rows.active_faults())
+        watch = self._monitor.fault_watch
+        page.faults.content = console_tables.fault_lines(watch.lines(), watch.lines(is_over=True))
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
             page.plots[page.chosen].draw()
@@ -276,7 +296,8 @@ class RunPage:
     def _update_controls(self, flown: Mapping[str, FlightFigures]) -> None:
         """Grey out what would be refused, and show on each page the drone that it has chosen."""
         self._page.refresh(self._monitor.condition)
-        self._page_forms.refresh(self._monitor.condition)
+        self.desk.release_lost()
+        self._page_forms.refresh(self._monitor.condition, self._page.chosen)
         self._page_forms.show_figures(partial(self._drone_figures, flown))
         self._page_forms.show_events(self.views.log.rows())
 
@@ -306,6 +327,17 @@ class RunPage:
     def _on_refused_command(self, event: Event) -> None:
         """Show that the world has refused a command of the console's."""
         self._notify(event.subject, str(event.data.get("reason", event.text)))
+
+    def _on_foreign_request(self, replayed: bool, cluster: str, text: str) -> None:
+        """Tell every page that somebody else has asked a formation for something: the last word must be seen."""
+        for client_id in () if replayed else self._server.get_clients():
+            self._tell(client_id, text)
+
+    def _tell(self, client_id: int, line: str) -> None:
+        """Tell one page about who is in control."""
+        client = self._server.get_clients().get(client_id)
+        if client is not None:
+            client.add_notification("Control", line, color="orange", auto_close_seconds=NOTICE_S)
 
     def _notify(self, what: str, refusal: str) -> None:
         for client in self._server.get_clients().values():

@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -28,10 +27,8 @@ faults = typer.Typer(
     name="fault", help="Inject faults into a running federation, and clear them.", no_args_is_help=True
 )
 
-UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "": 1.0}  # s
 SOURCE = "zsim.fault"
 ALL = "all"
-OPTION_OF = {"target": "the argument TARGET", "kind": "the argument KIND", "for_s": "--for", "at_s": "--at"}
 
 
 @app.command(rich_help_panel=PANEL)
@@ -160,10 +157,12 @@ def seconds(text: str | None) -> float | None:
     """Return the duration in a text such as 10s, 500ms or 2min."""
     if text is None:
         return None
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(ms|s|min|)", text.strip())
-    if not match:
-        raise typer.BadParameter(f"is {text!r}; must be a duration such as 10s, 500ms or 2min")
-    return float(match[1]) * UNITS[match[2]]
+    from zsim.scenario.fault_kinds import typed_duration_s
+
+    try:
+        return typed_duration_s(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
 def _duration(text: str | None) -> str | None:
@@ -289,22 +288,12 @@ def _parameters(kind: "FaultKind") -> list[str]:
 
 def _values(parameters: Sequence[str]) -> dict[str, Any]:
     """Return the map that texts NAME=VALUE make; values are YAML."""
-    from zsim.schema import yaml_file
+    from zsim.scenario.fault_kinds import typed_parameters
 
-    values: dict[str, Any] = {}
-    for text in parameters:
-        name, equals, value = text.partition("=")
-        if not equals or not re.fullmatch("[a-z][a-z0-9_]*", name):
-            raise typer.BadParameter(f"{text[:40]!r} is no parameter; must be NAME=VALUE, see `zsim fault kinds`")
-        if name in OPTION_OF:
-            raise typer.BadParameter(f"{name} is no parameter of a kind; give it by {OPTION_OF[name]}")
-        if name in values:
-            raise typer.BadParameter(f"{name} is given twice; must be given once")
-        try:
-            values[name] = yaml_file.value(value)
-        except ValueError as error:
-            raise typer.BadParameter(f"{name} {error}") from None
-    return values
+    try:
+        return typed_parameters(parameters)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
 def _ask(link: "Session", op: str, args: dict[str, Any]) -> dict[str, Any]:

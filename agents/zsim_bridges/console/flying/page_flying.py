@@ -76,6 +76,10 @@ class PageFlying:
         if drone in self._surroundings["names"]:
             self._pages.choose(client_id, drone)
 
+    def take_refusal(self, client_id: int | None, drone: str) -> str:
+        """Return why a page may not fly a drone: another one is in control of its formation; empty where it may."""
+        return self._pages.use(client_id, drone) if client_id is not None else ""
+
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
         """Return the view from above; `whole`: with what does not change, and the trails of before."""
         drones = self._scene.drones

@@ -12,6 +12,7 @@ from zsim_agents.formation.flight_data import (
     READY_TO_ENGAGE,
     REJOINING,
 )
+from zsim_bridges.console.monitoring.preflight import Check, takeoff_refusal
 
 AT_END = "the record is at its end; go back on the timeline"
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
@@ -29,6 +30,7 @@ class RunCondition(NamedTuple):
         drones: state of each drone by name, of those that were seen.
         phases: phase and reason of each formation by name.
         members: names of the drones of each formation.
+        checks: of each drone before a take-off, as far as they are known.
     """
 
     clock: str | None = None
@@ -39,6 +41,7 @@ class RunCondition(NamedTuple):
     drones: Mapping[str, str] = {}
     phases: Mapping[str, tuple[str, str]] = {}
     members: Mapping[str, Collection[str]] = {}
+    checks: Mapping[str, tuple[Check, ...]] = {}
 
     @property
     def level(self) -> Level:
@@ -77,7 +80,14 @@ def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
     modes = ("takeoff", "land", "emergency", "reset")
     unseen = run.grounded() or ("" if state else f"{drone} was not seen yet")
     refused = {mode: unseen or state_refusal(drone, state or "", mode) or "" for mode in modes}
+    refused["takeoff"] = refused["takeoff"] or preflight_refusal(run, [drone])
     return {**refused, "emergency": run.grounded()}  # never kept back: what is shown may be older than what is
+
+
+def preflight_refusal(run: RunCondition, drones: Collection[str]) -> str:
+    """Return why drones that are on the ground would not be let take off, by their checks; empty where they would."""
+    landed = [name for name in drones if run.drones.get(name) == "landed"]
+    return "; ".join(filter(None, (takeoff_refusal(name, run.checks.get(name, ())) for name in landed)))
 
 
 def is_held_by_fault(run: RunCondition, cluster: str) -> bool:
@@ -109,13 +119,16 @@ def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
 def _takeoff_refusal(run: RunCondition, cluster: str, phase: str) -> str:
     """Return why a formation would not take off; it starts with drones that are landed or in the air."""
     if phase != "idle":
-        return f"{cluster} is {_words(phase)}, not idle"
+        down = phase == "held" and _all_down(run, run.members.get(cluster, ()))
+        return f"{cluster} is {_words(phase)}, not idle{'; Land makes it idle' if down else ''}"
     members = [(name, run.drones.get(name, "landed")) for name in run.members.get(cluster, ())]
     stopped = [name for name, state in members if state == "emergency"]
     if stopped:
         return _reset_first(stopped)
     moving = [(name, state) for name, state in members if state not in AIRBORNE | DOWN]
-    return f"{moving[0][0]} is {_words(moving[0][1])}; it must be landed or in the air" if moving else ""
+    if moving:
+        return f"{moving[0][0]} is {_words(moving[0][1])}; it must be landed or in the air"
+    return preflight_refusal(run, run.members.get(cluster, ()))
 
 
 def _reset_first(stopped: Sequence[str]) -> str:
@@ -157,17 +170,21 @@ def fleet_refusals(run: RunCondition, single: Collection[str] = ()) -> dict[str,
 
 def _fleet_takeoff_refusal(run: RunCondition, single: Collection[str]) -> str:
     """Return why neither a formation nor a drone of none would take off."""
-    idle = [_takeoff_refusal(run, name, phase) for name, (phase, _) in run.phases.items() if phase == "idle"]
+    refusals = {name: _takeoff_refusal(run, name, phase) for name, (phase, _) in run.phases.items()}
     singles = {name: run.drones.get(name) for name in single}
-    if "" in idle or "landed" in singles.values():
+    landed = [name for name, state in singles.items() if state == "landed"]
+    unfit = [refusal for name in landed if (refusal := preflight_refusal(run, [name]))]
+    if "" in refusals.values() or len(landed) > len(unfit):
         return ""
     stopped = [name for name, state in singles.items() if state == "emergency"]
-    reasons = [*idle, *([_reset_first(stopped)] if stopped else [])]
-    return reasons[0] if reasons else "nobody is on the ground and idle"
+    on_ground = [refusal for name, refusal in refusals.items() if _all_down(run, run.members.get(name, ()))]
+    reasons = [*on_ground, *unfit, *([_reset_first(stopped)] if stopped else []), *refusals.values()]
+    return reasons[0] if reasons else "no drone is on the ground"
 
 
-def _all_down(run: RunCondition) -> bool:
-    return DOWN.issuperset(run.drones.values())
+def _all_down(run: RunCondition, names: Collection[str] | None = None) -> bool:
+    """Return whether all drones, or those of some names, are on the ground as far as they were seen."""
+    return DOWN.issuperset(state for name, state in run.drones.items() if names is None or name in names)
 
 
 def _words(phase: str) -> str:

@@ -1,14 +1,18 @@
 """What the page knows of a run beyond the newest views: its condition, figures of flight, alarms, pending requests."""
 
 import math
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from zsim.contract.views import DroneView, ViewCluster
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.console.monitoring import alarms
 from zsim_bridges.console.monitoring.alarms import Alarm, AlarmBoard, DroneCondition
+from zsim_bridges.console.monitoring.fault_watch import FaultWatch
 from zsim_bridges.console.monitoring.flight_figures import FlightMeter
 from zsim_bridges.console.monitoring.page_head import page_head
 from zsim_bridges.console.monitoring.pending_requests import PendingRequest, PendingRequests
+from zsim_bridges.console.monitoring.preflight import Check, preflight_checks
 from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ReceivedEstimate, ViewBuffer
@@ -30,6 +34,7 @@ class RunMonitor:
         condition: of the run, at the last update.
         board: its alarms; `severity_of` a drone is for its colour.
         flight: figures of the drones.
+        fault_watch: what faults strike, and what they did.
         pending: requests that are not done yet.
         record_end_s: simulated time of the last gate on record, of a replay.
     """
@@ -51,6 +56,8 @@ class RunMonitor:
         self.flight = FlightMeter()
         self.pending = PendingRequests()
         self.record_end_s = math.inf
+        self.fault_watch = FaultWatch()
+        self._t_ns = 0
 
     def end(self, reason: str) -> None:
         """Note that the run is over."""
@@ -63,14 +70,27 @@ class RunMonitor:
     def update(self, wall_s: float) -> list[PendingRequest]:
         """Look at the newest views; return the requests that were done meanwhile."""
         views, clock = self._views, self._time_monitor.clock
-        drones = {drone.name: drone.state for drone in views.drones.drones} if views.drones else {}
-        phases = {name: (view.phase, view.reason) for name, view in views.clusters.items()}
+        seen = views.drones.drones if views.drones else ()
+        drones = {drone.name: drone.state for drone in seen}
+        self._forget_future(views.drones.t_ns if views.drones else 0)
+        estimates = views.estimates()
+        conditions = {drone.name: self._drone(drone, estimates.get(drone.name)) for drone in seen}
+        foreign = self._foreign_commanders(seen)
+        phases = {
+            name: (view.phase, self._reason(name, view, conditions, foreign.get(name, {})))
+            for name, view in views.clusters.items()
+        }
         state, silent_s = clock.state if clock else None, self._time_monitor.silent_s
         at_end = clock is not None and state == "paused" and clock.t_ns >= self.record_end_s * 1e9 - ROUNDING_NS
         self.condition = RunCondition(
-            state, silent_s, self._ended, self._replayed, at_end, drones, phases, self._members
-        )
-        self.board.update(self._alarms(), wall_s)
+            state, silent_s, self._ended, self._replayed, at_end, drones, phases, self._members,
+            checks=self._checks(conditions, foreign),
+        )  # fmt: skip
+        states = {name: phase for name, (phase, _) in phases.items()}
+        wind_m_s = max((math.hypot(*each) for each in views.drones.wind_m_s), default=0.0) if views.drones else 0.0
+        seen_now = conditions, states, views.losses.now, wind_m_s
+        self.fault_watch.update(list(views.begun), views.active_faults(), *seen_now)
+        self.board.update(self._alarms(conditions, foreign), wall_s)
         return self.pending.pop_done(views.clusters, drones)
 
     def head(self, wall_s: float) -> dict[str, Any]:
@@ -80,33 +100,74 @@ class RunMonitor:
         rows, single = self.board.rows(wall_s), self._single
         return page_head(self._name, run, self._time_monitor.clock, t_ns, rows, single, self._world)
 
-    def _alarms(self) -> list[Alarm]:
+    def _forget_future(self, t_ns: int) -> None:
+        """Forget alarms and losses of later times, where a replay has gone back."""
+        if t_ns < self._t_ns:
+            self.board.clear()
+            self.fault_watch.clear()
+            self._views.begun.clear()
+            self._views.losses.now, self._views.failsafes = {}, {}
+        self._t_ns = t_ns
+
+    def _alarms(self, conditions: Mapping[str, DroneCondition], foreign: Mapping[str, dict[str, str]]) -> list[Alarm]:
         views = self._views
         if views.drones is None or self._ended:
             return []
-        estimates = views.estimates()
-        found = [
-            alarm
-            for drone in views.drones.drones
-            for alarm in alarms.drone_alarms(
-                self._drone(drone.name, drone.state, drone.battery_percent, estimates.get(drone.name))
-            )
-        ]
-        found += alarms.formation_alarms(self.condition.phases)
-        found += alarms.process_alarms(views.losses)
+        found = [alarm for drone in conditions.values() for alarm in alarms.drone_alarms(drone)]
+        found += alarms.formation_alarms(self.condition.phases, foreign, dict(views.clusters))
+        found += alarms.process_alarms(views.losses.now)
+        silent_s = self.condition.silent_s
+        found += [Alarm("red", "world", "silent", f"no answer for {silent_s:.0f} s")] if silent_s else []
         return found + alarms.fault_alarms(views.active_faults())
 
-    def _drone(self, name: str, state: str, battery: float, received: ReceivedEstimate | None) -> DroneCondition:
-        found = DroneCondition(name, state, battery)
+    def _foreign_commanders(self, seen: Iterable[DroneView]) -> dict[str, dict[str, str]]:
+        """Return who flies drones of each formation instead of its controller."""
+        commanders = {drone.name: drone.commander for drone in seen}
+        roles = {name: health.role for name, health in self._views.healths.items()}
+        return {
+            name: alarms.foreign_commanders(f"controller.{name}", members, commanders, roles)
+            for name, members in self._members.items()
+        }
+
+    def _reason(
+        self, name: str, view: ViewCluster, conditions: Mapping[str, DroneCondition], foreign: dict[str, str]
+    ) -> str:
+        """Return why a formation is as it is: what its controller says, who else flies its drones, and failsafes."""
+        notes = [alarms.foreign_text(foreign)] if foreign and view.phase in alarms.FLOWN_PHASES else []
+        members = (conditions[drone] for drone in self._members[name] if drone in conditions)
+        notes += [d.failsafe for d in members if d.failsafe and d.state in ("landing", "emergency", "landed")]
+        return "; ".join(filter(None, (view.reason, *notes)))
+
+    def _checks(
+        self, conditions: Mapping[str, DroneCondition], foreign: Mapping[str, dict[str, str]]
+    ) -> dict[str, tuple[Check, ...]]:
+        """Return the check of each drone before a take-off."""
+        others = {drone: who for each in foreign.values() for drone, who in each.items()}
+        return {
+            name: preflight_checks(drone, name not in self._single, others.get(name, ""))
+            for name, drone in conditions.items()
+        }
+
+    def _drone(self, drone: DroneView, received: ReceivedEstimate | None) -> DroneCondition:
+        _, x, y, _ = drone.orientation_wxyz
+        tilt_deg = math.degrees(math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y)))))
+        failsafe = self._views.failsafes.get(drone.name)
+        found = DroneCondition(
+            drone.name, drone.state, drone.battery_percent, tilt_deg=tilt_deg, commander=drone.commander,
+            failsafe=failsafe.text if failsafe else "", is_external=drone.name in self._views.external,
+        )  # fmt: skip
         if received is not None:
             fresh = received.fresh
             lag_ms = self._views.lag_ms(received)
-            sigma = received.sigma_m if fresh else None
-            found = found._replace(lag_ms=lag_ms, sigma_m=sigma, estimate_lost=not fresh)
-        link = self._views.link_of(name)
+            sigma = (received.sigma_m, received.yaw_sigma_deg) if fresh else (None, None)
+            found = found._replace(lag_ms=lag_ms, sigma_m=sigma[0], yaw_sigma_deg=sigma[1], estimate_lost=not fresh)
+        link = self._views.link_of(drone.name)
         if link is None:
             return found
         state_of = link.state
         return found._replace(
-            link_state=state_of.state, link_age_ms=state_of.age_ms, link_loss_percent=state_of.loss_percent
+            link_state=state_of.state,
+            link_age_ms=state_of.age_ms,
+            link_loss_percent=state_of.loss_percent,
+            link_age_s=link.age_s,
         )

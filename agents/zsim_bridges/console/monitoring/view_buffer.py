@@ -3,10 +3,12 @@
 import math
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
+import msgspec
 from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
@@ -16,11 +18,13 @@ from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample, Session
-from zsim_bridges.console.monitoring.alarms import BACK, LOST
+from zsim_bridges.console.monitoring.alarms import Losses
 from zsim_bridges.console.monitoring.event_log import EventLog
 from zsim_bridges.observer_process import ObserverProcess
 
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
+
+FAULTS_KEPT = 8  # that have begun
 
 
 class ReceivedEstimate(NamedTuple):
@@ -36,6 +40,10 @@ class ReceivedEstimate(NamedTuple):
     t_ns: int
     estimate: EstimateView
     fresh: bool
+
+    @property
+    def yaw_sigma_deg(self) -> float:
+        return math.degrees(self.estimate.yaw_sigma_rad)
 
     @property
     def sigma_m(self) -> float:
@@ -61,6 +69,7 @@ class ViewBuffer:
         variables: names of each formation's variables; views of other formations or variables are refused.
         refused: called, in a thread of Zenoh's, with the event of a command of the console's that the world refused.
         wall_s: monotonic.
+        asked: called, in a thread of Zenoh's, with a formation and what somebody else has asked it for, in words.
 
     Attributes:
         drones: the newest view of the drones.
@@ -70,7 +79,9 @@ class ViewBuffer:
         external: names of the drones whose bodies are external.
         faults: injected ones, planned and active.
         log: events as they are shown; events: newest first.
-        losses: the newest event about each process or drone that is lost.
+        losses: processes and drones that are lost.
+        begun: the last injected faults that have begun.
+        failsafes: the event of a landing or stop of the rotors of each drone, until it is commanded another mode.
         end: why the run ended, by its last event; empty while it goes on.
         on_own_event: called, in a thread of Zenoh's, with each event that a command of this console has caused.
     """
@@ -83,12 +94,14 @@ class ViewBuffer:
         variables: Mapping[str, tuple[str, ...]],
         refused: Callable[[Event], None],
         wall_s: Callable[[], float] = time.monotonic,
+        asked: Callable[[str, str], None] = lambda *_: None,
     ) -> None:
         self._link = link
         self._names = frozenset(drone.name for drone in info.drones)
         self._observer = observer
         self._variables = variables
         self._refused = refused
+        self._asked = asked
         self._wall_s = wall_s
         self._received_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
         self._new: dict[str, bytes] = {}
@@ -103,7 +116,9 @@ class ViewBuffer:
         self.faults: tuple[Fault, ...] = ()
         self.log = EventLog(observer.name)
         self.events = self.log.newest
-        self.losses: dict[str, Event] = {}
+        self.losses = Losses()
+        self.failsafes: dict[str, Event] = {}
+        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)
         self.end = ""
         self.on_own_event: Callable[[Event], None] = lambda _: None
 
@@ -112,6 +127,8 @@ class ViewBuffer:
         of_drivers = map(keys.link, sorted(self.external))
         for expression in ("view/**", keys.FAULTS, "process/*/health", *of_drivers):
             self._link.declare_subscriber(expression, self._on_publication)
+        for cluster in self._variables:
+            self._link.declare_subscriber(keys.cluster_request(cluster), self._on_request)
         self._link.declare_subscriber(keys.EVENT, self._on_event)
         samples = self._link.get(keys.FAULTS)
         with self._arrived:
@@ -191,6 +208,7 @@ class ViewBuffer:
             self._links[key], self._received_s[key] = message, self._wall_s()
         elif isinstance(message, Health):
             self.healths[keys.thing(key)] = message
+            self.losses.note_health(keys.thing(key), message)
         elif isinstance(message, run_messages.Faults):
             self.faults = message.faults
 
@@ -201,6 +219,18 @@ class ViewBuffer:
         else:
             self._observer.health.refused += 1
 
+    def _on_request(self, sample: RawSample) -> None:
+        """Note what somebody else has asked a formation for, such as another console."""
+        try:
+            request: run_messages.ClusterRequest = messages.decode(sample.key, sample.payload)
+        except DecodeError:
+            return
+        if request.ok and request.source != self._observer.name:
+            cluster = keys.thing(sample.key)
+            text = f"{cluster}: {request.op} by {request.source or 'somebody'} {arguments_text(request.args)}".strip()
+            self.log.add(Event(request.t_ns, 0, "accepted", request.source, cluster, text))
+            self._asked(cluster, text)
+
     def _on_event(self, sample: RawSample) -> None:
         try:
             event = messages.decode(keys.EVENT, sample.payload)
@@ -210,10 +240,14 @@ class ViewBuffer:
             with self._arrived:
                 self._answers[_drone(event)] += 1
                 self._arrived.notify_all()
-        if event.kind in LOST:
-            self.losses = {**self.losses, event.subject: event}
-        elif event.kind in BACK:
-            self.losses = {name: lost for name, lost in self.losses.items() if name != event.subject}
+        self.losses.note(event)
+        if event.kind in ("landing", "emergency"):
+            self.failsafes = {**self.failsafes, event.subject: event}
+        elif event.kind == "mode" and event.data.get("mode") != "emergency":
+            self.failsafes = {name: each for name, each in self.failsafes.items() if name != event.subject}
+        elif event.kind == "fault":
+            with suppress(msgspec.ValidationError):  # an event as anybody may publish it
+                self.begun.append(msgspec.convert(event.data, Fault))
         elif event.kind == "end":
             self.end = event.text
         if event.kind != "command":  # an event of a mode or of a refusal follows, with more in it
@@ -222,6 +256,22 @@ class ViewBuffer:
             self.on_own_event(event)
             if event.kind == "refused":
                 self._refused(event)
+
+
+def arguments_text(args: Mapping[str, Any]) -> str:
+    """Return the arguments of a request in words."""
+    return ", ".join(f"{name} {_value_text(value)}" for name, value in args.items())
+
+
+def _value_text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, dict):
+        return " ".join(f"{name}={_value_text(item)}" for name, item in value.items())[:120]
+    if isinstance(value, list):
+        of_figures = all(isinstance(item, int | float) for item in value)
+        return " ".join(map(_value_text, value))[:120] if of_figures else f"({len(value)})"
+    return str(value)[:120]
 
 
 def _drone(event: Event) -> str:

@@ -1,6 +1,7 @@
 """The page's panels: plots, forms and tables of one run."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import viser
@@ -10,6 +11,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition
+from zsim_bridges.console.page.control_desk import EVERY, RUN
 from zsim_bridges.console.page.formation_form import FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.page_forms import set_theme
@@ -43,7 +45,8 @@ class ConsolePage:
         flights: what plots show of single drones.
         chosen: the formation that is shown; empty where there is none.
         fleet: requests of all drones.
-        drone_folder, figure_folder, event_folder, theme_folder: of what each page has for itself.
+        control_folder, drone_folder, figure_folder, event_folder, theme_folder: of what each page has for itself.
+        parts: what a page must be in control of to use a control, by the control's id.
     """
 
     def __init__(
@@ -68,6 +71,7 @@ class ConsolePage:
         self.plots: dict[str, VariablePlots] = {}
         self.flights = flight_history([drone.name for drone in scenario.drones])
         self.chosen = next(iter(spaces), "")
+        self.parts: dict[str, str] = {}
         self._folders: dict[str, list[viser.GuiFolderHandle]] = {}
         self._set_theme(gui)
         self._right_panel(gui)
@@ -82,7 +86,9 @@ class ConsolePage:
 
     def _right_panel(self, gui: viser.GuiApi) -> None:
         self.phases = gui.add_html("")
-        self.fleet = FleetForm(gui, self._client, self._scenario)
+        self.control_folder = gui.add_folder(None)
+        with self._part(gui, EVERY):
+            self.fleet = FleetForm(gui, self._client, self._scenario)
         if len(self._spaces) > 1:
             choice = gui.add_dropdown("formation", list(self._spaces))
             choice.on_update(lambda _: self._show_formation(choice.value))
@@ -91,9 +97,11 @@ class ConsolePage:
             self._formation_tabs(gui, tabs)
         with tabs.add_tab("Faults"):
             self.faults = gui.add_html("")
-            FaultForm(gui, self._client, self._report, self._scenario, self._drones)
+            with self._part(gui, RUN):
+                FaultForm(gui, self._client, self._report, self._scenario, self._drones)
         with tabs.add_tab("Run"):
-            self.run_form = RunForm(gui, self._client, self._rate)
+            with self._part(gui, RUN):
+                self.run_form = RunForm(gui, self._client, self._rate)
             self._switches(gui)
             self.theme_folder = gui.add_folder(None)
 
@@ -103,11 +111,21 @@ class ConsolePage:
         for cluster in self._scenario.clusters:
             name, space = cluster.name, self._spaces[cluster.name]
             limits = slider_ranges(space, cluster, self._scenario)
-            with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder:
-                self.forms[name] = FormationForm(gui, self._client, self._report, cluster, space, limits)
+            with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder, self._part(gui, name):
+                form = FormationForm(gui, self._client, self._report, cluster, space, limits)
+            self.forms[name] = form
+            for control in form.safe:
+                self.parts.pop(control._impl.uuid if hasattr(control, "_impl") else "", None)
             with plots, gui.add_folder(None, visible=name == self.chosen) as plot_folder:
                 self.plots[name] = VariablePlots(gui, cluster, limits, self.flights)
             self._folders[name] = [form_folder, plot_folder]
+
+    @contextmanager
+    def _part(self, gui: viser.GuiApi, part: str) -> Iterator[None]:
+        """Note that the controls that are added meanwhile belong to a part; viser has no public way to their ids."""
+        before = set(_control_ids(gui))
+        yield
+        self.parts |= dict.fromkeys(set(_control_ids(gui)) - before, part)
 
     def _show_formation(self, chosen: str) -> None:
         self.chosen = chosen
@@ -137,3 +155,7 @@ class ConsolePage:
             self.event_folder = gui.add_folder(None)
         panel.dock_left()
         panel.set_width(PANEL_PX)
+
+
+def _control_ids(gui: viser.GuiApi) -> Collection[str]:
+    return getattr(gui, "_gui_input_handle_from_uuid", ())

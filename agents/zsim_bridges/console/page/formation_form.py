@@ -10,6 +10,7 @@ from zsim.contract.views import ViewCluster
 from zsim.scenario.scenario import Cluster, Trajectory
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.console_tables import preflight_lines
 from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals, is_held_by_fault
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables, range_refusal
@@ -28,6 +29,7 @@ from zsim_bridges.console.scene.picture import SHAPED_PHASES
 REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
+SAFE = ("hold", "land")
 LABELS = {**{op: label for label, op in OPERATIONS.items()}, "target": "sliders", "trajectory": "Trajectory"}
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
@@ -53,6 +55,9 @@ class FormationForm:
         cluster: of the scenario.
         space: of the formation.
         ranges: of its variables.
+
+    Attributes:
+        safe: the controls that a page may use without being in control.
     """
 
     def __init__(
@@ -73,7 +78,9 @@ class FormationForm:
         self._written: tuple[float, ...] | None = None  # where the waypoints begin that the console wrote
         self._edited = False
         self._controls = {op: self._button(gui, label, op) for label, op in OPERATIONS.items()}
+        self.safe = [self._controls[op] for op in SAFE]
         self._reasons = gui.add_html("")
+        self._checks = gui.add_html("")
         hint = "Duration of a move; 0: as fast as the robots' limits let it"
         self._others: list[tuple[str, Any]] = []  # further controls, each with the operation that it requests
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
@@ -96,6 +103,8 @@ class FormationForm:
             slider.lock(bool(refusals["target"]))
         shown = {op: label for op, label in LABELS.items() if op != "rejoin" or self._controls[op].visible}
         self._reasons.content = refusal_lines(shown, refusals)
+        landed = {name: run.checks[name] for name in self._cluster.drones if _is_before_takeoff(run, name)}
+        self._checks.content = preflight_lines(landed) if landed and not run.grounded() else ""
 
     def _offer_rejoin(self, run: RunCondition) -> None:
         """Let Rejoin be there only while a fault holds the formation."""
@@ -214,6 +223,10 @@ class FormationForm:
             self._report(RequestOutcome(f"{self._cluster.name}: trajectory", str(error)))
             return
         self._client.request_cluster(self._cluster.name, "trajectory", **args)
+
+
+def _is_before_takeoff(run: RunCondition, drone: str) -> bool:
+    return drone in run.checks and run.drones.get(drone) == "landed"
 
 
 def _planned_trajectory(trajectory: Trajectory) -> dict[str, Any]:

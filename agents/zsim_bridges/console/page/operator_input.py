@@ -5,8 +5,8 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from zsim.scenario.fault_kinds import FaultKind, expected, typed_rest, unstated
 from zsim.scenario.scenario import Cluster, Scenario
-from zsim.schema import yaml_file
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
 from zsim_agents.formation.variable_values import DEGREES
 
@@ -212,23 +212,28 @@ def waypoints_in_si(args: dict[str, Any], ranges: Mapping[str, SliderRange]) -> 
     return {"waypoints": points}
 
 
-def parse_parameters(text: str, names: Collection[str]) -> dict[str, Any]:
-    """Return a fault's own parameters, of `name: value, name: value`.
+def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
+    """Return the parameters and times of a fault, as they are typed behind TARGET KIND in a terminal.
+
+    Every magnitude must be stated, those too that have a default: an empty text must not strike all samples.
 
     Raises:
-        InputError: it is no such list, or names something that is not among `names`.
+        InputError: the text is no such list, names something that the kind has not, or leaves a magnitude out.
     """
-    where, allowed = f"parameters are {text[:40]!r}", "must be NAME: VALUE, NAME: VALUE, …"
+    where = f"parameters are {text[:40]!r}"
     try:
-        values = yaml_file.value("{" + text + "}")
+        values = typed_rest(text)
     except ValueError as error:
-        raise InputError(f"{where}: {error}; {allowed}") from None
-    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values) or None in values.values():
-        raise InputError(f"{where}; {allowed}")
-    for name in values:
-        if name not in names:
-            raise InputError(f"{where}; {name[:40]!r} is not known, allowed: {', '.join(names)}")
-    return values
+        raise InputError(f"{where}: {error}") from None
+    known = [p.name for p in kind.parameters]
+    for given in values:
+        if given not in (*known, "at_s", "for_s"):
+            allowed = ", ".join([*(f"{each}=VALUE" for each in known), "--at", "--for"])
+            raise InputError(f"{where}; {given[:40]!r} is not known, allowed: {allowed}")
+    missing = [f"{p.name} is missing; must be {expected(p)}" for p in unstated(kind, values)]
+    if missing:
+        raise InputError(f"{'; '.join(missing)} ({name})")
+    return {given: value for given, value in values.items() if value is not None}
 
 
 def _lines(text: str) -> list[tuple[int, str]]:

@@ -1,6 +1,9 @@
 """The controls that each page has for itself: the drone that it has chosen, and its theme."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from html import escape
+from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import viser
@@ -10,17 +13,20 @@ from zsim_bridges.console.console_tables import event_table
 from zsim_bridges.console.monitoring import event_log
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.run_condition import RunCondition
+from zsim_bridges.console.page.control_desk import RUN, ControlDesk, Holding, words
 from zsim_bridges.console.page.run_forms import DroneForm
 from zsim_bridges.console.scene.chosen_ring import ChosenRing
 from zsim_bridges.console.scene.ground_grid import draw_ground
 from zsim_bridges.console.scene.picture import Array, DronePoses
 
 ROWS_SHOWN = 60  # events
+SILENT_SHOWN_S = 3.0  # wall; pages look twice a second
 
 
 class _PageForm(NamedTuple):
     """Controls of one page."""
 
+    control: "ControlForm"
     drone: DroneForm
     ring: ChosenRing
     figures: viser.GuiHtmlHandle
@@ -34,7 +40,10 @@ class PageForms:
         server: viser's.
         client: sends requests.
         names, radii_m: of the drones.
-        drone_folder, figure_folder, event_folder, theme_folder: where they are to be.
+        desk: which page is in control.
+        part_of: returns what a page must be in control of to let a drone take off.
+        controls: what it must be in control of to use a control of all pages, by the control's id.
+        control_folder, drone_folder, figure_folder, event_folder, theme_folder: where they are to be.
     """
 
     def __init__(
@@ -43,6 +52,10 @@ class PageForms:
         client: CommandClient,
         names: list[str],
         radii_m: Array,
+        desk: ControlDesk,
+        part_of: Callable[[str], str],
+        controls: Mapping[str, str],
+        control_folder: Any,
         drone_folder: Any,
         figure_folder: Any,
         event_folder: Any,
@@ -52,7 +65,10 @@ class PageForms:
         self._client = client
         self._names = names
         self._radii_m = radii_m
-        self._folders = drone_folder, figure_folder, event_folder, theme_folder
+        self._desk = desk
+        self._part_of = part_of
+        self._controls = controls
+        self._folders = control_folder, drone_folder, figure_folder, event_folder, theme_folder
         self._forms: dict[int, _PageForm] = {}
         self._closed = False
         server.on_client_connect(self._add)
@@ -73,6 +89,10 @@ class PageForms:
         form = self._forms.get(-1 if client_id is None else client_id)
         return form.drone.chosen if form is not None else ""
 
+    def use(self, client_id: int, drone: str) -> str:
+        """Put a page in control of a drone's formation where that is free; return why it may not be."""
+        return self._may(client_id, drone, use=True)
+
     def move_rings(self, drones: DronePoses) -> None:
         """Put the ring of each page about the drone that it has chosen."""
         self._update(lambda form: form.ring.move(drones, form.drone.chosen))
@@ -87,9 +107,10 @@ class PageForms:
         """Show on each page the events that it has chosen."""
         self._update(lambda form: form.events.show(rows))
 
-    def refresh(self, run: RunCondition) -> None:
-        """Offer what would not be refused."""
+    def refresh(self, run: RunCondition, formation: str) -> None:
+        """Offer what would not be refused; show who is in control of the formation that is shown, and of the run."""
         self._update(lambda form: form.drone.refresh(run))
+        self._update(lambda form: form.control.refresh([formation, RUN] if formation else [RUN]))
 
     def _update(self, change: Callable[[_PageForm], None]) -> None:
         """Change the forms of all pages but of those that are closed just then, whose handles viser has removed."""
@@ -102,9 +123,13 @@ class PageForms:
     def _add(self, page: viser.ClientHandle) -> None:
         if self._closed:
             return
-        drone_folder, figure_folder, event_folder, theme_folder = self._folders
+        control_folder, drone_folder, figure_folder, event_folder, theme_folder = self._folders
+        self._desk.open(page.client_id)
+        with control_folder:
+            control = ControlForm(page.gui, self._desk, page.client_id, self._controls)
         with drone_folder:
-            drone = DroneForm(page.gui, self._client, self._names)
+            may = partial(self._may, page.client_id)
+            drone = DroneForm(page.gui, self._client, self._names, may)
         with figure_folder:
             figures = page.gui.add_html("")
         with event_folder:
@@ -112,12 +137,114 @@ class PageForms:
         with theme_folder:
             theme = page.gui.add_checkbox("Dark theme", False)
         theme.on_update(lambda _: _set_page_theme(page, dark=theme.value))
-        self._forms[page.client_id] = _PageForm(drone, ChosenRing(page.scene, self._radii_m), figures, events)
+        self._forms[page.client_id] = _PageForm(control, drone, ChosenRing(page.scene, self._radii_m), figures, events)
         if page.client_id not in self._server.get_clients():
             self._remove(page)  # it has disconnected meanwhile
 
     def _remove(self, page: viser.ClientHandle) -> None:
         self._forms.pop(page.client_id, None)
+        self._desk.close(page.client_id)
+
+    def _may(self, client_id: int, drone: str, use: bool) -> str:
+        """Return why a page may not let a drone take off; `use` puts it in control where it may."""
+        part = self._part_of(drone)
+        return self._desk.use(client_id, part) if use else self._desk.refusal(client_id, part)
+
+
+CONTROL_STYLE = "font-size:12px;line-height:1.35;padding:2px 10px 6px;overflow-wrap:anywhere"
+
+
+class ControlForm:
+    """Who is in control, on one page: asks for it, grants it, gives it up.
+
+    Args:
+        gui: viser's of that page, in the folder where it is to be.
+        desk: which page is in control.
+        page: viser's number of this one.
+        part_of: part of each control of all pages, by its id; viser gives the element on the page the same.
+    """
+
+    def __init__(self, gui: viser.GuiApi, desk: ControlDesk, page: int, part_of: Mapping[str, str]) -> None:
+        self._part_of = part_of
+        self._desk = desk
+        self._page = page
+        self._parts: list[str] = []
+        self._text = gui.add_html("")
+        self._buttons: list[tuple[Any, Any]] = []
+        for place in range(2):  # the formation that is shown, and the run
+            first, second = gui.add_button("Ask", visible=False), gui.add_button("Keep", visible=False, color="gray")
+            first.on_click(lambda _, place=place: self._press(place))
+            second.on_click(lambda _, place=place: self._answer(place, granted=False))
+            self._buttons.append((first, second))
+
+    def refresh(self, parts: list[str]) -> None:
+        """Show who is in control of some parts."""
+        self._parts = parts
+        holdings, others = self._desk.holdings(self._page, parts), self._desk.others(self._page)
+        here = f"you are {escape(self._desk.name_of(self._page))}"
+        lines = [f"<b>Control</b>: {here}, alone here"]
+        if others:
+            lines = [f"<b>Control</b>: {here}; also here: {escape(', '.join(others))}", *map(_holding_line, holdings)]
+        content = f"<div style='{CONTROL_STYLE}'>{'<br>'.join(lines)}</div>{self._greyed()}"
+        if self._text.content != content:
+            self._text.content = content
+        for (first, second), holding in zip_longest(self._buttons, holdings):
+            label, asked = _offer(holding) if others else ("", False)
+            _show_button(first, label)
+            _show_button(second, f"Keep {words(holding.part)}" if holding and asked else "")
+
+    def _greyed(self) -> str:
+        """Return the style that greys out, on this page, the controls of what others are in control of."""
+        held = self._desk.held_by_others(self._page)
+        rules = ",".join(f'[id="{control}"]' for control, part in self._part_of.items() if part in held)
+        return f"<style>{rules}{{opacity:.35}}</style>" if rules else ""
+
+    def _press(self, place: int) -> None:
+        for holding in self._desk.holdings(self._page, self._parts[place : place + 1]):
+            if not holding.mine:
+                self._desk.ask(self._page, holding.part)
+            elif holding.asker:
+                self._answer(place, granted=True)
+            else:
+                self._desk.release(self._page, holding.part)
+        self.refresh(self._parts)
+
+    def _answer(self, place: int, granted: bool) -> None:
+        for part in self._parts[place : place + 1]:
+            self._desk.answer(self._page, part, granted)
+        self.refresh(self._parts)
+
+
+def _holding_line(holding: Holding) -> str:
+    name = escape(words(holding.part))
+    if not holding.holder:
+        return f"{name}: free"
+    silent = f", silent for {holding.silent_s:.0f} s" if holding.silent_s > SILENT_SHOWN_S else ""
+    who = "<b>you</b>" if holding.mine else f"<b>{escape(holding.holder)}</b>{silent}"
+    asked = ""
+    if holding.asked_by_me:
+        asked = "; you have asked for it"
+    elif holding.asker:
+        asked = f"; <b>{escape(holding.asker)} asks for it</b>"
+    return f"{name}: {who}{asked}"
+
+
+def _offer(holding: Holding | None) -> tuple[str, bool]:
+    """Return the label of the first button of a part, empty for none, and whether somebody asks this page for it."""
+    if holding is None or not holding.holder or holding.asked_by_me:
+        return "", False
+    if not holding.mine:
+        return f"Ask for {words(holding.part)}", False
+    if holding.asker:
+        return f"Give {words(holding.part)} to {holding.asker}", True
+    return f"Release {words(holding.part)}", False
+
+
+def _show_button(button: Any, label: str) -> None:
+    if label and button.label != label:
+        button.label = label
+    if button.visible != bool(label):
+        button.visible = bool(label)
 
 
 class EventForm:

@@ -8,11 +8,18 @@ import viser
 
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX
-from zsim.scenario.fault_kinds import PROCESS_KILL, ROTORS, FaultKind, kinds_of
+from zsim.scenario.fault_kinds import PROCESS_KILL, ROTORS, FaultKind, expected, kinds_of, unstated
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
-from zsim_bridges.console.monitoring.run_condition import RunCondition, drone_refusals, fleet_refusals, run_refusals
+from zsim_bridges.console.console_tables import preflight_lines
+from zsim_bridges.console.monitoring.run_condition import (
+    RunCondition,
+    drone_refusals,
+    fleet_refusals,
+    preflight_refusal,
+    run_refusals,
+)
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import range_refusal
 
@@ -21,11 +28,20 @@ REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px
 
 LIMITS_STYLE = "font-size:11px;line-height:1.2;color:#868e96;padding:0 12px 4px;text-align:right"
 HELD_HINT = "hold it for 0.6 s, by hand or by Space or Enter"  # as long as HOLD_MS of orders.html
-DURATION_S, DURATION_MAX_S = 30.0, 1e5  # of a fault, unless another time is typed; longer than any run
-WEAK_THRUST_SHARE = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
-GUST_M_S = (4.0, 0.0, 0.0)  # about what the drones of the formation can still hold against
-LOSS_PROBABILITY = 0.3
-TIME_PARAMETERS = ("at_s", "for_s")  # s, simulated; of any fault, beside its own parameters
+DURATION_MAX_S = 1e5  # of a fault; longer than any run
+DURATION_S = 30.0  # of a fault, unless another time is typed
+FIXES_LOST_PERCENT = 100.0
+THRUST_LEFT_PERCENT = 70.0  # of a weak motor: less, and the aircraft cannot be held level
+GUST_M_S = 4.0  # about what the drones of the formation can still hold against
+MESSAGES_LOST_PERCENT = 30.0
+STRIKES = {
+    "drone": "a drone",
+    "world": "the world, so all drones",
+    "link": "the messages between two processes A/B; the radio of a drone is the kind radio",
+    "radio": "the radio between drones and others: the world's, or a formation's",
+    "process": "a process",
+}
+"""What the target of a kind is, in words."""
 
 
 class FaultForm:
@@ -56,30 +72,57 @@ class FaultForm:
         hint = "0: until it is cleared"
         self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=DURATION_MAX_S, step=1.0, hint=hint)
         gui.add_html(limits_line(f"for: 0 to {DURATION_MAX_S:g} s; {hint}"))
-        self._button(gui, "GPS lost", lambda: self._on_drone("gps_dropout"))
-        self._button(gui, "Motor weak", self._weaken)
-        self._button(gui, "Gust", lambda: self._add("gust", "world", velocity_m_s=list(GUST_M_S)))
-        self._button(
-            gui, "Link loss", lambda: self._add("link_loss", f"world/{self._estimator()}", probability=LOSS_PROBABILITY)
-        )
-        self._button(gui, "Kill estimator", lambda: self._add(PROCESS_KILL, self._estimator()))
+        share: dict[str, Any] = {"min": 0.0, "max": 100.0, "step": 1.0}
+        self._fixes = gui.add_number("fixes lost [%]", FIXES_LOST_PERCENT, **share)
+        self._button(gui, "GPS lost")
+        self._thrust = gui.add_number("thrust left [%]", THRUST_LEFT_PERCENT, **share)
+        self._button(gui, "Motor weak")
+        self._gust = gui.add_number("gust [m/s]", GUST_M_S, min=-100.0, max=100.0, step=0.5, hint="to the east")
+        self._button(gui, "Gust")
+        self._messages = gui.add_number("msgs lost [%]", MESSAGES_LOST_PERCENT, **share)
+        self._button(gui, "Messages lost")
+        self._button(gui, "Kill estimator")
+        self._strikes = gui.add_html("")
+        for control in (self._drone, self._fixes, self._thrust, self._gust, self._messages):
+            control.on_update(lambda _: self._describe())
+        self._describe()
         self._any_fault(gui, names)
         gui.add_button("Clear all faults", color="green").on_click(lambda _: client.request_world("fault_clear"))
 
-    def _button(self, gui: viser.GuiApi, label: str, act: Callable[[], None]) -> None:
-        gui.add_button(label, color="orange").on_click(lambda _: act())
+    def _button(self, gui: viser.GuiApi, label: str) -> None:
+        gui.add_button(label, color="orange").on_click(lambda _: self._add(*self._common()[label][:3]))
 
-    def _estimator(self) -> str:
-        return f"estimator.{self._drone.value}"
+    def _common(self) -> dict[str, tuple[str, str, dict[str, Any], str]]:
+        """Return the common faults by their button: kind, target, parameters, and what they strike in words."""
+        drone = self._drone.value
+        rotor = (self._rotors.get(drone) or ROTORS)[0]
+        fixes, thrust, gust, messages = (
+            float(each.value) for each in (self._fixes, self._thrust, self._gust, self._messages)
+        )
+        link = f"world/estimator.{drone}"
+        return {
+            "GPS lost": ("gps_dropout", drone, {"probability": fixes / 100}, f"{fixes:g} % of the fixes of {drone}"),
+            "Motor weak": (
+                "rotor_efficiency",
+                drone,
+                {"rotor": rotor, "value": thrust / 100},
+                f"rotor {rotor} of {drone}: {thrust:g} % of its thrust is left",
+            ),
+            "Gust": ("gust", "world", {"velocity_m_s": [gust, 0.0, 0.0]}, f"all drones: {gust:g} m/s to the east"),
+            "Messages lost": (
+                "link_loss",
+                link,
+                {"probability": messages / 100},
+                f"{messages:g} % of the messages between the processes {link.replace('/', ' and ')}; no radio",
+            ),
+            "Kill estimator": (PROCESS_KILL, f"estimator.{drone}", {}, f"process estimator.{drone}, as by kill -9"),
+        }
 
-    def _weaken(self) -> None:
-        rotors = self._rotors.get(self._drone.value) or ROTORS
-        self._on_drone("rotor_efficiency", rotor=rotors[0], value=WEAK_THRUST_SHARE)
+    def _describe(self) -> None:
+        lines = (f"<b>{escape(label)}</b>: {escape(each[3])}" for label, each in self._common().items())
+        self._strikes.content = f"<div style='{REASON_STYLE}'>{'<br>'.join(lines)}</div>"
 
-    def _on_drone(self, kind: str, **parameters: Any) -> None:
-        self._add(kind, self._drone.value, **parameters)
-
-    def _add(self, kind: str, target: str, **parameters: Any) -> None:
+    def _add(self, kind: str, target: str, parameters: Mapping[str, Any]) -> None:
         lasts_s, lasts = float(self._for.value), self._kinds[kind].lasts != "once" and "for_s" not in parameters
         refusal = range_refusal("for", lasts_s, 0.0, DURATION_MAX_S, "s") if lasts else None
         if refusal:
@@ -91,29 +134,54 @@ class FaultForm:
     def _any_fault(self, gui: viser.GuiApi, names: list[str]) -> None:
         with gui.add_folder("Any fault", expand_by_default=False):
             kind = gui.add_dropdown("kind", list(self._kinds))
-            target = gui.add_text("target", names[0], hint="drone, world, process, or link A/B")
-            help_ = gui.add_markdown(_help(self._kinds[kind.value]))
-            text = gui.add_text("parameters", "", hint="NAME: VALUE, NAME: VALUE, …; at_s and for_s too")
-            kind.on_update(lambda _: setattr(help_, "content", _help(self._kinds[kind.value])))
+            help_ = gui.add_markdown("")
+            target = gui.add_text("target", "", hint="as the kind asks; a link of processes is A/B")
+            text = gui.add_text(
+                "parameters", "", hint="as in `zsim fault add TARGET KIND …`: NAME=VALUE … --for 10s --at 40s"
+            )
+
+            def choose() -> None:
+                chosen = self._kinds[kind.value]
+                help_.content = _help(chosen)
+                target.value = _example_target(chosen, self._drone.value)
+                text.value = _example_parameters(chosen)
+
+            kind.on_update(lambda _: choose())
+            choose()
             gui.add_button("Inject it", color="orange").on_click(
                 lambda _: self._inject(kind.value, target.value, text.value)
             )
 
     def _inject(self, kind: str, target: str, text: str) -> None:
         try:
-            parameters = operator_input.parse_parameters(
-                text, [*TIME_PARAMETERS, *(p.name for p in self._kinds[kind].parameters)]
-            )
+            parameters = operator_input.parse_fault(text, kind, self._kinds[kind])
         except operator_input.InputError as error:
             self._report(RequestOutcome("fault_add", str(error)))
             return
-        self._add(kind, target.strip(), **parameters)
+        self._add(kind, target.strip(), parameters)
+
+
+def _example_target(kind: FaultKind, drone: str) -> str:
+    """Return a target that a kind may have, for a drone."""
+    estimator = f"estimator.{drone}"
+    targets = {"drone": drone, "link": f"world/{estimator}", "process": estimator}
+    return targets.get(kind.strikes, "world")
+
+
+def _example_parameters(kind: FaultKind) -> str:
+    """Return the magnitudes of a kind as they are typed, with their defaults; to be filled in where there is none."""
+    return " ".join(f"{p.name}={'' if p.default is None else p.default}" for p in unstated(kind, {}))
 
 
 def _help(fault: FaultKind) -> str:
-    """Return a kind's effect and parameters."""
-    lines = [f"`{p.name}` {p.description}{f' [{p.unit}]' if p.unit else ''}" for p in fault.parameters]
-    return f"<sub>{fault.description}; strikes a {fault.strikes}. {'; '.join(lines)}</sub>"
+    """Return a kind's effect, what it strikes, and its parameters with their limits."""
+    stated = unstated(fault, {})
+    lines = [
+        f"`{p.name}` {p.description}: {expected(p)}{'' if p in stated else ' (may be left out)'}"
+        for p in fault.parameters
+    ]
+    strikes = f"{fault.description}; strikes {STRIKES[fault.strikes]}."
+    return f"<sub>{' '.join([strikes, '; '.join(lines)])}</sub>"
 
 
 def limits_line(text: str) -> str:
@@ -267,7 +335,7 @@ class FleetForm:
 
     def __init__(self, gui: viser.GuiApi, client: CommandClient, scenario: Scenario) -> None:
         self._client = client
-        self._formations = [cluster.name for cluster in scenario.clusters]
+        self._formations = {cluster.name: cluster.drones for cluster in scenario.clusters}
         in_formation = {name for cluster in scenario.clusters for name in cluster.drones}
         self._drones = [drone.name for drone in scenario.drones]
         self._single = [name for name in self._drones if name not in in_formation]
@@ -294,13 +362,17 @@ class FleetForm:
         if operation == "reset":
             self._client.send_mode([d for d in self._drones if self._run.drones.get(d) == "emergency"], operation)
         else:
+            fit = {name: not preflight_refusal(self._run, drones) for name, drones in self._formations.items()}
             for name in self._formations:
-                self._client.request_cluster(name, operation)
-            if self._single:
-                self._client.send_mode(self._single, operation)
+                if operation != "takeoff" or fit[name]:
+                    self._client.request_cluster(name, operation)
+            single = [d for d in self._single if operation != "takeoff" or not preflight_refusal(self._run, [d])]
+            if single:
+                self._client.send_mode(single, operation)
 
 
 DRONE_MODES = {"takeoff": "Take off", "land": "Land", "emergency": "Emergency", "reset": "Reset"}
+IN_CONTROL = ("takeoff", "reset")  # modes that need control; anybody may land a drone, or stop it
 DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "reset": viser.Icon.REFRESH}
 
 
@@ -311,12 +383,22 @@ class DroneForm:
         gui: viser's of that page, in the folder where they are to be.
         client: sends requests.
         names: of the drones.
+        may: returns why this page may not let a drone take off or reset it, empty where it may; where it is asked in
+            order to do so, that puts the page in control.
 
     Attributes:
         choice: the control that chooses it.
     """
 
-    def __init__(self, gui: viser.GuiApi, client: CommandClient, names: Sequence[str]) -> None:
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        client: CommandClient,
+        names: Sequence[str],
+        may: Callable[[str, bool], str] = lambda *_: "",
+    ) -> None:
+        self._client = client
+        self._may = may
         self.choice = gui.add_dropdown("drone", list(names))
         self._buttons: dict[str, Any] = {}
         for mode, label in DRONE_MODES.items():
@@ -325,7 +407,7 @@ class DroneForm:
                 self._buttons[mode] = OrderButton(gui, f"{label} {self.chosen}", mode, of, held=held)
                 continue
             button = gui.add_button(f"{label} {self.chosen}", icon=DRONE_ICONS[mode], color="gray")
-            button.on_click(lambda _, mode=mode: client.send_mode([self.chosen], mode))
+            button.on_click(lambda _, mode=mode: self._send(mode))
             self._buttons[mode] = button
         self._reasons = gui.add_html("")
         self._run = RunCondition()
@@ -344,8 +426,16 @@ class DroneForm:
         """Offer what would not be refused."""
         self._run = run
         refusals = {**drone_refusals(run, self.chosen), **order_refusals(drone_refusals(heard(run), self.chosen))}
+        for mode in IN_CONTROL:
+            refusals[mode] = refusals[mode] or self._may(self.chosen, False)
         set_refusals(self._buttons, refusals)
-        self._reasons.content = refusal_lines(DRONE_MODES, refusals)
+        checks = run.checks.get(self.chosen, ()) if run.drones.get(self.chosen) == "landed" else ()
+        shown = preflight_lines({self.chosen: checks}) if checks and not run.grounded() else ""
+        self._reasons.content = refusal_lines(DRONE_MODES, refusals) + shown
+
+    def _send(self, mode: str) -> None:
+        if mode not in IN_CONTROL or not self._may(self.chosen, True):
+            self._client.send_mode([self.chosen], mode)
 
     def _rename(self) -> None:
         for mode, button in self._buttons.items():

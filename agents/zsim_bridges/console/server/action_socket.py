@@ -52,6 +52,7 @@ class ActionSockets:
         self._cameras = cameras
         self._record = record
         self._flying = flying
+        self._keys: dict[Any, str] = {}  # of the page at each socket
 
     async def respond(self, request: web.Request, role: str) -> web.StreamResponse:
         """Answer a request for a socket; return when it has closed."""
@@ -73,6 +74,7 @@ class ActionSockets:
 
     def lose(self, page: Any) -> None:
         """Note that a page's socket is closed: what it flies hovers."""
+        self._keys.pop(page, None)
         flying = self._flying()
         if flying is not None:
             flying.control.lose(page)
@@ -91,6 +93,8 @@ class ActionSockets:
             return None
         if isinstance(action, PlayRecord | FlyDrone):
             return self._operate(action, page) if role == OPERATOR else None
+        if isinstance(action, LookAtPlan) and page is not None:
+            self._keys[page] = action.page
         return self._look(action)
 
     def _look(self, action: LookFrom | LookAtPlan | ChooseDrone) -> Answer:
@@ -110,7 +114,14 @@ class ActionSockets:
             if record is not None:
                 record.play(action.op, action.value)
             return {}
-        return {} if flying is None else {"flight": _fly(flying.control, page, action)._asdict()}
+        if flying is None:
+            return {}
+        if isinstance(action, TakeDrone):
+            client_id = self._client_id(self._keys.get(page, "")) if page is not None else None
+            refusal = flying.take_refusal(client_id, action.drone)
+            if refusal:
+                return {"flight": FlightAnswer(action.drone, text=refusal)._asdict()}
+        return {"flight": _fly(flying.control, page, action)._asdict()}
 
 
 def _fly(control: ManualFlight, page: Any, action: FlyDrone) -> FlightAnswer:

@@ -24,6 +24,7 @@ from zsim_bridges.web.web_server import ANY_PORT, ServedSite, open_on_thread, st
 MESSAGE_MAX = 100_000  # bytes of one message of a page
 BACKEND_HOST = "127.0.0.1"  # where viser listens
 PAGE_HEADER = "X-Zsim-Page"  # a page's name: no page of another site can send it without asking first
+CLIENT_HEADER = "X-Zsim-Client"  # the key that the page was given, by which viser's number of it is known
 COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has what it keeps of a console that leaves
 SECRET_HEADER = "X-Zsim-Console"  # which viser's server asks for
 ALL_ADDRESSES = ("0.0.0.0", "::")
@@ -70,6 +71,7 @@ class ViserBackend(NamedTuple):
         head: returns what the head of the page shows, as plain data.
         command: takes an order; returns what has become of it so far, as plain data with its `state` and `reason`.
         files: what the run leaves behind.
+        looked: called with the key of a page that lives, its role, and the address that it is at.
     """
 
     port: int
@@ -81,6 +83,7 @@ class ViserBackend(NamedTuple):
     head: Callable[[], dict[str, Any]]
     command: Callable[[OrderRequest], dict[str, Any]]
     files: RunFiles
+    looked: Callable[[str, str, str], None] = lambda *_: None
 
 
 class HttpProxy:
@@ -179,6 +182,9 @@ class HttpProxy:
 
     async def _head(self, request: web.Request) -> web.Response:
         look = request.headers.get(PAGE_HEADER, ""), COPIED_HEADER in request.headers
+        key, role = request.headers.get(CLIENT_HEADER, ""), self._tokens.role_of(_page_request(request))
+        if key and role:
+            self._backend.looked(key, role, request.remote or "")
         return self._answer(request, lambda: {**self._backend.head(), **self._backend.files.shown(*look)})
 
     def _answer(self, request: web.Request, shown: Callable[[], dict[str, Any]]) -> web.Response:

@@ -11,6 +11,7 @@ from typing import Any
 import viser
 import viser.infra._infra
 import websockets.asyncio.server
+from viser._messages import GuiUpdateMessage
 from viser.infra._async_message_buffer import AsyncMessageBuffer
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
@@ -44,18 +45,26 @@ class _Buffer(AsyncMessageBuffer):
 viser.infra._infra.AsyncMessageBuffer = _Buffer  # type: ignore[misc]
 
 
+Permits = Callable[[int, str], bool]
+"""Returns whether a page, by viser's number of it, may use a control of all pages, by its id."""
+
+
 class PrivateViser:
     """A viser server on a port of loopback that refuses connections without the secret.
+
+    Args:
+        permits: a use that it does not permit changes nothing, and the page shows the value of before again.
 
     Attributes:
         server: viser's.
         secret: to be sent in SECRET_HEADER.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, permits: Permits = lambda *_: True) -> None:
         self.secret = secrets.token_urlsafe(24)
         with _silent(), _requiring_secret(self.secret):
             self.server = viser.ViserServer(host=BACKEND_HOST, port=0, verbose=False)
+        _guard_controls(self.server, permits)
 
     @property
     def port(self) -> int:
@@ -65,6 +74,24 @@ class PrivateViser:
         """Stop it."""
         with _silent():
             self.server.stop()
+
+
+def _guard_controls(server: viser.ViserServer, permits: Permits) -> None:
+    """Look at each use of a control before viser does: it shares controls, and cannot refuse one to a page."""
+    handle_update, pages = server.gui._handle_gui_updates, server.gui._websock_interface
+
+    async def guarded(client_id: Any, message: GuiUpdateMessage) -> None:
+        if permits(client_id, message.uuid):
+            await handle_update(client_id, message)
+            return
+        control: Any = server.gui._gui_input_handle_from_uuid.get(message.uuid)
+        page = server.get_clients().get(client_id)
+        if control is not None and page is not None and not control._impl.is_button:
+            before = GuiUpdateMessage(message.uuid, {"value": control.value})
+            page.gui._websock_interface.queue_message(before)
+
+    pages.unregister_handler(GuiUpdateMessage, handle_update)
+    pages.register_handler(GuiUpdateMessage, guarded)
 
 
 @contextlib.contextmanager

@@ -352,16 +352,6 @@ def test_waypoints_are_read():
     }
 
 
-def test_parameters_are_read():
-    names = ("rotor", "value", "velocity_m_s")
-    assert operator_input.parse_parameters("rotor: all, value: 1e3, velocity_m_s: [1, 2, 3]", names) == {
-        "rotor": "all",
-        "value": 1000.0,
-        "velocity_m_s": [1, 2, 3],
-    }
-    assert operator_input.parse_parameters("", names) == {}
-
-
 @pytest.mark.parametrize(
     ("text", "terms"),
     [
@@ -380,29 +370,6 @@ def test_an_invalid_expression_is_refused_by_line_and_value(text: str, terms: tu
 def test_a_waypoint_that_is_none_is_refused_in_words(text: str):
     with pytest.raises(operator_input.InputError):
         operator_input.parse_waypoints(text)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "value",
-        "value: [",
-        "1: 2",
-        "value:",
-        "value: 1, value: 2",
-        "value: &a 1, b: *a",
-        "[" * 2000,
-    ],
-    ids=lambda text: text[:20],
-)
-def test_parameters_that_are_none_are_refused_in_words(text: str):
-    with pytest.raises(operator_input.InputError, match="parameters"):
-        operator_input.parse_parameters(text, ("value",))
-
-
-def test_a_parameter_that_is_not_known_is_refused_by_its_name():
-    with pytest.raises(operator_input.InputError, match=r"'target'.*at_s, value"):
-        operator_input.parse_parameters("value: 2, target: drone2", ("at_s", "value"))
 
 
 # Who may pass
@@ -599,9 +566,9 @@ def test_many_formations_leave_room_for_the_emergency_button():
 
 def test_acting_faults_are_listed():
     assert console_tables.NO_FAULT in console_tables.fault_lines([])
-    lines = console_tables.fault_lines(["gust of world", "link_cut of a/<b>"])
-    assert "gust of world<br>" in lines
-    assert "link_cut of a/&lt;b&gt;" in lines
+    lines = console_tables.fault_lines(["gust of world", "link_cut of a/<b>"], ["gps_stuck of drone1"])
+    assert has_terms(without_tags(lines), "gust of world", "link_cut of a/&lt;b&gt;", "over", "gps_stuck of drone1")
+    assert "<b>" not in lines
 
 
 # Where it is

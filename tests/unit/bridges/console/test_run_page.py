@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from refused import has_terms
+from refused import has_terms, without_tags
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import DroneInfo, RotorInfo
@@ -18,6 +18,7 @@ from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
+from zsim_bridges.console.monitoring.run_condition import drone_refusals
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.orders import OrderRequest
 from zsim_bridges.console.run_page import RunPage
@@ -314,13 +315,88 @@ def test_an_emergency_is_in_the_head_of_the_page(seen: Seen):
     assert all(alarm["acknowledged"] for alarm in seen.show.head()["alarms"])
 
 
-def test_the_death_of_a_process_is_an_alarm_until_it_is_back(seen: Seen):
+def happen(seen: Seen, kind: str, subject: str, **data: Any) -> None:
+    event = Event(0, 0, kind, "world", subject, f"{subject}: {kind}", data)
+    seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
+
+
+def alarmed(seen: Seen) -> list[tuple[Any, ...]]:
+    """Return the alarms in the head: subject, name, whether it is over."""
+    return [(each["subject"], each["name"], each["over_s"] is not None) for each in seen.show.head()["alarms"]]
+
+
+def test_the_death_of_a_process_is_an_alarm_until_it_is_back_and_acknowledged(seen: Seen):
     seen.draw(drones(*NAMES))
-    for kind, alarmed in (("death", ["recorder"]), ("restart", [])):
-        event = Event(0, 0, kind, "world", "recorder", f"recorder: {kind}")
-        seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
+    for kind, is_over in (("death", False), ("drop", False), ("restart", True)):
+        happen(seen, kind, "recorder")
         seen.draw(drones(*NAMES))
-        assert [alarm["subject"] for alarm in seen.show.head()["alarms"]] == alarmed
+        assert alarmed(seen) == [("recorder", "dead", is_over)]
+    seen.show.command("acknowledge")
+    assert alarmed(seen) == []
+
+
+def test_a_world_that_was_silent_is_an_alarm_until_it_is_acknowledged(seen: Seen, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(TimeMonitor, "silent_s", 12.0)
+        seen.draw(drones(*NAMES))
+        assert alarmed(seen) == [("world", "silent", False)]
+    seen.draw(drones(*NAMES))
+    assert alarmed(seen) == [("world", "silent", True)]
+
+
+def test_alarms_of_later_times_are_forgotten_by_a_replay_that_goes_back(seen: Seen):
+    seen.draw(drones(*NAMES, t_ns=40_000_000))
+    happen(seen, "death", "recorder")
+    seen.draw(drones(*NAMES, t_ns=60_000_000))
+    assert alarmed(seen)
+    seen.draw(drones(*NAMES, t_ns=20_000_000))
+    assert alarmed(seen) == []
+
+
+def flown(change: dict[str, Any], of: str = NAMES[1]) -> tuple[str, ViewDrones]:
+    """Return a view of the triangle with one drone changed."""
+    key, view = drones(*NAMES)
+    changed = (msgspec.structs.replace(each, **(change if each.name == of else {})) for each in view.drones)
+    return key, msgspec.structs.replace(view, drones=tuple(changed))
+
+
+def test_a_formation_with_a_drone_flown_by_hand_is_not_told_to_be_engaged_alone(seen: Seen):
+    key, view = flown({"commander": "console.run"})
+    led = (
+        each if each.commander else msgspec.structs.replace(each, commander="controller.main") for each in view.drones
+    )
+    seen.draw((key, msgspec.structs.replace(view, drones=tuple(led))), cluster())
+    assert alarmed(seen) == [(CLUSTER, "not flown whole", False)]
+    for told in (seen.show.head()["detail"], seen.show._page.phases.content):
+        assert has_terms(without_tags(told), "engaged", NAMES[1], "console.run")
+
+
+def test_a_drone_that_lands_by_itself_tells_why_until_it_is_commanded(seen: Seen):
+    seen.draw(drones(*NAMES))
+    happen(seen, "landing", NAMES[1], cause="battery")
+    seen.draw(flown({"state": "landing"}), cluster())
+    assert alarmed(seen) == [(NAMES[1], "lands by itself", False)]
+    cause = f"{NAMES[1]}: landing"
+    assert cause in seen.show.head()["detail"]
+    assert cause in seen.show._page.drones.content
+    seen.draw(flown({"state": "landed"}), cluster())
+    assert cause in seen.show._page.drones.content
+    happen(seen, "mode", NAMES[1], mode="takeoff")
+    seen.draw(flown({"state": "flying"}), cluster())
+    assert cause not in seen.show._page.drones.content + seen.show.head()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("change", "terms"),
+    [({"battery_percent": 2.0}, ("2 %",)), ({"orientation_wxyz": (0.0, 1.0, 0.0, 0.0)}, ("180°",))],
+)
+def test_no_take_off_of_a_drone_that_is_empty_or_on_its_back(
+    seen: Seen, change: dict[str, Any], terms: tuple[str, ...]
+):
+    seen.draw(flown({"state": "landed", **change}))
+    refusal = drone_refusals(seen.show._monitor.condition, NAMES[1])["takeoff"]
+    assert has_terms(refusal, NAMES[1], *terms)
+    assert any(each[0] == NAMES[1] for each in alarmed(seen))
 
 
 def test_accepted_and_done_are_told_apart(seen: Seen):

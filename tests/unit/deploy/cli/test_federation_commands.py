@@ -13,7 +13,7 @@ from zsim.contract.run_messages import Fault
 from zsim.errors import SessionError
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_check import COMMON
-from zsim.scenario.fault_kinds import KINDS
+from zsim.scenario.fault_kinds import KINDS, OPTION_OF
 from zsim.transport.session import Session
 from zsim_deploy.cli import federation_commands
 from zsim_deploy.cli.federation_commands import row, seconds, selector
@@ -79,7 +79,7 @@ def test_what_is_no_parameter(text: str):
 def test_what_is_given_elsewhere_or_twice_is_no_parameter(given: list[str], terms: tuple[str, ...]):
     with refused(typer.BadParameter, *terms):
         federation_commands._values(given)
-    assert set(federation_commands.OPTION_OF) == set(COMMON)
+    assert set(OPTION_OF) == set(COMMON)
 
 
 @pytest.mark.parametrize("value", [10**20, [0, 10**24], {10**20: 1}, "\udcff"], ids=ascii)

@@ -9,10 +9,11 @@ from typing import Any
 
 import msgspec
 import pytest
-from refused import has_terms
+from refused import has_terms, without_tags
 
 from zsim.contract.views import ViewCluster
 from zsim.scenario import scenario_file
+from zsim.scenario.fault_check import Known, flaws
 from zsim.scenario.fault_kinds import KINDS
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.engagement_setup import gains_of
@@ -26,9 +27,6 @@ from zsim_bridges.console.page.formation_form import OPERATIONS, REST_S, Formati
 from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.run_forms import (
     DURATION_S,
-    GUST_M_S,
-    LOSS_PROBABILITY,
-    WEAK_THRUST_SHARE,
     DroneForm,
     FaultForm,
     FleetForm,
@@ -516,37 +514,44 @@ def test_waypoints_stand_still_in_the_noise_of_an_estimate_and_end_where_the_for
 
 
 @pytest.mark.parametrize(
-    ("label", "asked"),
+    ("label", "magnitude", "asked"),
     [
-        ("GPS lost", {"kind": "gps_dropout", "target": "drone2", "for_s": DURATION_S}),
+        ("GPS lost", ("fixes lost [%]", 40.0), ("gps_dropout", "drone2", {"probability": 0.4})),
         (
             "Motor weak",
-            {
-                "kind": "rotor_efficiency",
-                "target": "drone2",
-                "for_s": DURATION_S,
-                "rotor": "front_left",
-                "value": WEAK_THRUST_SHARE,
-            },
+            ("thrust left [%]", 80.0),
+            ("rotor_efficiency", "drone2", {"rotor": "front_left", "value": 0.8}),
         ),
-        ("Gust", {"kind": "gust", "target": "world", "for_s": DURATION_S, "velocity_m_s": list(GUST_M_S)}),
+        ("Gust", ("gust [m/s]", -6.0), ("gust", "world", {"velocity_m_s": [-6.0, 0.0, 0.0]})),
         (
-            "Link loss",
-            {
-                "kind": "link_loss",
-                "target": "world/estimator.drone2",
-                "for_s": DURATION_S,
-                "probability": LOSS_PROBABILITY,
-            },
+            "Messages lost",
+            ("msgs lost [%]", 25.0),
+            ("link_loss", "world/estimator.drone2", {"probability": 0.25}),
         ),
-        ("Kill estimator", {"kind": "process_kill", "target": "estimator.drone2"}),
+        ("Kill estimator", None, ("process_kill", "estimator.drone2", {})),
     ],
 )
-def test_a_common_fault_strikes_the_chosen_drone(bench: Bench, label: str, asked: dict[str, Any]):
-    bench.faults()
-    bench.gui.at["drone"].value = "drone2"
+def test_a_common_fault_strikes_what_it_says_with_its_magnitude(
+    bench: Bench, label: str, magnitude: tuple[str, float] | None, asked: tuple[str, str, dict[str, Any]]
+):
+    form = FaultForm(bench.gui, bench.client, bench.outcomes.append, bench.scenario)
+    bench.gui.at["drone"].put("drone2")
+    if magnitude:
+        bench.gui.at[magnitude[0]].put(magnitude[1])
     bench.gui.press(label)
-    assert bench.client.asked == [("world", "fault_add", asked)]
+    kind, target, parameters = asked
+    lasting = {} if kind == "process_kill" else {"for_s": DURATION_S}
+    assert bench.client.asked == [("world", "fault_add", {"kind": kind, "target": target, **lasting, **parameters})]
+    told = without_tags(form._strikes.content.replace("<br>", "\n"))
+    struck = "drones" if target == "world" else target.rpartition("/")[2]
+    assert has_terms(told, label, struck)
+    assert magnitude is None or has_terms(told, label, f"{magnitude[1]:g}")
+
+
+def test_a_link_of_processes_is_not_called_a_radio(bench: Bench):
+    form = FaultForm(bench.gui, bench.client, bench.outcomes.append, bench.scenario)
+    told = without_tags(form._strikes.content.replace("<br>", "\n"))
+    assert has_terms(told, "Messages lost", "processes", "world", "estimator.drone1", "no radio")
 
 
 def test_a_fault_of_no_duration_lasts_until_it_is_cleared(bench: Bench):
@@ -554,52 +559,84 @@ def test_a_fault_of_no_duration_lasts_until_it_is_cleared(bench: Bench):
     bench.gui.at["for [s]"].value = 0.0
     bench.gui.press("GPS lost")
     bench.gui.press("Clear all faults")
-    lasting = {"kind": "gps_dropout", "target": bench.names[0]}
+    lasting = {"kind": "gps_dropout", "target": bench.names[0], "probability": 1.0}
     assert bench.client.asked == [("world", "fault_add", lasting), ("world", "fault_clear", {})]
 
 
-def test_any_fault_is_injected_with_what_was_typed(bench: Bench):
+def test_any_fault_is_injected_as_it_is_typed_in_a_terminal(bench: Bench):
     bench.faults()
-    bench.gui.at["kind"].put("baro_bias")
+    bench.gui.at["kind"].put("accel_bias")
     bench.gui.at["target"].value = " drone3 "
-    bench.gui.at["parameters"].value = "value_m: 2.5"
+    bench.gui.at["parameters"].value = "value_m_s2=[0.5, 0, 0] --for 5s --at=2min"
     bench.gui.press("Inject it")
-    asked = {"kind": "baro_bias", "target": "drone3", "for_s": DURATION_S, "value_m": 2.5}
+    asked = {"kind": "accel_bias", "target": "drone3", "value_m_s2": [0.5, 0, 0], "for_s": 5.0, "at_s": 120.0}
     assert bench.client.asked == [("world", "fault_add", asked)]
 
 
-def test_a_time_among_the_parameters_is_the_one_that_is_sent(bench: Bench):
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_a_kind_that_is_chosen_has_a_target_that_it_may_strike_and_its_magnitudes_stated(bench: Bench, kind: str):
     bench.faults()
-    bench.gui.at["parameters"].value = "for_s: 5, at_s: 40"
+    bench.gui.at["kind"].put(kind)
+    target, text = bench.gui.at["target"].value, bench.gui.at["parameters"].value
+    known = Known(bench.names, ("main",), tuple(f"estimator.{name}" for name in bench.names))
+    missing = {path for path, _ in flaws({"kind": kind, "target": target, "for_s": 1.0}, known)}
+    assert "target" not in missing
+    assert missing - {"for_s"} <= {word.partition("=")[0] for word in text.split()}
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "terms"),
+    [
+        ("gps_dropout", "", ("probability", "missing", "from 0 to 1")),
+        ("gps_dropout", "--for 5s", ("probability", "missing", "from 0 to 1")),
+        ("gps_dropout", "probability=", ("probability", "missing", "from 0 to 1")),
+        ("rotor_efficiency", "", ("rotor", "missing", "front_left")),
+        ("gust", "", ("velocity_m_s", "missing", "m/s")),
+    ],
+)
+def test_a_magnitude_that_is_not_stated_is_refused_and_nothing_is_struck(
+    bench: Bench, kind: str, text: str, terms: tuple[str, ...]
+):
+    bench.faults()
+    bench.gui.at["kind"].put(kind)
+    bench.gui.at["parameters"].value = text
     bench.gui.press("Inject it")
-    asked = {"kind": next(iter(KINDS)), "target": bench.names[0], "for_s": 5, "at_s": 40}
-    assert bench.client.asked == [("world", "fault_add", asked)]
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, *terms)
 
 
 def test_a_kill_by_its_kind_is_sent_without_a_duration(bench: Bench):
     bench.faults()
     bench.gui.at["kind"].put("process_kill")
-    bench.gui.at["target"].value = "estimator.drone1"
     bench.gui.press("Inject it")
     assert bench.client.asked == [("world", "fault_add", {"kind": "process_kill", "target": "estimator.drone1"})]
 
 
-@pytest.mark.parametrize("text", ["value", "[" * 2000, "probability: 1, probability: 0"])
+@pytest.mark.parametrize("text", ["value", "'" * 3, "probability=1 probability=0", "probability=[", "probability: 1"])
 def test_parameters_that_are_none_are_told_and_not_sent(bench: Bench, text: str):
     bench.faults()
     bench.gui.at["parameters"].value = text
     bench.gui.press("Inject it")
     assert bench.client.asked == []
-    assert has_terms(bench.outcomes[0].refusal, "NAME", "VALUE")
+    assert "parameters" in bench.outcomes[0].refusal
 
 
-@pytest.mark.parametrize("name", ["kind", "target", "op", "self", "value"])
-def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name: str):
+@pytest.mark.parametrize("text", ["--for", "--for 10h", "--at soon"])
+def test_a_time_that_is_none_is_told_and_not_sent(bench: Bench, text: str):
     bench.faults()
-    bench.gui.at["parameters"].value = f"{name}: x"
+    bench.gui.at["parameters"].value = f"probability=1 {text}"
     bench.gui.press("Inject it")
     assert bench.client.asked == []
-    assert has_terms(bench.outcomes[0].refusal, f"{name!r}", "known", "at_s", "for_s", "probability")
+    assert has_terms(bench.outcomes[0].refusal, text.split()[0], "10s")
+
+
+@pytest.mark.parametrize("name", ["op", "self", "value"])
+def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name: str):
+    bench.faults()
+    bench.gui.at["parameters"].value = f"{name}=x"
+    bench.gui.press("Inject it")
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, f"{name!r}", "known", "probability=VALUE", "--at", "--for")
 
 
 # A formation

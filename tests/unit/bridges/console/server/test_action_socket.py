@@ -70,6 +70,7 @@ class FakeFlying:
 
     def __init__(self) -> None:
         self.chosen: list[tuple[Any, str]] = []
+        self.refused: int | None = -1  # page that another one keeps from flying
         self.done: list[tuple[Any, ...]] = []
         self.control: Any = SimpleNamespace(
             take=partial(self._note, "take"),
@@ -82,6 +83,9 @@ class FakeFlying:
     def _note(self, what: str, page: Any, *args: Any) -> FlightAnswer:
         self.done.append((what, page, *args))
         return FlightAnswer("drone2", "flying")
+
+    def take_refusal(self, client_id: int | None, drone: str) -> str:
+        return "main is held" if client_id == self.refused else ""
 
     def choose(self, client_id: int | None, drone: str) -> None:
         self.chosen.append((client_id, drone))
@@ -115,6 +119,17 @@ def test_an_operator_flies_a_drone_and_is_answered():
     ]  # fmt: skip
     sockets.lose("here")
     assert flying.done[-1] == ("lose", "here")
+
+
+def test_a_page_takes_no_drone_of_a_formation_that_another_page_is_in_control_of():
+    flying, sockets = flying_sockets()
+    flying.refused = 7
+    sockets.act(json.dumps({"do": "plan", "page": "key"}), OPERATOR, "here")
+    answer = sockets.act(json.dumps(FLYING[0]), OPERATOR, "here") or {}
+    assert (answer["flight"]["state"], answer["flight"]["text"]) == ("none", "main is held")
+    assert flying.done == []
+    sockets.lose("here")  # the next page at that socket is not yet known
+    assert (sockets.act(json.dumps(FLYING[0]), OPERATOR, "here") or {})["flight"]["state"] == "flying"
 
 
 @pytest.mark.parametrize("action", FLYING, ids=lambda action: action["do"])
