@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
-from zsim.contract import flight_messages, keys
+from zsim.contract import flight_messages, keys, messages
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import ZsimError
 from zsim.transport.session import Session
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
@@ -116,6 +117,14 @@ class RequestOutcome(NamedTuple):
     args: Mapping[str, Any] = {}
 
 
+class PastInstant(NamedTuple):
+    """The views of one instant on record; estimates by drone, formations by name."""
+
+    drones: ViewDrones
+    clusters: dict[str, ViewCluster]
+    estimates: dict[str, EstimateView]
+
+
 class CommandClient:
     """Sends requests in the console's name.
 
@@ -173,6 +182,30 @@ class CommandClient:
             if answer.ok and isinstance(answer.result, dict) and "to_s" in answer.result:
                 return answer.result
         return {}
+
+    def read(self, act: Task) -> bool:
+        """Let something be read in another thread; return whether it will be."""
+        try:
+            self._requests.submit(act)
+        except RuntimeError:  # closed
+            return False
+        return True
+
+    def past_views(self, from_s: float, to_s: float, every_s: float) -> list[PastInstant]:
+        """Return the views of instants on record, of a replay; empty where they are not answered."""
+        args = {"from_s": from_s, "to_s": to_s, "every_s": every_s}
+        found: dict[int, PastInstant] = {}
+        with suppress(ZsimError, LookupError, TypeError, ValueError):
+            answer = self._link.request(keys.CONTROL, "views", self._name, args, ANSWER_TIMEOUT_S)
+            for key, payload in answer.result if answer.ok else ():
+                view = messages.decode(key, payload)
+                if isinstance(view, ViewDrones):
+                    found[view.t_ns] = PastInstant(view, {}, {})
+                elif isinstance(view, ViewCluster):
+                    found[view.t_ns].clusters[key.rpartition("/")[2]] = view
+                elif isinstance(view, ViewEstimates):
+                    found[view.t_ns].estimates.update({each.name: each for each in view.estimates})
+        return list(found.values())
 
     def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
         """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""

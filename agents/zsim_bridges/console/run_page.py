@@ -12,6 +12,7 @@ from msgspec import UNSET
 
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
+from zsim.contract.views import EstimateView, ViewCluster
 from zsim.errors import DocumentError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -22,7 +23,7 @@ from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.cameras.camera_feed import CameraFeed
-from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.command_client import CommandClient, PastInstant, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
@@ -31,11 +32,11 @@ from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
 from zsim_bridges.console.page.console_page import ConsolePage
 from zsim_bridges.console.page.page_forms import PageForms
-from zsim_bridges.console.record_player import RecordPlayer
+from zsim_bridges.console.record_player import KEPT_S, RecordPlayer
 from zsim_bridges.console.run_state import console_state
 from zsim_bridges.console.scene.camera_follow import CameraFollow
 from zsim_bridges.console.scene.camera_frustums import CameraFrustums
-from zsim_bridges.console.scene.picture import DronePoses
+from zsim_bridges.console.scene.picture import DronePoses, FormationShape, drone_poses
 from zsim_bridges.console.scene.picture_rate import picture_rate_hz
 from zsim_bridges.console.scene.run_scene import RunScene
 from zsim_bridges.observer_process import ObserverProcess
@@ -101,7 +102,7 @@ class RunPage:
         self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command)
         self._monitor = RunMonitor(self.views, self._time_monitor, self._scenario, bool(info.replay_of), world)
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
-        self.record = RecordPlayer(self._client, self._time_monitor, bool(info.replay_of))
+        self.record = RecordPlayer(self._client, self._time_monitor, bool(info.replay_of), len(names))
         hats = self._scenario.environment.hats
         self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
         self._frustums = frustums
@@ -113,8 +114,9 @@ class RunPage:
         self._scene.nodes.on_click(self._on_click)
         show = self._scene.nodes.show
         self._page = ConsolePage(
-            server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones
-        )
+            server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones,
+            self._scene.trails.choose_length, replayed=bool(info.replay_of),
+        )  # fmt: skip
         page = self._page
         folders = page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
         self._page_forms = PageForms(server, self._client, list(names), self._scene.nodes.radii_m, *folders)
@@ -134,7 +136,9 @@ class RunPage:
         self.views.open()
         self.cameras.open()
         self.record.load()
-        self._monitor.record_end_s = self.record.timeline.get("to_s", math.inf)
+        timeline = self.record.timeline
+        if timeline:
+            self._monitor.record_s = timeline["from_s"], timeline["to_s"]
         pause = threading.Event()
         next_s = time.monotonic()
         with self._time_monitor.polling(), self.flying.running():
@@ -184,7 +188,10 @@ class RunPage:
             self._monitor.flight.update(self.views.drones)
         if wall_s - self._monitor_s >= TABLE_S:
             self._monitor_s = wall_s
+            if self._info.replay_of and self._scene.drones is not None:
+                self._keep_past(self._scene.drones.t_ns / 1e9)
             self._update_monitor(wall_s)
+        self._fill_past(self.record.take())
         self.cameras.update()
         for form in self._page.forms.values():
             form.send(wall_s)
@@ -224,24 +231,50 @@ class RunPage:
     def _store_unseen(self, new: bool) -> None:
         """Store what pages show of the time before they were opened."""
         if new and self.views.drones is not None:
-            self._add_points(self._scene.store(self.views.drones))
+            self._add_newest_points(self._scene.store(self.views.drones))
+
+    def _fill_past(self, instants: list[PastInstant]) -> None:
+        """Add what was read of a record to trails and plots."""
+        for past in instants:
+            drones = drone_poses(past.drones, self._names)
+            self._scene.trails.add(drones.t_ns / 1e9, drones.p_W)
+            known = {n: v for n, v in past.clusters.items() if n in self._spaces and v.names == self._spaces[n].names}
+            self._add_points(drones, self._scene.shapes_of(drones), known, past.estimates)
+        self._scene.trails.number += bool(instants)
+
+    def _keep_past(self, t_s: float) -> None:
+        """Let the record be read around the instant that a replay shows, and forget what is far from it."""
+        self.record.fill(t_s)
+        kept = t_s - KEPT_S, t_s + KEPT_S
+        self._scene.trails.keep(*kept)
+        for history in (self._page.flights.history, *(plots.history for plots in self._page.plots.values())):
+            history.keep(*kept)
 
     def _draw(self) -> None:
         assert self.views.drones is not None
         drones = self._scene.draw(self.views.drones, self._period_s(), self._page.chosen)
         self._page_forms.move_rings(drones)
-        self._add_points(drones)
+        self._add_newest_points(drones)
 
-    def _add_points(self, drones: DronePoses) -> None:
+    def _add_newest_points(self, drones: DronePoses) -> None:
+        estimates = {name: each.estimate for name, each in self.views.estimates().items() if each.fresh}
+        self._add_points(drones, self._scene.shapes, self.views.clusters, estimates)
+
+    def _add_points(
+        self,
+        drones: DronePoses,
+        shapes: Mapping[str, FormationShape | None],
+        clusters: Mapping[str, ViewCluster],
+        estimates: Mapping[str, EstimateView],
+    ) -> None:
         """Add the formations' variables and the drones' flight to the plots."""
         t_s = drones.t_ns / 1e9
-        for name, true_shape in self._scene.shapes.items():
-            view = self.views.clusters.get(name)
+        for name, true_shape in shapes.items():
+            view = clusters.get(name)
             if view is not None:
                 true_c = None if true_shape is None else true_shape.c
                 self._page.plots[name].history.add(t_s, view.desired, view.value, true_c)
-        estimates = self.views.estimates().items()
-        self._page.flights.add(drones, {name: each.estimate for name, each in estimates if each.fresh})
+        self._page.flights.add(drones, estimates)
 
     # Tables
 
@@ -256,7 +289,7 @@ class RunPage:
         page.faults.content = console_tables.fault_lines(self._table_rows.active_faults())
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
-            page.plots[page.chosen].draw()
+            page.plots[page.chosen].draw(self._scene.drones.t_ns / 1e9 if self._scene.drones else 0.0)
         self._scene.draw_trails()
 
     def _update_controls(self, flown: Mapping[str, FlightFigures]) -> None:

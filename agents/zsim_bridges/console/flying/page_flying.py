@@ -87,6 +87,8 @@ class PageFlying:
             "chosen": self._pages.chosen(client_id),
             "drones": map_view.positions(drones, states),
             "formations": map_view.formations(self._spaces, self._members, dict(self._views.clusters)),
+            "trail_s": self._scene.trails.length_s,
+            "trails_number": self._scene.trails.number,
         }
         if not whole:
             return shown

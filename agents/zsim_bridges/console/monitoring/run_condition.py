@@ -47,7 +47,7 @@ class RunCondition(NamedTuple):
             return "ended"
         if self.silent_s:
             return "silent"
-        if "emergency" in self.drones.values():
+        if "emergency" in self.drones.values() and not self.replayed:  # of a record nobody has to act
             return "emergency"
         return "paused" if self.clock == "paused" else "running" if self.clock == "running" else "waiting"
 

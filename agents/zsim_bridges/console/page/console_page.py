@@ -15,6 +15,7 @@ from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.page_forms import set_theme
 from zsim_bridges.console.page.run_forms import FaultForm, FleetForm, RunForm
 from zsim_bridges.console.page.variable_plots import VariablePlots, flight_history
+from zsim_bridges.console.scene.picture import TRAIL_S, TRAILS_S
 
 PANEL_PX = 350
 SWITCHES = {
@@ -36,6 +37,8 @@ class ConsolePage:
         show: shows or hides one of `SWITCHES` in the scene.
         rate: that the run was started with.
         drones: of the run, with their rotors.
+        choose_trail: lets trails go back so far [s].
+        replayed: whether a record is played back.
 
     Attributes:
         phases, drones, faults: the tables.
@@ -56,7 +59,11 @@ class ConsolePage:
         show: Callable[[str, bool], None],
         rate: float,
         drones: Sequence[DroneInfo] = (),
+        choose_trail: Callable[[float], None] = lambda _: None,
+        replayed: bool = False,
     ) -> None:
+        self._choose_trail = choose_trail
+        self._replayed = replayed
         self._scenario = scenario
         self._spaces = spaces
         self._client = client
@@ -66,7 +73,7 @@ class ConsolePage:
         self._drones = drones
         self.forms: dict[str, FormationForm] = {}
         self.plots: dict[str, VariablePlots] = {}
-        self.flights = flight_history([drone.name for drone in scenario.drones])
+        self.flights = flight_history([drone.name for drone in scenario.drones], around=replayed)
         self.chosen = next(iter(spaces), "")
         self._folders: dict[str, list[viser.GuiFolderHandle]] = {}
         self._set_theme(gui)
@@ -106,7 +113,7 @@ class ConsolePage:
             with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder:
                 self.forms[name] = FormationForm(gui, self._client, self._report, cluster, space, limits)
             with plots, gui.add_folder(None, visible=name == self.chosen) as plot_folder:
-                self.plots[name] = VariablePlots(gui, cluster, limits, self.flights)
+                self.plots[name] = VariablePlots(gui, cluster, limits, self.flights, self._replayed)
             self._folders[name] = [form_folder, plot_folder]
 
     def _show_formation(self, chosen: str) -> None:
@@ -126,6 +133,10 @@ class ConsolePage:
         for what, label in SWITCHES.items():
             switch = gui.add_checkbox(label, True)
             switch.on_update(lambda _, what=what, switch=switch: self._show(what, switch.value))
+        lengths = {f"the last {length_s:g} s": length_s for length_s in TRAILS_S}
+        chosen = next(text for text, length_s in lengths.items() if length_s == TRAIL_S)
+        trail = gui.add_dropdown("trails of", list(lengths), initial_value=chosen)
+        trail.on_update(lambda _: self._choose_trail(lengths[trail.value]))
 
     def _left_panel(self, gui: viser.GuiApi) -> None:
         panel = gui.add_panel()
