@@ -151,6 +151,7 @@ class CommandClient:
         self._report = report
         self._seqs: Counter[str] = Counter()  # messages sent on each key
         self._modes: Counter[str] = Counter()  # modes requested of each drone
+        self._cluster_requests: Counter[str] = Counter()  # made of each formation
         self._emergencies: Counter[str] = Counter()  # emergencies requested of each drone
         self._lock = threading.RLock()
         self._pools = [
@@ -209,9 +210,14 @@ class CommandClient:
 
     def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
         """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""
+        self._cluster_requests[cluster] += 1
         text = f"{cluster}: {op} {shown or _format_arguments(args)}".strip()
         what = RequestOutcome(text, "", cluster, op, args)
         self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
+
+    def requests_to(self, cluster: str) -> int:
+        """Return how many requests were made of a formation so far."""
+        return self._cluster_requests[cluster]
 
     def send_mode(self, drones: Sequence[str], mode: str) -> None:
         """Let drones take off, land, stop at once or leave the emergency, whoever commands them.

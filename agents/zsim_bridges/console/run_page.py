@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -116,12 +116,17 @@ class RunPage:
         self._page = ConsolePage(
             server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones,
             self._scene.trails.choose_length, replayed=bool(info.replay_of),
+            request_return=lambda cluster: self.flying.returns.request_formation(cluster),
         )  # fmt: skip
         page = self._page
         folders = page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
-        self._page_forms = PageForms(server, self._client, list(names), self._scene.nodes.radii_m, *folders)
+        self._page_forms = PageForms(
+            server, self._client, list(names), self._scene.nodes.radii_m, *folders, self._return_drones
+        )
         seen = self.views, self._time_monitor, self._monitor, self._scene, self._page_forms
-        self.flying = PageFlying(info, self._scenario, self._spaces, self._client, observer.name, *seen)
+        self.flying = PageFlying(
+            info, self._scenario, self._spaces, self._client, observer.name, *seen, self._note_return
+        )
 
     def close(self) -> None:
         """Send nothing any more."""
@@ -193,6 +198,7 @@ class RunPage:
             self._update_monitor(wall_s)
         self._fill_past(self.record.take())
         self.cameras.update()
+        self.flying.returns.tick()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
@@ -205,6 +211,9 @@ class RunPage:
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
                 self._update_tables(wall_s)
+
+    def _return_drones(self, drones: Sequence[str]) -> None:
+        self.flying.returns.request_drones(drones)
 
     def _update_monitor(self, wall_s: float) -> None:
         """Keep up with the run's condition, and note among the events what is done that was accepted before."""
@@ -285,7 +294,7 @@ class RunPage:
         page.phases.content = console_tables.formation_lines(
             {n: (v.phase, v.reason) for n, v in self.views.clusters.items()}
         )
-        page.drones.content = console_tables.drone_table(self._table_rows.drone_rows(), flown)
+        self._page_forms.show_drones(self._table_rows.drone_rows(), flown)
         page.faults.content = console_tables.fault_lines(self._table_rows.active_faults())
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
@@ -309,12 +318,17 @@ class RunPage:
         The world publishes an event of what it has done, but not of requests to formations, which are only accepted.
         """
         if outcome.refusal:
+            self.flying.returns.refused(outcome.subject)
             self._note("refused", outcome.subject, f"{outcome.request}: {outcome.refusal}")
             self._notify(outcome.request, outcome.refusal)
             return
         known = self._monitor.pending.accept(outcome.subject, outcome.op, outcome.request, outcome.args)
         if known or outcome.subject in self._spaces:
             self._note("accepted", outcome.subject, f"{outcome.request}: accepted")
+
+    def _note_return(self, subject: str, text: str) -> None:
+        self._note("refused", subject, text)
+        self._notify(f"return of {subject}", text)
 
     def _note(self, kind: str, subject: str, text: str) -> None:
         """Add an event of the console's own to those that are shown."""

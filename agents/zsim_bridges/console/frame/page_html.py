@@ -9,6 +9,7 @@ import importlib.resources
 PARTS = (  # of the page beside viser's; of the last three, each uses those before it
     "layout.html",
     "head_bar.html",
+    "fleet_table.html",
     "camera_windows.html",
     "scene_tools.html",
     "flight_bar.html",

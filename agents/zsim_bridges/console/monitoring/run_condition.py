@@ -72,9 +72,9 @@ def run_refusals(run: RunCondition) -> dict[str, str]:
 
 
 def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
-    """Return why each mode of one drone would be refused; empty where it would not."""
+    """Return why each mode of one drone, and its return, would be refused; empty where it would not."""
     state = run.drones.get(drone)
-    modes = ("takeoff", "land", "emergency", "reset")
+    modes = ("takeoff", "land", "return", "emergency", "reset")
     unseen = run.grounded() or ("" if state else f"{drone} was not seen yet")
     refused = {mode: unseen or state_refusal(drone, state or "", mode) or "" for mode in modes}
     return {**refused, "emergency": run.grounded()}  # never kept back: what is shown may be older than what is

@@ -39,9 +39,10 @@ class ConsolePage:
         drones: of the run, with their rotors.
         choose_trail: lets trails go back so far [s].
         replayed: whether a record is played back.
+        request_return: lets a formation fly back to where it started, and land.
 
     Attributes:
-        phases, drones, faults: the tables.
+        phases, faults: the tables.
         forms, plots: of each formation.
         flights: what plots show of single drones.
         chosen: the formation that is shown; empty where there is none.
@@ -61,7 +62,9 @@ class ConsolePage:
         drones: Sequence[DroneInfo] = (),
         choose_trail: Callable[[float], None] = lambda _: None,
         replayed: bool = False,
+        request_return: Callable[[str], None] = lambda _: None,
     ) -> None:
+        self._request_return = request_return
         self._choose_trail = choose_trail
         self._replayed = replayed
         self._scenario = scenario
@@ -111,7 +114,9 @@ class ConsolePage:
             name, space = cluster.name, self._spaces[cluster.name]
             limits = slider_ranges(space, cluster, self._scenario)
             with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder:
-                self.forms[name] = FormationForm(gui, self._client, self._report, cluster, space, limits)
+                self.forms[name] = FormationForm(
+                    gui, self._client, self._report, cluster, space, limits, self._request_return
+                )
             with plots, gui.add_folder(None, visible=name == self.chosen) as plot_folder:
                 self.plots[name] = VariablePlots(gui, cluster, limits, self.flights, self._replayed)
             self._folders[name] = [form_folder, plot_folder]
@@ -142,7 +147,6 @@ class ConsolePage:
         panel = gui.add_panel()
         with panel.add_tab("Drones", viser.Icon.DRONE):
             self.drone_folder = gui.add_folder(None)
-            self.drones = gui.add_html("")
             self.figure_folder = gui.add_folder(None)
         with panel.add_tab("Events", viser.Icon.LIST):
             self.event_folder = gui.add_folder(None)

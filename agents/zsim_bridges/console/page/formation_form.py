@@ -20,7 +20,13 @@ from zsim_bridges.console.scene.picture import SHAPED_PHASES
 REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
-LABELS = {**{op: label for label, op in OPERATIONS.items()}, "target": "sliders", "trajectory": "Trajectory"}
+RETURN = "Return"  # over the middle of the starts, and land there
+LABELS = {
+    **{op: label for label, op in OPERATIONS.items()},
+    "target": "sliders",
+    "trajectory": "Trajectory",
+    "return": RETURN,
+}
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
     "engage": viser.Icon.TRIANGLE,
@@ -47,6 +53,7 @@ class FormationForm:
         cluster: of the scenario.
         space: of the formation.
         ranges: of its variables.
+        request_return: lets a formation move over the middle of its starts, and land.
     """
 
     def __init__(
@@ -57,6 +64,7 @@ class FormationForm:
         cluster: Cluster,
         space: ClusterSpace,
         ranges: list[SliderRange],
+        request_return: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._client = client
         self._report = report
@@ -67,6 +75,10 @@ class FormationForm:
         self._written: tuple[float, ...] | None = None  # where the waypoints begin that the console wrote
         self._edited = False
         self._controls = {op: self._button(gui, label, op) for label, op in OPERATIONS.items()}
+        if {"x_c", "y_c"} <= set(space.names):
+            back = gui.add_button(RETURN, icon=viser.Icon.HOME, color="gray")
+            back.on_click(lambda _: request_return(cluster.name))
+            self._controls["return"] = back
         self._reasons = gui.add_html("")
         hint = "Duration of a move; 0: as fast as the robots' limits let it"
         self._others: list[tuple[str, Any]] = []  # further controls, each with the operation that it requests
@@ -80,6 +92,7 @@ class FormationForm:
     def offer(self, run: RunCondition) -> None:
         """Grey out what the controller would refuse, with its reason; a slider shows all the same where it stands."""
         refusals = formation_refusals(run, self._cluster.name)
+        refusals["return"] = refusals["target"]  # which is its first part
         set_refusals(self._controls, refusals)
         for op, control in self._others:
             set_refusals({op: control}, refusals)

@@ -1,15 +1,17 @@
 """The controls that each page has for itself: the drone that it has chosen, and its theme."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import viser
 
 from zsim_bridges.console.command_client import CommandClient
-from zsim_bridges.console.console_tables import event_table
+from zsim_bridges.console.console_tables import DroneRow, event_table
 from zsim_bridges.console.monitoring import event_log
 from zsim_bridges.console.monitoring.event_log import EventRow
+from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 from zsim_bridges.console.monitoring.run_condition import RunCondition
+from zsim_bridges.console.page.fleet_table import FleetTable
 from zsim_bridges.console.page.run_forms import DroneForm
 from zsim_bridges.console.scene.chosen_ring import ChosenRing
 from zsim_bridges.console.scene.ground_grid import draw_ground
@@ -22,6 +24,7 @@ class _PageForm(NamedTuple):
     """Controls of one page."""
 
     drone: DroneForm
+    fleet: FleetTable
     ring: ChosenRing
     figures: viser.GuiHtmlHandle
     events: "EventForm"
@@ -35,6 +38,7 @@ class PageForms:
         client: sends requests.
         names, radii_m: of the drones.
         drone_folder, figure_folder, event_folder, theme_folder: where they are to be.
+        request_return: lets drones fly back to where they started.
     """
 
     def __init__(
@@ -47,7 +51,9 @@ class PageForms:
         figure_folder: Any,
         event_folder: Any,
         theme_folder: Any,
+        request_return: Callable[[Sequence[str]], None] = lambda _: None,
     ) -> None:
+        self._request_return = request_return
         self._server = server
         self._client = client
         self._names = names
@@ -68,6 +74,12 @@ class PageForms:
         if form is not None:
             form.drone.choose(drone)
 
+    def toggle(self, client_id: int | None, drone: str) -> None:
+        """Select a drone on one page for one command with others, or no longer."""
+        form = self._forms.get(-1 if client_id is None else client_id)
+        if form is not None:
+            form.fleet.toggle(drone)
+
     def chosen(self, client_id: int | None) -> str:
         """Return the drone that one page has chosen; empty of one that is not open."""
         form = self._forms.get(-1 if client_id is None else client_id)
@@ -82,6 +94,10 @@ class PageForms:
         forms = list(self._forms.values())
         contents = {drone: figures_of(drone) for drone in {form.drone.chosen for form in forms}}
         self._update(lambda form: setattr(form.figures, "content", contents.get(form.drone.chosen, "")))
+
+    def show_drones(self, rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures]) -> None:
+        """Show on each page the drones as it sorts and filters them."""
+        self._update(lambda form: form.fleet.show(rows, figures, form.drone.chosen))
 
     def show_events(self, rows: Sequence[EventRow]) -> None:
         """Show on each page the events that it has chosen."""
@@ -104,7 +120,8 @@ class PageForms:
             return
         drone_folder, figure_folder, event_folder, theme_folder = self._folders
         with drone_folder:
-            drone = DroneForm(page.gui, self._client, self._names)
+            drone = DroneForm(page.gui, self._client, self._names, self._request_return)
+            fleet = FleetTable(page.gui, self._names, lambda: drone.select(fleet.selected))
         with figure_folder:
             figures = page.gui.add_html("")
         with event_folder:
@@ -112,7 +129,7 @@ class PageForms:
         with theme_folder:
             theme = page.gui.add_checkbox("Dark theme", False)
         theme.on_update(lambda _: _set_page_theme(page, dark=theme.value))
-        self._forms[page.client_id] = _PageForm(drone, ChosenRing(page.scene, self._radii_m), figures, events)
+        self._forms[page.client_id] = _PageForm(drone, fleet, ChosenRing(page.scene, self._radii_m), figures, events)
         if page.client_id not in self._server.get_clients():
             self._remove(page)  # it has disconnected meanwhile
 

@@ -218,34 +218,51 @@ class FleetForm:
                 self._client.send_mode(self._single, operation)
 
 
-DRONE_MODES = {"takeoff": "Take off", "land": "Land", "emergency": "Emergency", "reset": "Reset"}
+DRONE_MODES = {
+    "takeoff": "Take off",
+    "land": "Land",
+    "return": "Return",
+    "emergency": "Emergency",
+    "reset": "Reset",
+}  # and what is none: to fly back to the start and land there
 DRONE_ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
     "land": viser.Icon.PLANE_ARRIVAL,
+    "return": viser.Icon.HOME,
     "emergency": viser.Icon.ALERT_TRIANGLE,
     "reset": viser.Icon.REFRESH,
 }
 
 
 class DroneForm:
-    """Take-off, landing and emergency of one drone, on one page: what another page chooses changes nothing here.
+    """Modes of one drone, or of all that are selected, on one page: what another page chooses changes nothing here.
 
     Args:
         gui: viser's of that page, in the folder where they are to be.
         client: sends requests.
         names: of the drones.
+        request_return: lets drones fly back to where they started, and land.
 
     Attributes:
-        choice: the control that chooses it.
+        choice: the control that chooses one.
     """
 
-    def __init__(self, gui: viser.GuiApi, client: CommandClient, names: Sequence[str]) -> None:
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        client: CommandClient,
+        names: Sequence[str],
+        request_return: Callable[[Sequence[str]], None] = lambda _: None,
+    ) -> None:
+        self._client = client
+        self._request_return = request_return
         self.choice = gui.add_dropdown("drone", list(names))
+        self._selected: list[str] = []
         self._buttons: dict[str, Any] = {}
         for mode, label in DRONE_MODES.items():
             colour = "red" if mode == "emergency" else "gray"
-            button = gui.add_button(f"{label} {self.chosen}", icon=DRONE_ICONS[mode], color=colour)
-            button.on_click(lambda _, mode=mode: client.send_mode([self.chosen], mode))
+            button = gui.add_button(f"{label} {self._subject}", icon=DRONE_ICONS[mode], color=colour)
+            button.on_click(lambda _, mode=mode: self._request(mode))
             self._buttons[mode] = button
         self._reasons = gui.add_html("")
         self._run = RunCondition()
@@ -256,18 +273,42 @@ class DroneForm:
         """Name of the drone that is chosen."""
         return self.choice.value
 
+    @property
+    def targets(self) -> list[str]:
+        """Names of the drones that a button is for: those that are selected, else the one that is chosen."""
+        return self._selected or [self.chosen]
+
+    @property
+    def _subject(self) -> str:
+        return self.targets[0] if len(self.targets) == 1 else f"{len(self.targets)} drones"
+
     def choose(self, drone: str) -> None:
         """Choose a drone, as a click on it in the scene does."""
         self.choice.value = drone
 
+    def select(self, drones: Sequence[str]) -> None:
+        """Let the buttons be for all of these; of none: for the chosen one."""
+        self._selected = list(drones)
+        self._rename()
+
     def refresh(self, run: RunCondition) -> None:
-        """Offer what would not be refused."""
+        """Offer what would not be refused of one of the drones at least."""
         self._run = run
-        refusals = drone_refusals(run, self.chosen)
-        set_refusals(self._buttons, refusals)
-        self._reasons.content = refusal_lines(DRONE_MODES, refusals)
+        refusals = [drone_refusals(run, drone) for drone in self.targets]
+        common = {mode: refusals[0][mode] if all(each[mode] for each in refusals) else "" for mode in DRONE_MODES}
+        set_refusals(self._buttons, common)
+        self._reasons.content = refusal_lines(DRONE_MODES, common)
+
+    def _request(self, mode: str) -> None:
+        """Request a mode of all drones that would not refuse it; an emergency of all."""
+        able = [drone for drone in self.targets if not drone_refusals(self._run, drone)[mode]]
+        drones = able or self.targets  # what is shown may be older than what is: whoever may refuse it then says why
+        if mode == "return":
+            self._request_return(drones)
+        else:
+            self._client.send_mode(drones, mode)
 
     def _rename(self) -> None:
         for mode, button in self._buttons.items():
-            button.label = f"{DRONE_MODES[mode]} {self.chosen}"
+            button.label = f"{DRONE_MODES[mode]} {self._subject}"
         self.refresh(self._run)

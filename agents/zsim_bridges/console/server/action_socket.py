@@ -20,6 +20,7 @@ from zsim_bridges.console.server.page_actions import (
     LookFrom,
     PageAction,
     PlayRecord,
+    SelectDrone,
     SteerDrone,
     TakeDrone,
 )
@@ -93,7 +94,7 @@ class ActionSockets:
             return self._operate(action, page) if role == OPERATOR else None
         return self._look(action)
 
-    def _look(self, action: LookFrom | LookAtPlan | ChooseDrone) -> Answer:
+    def _look(self, action: LookFrom | LookAtPlan | ChooseDrone | SelectDrone) -> Answer:
         client_id, flying = self._client_id(action.page), self._flying()
         if isinstance(action, LookFrom):
             if client_id is not None:
@@ -102,6 +103,8 @@ class ActionSockets:
             return {"plan": flying.plan(client_id, action.whole)}
         elif flying is not None and isinstance(action, ChooseDrone):
             flying.choose(client_id, action.drone)
+        elif flying is not None and isinstance(action, SelectDrone):
+            flying.select(client_id, action.drone)
         return {}
 
     def _operate(self, action: PlayRecord | FlyDrone, page: Any) -> Answer:

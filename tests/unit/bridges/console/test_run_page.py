@@ -181,7 +181,7 @@ def test_a_run_that_nobody_watched_leaves_its_last_picture(viser: PrivateViser):
     seen = Seen(viser.server, watched=False)
     seen.draw(drones(*NAMES), cluster())
     page = seen.show._page
-    assert "flying" in page.drones.content
+    assert seen.show.state()["drones"][0]["state"] == "flying"
     assert "engaged" in page.phases.content
     seen.show.close()
 
