@@ -113,6 +113,7 @@ class StagedRun:
         self._performed_s = 0.0  # wall
         self._present = threading.Event()  # once the past has been performed
         self.percent = 73.0  # of each battery
+        self.percent_of: dict[str, float] = {}  # of those that are otherwise
         drones = tuple(DroneInfo(drone.name, "ardrone2") for drone in self._scenario.drones)
         self.info: Any = SimpleNamespace(
             run_id="staged", rate=1.0, gate_ns=GATE_NS, mode="lockstep", drones=drones, scenario=scenario.read_text(),
@@ -150,7 +151,14 @@ class StagedRun:
         sway = SWAY_M * np.array([(math.sin(phase + k), math.cos(phase + 2 * k), 0.0) for k in range(len(names))])
         true_W, believed_W = p_W + sway, p_W + 0.8 * sway
         views = tuple(
-            DroneView(name, tuple(p), LEVEL, ROTORS, self._state, self.percent - self._drain_percent_s * t_s)
+            DroneView(
+                name,
+                tuple(p),
+                LEVEL,
+                ROTORS,
+                self._state,
+                self.percent_of.get(name, self.percent) - self._drain_percent_s * t_s,
+            )
             for name, p in zip(names, true_W.tolist(), strict=True)
         )
         found: list[tuple[str, Any]] = [(keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((1.0, 0.5, 0.0),)))]
@@ -179,10 +187,10 @@ class StagedRun:
 
 
 @contextmanager
-def staged_console(run: StagedRun, folder: Path | None = None) -> Iterator[str]:
-    """Serve pages of a run, recorded in a folder if there is one; yield the operator's address."""
+def staged_console(run: StagedRun, folder: Path | None = None, hz: float = PICTURES_HZ) -> Iterator[str]:
+    """Serve pages of a run, recorded in a folder if there is one, so many pictures a second; yield the operator's address."""
     port = free_port()
-    console = Console(ListenAddress("127.0.0.1", port), "console.1", None, PICTURES_HZ, lambda _: None, folder=folder)
+    console = Console(ListenAddress("127.0.0.1", port), "console.1", None, hz, lambda _: None, folder=folder)
     over = threading.Event()
     link: Any = run.link
     args = link, run.info, run.observer, over.is_set, lambda _: None

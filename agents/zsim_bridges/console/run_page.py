@@ -4,7 +4,6 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import viser
@@ -117,6 +116,7 @@ class RunPage:
             server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones,
             self._scene.trails.choose_length, replayed=bool(info.replay_of),
             request_return=lambda cluster: self.flying.returns.request_formation(cluster),
+            show_preview=self._scene.preview,
         )  # fmt: skip
         page = self._page
         folders = page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
@@ -305,12 +305,10 @@ class RunPage:
         """Grey out what would be refused, and show on each page the drone that it has chosen."""
         self._page.refresh(self._monitor.condition)
         self._page_forms.refresh(self._monitor.condition)
-        self._page_forms.show_figures(partial(self._drone_figures, flown))
+        self._page_forms.show_figures(
+            lambda drone: console_tables.figure_lines(flown.get(drone)), self._table_rows.sensor_table
+        )
         self._page_forms.show_events(self.views.log.rows())
-
-    def _drone_figures(self, flown: Mapping[str, FlightFigures], drone: str) -> str:
-        """Return figures and sensors of one drone, as HTML."""
-        return console_tables.figure_lines(flown.get(drone)) + self._table_rows.sensor_table(drone)
 
     def _on_outcome(self, outcome: RequestOutcome) -> None:
         """Show the outcome of a request: a refusal in the corner of every page, and among the events.

@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
+
 from zsim.contract.messages import Info
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
@@ -96,6 +98,9 @@ class PageFlying:
             "chosen": self._pages.chosen(client_id),
             "drones": map_view.positions(drones, states),
             "formations": map_view.formations(self._spaces, self._members, dict(self._views.clusters)),
+            "previews": [
+                np.round(way[:, :, :2], map_view.DIGITS).tolist() for way in list(self._scene.previews.values())
+            ],
             "trail_s": self._scene.trails.length_s,
             "trails_number": self._scene.trails.number,
         }

@@ -6,7 +6,7 @@ Viewers see its controls disabled.
 import gzip
 import importlib.resources
 
-PARTS = (  # of the page beside viser's; of the last three, each uses those before it
+PARTS = (  # of the page beside viser's; of the map and the flight bar, each uses those before it
     "layout.html",
     "head_bar.html",
     "fleet_table.html",
@@ -15,6 +15,7 @@ PARTS = (  # of the page beside viser's; of the last three, each uses those befo
     "flight_bar.html",
     "map_drawing.html",
     "map_view.html",
+    "touch.html",
 )
 VIEW_STYLE = (
     "<style>.mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"

@@ -1,6 +1,7 @@
 """The page's panels: plots, forms and tables of one run."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import viser
@@ -10,6 +11,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition
+from zsim_bridges.console.page.flight_preview import FlightPreview
 from zsim_bridges.console.page.formation_form import FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.page_forms import set_theme
@@ -40,6 +42,7 @@ class ConsolePage:
         choose_trail: lets trails go back so far [s].
         replayed: whether a record is played back.
         request_return: lets a formation fly back to where it started, and land.
+        show_preview: shows what a formation would fly, None for nothing.
 
     Attributes:
         phases, faults: the tables.
@@ -63,7 +66,9 @@ class ConsolePage:
         choose_trail: Callable[[float], None] = lambda _: None,
         replayed: bool = False,
         request_return: Callable[[str], None] = lambda _: None,
+        show_preview: Callable[[str, FlightPreview | None], None] = lambda name, preview: None,
     ) -> None:
+        self._show_preview = show_preview
         self._request_return = request_return
         self._choose_trail = choose_trail
         self._replayed = replayed
@@ -115,7 +120,14 @@ class ConsolePage:
             limits = slider_ranges(space, cluster, self._scenario)
             with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder:
                 self.forms[name] = FormationForm(
-                    gui, self._client, self._report, cluster, space, limits, self._request_return
+                    gui,
+                    self._client,
+                    self._report,
+                    cluster,
+                    space,
+                    limits,
+                    self._request_return,
+                    partial(self._show_preview, name),
                 )
             with plots, gui.add_folder(None, visible=name == self.chosen) as plot_folder:
                 self.plots[name] = VariablePlots(gui, cluster, limits, self.flights, self._replayed)

@@ -76,11 +76,12 @@ class FleetTable:
         self._changed = changed
         self._selected: frozenset[str] = frozenset()
         self._shown: tuple[str, ...] = self._names
-        orders = list(ORDERS)
-        self._order = gui.add_dropdown("sort by", orders, initial_value=orders[len(names) > MANY])
-        self._choice = gui.add_dropdown("show", list(CHOICES))
-        self._text = gui.add_text("filter", "", hint="Parts of a name, state, commander, fault or link")
-        select = gui.add_button_group("select", ["all shown", "none"])
+        orders, are_many = list(ORDERS), len(names) > MANY
+        with gui.add_folder("Sort, filter, select", expand_by_default=are_many):
+            self._order = gui.add_dropdown("sort by", orders, initial_value=orders[are_many])
+            self._choice = gui.add_dropdown("show", list(CHOICES))
+            self._text = gui.add_text("filter", "", hint="Parts of a name, state, commander, fault or link")
+            select = gui.add_button_group("select", ["all shown", "none"])
         select.on_click(lambda _: self._select_shown(select.value == "all shown"))
         self.table = gui.add_html("")
 

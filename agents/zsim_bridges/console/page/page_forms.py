@@ -26,6 +26,7 @@ class _PageForm(NamedTuple):
     drone: DroneForm
     fleet: FleetTable
     ring: ChosenRing
+    instruments: viser.GuiHtmlHandle
     figures: viser.GuiHtmlHandle
     events: "EventForm"
 
@@ -89,11 +90,15 @@ class PageForms:
         """Put the ring of each page about the drone that it has chosen."""
         self._update(lambda form: form.ring.move(drones, form.drone.chosen))
 
-    def show_figures(self, figures_of: Callable[[str], str]) -> None:
-        """Show on each page the figures of the drone that it has chosen; `figures_of` a drone are HTML."""
-        forms = list(self._forms.values())
-        contents = {drone: figures_of(drone) for drone in {form.drone.chosen for form in forms}}
-        self._update(lambda form: setattr(form.figures, "content", contents.get(form.drone.chosen, "")))
+    def show_figures(self, instruments_of: Callable[[str], str], sensors_of: Callable[[str], str]) -> None:
+        """Show on each page instruments and sensors of the drone that it has chosen; both of a drone are HTML."""
+        chosen = {form.drone.chosen for form in list(self._forms.values())}
+        contents = {drone: (instruments_of(drone), sensors_of(drone)) for drone in chosen}
+
+        def show(form: _PageForm) -> None:
+            form.instruments.content, form.figures.content = contents.get(form.drone.chosen, ("", ""))
+
+        self._update(show)
 
     def show_drones(self, rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures]) -> None:
         """Show on each page the drones as it sorts and filters them."""
@@ -121,6 +126,7 @@ class PageForms:
         drone_folder, figure_folder, event_folder, theme_folder = self._folders
         with drone_folder:
             drone = DroneForm(page.gui, self._client, self._names, self._request_return)
+            instruments = page.gui.add_html("")
             fleet = FleetTable(page.gui, self._names, lambda: drone.select(fleet.selected))
         with figure_folder:
             figures = page.gui.add_html("")
@@ -129,7 +135,9 @@ class PageForms:
         with theme_folder:
             theme = page.gui.add_checkbox("Dark theme", False)
         theme.on_update(lambda _: _set_page_theme(page, dark=theme.value))
-        self._forms[page.client_id] = _PageForm(drone, fleet, ChosenRing(page.scene, self._radii_m), figures, events)
+        self._forms[page.client_id] = _PageForm(
+            drone, fleet, ChosenRing(page.scene, self._radii_m), instruments, figures, events
+        )
         if page.client_id not in self._server.get_clients():
             self._remove(page)  # it has disconnected meanwhile
 

@@ -12,6 +12,7 @@ from zsim.math import frames
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
+from zsim_bridges.console.page.flight_preview import FlightPreview
 from zsim_bridges.console.scene.camera_follow import CameraFollow
 from zsim_bridges.console.scene.picture import (
     Array,
@@ -43,6 +44,7 @@ class RunScene:
         drones: their newest poses, None before the first view.
         shapes: the formations as they truly stand, by name; None where a drone of one is missing.
         trails: of the drones.
+        previews: ways (n, M, 3) [m] of the drones of formations, by name, that would be flown.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class RunScene:
         self._drawn_ghosts: dict[str, Any] = {}
         self.drones: DronePoses | None = None
         self.shapes: dict[str, FormationShape | None] = {}
+        self.previews: dict[str, Array] = {}
         self.trails = CanvasTrails(len(self._names), around=bool(info.replay_of))
         robots = sum(space.n for space in spaces.values())
         arms_m = [drone.arm_m for drone in scenario.drones]
@@ -102,6 +105,13 @@ class RunScene:
         self._draw_ghosts()
         self._camera_follow.follow(self._camera_targets(drones))
         return drones
+
+    def preview(self, cluster: str, shown: FlightPreview | None) -> None:
+        """Show what a formation would fly, in place of what was shown before; None for nothing."""
+        self.previews = {**self.previews, cluster: shown.paths_W} if shown else {
+            name: paths_W for name, paths_W in self.previews.items() if name != cluster
+        }  # fmt: skip
+        self.nodes.previews(list(self.previews.values()))
 
     def draw_trails(self) -> None:
         """Draw trails and wind, which change slowly."""

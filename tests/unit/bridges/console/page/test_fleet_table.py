@@ -1,6 +1,7 @@
 """How a page sorts and filters its drones, and selects several of them for one command."""
 
 import math
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -82,6 +83,9 @@ class Gui:
 
     def add_dropdown(self, label: str, options: list[str], initial_value: str = "") -> Control:
         return self.by_label.setdefault(label, Control(initial_value or options[0]))
+
+    def add_folder(self, _: str, expand_by_default: bool) -> Any:
+        return nullcontext()
 
     def add_text(self, label: str, value: str, **_: Any) -> Control:
         return self.by_label.setdefault(label, Control(value))
