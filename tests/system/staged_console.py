@@ -48,6 +48,7 @@ class StagedLink:
         self.asked: list[tuple[str, dict[str, Any]]] = []
         self.clock: Clock | None = None
         self.timeline: dict[str, Any] = {}
+        self.views_at: Callable[[float], list[tuple[str, Any]]] = lambda _: []
 
     def declare_subscriber(self, expression: str, callback: Callable[[Any], None]) -> None:
         self.subscribers.append((expression, callback))
@@ -68,6 +69,10 @@ class StagedLink:
         return [SimpleNamespace(key=keys.CLOCK, payload=messages.encode(self.clock))]
 
     def request(self, key: str, op: str, source: str, args: dict[str, Any], timeout_s: float) -> ControlAnswer:
+        if op == "views":
+            count = int((args["to_s"] - args["from_s"]) / args["every_s"]) + 1
+            views = [each for k in range(count) for each in self.views_at(args["from_s"] + k * args["every_s"])]
+            return ControlAnswer(True, "", result=[(key, messages.encode(view)) for key, view in views])
         self.asked.append((op, args))
         return ControlAnswer(True, "", result=self.timeline if op == "timeline" else None)
 
@@ -107,7 +112,7 @@ class StagedRun:
         self._space = scenario_space(self._scenario, self._cluster)
         self._past_s = past_s
         self.link = StagedLink()
-        self.link.timeline = timeline or {}
+        self.link.timeline, self.link.views_at = timeline or {}, self.views_at
         self.t_s, self.clock_state, self.stands = 0.0, "running", False
         self.changes: dict[str, dict[str, Any]] = {}
         self.phase = "engaged"
@@ -115,6 +120,7 @@ class StagedRun:
         self.commander: str | None = None
         self._present = threading.Event()  # once the past has been performed
         self.percent = 73.0  # of each battery
+        self.percent_of: dict[str, float] = {}  # of those that are otherwise
         drones = tuple(DroneInfo(drone.name, "ardrone2") for drone in self._scenario.drones)
         self.info: Any = SimpleNamespace(
             run_id="staged", rate=1.0, gate_ns=GATE_NS, mode="lockstep", drones=drones, scenario=scenario.read_text(),
@@ -138,28 +144,41 @@ class StagedRun:
 
     def publish_views(self) -> None:
         """Publish where all drones are at `t_s`, where they are believed to be, and where they are to be."""
-        t_ns, names = round(self.t_s * 1e9), self._cluster.drones
+        for key, view in self.views_at(self.t_s):
+            self.link.publish(key, view)
+
+    def views_at(self, t_s: float) -> list[tuple[str, Any]]:
+        """Return the views of an instant, by key."""
+        t_ns, names = round(t_s * 1e9), self._cluster.drones
         desired = self._space.specimen(APART_M)
         for name, value in self._cluster.plan.target.items():
             desired[self._space.index(name)] = float(value)
         p_W, yaw = self._space.inverse(desired)
-        phase = math.tau * self.t_s / SWAY_S
+        phase = math.tau * t_s / SWAY_S
         sway = SWAY_M * np.array([(math.sin(phase + k), math.cos(phase + 2 * k), 0.0) for k in range(len(names))])
         true_W, believed_W = p_W + sway, p_W + 0.8 * sway
         who = self.commander
         views = tuple(
-            DroneView(name, tuple(p), LEVEL, ROTORS, self._state, self.percent - self._drain_percent_s * self.t_s, who)
+            DroneView(
+                name,
+                tuple(p),
+                LEVEL,
+                ROTORS,
+                self._state,
+                self.percent_of.get(name, self.percent) - self._drain_percent_s * t_s,
+                who,
+            )
             for name, p in zip(names, true_W.tolist(), strict=True)
         )
         views = tuple(msgspec.structs.replace(each, **self.changes.get(each.name, {})) for each in views)
-        self.link.publish(keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((1.0, 0.5, 0.0),)))
+        found: list[tuple[str, Any]] = [(keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((1.0, 0.5, 0.0),)))]
         for name, p, psi in zip(names, believed_W.tolist(), yaw.tolist(), strict=True):
             estimate = EstimateView(name, tuple(p), COVARIANCE_M2, psi, 0.05, GPS)
-            self.link.publish(keys.estimates_view(f"estimator.{name}"), ViewEstimates(t_ns, 0, (estimate,)))
+            found.append((keys.estimates_view(f"estimator.{name}"), ViewEstimates(t_ns, 0, (estimate,))))
         value = self._space.forward(believed_W, yaw)
         shape = self._space.names, tuple(value.tolist()), tuple(desired.tolist())
         cluster = ViewCluster(t_ns, 0, self.phase, *shape, "")  # type: ignore[arg-type]
-        self.link.publish(keys.cluster_view(self._cluster.name), cluster)
+        return [*found, (keys.cluster_view(self._cluster.name), cluster)]
 
     def happen(self, kind: str, subject: str, text: str, **data: Any) -> None:
         """Publish an event of the world."""
@@ -179,10 +198,10 @@ class StagedRun:
 
 
 @contextmanager
-def staged_console(run: StagedRun, folder: Path | None = None) -> Iterator[str]:
-    """Serve pages of a run, recorded in a folder if there is one; yield the operator's address."""
+def staged_console(run: StagedRun, folder: Path | None = None, hz: float = PICTURES_HZ) -> Iterator[str]:
+    """Serve pages of a run, recorded in a folder if there is one, so many pictures a second; yield the operator's address."""
     port = free_port()
-    console = Console(ListenAddress("127.0.0.1", port), "console.1", None, PICTURES_HZ, lambda _: None, folder=folder)
+    console = Console(ListenAddress("127.0.0.1", port), "console.1", None, hz, lambda _: None, folder=folder)
     over = threading.Event()
     link: Any = run.link
     args = link, run.info, run.observer, over.is_set, lambda _: None

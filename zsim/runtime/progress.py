@@ -152,11 +152,18 @@ class PipedConsole(Console):
 
 
 class Screen:
-    """Shows progress on a terminal; on anything else, a line every ten simulated seconds and events."""
+    """Shows progress on a terminal; on anything else, a line every ten simulated seconds and events.
 
-    def __init__(self, duration_s: float, console: Console | None = None) -> None:
+    Args:
+        duration_s: simulated time of the end.
+        console: where it is shown; None for stderr.
+        from_s: simulated time of the beginning, which a replay may have within the record.
+    """
+
+    def __init__(self, duration_s: float, console: Console | None = None, from_s: float = 0.0) -> None:
         self.console = console or PipedConsole(stderr=True)
         self._duration_s = duration_s
+        self._from_s = from_s
         self._live = Live(Text("starting …"), console=self.console, refresh_per_second=5, transient=True)
         self._is_live = self.console.is_terminal
         self._next_plain_s = 0.0
@@ -188,7 +195,7 @@ class Screen:
     def clock(self, line: dict[str, Any]) -> None:
         for repeated in self._repeated.over(line["t_s"]):
             self.say(repeated)
-        text = describe(line, self._duration_s)
+        text = describe(line, self._duration_s, self._from_s)
         if self._is_live:
             self._live.update(cell(text))
             return
@@ -207,9 +214,10 @@ class Screen:
         """One live line has no room for it; `zsim up` has a table."""
 
 
-def describe(line: dict[str, Any], duration_s: float) -> str:
+def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> str:
     """Return the live line: simulated time, real-time factor, phase, who is waited for."""
-    share = min(1.0, line["t_s"] / duration_s) if duration_s else 0.0
+    span_s = duration_s - from_s
+    share = min(1.0, max(0.0, line["t_s"] - from_s) / span_s) if span_s > 0.0 else 0.0
     filled = int(20 * share)
     bar = "█" * filled + "░" * (20 - filled)
     text = f"{bar} {line['t_s']:7.1f} / {duration_s:g} s  × {line['rate']:.1f} real time"

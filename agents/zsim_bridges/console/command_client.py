@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
-from zsim.contract import flight_messages, keys
+from zsim.contract import flight_messages, keys, messages
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import ZsimError
 from zsim.transport.session import Session, Unanswered
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer, arguments_text
@@ -127,6 +128,14 @@ class NoAnswer(str):
     __slots__ = ()
 
 
+class PastInstant(NamedTuple):
+    """The views of one instant on record; estimates by drone, formations by name."""
+
+    drones: ViewDrones
+    clusters: dict[str, ViewCluster]
+    estimates: dict[str, EstimateView]
+
+
 class CommandClient:
     """Sends requests in the console's name.
 
@@ -153,6 +162,7 @@ class CommandClient:
         self._report = report
         self._seqs: Counter[str] = Counter()  # messages sent on each key
         self._modes: Counter[str] = Counter()  # modes requested of each drone
+        self._cluster_requests: Counter[str] = Counter()  # made of each formation
         self._emergencies: Counter[str] = Counter()  # emergencies requested of each drone
         self._lock = threading.RLock()
         self._pools = [
@@ -185,11 +195,40 @@ class CommandClient:
                 return answer.result
         return {}
 
+    def read(self, act: Task) -> bool:
+        """Let something be read in another thread; return whether it will be."""
+        try:
+            self._requests.submit(act)
+        except RuntimeError:  # closed
+            return False
+        return True
+
+    def past_views(self, from_s: float, to_s: float, every_s: float) -> list[PastInstant]:
+        """Return the views of instants on record, of a replay; empty where they are not answered."""
+        args = {"from_s": from_s, "to_s": to_s, "every_s": every_s}
+        found: dict[int, PastInstant] = {}
+        with suppress(ZsimError, LookupError, TypeError, ValueError):
+            answer = self._link.request(keys.CONTROL, "views", self._name, args, ANSWER_TIMEOUT_S)
+            for key, payload in answer.result if answer.ok else ():
+                view = messages.decode(key, payload)
+                if isinstance(view, ViewDrones):
+                    found[view.t_ns] = PastInstant(view, {}, {})
+                elif isinstance(view, ViewCluster):
+                    found[view.t_ns].clusters[key.rpartition("/")[2]] = view
+                elif isinstance(view, ViewEstimates):
+                    found[view.t_ns].estimates.update({each.name: each for each in view.estimates})
+        return list(found.values())
+
     def request_cluster(self, cluster: str, op: str, shown: str = "", order: str = "", **args: Any) -> None:
         """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""
+        self._cluster_requests[cluster] += 1
         text = f"{cluster}: {op} {shown or arguments_text(args)}".strip()
         what = RequestOutcome(text, "", cluster, op, args, order)
         self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
+
+    def requests_to(self, cluster: str) -> int:
+        """Return how many requests were made of a formation so far."""
+        return self._cluster_requests[cluster]
 
     def send_mode(self, drones: Sequence[str], mode: str, order: str = "") -> None:
         """Let drones take off, land, stop at once or leave the emergency, whoever commands them.

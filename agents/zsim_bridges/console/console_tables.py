@@ -5,11 +5,17 @@ Order of this file: HTML, which is pure and in which all texts of other processe
 
 import math
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
-from zsim_bridges.console.monitoring.alarms import LATE_MS, Severity, battery_severity
+from zsim_bridges.console.monitoring.alarms import (
+    LATE_MS,
+    LINK_LOSS_PERCENT,
+    LINK_OLD_MS,
+    Severity,
+    battery_severity,
+)
 from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 from zsim_bridges.console.monitoring.preflight import LINK_SILENT_S, Check
@@ -48,7 +54,9 @@ EVENT_COLOURS = {
 LINK_COLOURS = {"waiting": AMBER, "connected": BLUE, "armed": GREEN, "lost": RED}
 SEVERITY_COLOURS = {"red": RED, "amber": AMBER}
 LEFT_MAX_S = 24 * 3600.0  # of a battery that lasts longer no time is shown
-COLUMNS = 7  # of the table of drones
+COLUMNS = 8  # of the table of drones
+PITCH_PX_PER_DEG = 0.9  # of the artificial horizon
+COMPASS = (("N", 0, 1), ("E", 1, 0), ("S", 0, -1), ("W", -1, 0))  # marks, with x to the right and y up
 NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
@@ -72,11 +80,29 @@ class DroneRow(NamedTuple):
     sigma_m: float | None = None
     severity: Severity | None = None  # of its worst alarm
     failsafe: str = ""  # why it has landed or stopped by itself
+    link_badness: float = 0.0  # for sorting: 1 where its age, its loss or its estimator's lag is an alarm
 
 
-def drone_table(rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures] | None = None) -> str:
-    """Return the table of all drones, with the `figures` of their flight by name."""
+def drone_table(
+    rows: Sequence[DroneRow],
+    figures: Mapping[str, FlightFigures] | None = None,
+    selected: Collection[str] = (),
+    chosen: str = "",
+    empty: str = "",
+) -> str:
+    """Return a table of drones.
+
+    Args:
+        rows: in their order.
+        figures: of their flight by name.
+        selected: names of those that one command is for.
+        chosen: whose instruments are shown.
+        empty: text where there is no row.
+    """
+    if not rows and empty:
+        return f"<div style='{STYLE};{BESIDE};color:{GREY}'>{escape(empty)}</div>"
     head = _head(
+        ("", "selected for one command"),
         ("drone", ""),
         ("state", "of its firmware"),
         ("z [m]", "height over the origin"),
@@ -85,10 +111,11 @@ def drone_table(rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures] |
         ("battery", "with the time left at the present drain"),
         ("σ [m]", "of the estimated position"),
     )
-    return _table(head + "".join(_drone_cells(row, (figures or {}).get(row.name)) for row in rows))
+    cells = (_drone_cells(row, (figures or {}).get(row.name), row.name in selected, row.name == chosen) for row in rows)
+    return _table(head + "".join(cells))
 
 
-def _drone_cells(row: DroneRow, figures: FlightFigures | None) -> str:
+def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, chosen: bool) -> str:
     name = _coloured(row.name, SEVERITY_COLOURS[row.severity]) if row.severity else escape(row.name)
     if len(row.name) > NAME_WHOLE:
         name = f"<div style='{WRAP};overflow-wrap:anywhere'>{name}</div>"
@@ -102,10 +129,14 @@ def _drone_cells(row: DroneRow, figures: FlightFigures | None) -> str:
     charge = _coloured(f"{row.battery_percent:.0f} %{',' if left else ''}", colour)
     battery = f"<div style='{WRAP}'>{charge} {_coloured(left, colour)}</div>" if left else charge
     sigma = "–" if row.sigma_m is None else f"{row.sigma_m:.2f}"
-    return _cells((name, state, *flown, battery, sigma)) + _drone_notes(row)
+    drone = escape(row.name)
+    ticked = "true" if selected else "false"
+    tick = f"<span class='zsim-select' role=checkbox aria-checked={ticked} aria-label='select {drone}'></span>"
+    mark = f" data-zsim-drone='{drone}'{' data-zsim-chosen' if chosen else ''}"
+    return _cells((tick, name, state, *flown, battery, sigma), mark) + _drone_notes(row, mark)
 
 
-def _drone_notes(row: DroneRow) -> str:
+def _drone_notes(row: DroneRow, mark: str) -> str:
     """Return the rows below that of a drone: who flies it, and what is wrong."""
     lag = "no estimate" if row.lag_ms is None else f"lag {row.lag_ms:.0f} ms"
     late = row.lag_ms is not None and row.lag_ms > LATE_MS
@@ -115,7 +146,7 @@ def _drone_notes(row: DroneRow) -> str:
     faults = f"⚠ {', '.join(row.faults)}" if row.faults else ""
     notes = [(escape(row.failsafe), RED), (escape(faults), AMBER), (escape(row.link[0]), row.link[1])]
     return "".join(
-        f"<tr><td colspan={COLUMNS} style='color:{colour};padding:0 4px 2px 12px;white-space:normal'>{note}</td></tr>"
+        f"<tr{mark}><td></td><td colspan={COLUMNS - 1} style='color:{colour};padding:0 4px 2px;{WRAP}'>{note}</td></tr>"
         for note, colour in ((about, GREY), *notes)
         if note
     )
@@ -134,7 +165,47 @@ def figure_lines(figures: FlightFigures | None) -> str:
     place = f"position {x:.2f}, {y:.2f}, {z:.2f} m"
     speed = f"speed {figures.speed_m_s:.2f} m/s, climb {figures.climb_m_s:+.2f} m/s"
     turn = f"roll {figures.roll_deg:+.1f}°, pitch {figures.pitch_deg:+.1f}°, heading {figures.heading_deg:.0f}°"
-    return f"<div style='{STYLE};{BESIDE}'>{place}<br>{speed}<br>{turn}</div>"
+    return f"<div style='{STYLE};{BESIDE}'>{_instruments(figures)}{place}<br>{speed}<br>{turn}</div>"
+
+
+def _instruments(figures: FlightFigures) -> str:
+    """Return an artificial horizon, a compass, and gauges of speed, height and climb, as SVG."""
+    pitch_px = max(-36.0, min(36.0, figures.pitch_deg * PITCH_PX_PER_DEG))
+    ladder = "".join(
+        f"<line x1=-{9 if deg % 20 else 16} x2={9 if deg % 20 else 16} y1={y} y2={y} stroke='#fff'/>"
+        for deg in range(-40, 41, 10)
+        if deg
+        for y in [-deg * PITCH_PX_PER_DEG]
+    )
+    horizon = (
+        "<clipPath id=zsim-horizon><circle r=38 /></clipPath><g clip-path='url(#zsim-horizon)'>"
+        f"<g transform='rotate({-figures.roll_deg:.1f}) translate(0 {pitch_px:.1f})'>"
+        "<rect x=-90 y=-180 width=180 height=180 fill='#4dabf7'/><rect x=-90 y=0 width=180 height=180 fill='#a0704a'/>"
+        f"<line x1=-90 x2=90 stroke='#fff' stroke-width=1.5 />{ladder}</g></g>"
+        "<circle r=38 fill=none stroke='#868e96' stroke-width=2 />"
+        "<path d='M-22 0H-8L0 6L8 0H22' fill=none stroke='#ffd43b' stroke-width=2.5 />"
+    )
+    # A heading is counted from east to north; a compass has north at the top.
+    marks = "".join(f"<text x={28 * x} y={-28 * y + 4} text-anchor=middle>{mark}</text>" for mark, x, y in COMPASS)
+    compass = (
+        "<circle r=38 fill=none stroke='#868e96' stroke-width=2 />"
+        f"{marks}<g transform='rotate({90.0 - figures.heading_deg:.0f})'>"
+        f"<path d='M0 -20L8 14L0 8L-8 14Z' fill='{BLUE}'/></g>"
+    )
+    gauges = "".join(
+        f"<text x=0 y={y}>{label}</text><text x=92 y={y} text-anchor=end font-weight=700 font-size=14>{value}</text>"
+        for y, label, value in (
+            (16, "speed", f"{figures.speed_m_s:.1f} m/s"),
+            (40, "height", f"{figures.position_m[2]:.1f} m"),
+            (64, "climb", f"{figures.climb_m_s:+.1f} m/s"),
+        )
+    )
+    return (
+        "<svg class=zsim-instruments role=img viewBox='0 0 280 84' style='width:100%;max-width:330px' "
+        "fill=currentColor font-size=11 aria-label='attitude, heading, speed, height, climb'>"
+        f"<g transform='translate(42 42)'>{horizon}</g>"
+        f"<g transform='translate(130 42)'>{compass}</g><g transform='translate(182 4)'>{gauges}</g></svg>"
+    )
 
 
 def link_note(link: ReceivedLink | None) -> tuple[str, str]:
@@ -149,6 +220,13 @@ def link_note(link: ReceivedLink | None) -> tuple[str, str]:
     known = [text.format(value) for text, value in figures if value is not None]
     known += [f"{state.refused} refused"] if state.refused else []
     return f"external; {state.state}: {', '.join([state.peer, *known])}", LINK_COLOURS[state.state]
+
+
+def link_badness(link: ReceivedLink | None) -> float:
+    """Return how bad an external drone's link is: infinite where there is none, 1 where its figures are an alarm."""
+    if link is None or link.age_s > LINK_SILENT_S or link.state.state == "lost":
+        return math.inf
+    return max((link.state.age_ms or 0.0) / LINK_OLD_MS, (link.state.loss_percent or 0.0) / LINK_LOSS_PERCENT)
 
 
 def sensor_table(
@@ -248,8 +326,8 @@ def _row(cells: Iterable[object]) -> str:
     return _cells(escape(str(cell)) for cell in cells)
 
 
-def _cells(cells: Iterable[str]) -> str:
-    return f"<tr>{''.join(f'<td align=left>{cell}</td>' for cell in cells)}</tr>"
+def _cells(cells: Iterable[str], mark: str = "") -> str:
+    return f"<tr{mark}>{''.join(f'<td align=left>{cell}</td>' for cell in cells)}</tr>"
 
 
 def _coloured(text: str, colour: str) -> str:
@@ -290,12 +368,14 @@ class TableRows:
             lag = self._views.lag_ms(received) if received else None
             row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, fixes, own_faults)
             external = drone.name in self._views.external
-            link = link_note(self._views.link_of(drone.name)) if external else ("", "")
+            received_link = self._views.link_of(drone.name)
+            link = link_note(received_link) if external else ("", "")
             sigma = received.sigma_m if received and received.fresh else None
             failsafe = self._views.failsafes.get(drone.name)
             is_down = drone.state in ("landing", "landed", "emergency")
             cause = failsafe.text if failsafe and is_down else ""
-            rows.append(DroneRow(*row, link, sigma, self._severity_of(drone.name), cause))
+            badness = link_badness(received_link) if external else (lag or 0.0) / LATE_MS
+            rows.append(DroneRow(*row, link, sigma, self._severity_of(drone.name), cause, badness))
         return rows
 
     def sensor_table(self, drone: str) -> str:

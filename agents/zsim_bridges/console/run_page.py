@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,6 +12,7 @@ from msgspec import UNSET
 
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
+from zsim.contract.views import EstimateView, ViewCluster
 from zsim.errors import DocumentError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -22,7 +23,7 @@ from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.cameras.camera_feed import CameraFeed
-from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.command_client import CommandClient, PastInstant, RequestOutcome
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures
@@ -33,11 +34,11 @@ from zsim_bridges.console.orders import OrderBook, OrderRequest
 from zsim_bridges.console.page.console_page import ConsolePage
 from zsim_bridges.console.page.control_desk import RUN, ControlDesk
 from zsim_bridges.console.page.page_forms import PageForms
-from zsim_bridges.console.record_player import RecordPlayer
+from zsim_bridges.console.record_player import KEPT_S, RecordPlayer
 from zsim_bridges.console.run_state import console_state
 from zsim_bridges.console.scene.camera_follow import CameraFollow
 from zsim_bridges.console.scene.camera_frustums import CameraFrustums
-from zsim_bridges.console.scene.picture import DronePoses
+from zsim_bridges.console.scene.picture import DronePoses, FormationShape, drone_poses
 from zsim_bridges.console.scene.picture_rate import picture_rate_hz
 from zsim_bridges.console.scene.run_scene import RunScene
 from zsim_bridges.observer_process import ObserverProcess
@@ -112,7 +113,7 @@ class RunPage:
         whose = self._client, info.run_id, members, names
         self.orders = OrderBook(*whose, unflyable, lambda: observer.now_ns, silent_s, self.views.external)
         self.views.on_own_event = self.orders.on_event
-        self.record = RecordPlayer(self._client, self._time_monitor, bool(info.replay_of))
+        self.record = RecordPlayer(self._client, self._time_monitor, bool(info.replay_of), len(names))
         hats = self._scenario.environment.hats
         self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
         self._frustums = frustums
@@ -124,17 +125,24 @@ class RunPage:
         self._scene.nodes.on_click(self._on_click)
         show = self._scene.nodes.show
         self._page = ConsolePage(
-            server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones
-        )
+            server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones,
+            self._scene.trails.choose_length, replayed=bool(info.replay_of),
+            request_return=lambda cluster: self.flying.returns.request_formation(cluster),
+            show_preview=self._scene.preview,
+        )  # fmt: skip
         page = self._page
         self.desk = ControlDesk(list(self._spaces), self._tell)
         self._told_s: dict[int, float] = {}  # wall; when a page was last told that it is not in control
         self._members = {cluster.name: cluster.drones for cluster in self._scenario.clusters}
         folders = page.control_folder, page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
         control = self.desk, self.part_of, page.parts
-        self._page_forms = PageForms(server, self._client, list(names), self._scene.nodes.radii_m, *control, *folders)
+        self._page_forms = PageForms(
+            server, self._client, list(names), self._scene.nodes.radii_m, *control, *folders, self._return_drones
+        )
         seen = self.views, self._time_monitor, self._monitor, self._scene, self._page_forms
-        self.flying = PageFlying(info, self._scenario, self._spaces, self._client, observer.name, *seen)
+        self.flying = PageFlying(
+            info, self._scenario, self._spaces, self._client, observer.name, *seen, self._note_return
+        )
 
     def close(self) -> None:
         """Send nothing any more."""
@@ -149,7 +157,9 @@ class RunPage:
         self.views.open()
         self.cameras.open()
         self.record.load()
-        self._monitor.record_end_s = self.record.timeline.get("to_s", math.inf)
+        timeline = self.record.timeline
+        if timeline:
+            self._monitor.record_s = timeline["from_s"], timeline["to_s"]
         pause = threading.Event()
         next_s = time.monotonic()
         with self._time_monitor.polling(), self.flying.running():
@@ -212,8 +222,12 @@ class RunPage:
             self._monitor.flight.update(self.views.drones)
         if wall_s - self._monitor_s >= TABLE_S:
             self._monitor_s = wall_s
+            if self._info.replay_of and self._scene.drones is not None:
+                self._keep_past(self._scene.drones.t_ns / 1e9)
             self._update_monitor(wall_s)
+        self._fill_past(self.record.take())
         self.cameras.update()
+        self.flying.returns.tick()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
@@ -226,6 +240,9 @@ class RunPage:
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
                 self._update_tables(wall_s)
+
+    def _return_drones(self, drones: Sequence[str]) -> None:
+        self.flying.returns.request_drones(drones)
 
     def _update_monitor(self, wall_s: float) -> None:
         """Keep up with the run's condition and with orders, and note what is done that was accepted before."""
@@ -259,24 +276,50 @@ class RunPage:
     def _store_unseen(self, new: bool) -> None:
         """Store what pages show of the time before they were opened."""
         if new and self.views.drones is not None:
-            self._add_points(self._scene.store(self.views.drones))
+            self._add_newest_points(self._scene.store(self.views.drones))
+
+    def _fill_past(self, instants: list[PastInstant]) -> None:
+        """Add what was read of a record to trails and plots."""
+        for past in instants:
+            drones = drone_poses(past.drones, self._names)
+            self._scene.trails.add(drones.t_ns / 1e9, drones.p_W)
+            known = {n: v for n, v in past.clusters.items() if n in self._spaces and v.names == self._spaces[n].names}
+            self._add_points(drones, self._scene.shapes_of(drones), known, past.estimates)
+        self._scene.trails.number += bool(instants)
+
+    def _keep_past(self, t_s: float) -> None:
+        """Let the record be read around the instant that a replay shows, and forget what is far from it."""
+        self.record.fill(t_s)
+        kept = t_s - KEPT_S, t_s + KEPT_S
+        self._scene.trails.keep(*kept)
+        for history in (self._page.flights.history, *(plots.history for plots in self._page.plots.values())):
+            history.keep(*kept)
 
     def _draw(self) -> None:
         assert self.views.drones is not None
         drones = self._scene.draw(self.views.drones, self._period_s(), self._page.chosen)
         self._page_forms.move_rings(drones)
-        self._add_points(drones)
+        self._add_newest_points(drones)
 
-    def _add_points(self, drones: DronePoses) -> None:
+    def _add_newest_points(self, drones: DronePoses) -> None:
+        estimates = {name: each.estimate for name, each in self.views.estimates().items() if each.fresh}
+        self._add_points(drones, self._scene.shapes, self.views.clusters, estimates)
+
+    def _add_points(
+        self,
+        drones: DronePoses,
+        shapes: Mapping[str, FormationShape | None],
+        clusters: Mapping[str, ViewCluster],
+        estimates: Mapping[str, EstimateView],
+    ) -> None:
         """Add the formations' variables and the drones' flight to the plots."""
         t_s = drones.t_ns / 1e9
-        for name, true_shape in self._scene.shapes.items():
-            view = self.views.clusters.get(name)
+        for name, true_shape in shapes.items():
+            view = clusters.get(name)
             if view is not None:
                 true_c = None if true_shape is None else true_shape.c
                 self._page.plots[name].history.add(t_s, view.desired, view.value, true_c)
-        estimates = self.views.estimates().items()
-        self._page.flights.add(drones, {name: each.estimate for name, each in estimates if each.fresh})
+        self._page.flights.add(drones, estimates)
 
     # Tables
 
@@ -285,12 +328,12 @@ class RunPage:
         flown = self._monitor.flight.figures
         self._update_controls(flown)
         page.phases.content = console_tables.formation_lines(self._monitor.condition.phases)
-        page.drones.content = console_tables.drone_table(self._table_rows.drone_rows(), flown)
+        self._page_forms.show_drones(self._table_rows.drone_rows(), flown)
         watch = self._monitor.fault_watch
         page.faults.content = console_tables.fault_lines(watch.lines(), watch.lines(is_over=True))
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
-            page.plots[page.chosen].draw()
+            page.plots[page.chosen].draw(self._scene.drones.t_ns / 1e9 if self._scene.drones else 0.0)
         self._scene.draw_trails()
 
     def _update_controls(self, flown: Mapping[str, FlightFigures]) -> None:
@@ -298,12 +341,10 @@ class RunPage:
         self._page.refresh(self._monitor.condition)
         self.desk.release_lost()
         self._page_forms.refresh(self._monitor.condition, self._page.chosen)
-        self._page_forms.show_figures(partial(self._drone_figures, flown))
+        self._page_forms.show_figures(
+            lambda drone: console_tables.figure_lines(flown.get(drone)), self._table_rows.sensor_table
+        )
         self._page_forms.show_events(self.views.log.rows())
-
-    def _drone_figures(self, flown: Mapping[str, FlightFigures], drone: str) -> str:
-        """Return figures and sensors of one drone, as HTML."""
-        return console_tables.figure_lines(flown.get(drone)) + self._table_rows.sensor_table(drone)
 
     def _on_outcome(self, outcome: RequestOutcome) -> None:
         """Show the outcome of a request: a refusal in the corner of every page, and among the events.
@@ -313,12 +354,17 @@ class RunPage:
         if outcome.order and not self.orders.note(outcome):
             return
         if outcome.refusal:
+            self.flying.returns.refused(outcome.subject)
             self._note("refused", outcome.subject, f"{outcome.request}: {outcome.refusal}")
             self._notify(outcome.request, outcome.refusal)
             return
         known = self._monitor.pending.accept(outcome.subject, outcome.op, outcome.request, outcome.args)
         if known or outcome.subject in self._spaces:
             self._note("accepted", outcome.subject, f"{outcome.request}: accepted")
+
+    def _note_return(self, subject: str, text: str) -> None:
+        self._note("refused", subject, text)
+        self._notify(f"return of {subject}", text)
 
     def _note(self, kind: str, subject: str, text: str) -> None:
         """Add an event of the console's own to those that are shown."""

@@ -74,11 +74,10 @@ def console(
     from zsim.transport.open_files import SERVER_FILES, require_files
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.server.http_proxy import ListenAddress
-    from zsim_deploy.roles.priority import lower_priority
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import log_printer, serve_runs
 
-    lower_priority(only_viewed=True)
+    # Of normal priority: an operator's emergency goes through it, and one that gave way would be reported as silent.
     own_name = process_name("console", name, reach.who, "*")
     say = JsonProgress().say if reach.launched else log_printer(None)
     require_files(SERVER_FILES, "a console and its pages")

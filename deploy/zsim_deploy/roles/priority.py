@@ -3,26 +3,17 @@
 import os
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 
 NICE = 5  # of processes for which no gate waits
-NICE_FOR_VIEWS = 10  # of those that only people look at: a picture may come later, a gate may not
 AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
 TRIES = 5
 AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
 
 
-def lower_priority(only_viewed: bool = False) -> None:
-    """Let the world go first. Threads to come, too.
-
-    Args:
-        only_viewed: only a person waits for it; then it does not interrupt others when it wakes up (SCHED_BATCH).
-    """
-    lower(NICE_FOR_VIEWS if only_viewed else NICE)
-    if only_viewed and sys.platform == "linux":
-        with suppress(OSError):  # it may be in a class from which one does not come back
-            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+def lower_priority() -> None:
+    """Let the world go first. Threads to come, too."""
+    lower(NICE)
 
 
 def lower(niceness: int) -> None:

@@ -198,7 +198,10 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
         playback = Playback(reader, scenario, info, options.choice, options.rate, time.monotonic_ns)
         for name in options.expect:
             playback.barrier.expect(name)
-        with Screen(scenario.duration_s) as screen:
+        last = reader.last(keys.CLOCK)
+        last_ns = options.choice.to_ns if last is None else min(last.t_ns, options.choice.to_ns or last.t_ns)
+        end_s = scenario.duration_s if last_ns is None else last_ns / 1e9
+        with Screen(end_s, from_s=options.choice.from_ns / 1e9) as screen:
             where = f"{scenario.federation!r} on {', '.join(options.endpoints)}"
             text = f"replay of run {info.run_id} as {where}; Ctrl-C ends it"
             run(playback, options.endpoints, stop.reason, world_progress(screen), lambda: screen.say(text), who)

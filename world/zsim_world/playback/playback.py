@@ -32,6 +32,9 @@ RECORD_OVER = "the record is over"  # why a replay of the whole record ended
 
 NOT_FLYABLE = "a replay: nobody can be flown"
 SEEK_MAX_S = 1e9  # beyond it, nanoseconds are no int64
+VIEWED_MAX = 10_000  # drones times instants in one answer to `views`: 2 MB
+VIEWED_MAX_S = 60.0  # simulated, in one answer to `views`; chosen: the replay stands while it reads them
+BEFORE_NS = 1_000_000_000  # in which each key that views are made of is published once
 FLIGHT_OPS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that only a flight takes
 
 
@@ -84,7 +87,7 @@ class Playback(Coordinator):
         super().__init__(scenario, "lockstep", rate, wall_ns, run_id, [])
         self._recorded = info
         self._played = played
-        self._operations |= {"seek": self._seek, "timeline": self._timeline}
+        self._operations |= {"seek": self._seek, "timeline": self._timeline, "views": self._views_of_past}
         self.refused_queries = tuple(keys.cluster_control(cluster.name) for cluster in scenario.clusters)
         self._table = run_key_table(info)
         self._kinds = len(self._table) // len(self.names)  # of messages about a drone
@@ -93,6 +96,7 @@ class Playback(Coordinator):
         self._last: dict[str, bytes] = {}
         topics = reader.topics()
         wanted = {key for key in topics if is_played(key, played.keys)}
+        self._viewed = self._views.sources & wanted
         self._recounts = any(keys.is_sensor(key) and key not in wanted for key in topics)
         self._reader = reader
         self._plays_faults = keys.FAULTS in wanted
@@ -152,6 +156,29 @@ class Playback(Coordinator):
         first = next(self._reader.messages([keys.CLOCK]), last)
         span = {"from_s": first.t_ns / 1e9, "to_s": last.t_ns / 1e9} if first and last else {}
         return ControlAnswer(True, result={**span, "marks": timeline_marks(self._reader)})
+
+    def _views_of_past(self, request: ControlRequest) -> Refusal | ControlAnswer:
+        """Answer the views of instants on record, `every_s` apart, wherever the replay is: for curves and trails."""
+        from_s, to_s, every_s = (number(request.args.get(name)) for name in ("from_s", "to_s", "every_s"))
+        if from_s is None or not 0.0 <= from_s < SEEK_MAX_S:
+            return refused_argument(request, "from_s", "a time on record [s]")
+        if to_s is None or not from_s <= to_s <= from_s + VIEWED_MAX_S:
+            return refused_argument(request, "to_s", f"from from_s to {VIEWED_MAX_S:g} s after it")
+        count_max = max(1, VIEWED_MAX // len(self.names))
+        if every_s is None or not every_s > 0.0 or (to_s - from_s) / every_s >= count_max:
+            return refused_argument(request, "every_s", f"above 0, for {count_max} instants of this run at most")
+        instants = [round((from_s + k * every_s) * 1e9) for k in range(int((to_s - from_s) / every_s) + 1)]
+        last: dict[str, bytes] = {}
+        found: list[tuple[str, bytes]] = []
+        for seq, (t_ns, passed) in enumerate(self._recorded_gates.before(instants, self._viewed, BEFORE_NS)):
+            last |= passed
+            if any(key.endswith("/truth") for key in passed):  # else the record has a gap there, or has ended
+                found += [(view.key, messages.encode(view.message)) for view in self._views.views(last, t_ns, seq)]
+        return ControlAnswer(True, result=found)
+
+    def control(self, request: ControlRequest) -> ControlAnswer:
+        """Answer a request; `views` are asked for again and again, and are no event."""
+        return self._answer(request) if request.op == "views" else super().control(request)
 
     def _seek(self, request: ControlRequest) -> Refusal | None:
         """Go on from another gate. Whoever is waited for would miss what lies between."""

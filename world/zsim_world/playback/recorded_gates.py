@@ -1,5 +1,6 @@
 """A record read as the gates of a run, a few of them in memory at a time; what of it is played, and its views."""
 
+from bisect import bisect_left
 from collections import defaultdict, deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from zsim.contract.views import (
 )
 from zsim.errors import DecodeError
 from zsim.record import Recorded, RecordReader
+from zsim.record.record_reader import OVERLAP_NS
 from zsim.runtime.agent import Output
 from zsim.scenario import rights
 from zsim.scenario.fault_kinds import PROCESS_KILL
@@ -72,6 +74,29 @@ class RecordedGates:
         for gate in self._all(from_ns):
             if gate.t_ns >= from_ns:
                 yield gate
+
+    def before(
+        self, instants_ns: Sequence[int], wanted: Collection[str], back_ns: int
+    ) -> Iterator[tuple[int, dict[str, bytes]]]:
+        """Yield each instant with the last payload by key since the instant before; for the first one since back_ns.
+
+        Args:
+            instants_ns: ascending.
+            wanted: keys.
+            back_ns: how far before the first instant is looked.
+        """
+        first_ns, last_ns = instants_ns[0] - back_ns, instants_ns[-1]
+        newest: list[dict[str, Recorded]] = [{} for _ in instants_ns]
+        for recorded in self._reader.messages(wanted, by_time=False, from_ns=max(0, first_ns)):
+            if recorded.t_ns > last_ns + OVERLAP_NS:
+                break
+            if first_ns <= recorded.t_ns <= last_ns:
+                of_instant = newest[bisect_left(instants_ns, recorded.t_ns)]
+                held = of_instant.get(recorded.key)
+                if held is None or held.t_ns <= recorded.t_ns:
+                    of_instant[recorded.key] = recorded
+        for t_ns, of_instant in zip(instants_ns, newest, strict=True):
+            yield t_ns, {key: recorded.payload for key, recorded in of_instant.items()}
 
     def _all(self, from_ns: int) -> Iterator[Gate]:
         held: dict[int, list[Recorded]] = {}

@@ -176,6 +176,12 @@ class ManualFlight:
             flight.stick, flight.place_W, flight.seen_s = None, (x_m, y_m, height_m), self._wall_s()
         return self.answer(page)
 
+    def is_on_way(self, page: Any) -> bool:
+        """Return whether the page's drone flies to a place."""
+        with self._lock:
+            flight = self._flights.get(page)
+            return flight is not None and flight.place_W is not None
+
     def leave(self, page: Any, text: str = "") -> FlightAnswer:
         """Let the page's drone hover, and give it back; `text` says why."""
         with self._lock:

@@ -62,6 +62,7 @@ def formations(
 
 
 def trail_lines(trails: CanvasTrails, drones: DronePoses) -> list[list[list[float]]]:
-    """Return of each drone the last stretch of its path, x and y [m]."""
-    segments, owners = trails.segments(drones.p_W)
-    return [np.round(segments[owners == i][:, 0, :2], DIGITS).tolist() for i in range(len(drones.names))]
+    """Return of each drone the last stretch of its path: x and y [m], and when it was there [s]."""
+    segments, owners, times = trails.segments(drones.t_ns / 1e9, drones.p_W)
+    points = np.round(np.column_stack((segments[:, 0, :2], times)), DIGITS)
+    return [points[owners == i].tolist() for i in range(len(drones.names))]

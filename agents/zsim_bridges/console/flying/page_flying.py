@@ -1,8 +1,10 @@
 """What pages may do with single drones in one run: choose one, see all from above, fly one."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+import numpy as np
 
 from zsim.contract.messages import Info
 from zsim.scenario.scenario import Scenario
@@ -13,6 +15,7 @@ from zsim_bridges.console.flying.flight_conditions import DroneSight, RunSight
 from zsim_bridges.console.flying.flown_velocity import DronePose
 from zsim_bridges.console.flying.geofence import geofence_of
 from zsim_bridges.console.flying.manual_flight import ManualFlight
+from zsim_bridges.console.flying.return_flights import ReturnFlights
 from zsim_bridges.console.monitoring.run_monitor import RunMonitor
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
@@ -34,9 +37,11 @@ class PageFlying:
         monitor: has the run's condition.
         scene: has the drones' poses and trails.
         pages: have the drone that each has chosen.
+        note: called with a drone or formation whose return does not go on, and why.
 
     Attributes:
         control: of the drones that are flown from pages.
+        returns: of the drones and formations that fly back to where they started.
     """
 
     def __init__(
@@ -51,6 +56,7 @@ class PageFlying:
         monitor: RunMonitor,
         scene: RunScene,
         pages: PageForms,
+        note: Callable[[str, str], None] = lambda subject, why: None,
     ) -> None:
         self._views = views
         self._time_monitor = time_monitor
@@ -64,6 +70,7 @@ class PageFlying:
         self._members = {each.name: [names.index(drone) for drone in each.drones] for each in scenario.clusters}
         limits = {drone.name: drone.limits for drone in scenario.drones}
         self.control = ManualFlight(client, name, limits, fence, info.gate_ns / 1e9, self._sight, self._run_sight)
+        self.returns = ReturnFlights(scenario, client, self.control, self._sight, lambda: views.clusters, note)
 
     @contextmanager
     def running(self) -> Iterator[None]:
@@ -80,6 +87,10 @@ class PageFlying:
         """Return why a page may not fly a drone: another one is in control of its formation; empty where it may."""
         return self._pages.use(client_id, drone) if client_id is not None else ""
 
+    def select(self, client_id: int | None, drone: str) -> None:
+        """Select a drone on one page for one command with others, or no longer."""
+        self._pages.toggle(client_id, drone)
+
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
         """Return the view from above; `whole`: with what does not change, and the trails of before."""
         drones = self._scene.drones
@@ -91,6 +102,11 @@ class PageFlying:
             "chosen": self._pages.chosen(client_id),
             "drones": map_view.positions(drones, states),
             "formations": map_view.formations(self._spaces, self._members, dict(self._views.clusters)),
+            "previews": [
+                np.round(way[:, :, :2], map_view.DIGITS).tolist() for way in list(self._scene.previews.values())
+            ],
+            "trail_s": self._scene.trails.length_s,
+            "trails_number": self._scene.trails.number,
         }
         if not whole:
             return shown

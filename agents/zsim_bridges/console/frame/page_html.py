@@ -6,15 +6,17 @@ Viewers see its controls disabled.
 import gzip
 import importlib.resources
 
-PARTS = (  # of the page beside viser's; orders.html is used by all that follow, each of the last three by the next
+PARTS = (  # of the page beside viser's; each part may use those before it
     "layout.html",
     "orders.html",
     "head_bar.html",
+    "fleet_table.html",
     "camera_windows.html",
     "scene_tools.html",
     "flight_bar.html",
     "map_drawing.html",
     "map_view.html",
+    "touch.html",
 )
 VIEW_STYLE = (
     "<style>.mantine-Button-root,.mantine-Slider-root,.mantine-Input-input,.zsim-order"

@@ -19,6 +19,7 @@ def page_head(
     alarms: Sequence[dict[str, object]] = (),
     single: Sequence[str] = (),
     world: str = "",
+    record_s: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
     """Return the head of the page of a run.
 
@@ -30,12 +31,13 @@ def page_head(
         alarms: as `AlarmBoard.rows`.
         single: drones of no formation.
         world: where the run is, in words.
+        record_s: of a replay, the times of the first and the last gate on record [s].
     """
     level = "waiting" if run.level == "running" and _stands(clock) else run.level
-    title, detail = _words(run, clock, t_ns, world)
-    lines = [each for each in (name, "replay" if run.replayed else "", detail, *_phases(run)) if each]
+    title, detail = _words(run, clock, t_ns, world, record_s)
+    lines = [each for each in (name, "a record is played back" if run.replayed else "", detail, *_phases(run)) if each]
     refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.grounded()}
-    head = {"level": level, "title": title, "detail": " · ".join(lines), "t_s": t_ns / 1e9}
+    head = {"level": level, "title": title, "detail": " · ".join(lines), "t_s": t_ns / 1e9, "replay": run.replayed}
     return {**head, "age_s": run.silent_s, "refusals": refusals, "alarms": list(alarms)}
 
 
@@ -49,7 +51,7 @@ def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
     reason = f"the run is over: {ended}" if ended else "there is no run yet"
     refusals = {"land": reason, "emergency": reason}
     words = ("ended", "run over", ended) if ended else ("waiting", "waiting for a world", world)
-    head = {**dict(zip(("level", "title", "detail"), words, strict=True)), "t_s": 0.0}
+    head = {**dict(zip(("level", "title", "detail"), words, strict=True)), "t_s": 0.0, "replay": False}
     return {**head, "age_s": 0.0, "refusals": refusals, "alarms": []}
 
 
@@ -58,7 +60,9 @@ def _stands(clock: Clock | None) -> bool:
     return clock is not None and any(each.since_wall_s > STANDS_S for each in clock.waiting_for)
 
 
-def _words(run: RunCondition, clock: Clock | None, t_ns: int, world: str) -> tuple[str, str]:
+def _words(
+    run: RunCondition, clock: Clock | None, t_ns: int, world: str, record_s: tuple[float, float] | None
+) -> tuple[str, str]:
     """Return the title and the detail."""
     t_s = (t_ns or (clock.t_ns if clock else 0)) / 1e9
     if run.level == "ended":
@@ -68,6 +72,10 @@ def _words(run: RunCondition, clock: Clock | None, t_ns: int, world: str) -> tup
     state = "waiting" if run.clock == "running" and _stands(clock) else run.clock or "no clock yet"
     pace = f" × {clock.rate:.1f}" if clock is not None and state == "running" else ""
     title = f"{state} {t_s:.1f} s{pace}"
+    if run.replayed:
+        from_s, to_s = record_s or (t_s, t_s)
+        share = f" ({100.0 * min(1.0, max(0.0, t_s - from_s) / (to_s - from_s)):.0f} %)" if to_s > from_s else ""
+        title = f"REPLAY · {state} {t_s:.1f} of {to_s:.1f} s{share}{pace}"
     return f"EMERGENCY · {title}" if run.level == "emergency" else title, _waiting(clock, world)
 
 

@@ -50,7 +50,7 @@ class RunCondition(NamedTuple):
             return "ended"
         if self.silent_s:
             return "silent"
-        if "emergency" in self.drones.values():
+        if "emergency" in self.drones.values() and not self.replayed:  # of a record nobody has to act
             return "emergency"
         return "paused" if self.clock == "paused" else "running" if self.clock == "running" else "waiting"
 
@@ -75,9 +75,9 @@ def run_refusals(run: RunCondition) -> dict[str, str]:
 
 
 def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
-    """Return why each mode of one drone would be refused; empty where it would not."""
+    """Return why each mode of one drone, and its return, would be refused; empty where it would not."""
     state = run.drones.get(drone)
-    modes = ("takeoff", "land", "emergency", "reset")
+    modes = ("takeoff", "land", "return", "emergency", "reset")
     unseen = run.grounded() or ("" if state else f"{drone} was not seen yet")
     refused = {mode: unseen or state_refusal(drone, state or "", mode) or "" for mode in modes}
     refused["takeoff"] = refused["takeoff"] or preflight_refusal(run, [drone])

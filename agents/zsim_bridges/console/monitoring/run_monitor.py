@@ -36,7 +36,7 @@ class RunMonitor:
         flight: figures of the drones.
         fault_watch: what faults strike, and what they did.
         pending: requests that are not done yet.
-        record_end_s: simulated time of the last gate on record, of a replay.
+        record_s: simulated times of the first and the last gate on record, of a replay.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class RunMonitor:
         self.board = AlarmBoard()
         self.flight = FlightMeter()
         self.pending = PendingRequests()
-        self.record_end_s = math.inf
+        self.record_s: tuple[float, float] | None = None
         self.fault_watch = FaultWatch()
         self._t_ns = 0
 
@@ -81,7 +81,8 @@ class RunMonitor:
             for name, view in views.clusters.items()
         }
         state, silent_s = clock.state if clock else None, self._time_monitor.silent_s
-        at_end = clock is not None and state == "paused" and clock.t_ns >= self.record_end_s * 1e9 - ROUNDING_NS
+        end_s = self.record_s[1] if self.record_s else math.inf
+        at_end = clock is not None and state == "paused" and clock.t_ns >= end_s * 1e9 - ROUNDING_NS
         self.condition = RunCondition(
             state, silent_s, self._ended, self._replayed, at_end, drones, phases, self._members,
             checks=self._checks(conditions, foreign),
@@ -98,7 +99,7 @@ class RunMonitor:
         t_ns = self._views.drones.t_ns if self._views.drones else 0
         run = self.condition._replace(silent_s=self._time_monitor.silent_s)
         rows, single = self.board.rows(wall_s), self._single
-        return page_head(self._name, run, self._time_monitor.clock, t_ns, rows, single, self._world)
+        return page_head(self._name, run, self._time_monitor.clock, t_ns, rows, single, self._world, self.record_s)
 
     def _forget_future(self, t_ns: int) -> None:
         """Forget alarms and losses of later times, where a replay has gone back."""

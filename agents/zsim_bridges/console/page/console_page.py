@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import viser
@@ -12,11 +13,13 @@ from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.page.control_desk import EVERY, RUN
+from zsim_bridges.console.page.flight_preview import FlightPreview
 from zsim_bridges.console.page.formation_form import FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.page_forms import set_theme
 from zsim_bridges.console.page.run_forms import FaultForm, FleetForm, RunForm
 from zsim_bridges.console.page.variable_plots import VariablePlots, flight_history
+from zsim_bridges.console.scene.picture import TRAIL_S, TRAILS_S
 
 PANEL_PX = 350
 SWITCHES = {
@@ -38,9 +41,13 @@ class ConsolePage:
         show: shows or hides one of `SWITCHES` in the scene.
         rate: that the run was started with.
         drones: of the run, with their rotors.
+        choose_trail: lets trails go back so far [s].
+        replayed: whether a record is played back.
+        request_return: lets a formation fly back to where it started, and land.
+        show_preview: shows what a formation would fly, None for nothing.
 
     Attributes:
-        phases, drones, faults: the tables.
+        phases, faults: the tables.
         forms, plots: of each formation.
         flights: what plots show of single drones.
         chosen: the formation that is shown; empty where there is none.
@@ -59,7 +66,15 @@ class ConsolePage:
         show: Callable[[str, bool], None],
         rate: float,
         drones: Sequence[DroneInfo] = (),
+        choose_trail: Callable[[float], None] = lambda _: None,
+        replayed: bool = False,
+        request_return: Callable[[str], None] = lambda _: None,
+        show_preview: Callable[[str, FlightPreview | None], None] = lambda name, preview: None,
     ) -> None:
+        self._show_preview = show_preview
+        self._request_return = request_return
+        self._choose_trail = choose_trail
+        self._replayed = replayed
         self._scenario = scenario
         self._spaces = spaces
         self._client = client
@@ -69,7 +84,7 @@ class ConsolePage:
         self._drones = drones
         self.forms: dict[str, FormationForm] = {}
         self.plots: dict[str, VariablePlots] = {}
-        self.flights = flight_history([drone.name for drone in scenario.drones])
+        self.flights = flight_history([drone.name for drone in scenario.drones], around=replayed)
         self.chosen = next(iter(spaces), "")
         self.parts: dict[str, str] = {}
         self._folders: dict[str, list[viser.GuiFolderHandle]] = {}
@@ -112,12 +127,21 @@ class ConsolePage:
             name, space = cluster.name, self._spaces[cluster.name]
             limits = slider_ranges(space, cluster, self._scenario)
             with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder, self._part(gui, name):
-                form = FormationForm(gui, self._client, self._report, cluster, space, limits)
+                form = FormationForm(
+                    gui,
+                    self._client,
+                    self._report,
+                    cluster,
+                    space,
+                    limits,
+                    self._request_return,
+                    partial(self._show_preview, name),
+                )
             self.forms[name] = form
             for control in form.safe:
                 self.parts.pop(control._impl.uuid if hasattr(control, "_impl") else "", None)
             with plots, gui.add_folder(None, visible=name == self.chosen) as plot_folder:
-                self.plots[name] = VariablePlots(gui, cluster, limits, self.flights)
+                self.plots[name] = VariablePlots(gui, cluster, limits, self.flights, self._replayed)
             self._folders[name] = [form_folder, plot_folder]
 
     @contextmanager
@@ -144,12 +168,15 @@ class ConsolePage:
         for what, label in SWITCHES.items():
             switch = gui.add_checkbox(label, True)
             switch.on_update(lambda _, what=what, switch=switch: self._show(what, switch.value))
+        lengths = {f"the last {length_s:g} s": length_s for length_s in TRAILS_S}
+        chosen = next(text for text, length_s in lengths.items() if length_s == TRAIL_S)
+        trail = gui.add_dropdown("trails of", list(lengths), initial_value=chosen)
+        trail.on_update(lambda _: self._choose_trail(lengths[trail.value]))
 
     def _left_panel(self, gui: viser.GuiApi) -> None:
         panel = gui.add_panel()
         with panel.add_tab("Drones", viser.Icon.DRONE):
             self.drone_folder = gui.add_folder(None)
-            self.drones = gui.add_html("")
             self.figure_folder = gui.add_folder(None)
         with panel.add_tab("Events", viser.Icon.LIST):
             self.event_folder = gui.add_folder(None)

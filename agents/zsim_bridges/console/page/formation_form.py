@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 from functools import partial
+from html import escape
 from typing import Any
 
+import numpy as np
 import viser
 
 from zsim.contract.views import ViewCluster
@@ -13,6 +15,7 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import preflight_lines
 from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals, is_held_by_fault
 from zsim_bridges.console.page import operator_input
+from zsim_bridges.console.page.flight_preview import FlightPreview, preview_of
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables, range_refusal
 from zsim_bridges.console.page.run_forms import (
     ORDERS,
@@ -26,11 +29,18 @@ from zsim_bridges.console.page.run_forms import (
 from zsim_bridges.console.page.variable_slider import VariableSlider
 from zsim_bridges.console.scene.picture import SHAPED_PHASES
 
+PREVIEW_STYLE = "font-size:12px;line-height:1.3;padding:2px 10px;color:#d9480f"
 REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
 SAFE = ("hold", "land")
-LABELS = {**{op: label for label, op in OPERATIONS.items()}, "target": "sliders", "trajectory": "Trajectory"}
+RETURN = "Return"  # over the middle of the starts, and land there
+LABELS = {
+    **{op: label for label, op in OPERATIONS.items()},
+    "target": "sliders",
+    "trajectory": "Trajectory",
+    "return": RETURN,
+}
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
     "engage": viser.Icon.TRIANGLE,
@@ -55,6 +65,8 @@ class FormationForm:
         cluster: of the scenario.
         space: of the formation.
         ranges: of its variables.
+        request_return: lets a formation move over the middle of its starts, and land.
+        show_preview: shows in the scene what would be flown; None: nothing.
 
     Attributes:
         safe: the controls that a page may use without being in control.
@@ -68,7 +80,11 @@ class FormationForm:
         cluster: Cluster,
         space: ClusterSpace,
         ranges: list[SliderRange],
+        request_return: Callable[[str], None] = lambda _: None,
+        show_preview: Callable[[FlightPreview | None], None] = lambda _: None,
     ) -> None:
+        self._show_preview = show_preview
+        self._previewed: tuple[str, str, dict[str, Any]] | None = None  # operation, as shown, arguments
         self._client = client
         self._report = report
         self._cluster = cluster
@@ -79,12 +95,24 @@ class FormationForm:
         self._edited = False
         self._controls = {op: self._button(gui, label, op) for label, op in OPERATIONS.items()}
         self.safe = [self._controls[op] for op in SAFE]
+        if {"x_c", "y_c"} <= set(space.names):
+            back = gui.add_button(RETURN, icon=viser.Icon.HOME, color="gray")
+            back.on_click(lambda _: request_return(cluster.name))
+            self._controls["return"] = back
         self._reasons = gui.add_html("")
         self._checks = gui.add_html("")
         hint = "Duration of a move; 0: as fast as the robots' limits let it"
         self._others: list[tuple[str, Any]] = []  # further controls, each with the operation that it requests
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
         gui.add_html(limits_line(f"over: 0 to {OVER_MAX_S:g} s"))
+        self._first = gui.add_checkbox(
+            "Preview first", False, hint="Show what a target or a trajectory would fly, and ask before it is flown"
+        )
+        self._preview_text = gui.add_html("", visible=False)
+        self._fly_it = gui.add_button("Fly what is previewed", icon=viser.Icon.PLAYER_PLAY, color="blue", visible=False)
+        self._fly_it.on_click(lambda _: self._end_preview(fly=True))
+        self._discard = gui.add_button("Discard it", color="gray", visible=False)
+        self._discard.on_click(lambda _: self._end_preview(fly=False))
         shown = primary_variables(space.names)
         self._sliders = {name: VariableSlider(gui, self._ranges[name]) for name in shown}
         if len(shown) < space.size:
@@ -95,6 +123,7 @@ class FormationForm:
         """Grey out what the controller would refuse, with its reason; a slider shows all the same where it stands."""
         name = self._cluster.name
         refusals = {**formation_refusals(run, name), **order_refusals(formation_refusals(heard(run), name))}
+        refusals["return"] = refusals["target"]  # which is its first part
         set_refusals(self._controls, refusals)
         for op, control in self._others:
             set_refusals({op: control}, refusals)
@@ -131,7 +160,7 @@ class FormationForm:
         moved = {name: value for name, slider in self._sliders.items() if (value := slider.pop_value()) is not None}
         if self.request_target(moved):
             for name in moved:
-                self._sliders[name].hold(wall_s)
+                self._sliders[name].hold(wall_s)  # one that is only previewed goes back by itself
 
     def request_target(self, shown: dict[str, float]) -> bool:
         """Request values in the units of the page; return whether they are within their ranges."""
@@ -144,8 +173,38 @@ class FormationForm:
         values = {name: self._ranges[name].to_si(value) for name, value in shown.items()}
         lasting: dict[str, Any] = {"over_s": over_s} if over_s > 0 else {}
         text = ", ".join(f"{name} {value:g} {self._ranges[name].unit}" for name, value in shown.items())
-        self._client.request_cluster(self._cluster.name, "target", shown=text, values=values, **lasting)
+        self._request("target", text, {"values": values, **lasting})
         return True
+
+    def _request(self, op: str, shown: str, args: dict[str, Any]) -> None:
+        """Request a target or a trajectory, or preview it first."""
+        if not self._first.value or self._shown is None:
+            self._end_preview(fly=False)
+            self._client.request_cluster(self._cluster.name, op, shown=shown, **args)
+            return
+        if op == "target" and self._previewed is not None and self._previewed[0] == op:  # of sliders moved one by one
+            _, shown_before, before = self._previewed
+            shown, args = f"{shown_before}, {shown}", {**args, "values": {**before["values"], **args["values"]}}
+        apart_m = self._cluster.gains.separation_min_m
+        try:
+            preview = preview_of(self._space, op, args, np.array(self._shown), apart_m)
+        except operator_input.InputError as error:
+            self._report(RequestOutcome(f"{self._cluster.name}: {op}", str(error)))
+            return
+        self._previewed = op, shown, args
+        self._show_preview(preview)
+        self._preview_text.content = f"<div style='{PREVIEW_STYLE}'>{escape(f'{op} {shown}: {preview.text}')}</div>"
+        self._preview_text.visible = self._fly_it.visible = self._discard.visible = True
+
+    def _end_preview(self, fly: bool) -> None:
+        previewed, self._previewed = self._previewed, None
+        if previewed is None:
+            return
+        self._preview_text.visible = self._fly_it.visible = self._discard.visible = False
+        self._show_preview(None)
+        if fly:
+            op, shown, args = previewed
+            self._client.request_cluster(self._cluster.name, op, shown=shown, **args)
 
     def _button(self, gui: viser.GuiApi, label: str, op: str) -> Any:
         if op in ORDERS:
@@ -222,7 +281,7 @@ class FormationForm:
         except operator_input.InputError as error:
             self._report(RequestOutcome(f"{self._cluster.name}: trajectory", str(error)))
             return
-        self._client.request_cluster(self._cluster.name, "trajectory", **args)
+        self._request("trajectory", "", args)
 
 
 def _is_before_takeoff(run: RunCondition, drone: str) -> bool:

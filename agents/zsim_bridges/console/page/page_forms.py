@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import viser
 
 from zsim_bridges.console.command_client import CommandClient
-from zsim_bridges.console.console_tables import event_table
+from zsim_bridges.console.console_tables import DroneRow, event_table
 from zsim_bridges.console.monitoring import event_log
 from zsim_bridges.console.monitoring.event_log import EventRow
+from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.page.control_desk import RUN, ControlDesk, Holding, words
+from zsim_bridges.console.page.fleet_table import FleetTable
 from zsim_bridges.console.page.run_forms import DroneForm
 from zsim_bridges.console.scene.chosen_ring import ChosenRing
 from zsim_bridges.console.scene.ground_grid import draw_ground
@@ -28,7 +30,9 @@ class _PageForm(NamedTuple):
 
     control: "ControlForm"
     drone: DroneForm
+    fleet: FleetTable
     ring: ChosenRing
+    instruments: viser.GuiHtmlHandle
     figures: viser.GuiHtmlHandle
     events: "EventForm"
 
@@ -44,6 +48,7 @@ class PageForms:
         part_of: returns what a page must be in control of to let a drone take off.
         controls: what it must be in control of to use a control of all pages, by the control's id.
         control_folder, drone_folder, figure_folder, event_folder, theme_folder: where they are to be.
+        request_return: lets drones fly back to where they started.
     """
 
     def __init__(
@@ -60,7 +65,9 @@ class PageForms:
         figure_folder: Any,
         event_folder: Any,
         theme_folder: Any,
+        request_return: Callable[[Sequence[str]], None] = lambda _: None,
     ) -> None:
+        self._request_return = request_return
         self._server = server
         self._client = client
         self._names = names
@@ -84,6 +91,12 @@ class PageForms:
         if form is not None:
             form.drone.choose(drone)
 
+    def toggle(self, client_id: int | None, drone: str) -> None:
+        """Select a drone on one page for one command with others, or no longer."""
+        form = self._forms.get(-1 if client_id is None else client_id)
+        if form is not None:
+            form.fleet.toggle(drone)
+
     def chosen(self, client_id: int | None) -> str:
         """Return the drone that one page has chosen; empty of one that is not open."""
         form = self._forms.get(-1 if client_id is None else client_id)
@@ -97,11 +110,19 @@ class PageForms:
         """Put the ring of each page about the drone that it has chosen."""
         self._update(lambda form: form.ring.move(drones, form.drone.chosen))
 
-    def show_figures(self, figures_of: Callable[[str], str]) -> None:
-        """Show on each page the figures of the drone that it has chosen; `figures_of` a drone are HTML."""
-        forms = list(self._forms.values())
-        contents = {drone: figures_of(drone) for drone in {form.drone.chosen for form in forms}}
-        self._update(lambda form: setattr(form.figures, "content", contents.get(form.drone.chosen, "")))
+    def show_figures(self, instruments_of: Callable[[str], str], sensors_of: Callable[[str], str]) -> None:
+        """Show on each page instruments and sensors of the drone that it has chosen; both of a drone are HTML."""
+        chosen = {form.drone.chosen for form in list(self._forms.values())}
+        contents = {drone: (instruments_of(drone), sensors_of(drone)) for drone in chosen}
+
+        def show(form: _PageForm) -> None:
+            form.instruments.content, form.figures.content = contents.get(form.drone.chosen, ("", ""))
+
+        self._update(show)
+
+    def show_drones(self, rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures]) -> None:
+        """Show on each page the drones as it sorts and filters them."""
+        self._update(lambda form: form.fleet.show(rows, figures, form.drone.chosen))
 
     def show_events(self, rows: Sequence[EventRow]) -> None:
         """Show on each page the events that it has chosen."""
@@ -129,7 +150,9 @@ class PageForms:
             control = ControlForm(page.gui, self._desk, page.client_id, self._controls)
         with drone_folder:
             may = partial(self._may, page.client_id)
-            drone = DroneForm(page.gui, self._client, self._names, may)
+            drone = DroneForm(page.gui, self._client, self._names, may, self._request_return)
+            instruments = page.gui.add_html("")
+            fleet = FleetTable(page.gui, self._names, lambda: drone.select(fleet.selected))
         with figure_folder:
             figures = page.gui.add_html("")
         with event_folder:
@@ -137,7 +160,9 @@ class PageForms:
         with theme_folder:
             theme = page.gui.add_checkbox("Dark theme", False)
         theme.on_update(lambda _: _set_page_theme(page, dark=theme.value))
-        self._forms[page.client_id] = _PageForm(control, drone, ChosenRing(page.scene, self._radii_m), figures, events)
+        self._forms[page.client_id] = _PageForm(
+            control, drone, fleet, ChosenRing(page.scene, self._radii_m), instruments, figures, events
+        )
         if page.client_id not in self._server.get_clients():
             self._remove(page)  # it has disconnected meanwhile
 

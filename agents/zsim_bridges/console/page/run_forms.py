@@ -235,7 +235,7 @@ class OrderButton:
         gui: viser's, in the folder where it is to be.
         label: of the button.
         op: see `OrderRequest`.
-        of: whom it concerns: {"drone": name} or {"cluster": name}.
+        of: whom it concerns: {"drone": name}, of several by commas, or {"cluster": name}.
         held: whether it is to be held for a while.
 
     Attributes:
@@ -371,13 +371,19 @@ class FleetForm:
                 self._client.send_mode(single, operation)
 
 
-DRONE_MODES = {"takeoff": "Take off", "land": "Land", "emergency": "Emergency", "reset": "Reset"}
-IN_CONTROL = ("takeoff", "reset")  # modes that need control; anybody may land a drone, or stop it
-DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "reset": viser.Icon.REFRESH}
+DRONE_MODES = {
+    "takeoff": "Take off",
+    "land": "Land",
+    "return": "Return",
+    "emergency": "Emergency",
+    "reset": "Reset",
+}  # and what is none: to fly back to the start and land there
+IN_CONTROL = ("takeoff", "return", "reset")  # what needs control; anybody may land a drone, or stop it
+DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "return": viser.Icon.HOME, "reset": viser.Icon.REFRESH}
 
 
 class DroneForm:
-    """Take-off, landing and emergency of one drone, on one page: what another page chooses changes nothing here.
+    """Modes of one drone, or of all that are selected, on one page: what another page chooses changes nothing here.
 
     Args:
         gui: viser's of that page, in the folder where they are to be.
@@ -385,9 +391,10 @@ class DroneForm:
         names: of the drones.
         may: returns why this page may not let a drone take off or reset it, empty where it may; where it is asked in
             order to do so, that puts the page in control.
+        request_return: lets drones fly back to where they started, and land.
 
     Attributes:
-        choice: the control that chooses it.
+        choice: the control that chooses one.
     """
 
     def __init__(
@@ -396,18 +403,21 @@ class DroneForm:
         client: CommandClient,
         names: Sequence[str],
         may: Callable[[str, bool], str] = lambda *_: "",
+        request_return: Callable[[Sequence[str]], None] = lambda _: None,
     ) -> None:
         self._client = client
         self._may = may
+        self._request_return = request_return
         self.choice = gui.add_dropdown("drone", list(names))
+        self._selected: list[str] = []
         self._buttons: dict[str, Any] = {}
         for mode, label in DRONE_MODES.items():
             if mode in ORDERS:
-                of, held = {"drone": self.chosen}, mode == "emergency"
-                self._buttons[mode] = OrderButton(gui, f"{label} {self.chosen}", mode, of, held=held)
+                held = mode == "emergency"
+                self._buttons[mode] = OrderButton(gui, f"{label} {self._subject}", mode, self._order, held=held)
                 continue
-            button = gui.add_button(f"{label} {self.chosen}", icon=DRONE_ICONS[mode], color="gray")
-            button.on_click(lambda _, mode=mode: self._send(mode))
+            button = gui.add_button(f"{label} {self._subject}", icon=DRONE_ICONS[mode], color="gray")
+            button.on_click(lambda _, mode=mode: self._request(mode))
             self._buttons[mode] = button
         self._reasons = gui.add_html("")
         self._run = RunCondition()
@@ -418,30 +428,63 @@ class DroneForm:
         """Name of the drone that is chosen."""
         return self.choice.value
 
+    @property
+    def targets(self) -> list[str]:
+        """Names of the drones that a button is for: those that are selected, else the one that is chosen."""
+        return self._selected or [self.chosen]
+
+    @property
+    def _order(self) -> dict[str, str]:
+        """Whom an order concerns."""
+        return {"drone": ",".join(self.targets)}
+
+    @property
+    def _subject(self) -> str:
+        return self.targets[0] if len(self.targets) == 1 else f"{len(self.targets)} drones"
+
     def choose(self, drone: str) -> None:
         """Choose a drone, as a click on it in the scene does."""
         self.choice.value = drone
 
-    def refresh(self, run: RunCondition) -> None:
-        """Offer what would not be refused."""
-        self._run = run
-        refusals = {**drone_refusals(run, self.chosen), **order_refusals(drone_refusals(heard(run), self.chosen))}
-        for mode in IN_CONTROL:
-            refusals[mode] = refusals[mode] or self._may(self.chosen, False)
-        set_refusals(self._buttons, refusals)
-        checks = run.checks.get(self.chosen, ()) if run.drones.get(self.chosen) == "landed" else ()
-        shown = preflight_lines({self.chosen: checks}) if checks and not run.grounded() else ""
-        self._reasons.content = refusal_lines(DRONE_MODES, refusals) + shown
+    def select(self, drones: Sequence[str]) -> None:
+        """Let the buttons be for all of these; of none: for the chosen one."""
+        self._selected = list(drones)
+        self._rename()
 
-    def _send(self, mode: str) -> None:
-        if mode not in IN_CONTROL or not self._may(self.chosen, True):
-            self._client.send_mode([self.chosen], mode)
+    def refresh(self, run: RunCondition) -> None:
+        """Offer what would not be refused of one of the drones at least."""
+        self._run = run
+        heard_of = heard(run)
+        refusals = [
+            {**drone_refusals(run, drone), **order_refusals(drone_refusals(heard_of, drone))} for drone in self.targets
+        ]
+        for drone, each in zip(self.targets, refusals, strict=True):
+            for mode in IN_CONTROL:
+                each[mode] = each[mode] or self._may(drone, False)
+        common = {mode: refusals[0][mode] if all(each[mode] for each in refusals) else "" for mode in DRONE_MODES}
+        set_refusals(self._buttons, common)
+        landed = {d: run.checks.get(d, ()) for d in self.targets if run.drones.get(d) == "landed"}
+        checks = {drone: found for drone, found in landed.items() if found}
+        shown = preflight_lines(checks) if checks and not run.grounded() else ""
+        self._reasons.content = refusal_lines(DRONE_MODES, common) + shown
+
+    def _request(self, mode: str) -> None:
+        """Request what needs control, of all drones that would not refuse it."""
+        able = [drone for drone in self.targets if not drone_refusals(self._run, drone)[mode]]
+        drones = able or self.targets  # what is shown may be older than what is: whoever may refuse it then says why
+        drones = [drone for drone in drones if not self._may(drone, True)]
+        if not drones:
+            return
+        if mode == "return":
+            self._request_return(drones)
+        else:
+            self._client.send_mode(drones, mode)
 
     def _rename(self) -> None:
         for mode, button in self._buttons.items():
-            label = f"{DRONE_MODES[mode]} {self.chosen}"
+            label = f"{DRONE_MODES[mode]} {self._subject}"
             if isinstance(button, OrderButton):
-                button.name(label, {"drone": self.chosen})
+                button.name(label, self._order)
             else:
                 button.label = label
         self.refresh(self._run)

@@ -23,12 +23,12 @@ ARM_M = 0.1785  # from the centre to a rotor's axis
 ROTOR_RADIUS_M = 0.10  # 8 inch propellers of the AR.Drone
 RING = 1.31  # rotor radii, outer radius of a hull ring: half of the 0.515 m of the hull, less 0.126 m to its centre
 ROTOR_Z_M = 0.030  # of the rotors over the centre of mass; drawn
-COLOURS = {  # sRGB, 0 to 255
-    "cross": (42, 44, 48),
-    "hull": (74, 78, 86),
+COLOURS = {  # sRGB, 0 to 255; the greys are lighter than the AR.Drone's, to be seen on the ground of the dark theme too
+    "cross": (104, 108, 116),
+    "hull": (124, 129, 138),
     "nose": (240, 108, 24),  # the orange of the outdoor hull's nose
     "hat": (226, 0, 134),  # the paper's magenta marker
-    "rotor": (28, 28, 30),
+    "rotor": (96, 99, 105),
 }
 
 

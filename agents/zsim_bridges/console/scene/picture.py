@@ -4,6 +4,7 @@ Axes, units and quaternions as everywhere: W east, north, up; quaternions w firs
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from itertools import takewhile
 from typing import NamedTuple
@@ -179,47 +180,91 @@ def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationSha
 
 
 TRAIL_POINTS_MAX = 6_000  # of all trails together: 144 kB for a browser each time
-POINTS_OF_ONE = 300
+TRAIL_MAX_S = 180.0  # simulated; as far as curves go back
+TRAILS_S = (10.0, 30.0, 60.0, TRAIL_MAX_S)  # lengths among which one chooses
+TRAIL_S = 60.0  # of those, the one that is chosen at first
 SPACING_M = 0.08  # of two points: a sixth of a hull
+SPACING_S = 0.05  # simulated, and of two points in time: as often as pictures come at 1 × real time
+RECORD_GAP_S = 5.0  # simulated; between two points of a record farther apart it was not read yet, so nothing is drawn
+STILL_M = 1e-3  # of a segment: a drone that stands leaves no trail
 
 
 class CanvasTrails:
-    """The trails of N drones: the last stretch of each one's path.
+    """The trails of N drones: where each was within the last seconds.
 
     Args:
         count: how many drones.
+        around: whether points of any time are kept, in whatever order they come, as of a record.
+
+    Attributes:
+        length_s: how far trails go back, simulated.
+        number: another one where trails are not those of before and what was added since.
     """
 
-    def __init__(self, count: int) -> None:
-        self._capacity = min(POINTS_OF_ONE, max(2, TRAIL_POINTS_MAX // count))
-        self._points = np.zeros((count, self._capacity, 3))
-        self._lengths = np.zeros(count, dtype=np.int64)
+    def __init__(self, count: int, around: bool = False) -> None:
+        self._count = count
+        self._around = around
+        self._times: list[float] = []
+        self._rows: list[NDArray[np.float32]] = []
+        self.length_s = TRAIL_S
+        self.number = 0
 
-    def add(self, p_W: Array) -> bool:
-        """Add positions (N, 3) [m], NaN of a drone that is not in the view; return whether any has moved on."""
-        last = self._points[np.arange(len(p_W)), np.maximum(self._lengths - 1, 0)]
-        moved = (np.linalg.norm(p_W - last, axis=1) >= SPACING_M) | (self._lengths == 0)
-        moved &= np.isfinite(p_W[:, 0])
-        for i in np.flatnonzero(moved):
-            if self._lengths[i] == self._capacity:
-                self._points[i, :-1] = self._points[i, 1:]
-            else:
-                self._lengths[i] += 1
-            self._points[i, self._lengths[i] - 1] = p_W[i]
-        return bool(moved.any())
+    def add(self, t_s: float, p_W: Array) -> bool:
+        """Add positions (N, 3) [m] of an instant, NaN of a drone that is not in the view; return whether they were.
 
-    def segments(self, p_W: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Return segments (M, 2, 3) up to where the drones are now, (N, 3), and the index of its drone, (M,)."""
-        lines, owners = [np.zeros((0, 2, 3))], [np.zeros(0, dtype=np.int64)]
-        present = np.isfinite(p_W[:, 0])
-        for i, length in enumerate(self._lengths):
-            if not length or not present[i]:
-                continue
-            way = np.vstack((self._points[i, :length], p_W[i]))
-            lines.append(np.stack((way[:-1], way[1:]), axis=1))
-            owners.append(np.full(len(way) - 1, i))
-        return np.concatenate(lines), np.concatenate(owners)
+        Those of a flight are left out while no drone has moved on, and go on in time: before the last ones all begins
+        anew.
+        """
+        if not self._around and self._times and t_s < self._times[-1]:
+            self.clear()
+        place = bisect_left(self._times, t_s)
+        near = self._times[max(0, place - 1) : place + 1]
+        if any(abs(other_s - t_s) < SPACING_S * 0.99 for other_s in near):
+            return False
+        if not self._around and self._rows:
+            away_m = np.linalg.norm(p_W - self._rows[-1], axis=1)
+            appears = np.isfinite(p_W[:, 0]) & ~np.isfinite(self._rows[-1][:, 0])
+            if not (appears | (away_m >= SPACING_M)).any():
+                return False
+        self._times.insert(place, t_s)
+        self._rows.insert(place, p_W.astype(np.float32))
+        if not self._around:
+            self.keep(t_s - TRAIL_MAX_S, math.inf)
+        return True
+
+    def keep(self, from_s: float, to_s: float) -> None:
+        """Remove the points of other times."""
+        old, late = bisect_left(self._times, from_s), bisect_left(self._times, to_s)
+        del self._times[late:], self._rows[late:], self._times[:old], self._rows[:old]
+
+    def choose_length(self, length_s: float) -> None:
+        """Let trails go back so far [s, simulated]."""
+        self.length_s = length_s
+        self.number += 1
+
+    def segments(self, t_s: float, p_W: Array) -> tuple[Array, NDArray[np.int64], Array]:
+        """Return segments (M, 2, 3) up to where the drones are now, (N, 3), of which drone, (M,), and since when, (M,).
+
+        Of many points those of evenly spaced times are taken.
+        """
+        begin, end = bisect_left(self._times, t_s - self.length_s), bisect_left(self._times, t_s)
+        times = np.array(self._times[begin:end])
+        rows = np.arange(len(times))
+        if len(times) * self._count > TRAIL_POINTS_MAX:
+            # A step that hardly ever changes, and points that stay the same: else trails would tremble.
+            step_s = 2.0 ** math.ceil(math.log2((times[-1] - times[0]) * self._count / TRAIL_POINTS_MAX))
+            rows = np.flatnonzero(np.diff(np.floor(times / step_s), prepend=-math.inf))
+        times = np.append(times[rows], t_s)
+        way = np.stack([*(self._rows[begin + k] for k in rows), p_W]).astype(float)
+        lines = np.stack((way[:-1], way[1:]), axis=2).transpose(1, 0, 2, 3)  # drone, instant, end, axis
+        drawn = np.linalg.norm(lines[:, :, 1] - lines[:, :, 0], axis=2) > STILL_M  # not of NaN
+        drawn &= np.isfinite(p_W[:, :1])
+        drawn &= (np.diff(times) < RECORD_GAP_S) | (not self._around)
+        owners, instants = np.nonzero(drawn)
+        return lines[drawn], owners, times[instants]
 
     def clear(self) -> None:
         """Remove all points."""
-        self._lengths[:] = 0
+        self._times.clear()
+        self._rows.clear()
+        self.number += 1

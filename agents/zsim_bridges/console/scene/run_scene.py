@@ -12,6 +12,7 @@ from zsim.math import frames
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
+from zsim_bridges.console.page.flight_preview import FlightPreview
 from zsim_bridges.console.scene.camera_follow import CameraFollow
 from zsim_bridges.console.scene.picture import (
     Array,
@@ -43,6 +44,7 @@ class RunScene:
         drones: their newest poses, None before the first view.
         shapes: the formations as they truly stand, by name; None where a drone of one is missing.
         trails: of the drones.
+        previews: ways (n, M, 3) [m] of the drones of formations, by name, that would be flown.
     """
 
     def __init__(
@@ -62,7 +64,8 @@ class RunScene:
         self._drawn_ghosts: dict[str, Any] = {}
         self.drones: DronePoses | None = None
         self.shapes: dict[str, FormationShape | None] = {}
-        self.trails = CanvasTrails(len(self._names))
+        self.previews: dict[str, Array] = {}
+        self.trails = CanvasTrails(len(self._names), around=bool(info.replay_of))
         robots = sum(space.n for space in spaces.values())
         arms_m = [drone.arm_m for drone in scenario.drones]
         self.nodes = SceneNodes(server, info.drones, arms_m, robots, len(spaces))
@@ -78,11 +81,9 @@ class RunScene:
     def store(self, view: ViewDrones) -> DronePoses:
         """Store the drones' newest poses, and return them; cameras of later pages look at them."""
         drones = drone_poses(view, self._names)
-        if self.drones is not None and drones.t_ns < self.drones.t_ns:
-            self.trails.clear()  # a replay has gone back
         self.drones = drones
-        self.trails.add(drones.p_W)
-        self._update_shapes(drones)
+        self.trails.add(drones.t_ns / 1e9, drones.p_W)
+        self.shapes = self.shapes_of(drones)
         self._camera_follow.set_target(self._camera_targets(drones))
         return drones
 
@@ -105,10 +106,18 @@ class RunScene:
         self._camera_follow.follow(self._camera_targets(drones))
         return drones
 
+    def preview(self, cluster: str, shown: FlightPreview | None) -> None:
+        """Show what a formation would fly, in place of what was shown before; None for nothing."""
+        self.previews = {**self.previews, cluster: shown.paths_W} if shown else {
+            name: paths_W for name, paths_W in self.previews.items() if name != cluster
+        }  # fmt: skip
+        self.nodes.previews(list(self.previews.values()))
+
     def draw_trails(self) -> None:
         """Draw trails and wind, which change slowly."""
         if self.drones is not None:
-            self.nodes.trails(*self.trails.segments(self.drones.p_W))
+            segments, owners, _ = self.trails.segments(self.drones.t_ns / 1e9, self.drones.p_W)
+            self.nodes.trails(segments, owners)
             self.nodes.wind(self.drones)
 
     def _draw_ghosts(self) -> None:
@@ -123,12 +132,14 @@ class RunScene:
         p_W = np.concatenate([p for p, _ in shown]) if shown else np.zeros((0, 3))
         self.nodes.ghosts(p_W, np.concatenate([q for _, q in shown]) if shown else np.zeros((0, 4)))
 
-    def _update_shapes(self, drones: DronePoses) -> None:
+    def shapes_of(self, drones: DronePoses) -> dict[str, FormationShape | None]:
+        """Return the formations as they truly stand, by name; None where a drone of one is missing."""
         there, yaw = drones.present, frames.heading(drones.q_WB)
-        for name, space in self._spaces.items():
-            members = self._members[name]
-            whole = bool(there[members].all())
-            self.shapes[name] = formation_shape(space, drones.p_W[members], yaw[members]) if whole else None
+        return {
+            name: formation_shape(space, drones.p_W[members], yaw[members]) if there[members].all() else None
+            for name, space in self._spaces.items()
+            for members in [self._members[name]]
+        }
 
     def _camera_targets(self, drones: DronePoses) -> Array:
         """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""

@@ -29,6 +29,8 @@ LARGE_MAX = 12  # names in full, at full size; of more drones what tells them ap
 SMALL = 0.8  # of the size of a name
 SOLID = (134, 142, 150)
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
+PREVIEW = (217, 72, 15)
+PREVIEW_PX = 3.0  # of a way that would be flown
 SIDE_PX = 2.0  # of a formation's sides: as wide from afar
 WIND_M_PER_M_S = 0.5  # length of the arrow
 WIND_MIN_M_S = 0.05  # below it no arrow
@@ -36,6 +38,7 @@ WIND_ABOVE_M = 1.5  # of the arrow over the highest drone
 LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name over its drone
 MIDDLE = "center-center"  # of a label
 LABELS_MAX = 3  # p, q and beta
+LUMINANCE_MIN = 0.12  # of a trail: 2.5 times as bright as the ground of the dark theme, as WCAG 2.2 counts contrast
 HIDDEN = (0.0, 0.0, -1000.0)  # m; position of instances that are not shown, since they cannot be hidden one by one
 
 
@@ -66,7 +69,7 @@ class SceneNodes:
         self._count = len(drones)
         names = tuple(drone.name for drone in drones)
         self._trail_node: Any = None
-        self._trail_colours = linear(np.array([rgb(each) for each in drone_colours(max(1, len(drones)))]))
+        self._trail_colours = linear(np.array([lightened(rgb(each)) for each in drone_colours(max(1, len(drones)))]))
         self._trails_shown = True
         server.scene.reset()
         server.scene.set_up_direction("+z")
@@ -79,6 +82,12 @@ class SceneNodes:
         ghost = airframe.whole(looks[0])
         self._ghosts = self._batch("/ghosts", ghost, robots, GHOST, opacity=0.5) if robots else None
         self._ellipsoids = self._batch("/estimates", airframe.ball(), len(names), ELLIPSOID, opacity=0.35)
+        if robots:
+            self._preview_ends = self._batch("/preview_ends", ghost, robots, PREVIEW, opacity=0.6)
+            self._preview_lines = self._scene.add_line_segments(
+                "/preview", np.tile(HIDDEN, (1, 2, 1)), PREVIEW, thickness=PREVIEW_PX, thickness_units="screen",
+                visible=False,
+            )  # fmt: skip
         self._names = self._labels(names)
         self._wind = self._scene.add_arrows(
             "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
@@ -148,6 +157,16 @@ class SceneNodes:
         if self._ghosts is not None:
             positions, attitudes, _ = _padded(len(self._ghosts.batched_positions), p_W, q)
             self._ghosts.batched_positions, self._ghosts.batched_wxyzs = positions, attitudes
+
+    def previews(self, ways: Sequence[Array]) -> None:
+        """Draw the ways (n, M, 3) that formations would fly, with a mark at the end of each drone's; none: nothing."""
+        lines = [np.stack((way[:, :-1], way[:, 1:]), axis=2).reshape(-1, 2, 3) for way in ways]
+        ends = [way[:, -1] for way in ways]
+        segments = np.asarray(np.concatenate(lines) if lines else np.tile(HIDDEN, (1, 2, 1)), np.float32)
+        p_W = np.concatenate(ends) if ends else np.zeros((0, 3))
+        self._preview_lines.points, self._preview_lines.visible = segments, bool(lines)
+        p, q, _ = _padded(len(self._preview_ends.batched_positions), p_W, np.tile((1.0, 0.0, 0.0, 0.0), (len(p_W), 1)))
+        self._preview_ends.batched_positions, self._preview_ends.batched_wxyzs = p, q
 
     def shapes(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
         """Draw the frames and triangles of all formations, and the figures of the chosen one."""
@@ -266,6 +285,17 @@ class _FormationNodes:
             label.visible = i < len(texts)
             if label.visible:
                 label.text, label.position = texts[i]
+
+
+def luminance(colour: Sequence[float]) -> float:
+    """Return the relative luminance of an sRGB colour, 0 to 255 (WCAG 2.2)."""
+    return float(np.dot((0.2126, 0.7152, 0.0722), linear(np.array(colour, float)) / 255.0))
+
+
+def lightened(colour: Sequence[float]) -> Sequence[float]:
+    """Return a colour with as much white in it that it is seen on the ground of the dark theme; not of a light one."""
+    mixed = (np.array(colour) + share * (255.0 - np.array(colour)) for share in np.arange(0.0, 1.01, 0.05))
+    return next(each.tolist() for each in mixed if luminance(each.tolist()) >= LUMINANCE_MIN)
 
 
 def linear(colours: Array) -> NDArray[np.uint8]:

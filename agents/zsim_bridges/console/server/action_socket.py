@@ -20,6 +20,7 @@ from zsim_bridges.console.server.page_actions import (
     LookFrom,
     PageAction,
     PlayRecord,
+    SelectDrone,
     SteerDrone,
     TakeDrone,
 )
@@ -97,7 +98,7 @@ class ActionSockets:
             self._keys[page] = action.page
         return self._look(action)
 
-    def _look(self, action: LookFrom | LookAtPlan | ChooseDrone) -> Answer:
+    def _look(self, action: LookFrom | LookAtPlan | ChooseDrone | SelectDrone) -> Answer:
         client_id, flying = self._client_id(action.page), self._flying()
         if isinstance(action, LookFrom):
             if client_id is not None:
@@ -106,6 +107,8 @@ class ActionSockets:
             return {"plan": flying.plan(client_id, action.whole)}
         elif flying is not None and isinstance(action, ChooseDrone):
             flying.choose(client_id, action.drone)
+        elif flying is not None and isinstance(action, SelectDrone):
+            flying.select(client_id, action.drone)
         return {}
 
     def _operate(self, action: PlayRecord | FlyDrone, page: Any) -> Answer:

@@ -43,6 +43,13 @@ class ChooseDrone(_Action, frozen=True, tag="choose"):
     drone: Name
 
 
+class SelectDrone(_Action, frozen=True, tag="select"):
+    """Select a drone on the page itself for one command with others, or no longer."""
+
+    page: Name
+    drone: Name
+
+
 class PlayRecord(_Action, frozen=True, tag="play"):
     """Let a replay go on from an instant, pause, resume, do a step, or change its pace; of operators only."""
 
@@ -90,5 +97,5 @@ class LeaveDrone(_Action, frozen=True, tag="leave"):
 
 
 FlyDrone = TakeDrone | SteerDrone | GoToPlace | LeaveDrone
-PageAction = LookFrom | LookAtPlan | ChooseDrone | PlayRecord | FlyDrone
+PageAction = LookFrom | LookAtPlan | ChooseDrone | SelectDrone | PlayRecord | FlyDrone
 DECODER = msgspec.json.Decoder(PageAction)

@@ -27,7 +27,7 @@ from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import primary_variables, slider_ranges
 from zsim_bridges.console.page.variable_history import HISTORY_POINTS_MAX, INTERVAL_S, SPAN_S, VariableHistory
 from zsim_bridges.console.scene import picture as pic
-from zsim_bridges.console.scene.picture import POINTS_OF_ONE, SPACING_M, CanvasTrails
+from zsim_bridges.console.scene.picture import SPACING_M, TRAIL_POINTS_MAX, TRAILS_S, CanvasTrails
 from zsim_bridges.console.server.http_proxy import ListenAddress
 from zsim_bridges.console.server.page_messages import PageControls, ViewerCamera, is_permitted
 from zsim_bridges.console.server.page_tokens import OPERATOR, VIEWER, PageRequest, PageTokens
@@ -163,35 +163,74 @@ def test_a_pair_has_one_side():
 # Trails and plots
 
 
-def test_a_trail_grows_with_the_way_and_forgets_its_beginning():
+def test_a_trail_goes_back_as_far_as_is_chosen():
     trails = CanvasTrails(2)
-    for k in range(POINTS_OF_ONE + 50):
-        trails.add(np.array([(k * 2 * SPACING_M, 0.0, 1.0), (5.0, 5.0, 1.0)]))
+    for k in range(300):
+        trails.add(k * 0.5, np.array([(k * 2 * SPACING_M, 0.0, 1.0), (5.0, 5.0, 1.0)]))
     now = np.array([(1000.0, 0.0, 1.0), (5.0, 5.0, 1.0)])
-    segments, whose = trails.segments(now)
-    assert (whose == 0).sum() == POINTS_OF_ONE
-    assert (whose == 1).sum() == 1
-    assert segments[whose == 0][0, 0, 0] == pytest.approx(50 * 2 * SPACING_M)
-    assert segments[whose == 0][-1, 1].tolist() == [1000.0, 0.0, 1.0]
+    for length_s in TRAILS_S[:3]:
+        number = trails.number
+        trails.choose_length(length_s)
+        assert trails.number != number  # a map that has trails of another length asks for them anew
+        segments, whose, since_s = trails.segments(150.0, now)
+        assert set(whose) == {0}  # one that stands has no trail
+        assert len(segments) == 2 * length_s
+        assert since_s[0] == 150.0 - length_s
+        assert segments[0, 0, 0] == pytest.approx(2 * (150.0 - length_s) * 2 * SPACING_M)
+        assert segments[-1, 1].tolist() == [1000.0, 0.0, 1.0]
 
 
 def test_a_drone_that_is_not_there_leaves_no_trail():
     trails = CanvasTrails(2)
     nowhere = (np.nan, np.nan, np.nan)
     for k in range(5):
-        trails.add(np.array([(float(k), 0.0, 1.0), nowhere]))
-    segments, whose = trails.segments(np.array([(9.0, 0.0, 1.0), nowhere]))
+        trails.add(k * 1.0, np.array([(float(k), 0.0, 1.0), nowhere]))
+    segments, whose, _ = trails.segments(5.0, np.array([(9.0, 0.0, 1.0), nowhere]))
     assert whose.tolist() == [0] * 5
     assert np.isfinite(segments).all()
-    trails.clear()
-    assert trails.segments(np.zeros((2, 3)))[0].shape == (0, 2, 3)
+    trails.add(0.0, np.zeros((2, 3)))  # back in time, all begins anew
+    assert trails.segments(0.0, np.zeros((2, 3)))[0].shape == (0, 2, 3)
 
 
-def test_many_trails_are_short():
-    trails = CanvasTrails(50)
-    for k in range(1000):
-        trails.add(np.full((50, 3), k * 1.0))
-    assert len(trails.segments(np.zeros((50, 3)))[0]) <= 6000
+@pytest.mark.parametrize("count", [3, 50])
+def test_many_points_are_thinned_out_the_same_ones_each_time(count: int):
+    trails = CanvasTrails(count)
+    trails.choose_length(180.0)
+    kept: list[set[float]] = []
+    for k in range(3600):
+        trails.add(k * 0.05, np.full((count, 3), k * 1.0))
+        if k in (3500, 3502):
+            segments, _, since_s = trails.segments(k * 0.05, np.full((count, 3), k * 1.0))
+            assert 0.4 * TRAIL_POINTS_MAX < len(segments) <= TRAIL_POINTS_MAX + count
+            kept.append(set(since_s))
+    assert len(kept[0] ^ kept[1]) <= 3
+
+
+def test_trails_of_a_record_are_there_on_both_sides_of_what_was_read_last():
+    trails, here = CanvasTrails(1, around=True), np.array([(100.0, 0.0, 1.0)])
+    for t_s in (*np.arange(60.0, 80.0, 0.25), *np.arange(0.0, 20.0, 0.25)):  # a piece, and an earlier one
+        trails.add(t_s, np.array([(t_s, 0.0, 1.0)]))
+    trails.choose_length(30.0)
+    for at_s in (79.9, 19.9):
+        segments, _, since_s = trails.segments(at_s, here)
+        assert len(segments) > 70
+        assert since_s.min() >= at_s - 30.0
+    assert trails.segments(45.0, here)[0][:, 1, 0].max() < 20.0  # nothing is drawn across what was not read
+    trails.keep(50.0, 70.0)
+    assert len(trails.segments(19.9, here)[0]) == 0
+
+
+def test_curves_of_a_record_stand_around_the_shown_instant():
+    history = VariableHistory(1, around=True)
+    for t_s in (*np.arange(100.0, 110.0, INTERVAL_S), *np.arange(80.0, 90.0, INTERVAL_S), 105.01):
+        history.add(t_s, (t_s,), (t_s,), None)
+    t, desired, *_ = history.curves(0, angular=False, span_s=60.0, at_s=95.0)
+    assert (t[0], t[-1], len(t)) == (80.0, 109.75, 80)
+    assert (desired == t).all()
+    t, *_ = history.curves(0, angular=False, span_s=20.0, at_s=85.0)
+    assert (t[0], t[-1]) == (80.0, 89.75)
+    history.keep(100.0, 200.0)
+    assert history.curves(0, angular=False, span_s=60.0, at_s=95.0)[0][0] == 100.0
 
 
 def test_curves_keep_the_last_minutes():

@@ -73,6 +73,37 @@ def test_the_timeline_has_what_would_be_refused(run: RunCondition, refused: set[
     assert {op for op, reason in refusals.items() if reason} == refused
 
 
+def test_a_record_is_read_around_the_shown_instant_the_nearest_first():
+    asked: list[tuple[float, float]] = []
+    tasks: list[Any] = []
+    client: Any = SimpleNamespace(
+        timeline=lambda: {"from_s": 0.0, "to_s": 1000.0},
+        past_views=lambda from_s, to_s, every_s: asked.append((from_s, to_s)) or [(from_s, to_s)],
+        read=lambda act: tasks.append(act) or True,
+    )
+    monitor: Any = SimpleNamespace(clock=None, poll=lambda: None)
+    made = RecordPlayer(client, monitor, True)
+    made.load()
+
+    def read(t_s: float) -> list[float]:
+        asked.clear()
+        made.fill(t_s)
+        made.fill(t_s)  # it is read once at a time
+        while tasks:
+            tasks.pop()()
+        return [from_s for from_s, _ in asked]
+
+    begun = read(505.0)
+    assert begun[0] == 500.0
+    assert set(begun[1:3]) == {490.0, 510.0}
+    assert (min(begun), max(begun)) == (320.0, 590.0)
+    assert read(505.0) == []
+    assert read(515.0) == [600.0]
+    assert read(5.0)[0] == 0.0
+    assert read(505.0)[0] == 500.0  # it was forgotten, so far away
+    assert made.take() == [(500.0, 509.875)]
+
+
 def test_a_flight_has_no_timeline():
     made, asked = player("running", is_replay=False)
     made.play("pause", 1.0)

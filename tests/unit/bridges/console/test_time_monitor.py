@@ -227,7 +227,13 @@ def test_who_never_came_has_no_host_but_an_address_at_which_it_is_awaited():
 
 
 def test_a_replay_is_named_as_one():
-    assert has_terms(page_head("step", RunCondition("running", replayed=True), clock(S), S)["detail"], "replay")
+    emergency = RunCondition("paused", replayed=True, drones={"drone1": "emergency"})
+    head = page_head("step", emergency, clock(15 * S), 15 * S, record_s=(10.0, 20.0))
+    assert head["replay"]
+    assert head["level"] == "paused"  # of a record nobody has to act: no red head
+    assert has_terms(head["title"], "REPLAY", "15.0 of 20.0 s", "50 %")
+    flight = page_head("step", emergency._replace(replayed=False), clock(S), S)
+    assert (flight["level"], flight["replay"]) == ("emergency", False)
 
 
 # Estimators

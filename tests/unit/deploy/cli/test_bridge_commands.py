@@ -1,5 +1,6 @@
 """What the commands of bridges do beside bridging: the ROS package of our own messages, and what they refuse."""
 
+import os
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,6 +39,21 @@ def test_a_folder_that_cannot_be_written_is_a_line(tmp_path: Path) -> None:
 def test_a_secured_world_needs_a_router_for_ros(tmp_path: Path) -> None:
     with refused(typer.BadParameter, "--tls", "--router"):
         ros2(tls=tmp_path)
+
+
+def test_a_console_gives_way_to_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An operator's emergency goes through it; and one that gives way is late with its health, and reported silent."""
+    pytest.importorskip("viser", reason="viser is not installed; pip install '.[console]'")
+    own = os.nice(0), os.sched_getscheduler(0)
+    served: list[tuple[int, int]] = []
+    monkeypatch.setattr(os, "nice", lambda more: own[0] + more)
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: served.append((-1, -1)))
+    monkeypatch.setattr("zsim_deploy.roles.priority.lower_priority", lambda *_, **__: served.append((-1, -1)))
+    monkeypatch.setattr(
+        "zsim_deploy.roles.roles.serve_runs", lambda *_, **__: served.append((os.nice(0), os.sched_getscheduler(0)))
+    )
+    console()
+    assert served == [own]
 
 
 @pytest.mark.parametrize(

@@ -373,6 +373,44 @@ def test_a_timeline_has_the_ends_of_the_record_and_its_events(tmp_path: Path):
     assert [(mark["t_s"], mark["kind"]) for mark in answer.result["marks"]] == [(GATE_NS / 1e9, "death")]
 
 
+def test_the_views_of_any_part_of_the_record_are_answered_wherever_the_replay_is(flight: RecordReader):
+    made = playback(flight)
+    played(made)
+    args = {"from_s": 0.04, "to_s": 0.16, "every_s": 0.04}
+    before = made.requests, len(made.take_outbox())
+    answer = made.control(ControlRequest("views", args, "console.1"))
+    assert answer.ok
+    views = [messages.decode(key, payload) for key, payload in answer.result if key == keys.VIEW_DRONES]
+    assert [view.t_ns // GATE_NS for view in views] == [2, 4, 6, 8]
+    assert [view.drones[0].position_m[0] for view in views] == [2.0, 4.0, 6.0, 8.0]
+    clusters = [messages.decode(key, payload) for key, payload in answer.result if key == keys.cluster_view("main")]
+    assert [view.t_ns // GATE_NS for view in clusters] == [2, 4, 6, 8]
+    assert len([key for key, _ in answer.result if key == keys.estimates_view("estimator.d2")]) == 4
+    assert (made.requests, len(made.take_outbox())) == before  # no event: it is asked for again and again
+
+
+@pytest.mark.parametrize(
+    ("args", "found"),
+    [
+        ({}, ("from_s", "None")),
+        ({"from_s": -1.0, "to_s": 1.0, "every_s": 0.1}, ("from_s", "-1.0")),
+        ({"from_s": 0.0, "to_s": 1e6, "every_s": 0.1}, ("to_s", "1000000.0")),
+        ({"from_s": 0.0, "to_s": 1.0, "every_s": 0}, ("every_s", "0")),
+        ({"from_s": 0.0, "to_s": 50.0, "every_s": 1e-6}, ("every_s", "1e-06")),
+    ],
+)
+def test_views_of_no_part_of_a_record_are_refused(flight: RecordReader, args: dict[str, Any], found: tuple[str, str]):
+    answer = playback(flight).control(ControlRequest("views", args))
+    assert not answer.ok
+    assert parts(answer.error) == found
+
+
+def test_of_a_part_that_the_record_lacks_there_are_no_views(flight: RecordReader):
+    args = {"from_s": 0.1, "to_s": 30.0, "every_s": 0.1}
+    answer = playback(flight).control(ControlRequest("views", args))
+    assert {messages.decode(key, payload).t_ns for key, payload in answer.result} <= {100_000_000, 200_000_000}
+
+
 def test_of_many_events_a_timeline_has_some(tmp_path: Path):
     many = [event(k // 10, "control", k) for k in range(1000)]
     with write(tmp_path, [*gate(0), *many]) as reader:

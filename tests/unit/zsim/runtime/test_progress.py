@@ -100,3 +100,10 @@ def test_a_start_that_takes_long_is_explained(monkeypatch: pytest.MonkeyPatch, i
     start.over()
     start._timer.join()
     assert shown == [progress.SLOW_NOTICE] * is_slow
+
+
+def test_progress_of_a_part_counts_that_part() -> None:
+    line = {"t_s": 15.0, "rate": 1.0, "state": "running", "waiting_for": []}
+    assert progress.describe(line, 20.0, from_s=10.0).count("█") == 10
+    assert progress.describe({**line, "t_s": 10.0}, 20.0, from_s=10.0).count("█") == 0
+    assert progress.describe({**line, "t_s": 20.0}, 20.0, from_s=10.0).count("░") == 0

@@ -64,10 +64,10 @@ def test_trails_are_the_last_stretch_of_each_way():
     names, trails = ("drone1", "drone2"), CanvasTrails(2)
     poses = drone_poses(ViewDrones(0, 0, (drone("drone1"),), ()), names)
     for x in range(4):
-        poses = drone_poses(ViewDrones(0, 0, (drone("drone1", float(x)),), ()), names)
-        trails.add(poses.p_W)
+        poses = drone_poses(ViewDrones(x * 10**9, 0, (drone("drone1", float(x)),), ()), names)
+        trails.add(float(x), poses.p_W)
     way, nothing = map_view.trail_lines(trails, poses)
-    assert way[:4] == [[0.0, 2.0], [1.0, 2.0], [2.0, 2.0], [3.0, 2.0]]
+    assert way == [[0.0, 2.0, 0.0], [1.0, 2.0, 1.0], [2.0, 2.0, 2.0]]  # and from there to where it is
     assert nothing == []
 
 

@@ -23,9 +23,11 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, fleet_refusals
 from zsim_bridges.console.page.console_page import SWITCHES, ConsolePage
+from zsim_bridges.console.page.flight_preview import FlightPreview
 from zsim_bridges.console.page.formation_form import OPERATIONS, REST_S, FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.run_forms import (
+    DRONE_MODES,
     DURATION_S,
     DroneForm,
     FaultForm,
@@ -150,7 +152,7 @@ class Gui:
     def add_folder(self, label: str | None, **_: Any) -> Control:
         return Control()
 
-    def add_html(self, content: str) -> Control:
+    def add_html(self, content: str, **_: Any) -> Control:
         if "data-zsim-order" not in content:
             return Control()
         button = OrderHtml()
@@ -267,6 +269,56 @@ def test_all_formations_and_all_drones_of_none_take_off(bench: Bench):
     FleetForm(bench.gui, bench.client, mixed())
     bench.gui.press("Take off all")
     assert bench.client.asked == [("main", "takeoff", {}), ("other", "takeoff", {}), (("d5", "d6"), "takeoff")]
+
+
+def test_a_command_is_for_all_that_are_selected_and_would_not_refuse_it(bench: Bench):
+    returning: list[list[str]] = []
+    back = returning.append
+    form = DroneForm(bench.gui, bench.client, bench.names, request_return=lambda drones: back(list(drones)))
+    first, second, third = bench.names
+    button = {mode: bench.gui.at[f"{label} {first}"] for mode, label in DRONE_MODES.items()}
+    form.select([first, third])
+    assert button["land"].label == "Land 2 drones"
+    form.refresh(RunCondition("running", drones={first: "flying", second: "flying", third: "landed"}))
+    assert not button["land"].disabled  # of one that flies
+    button["takeoff"].put(None)
+    button["return"].put(None)
+    assert bench.client.asked == [((third,), "takeoff")]
+    for mode in ("land", "emergency"):
+        order = button[mode]
+        assert isinstance(order, OrderHtml)
+        assert order.order["drone"] == f"{first},{third}"  # the page makes an order of it for each
+    assert returning == [[first]]
+    form.select([])
+    assert button["land"].label == f"Land {first}"
+
+
+def test_what_is_previewed_is_flown_once_it_is_asked_for(bench: Bench):
+    shown: list[FlightPreview | None] = []
+    ranges = slider_ranges(bench.space, bench.cluster, bench.scenario)
+    form = FormationForm(
+        bench.gui, bench.client, bench.outcomes.append, bench.cluster, bench.space, ranges, show_preview=shown.append
+    )
+    c = tuple(bench.space.specimen(4.0).tolist())
+    form.refresh(ViewCluster(0, 0, "engaged", bench.space.names, c, c, ""), 0.0)
+    bench.gui.at["Preview first"].value = True
+    assert form.request_target({"x_c": 7.0})
+    assert form.request_target({"z_c": 9.0})
+    assert bench.client.asked == []
+    ways = [each.paths_W for each in shown if each is not None]
+    assert len(ways) == 2
+    assert ways[1][:, -1].mean(axis=0)[[0, 2]] == pytest.approx([7.0, 9.0])  # both, one after the other
+    bench.gui.press("Fly what is previewed")
+    assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"x_c": 7.0, "z_c": 9.0}})]
+    assert shown[-1] is None
+    form.request_target({"x_c": 8.0})
+    bench.gui.press("Discard it")
+    bench.gui.press("Fly what is previewed")
+    assert len(bench.client.asked) == 1
+    bench.gui.at["Preview first"].value = False
+    form.request_target({"x_c": 8.0})
+    assert len(bench.client.asked) == 2
+    assert bench.outcomes == []
 
 
 @pytest.mark.parametrize("alone", [True, False])

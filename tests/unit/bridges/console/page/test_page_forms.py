@@ -69,7 +69,7 @@ def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
     pages.open(1)
     pages.open(2)
     pages.figures[1].removed = True
-    forms.show_figures(lambda drone: f"figures of {drone}")
+    forms.show_figures(lambda _: "", lambda drone: f"figures of {drone}")
     assert (pages.figures[1].shown, pages.figures[2].shown) == ("", "figures of drone1")
     assert forms.chosen(1) == ""
     assert forms.chosen(2) == "drone1"

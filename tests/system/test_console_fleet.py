@@ -1,0 +1,162 @@
+"""Thirty drones on a page: sorted, filtered, selected for one command, on a desk's screen and under a thumb."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from chromium import needs_browser
+from console_browser import IN_SIGHT, SCREENS, BrowserPage
+from staged_console import StagedRun, staged_console
+
+pytestmark = [
+    needs_browser,
+    pytest.mark.filterwarnings("ignore:Queued a "),  # of viser, where a page is closed just then
+]
+
+GRID = Path(__file__).parents[2] / "scenarios" / "grid30.yaml"
+DRAWN_HZ = 10.0  # as of thirty drones
+TOUCH_PX = 44  # WCAG 2.2, 2.5.5
+CELL_JS = """([drone, cell]) => {
+  const row = document.querySelector(`[data-zsim-drone=${drone}]`), box = row.children[cell].getBoundingClientRect();
+  row.scrollIntoView({ block: "center" });
+  const there = row.children[cell].getBoundingClientRect();
+  return [there.x + there.width / 2, there.y + there.height / 2];
+}"""
+ROWS_JS = (
+    "() => [...document.querySelectorAll('[data-zsim-drone]:has(.zsim-select)')].map(row => row.dataset.zsimDrone)"
+)
+SMALL_JS = f"""() => [...document.querySelectorAll("button, select, input, [role=tab], .zsim-select")].filter(each => {{
+  const box = each.getBoundingClientRect(), {{ left, top, width, height }} = box;
+  if (!each.checkVisibility({{ opacityProperty: false, visibilityProperty: true }}) || width < 2 || each.type === "range") return false;
+  const hit = document.elementFromPoint(left + width / 2, top + height / 2);
+  if (!hit || !(each.contains(hit) || hit.contains(each))) return false;  // scrolled out of sight
+  return height < {TOUCH_PX} - .5 || (!each.textContent.trim() && width < {TOUCH_PX} - .5);
+}}).map(each => `${{each.tagName}}.${{each.className}} '${{each.textContent.trim()}}' ${{JSON.stringify(each.getBoundingClientRect())}}`)"""
+BARS_JS = """() => {
+  const shown = [...document.querySelectorAll("#zsim-head, #zsim-tools, #zsim-flight > *, #zsim-record, #zsim-age, #zsim-map .fit," +
+    " .zsim-sheet, .mantine-Notification-root")].filter(each => each.checkVisibility()).map(each => [each, each.getBoundingClientRect()]);
+  const found = [];
+  for (const [a, p] of shown) for (const [b, q] of shown) {
+    if (a === b || a.compareDocumentPosition(b) & Node.DOCUMENT_POSITION_PRECEDING) continue;
+    if (Math.min(p.right, q.right) - Math.max(p.left, q.left) > 1 && Math.min(p.bottom, q.bottom) - Math.max(p.top, q.top) > 1)
+      found.push(`${a.id || a.className} and ${b.id || b.className}`);
+  }
+  return found;
+}"""
+"""Pairs of bars of which one lies over the other."""
+DRONES_JS = """() => {
+  const view = JSON.parse(document.getElementById("zsim-map").dataset.view);
+  const canvas = document.querySelector("#zsim-map canvas").getBoundingClientRect();
+  return [[-8.75, 7], [8.75, 7], [-8.75, -7], [8.75, -7]].filter(([x, y]) => {
+    const px = canvas.x + canvas.width / 2 + (x + 5 - view.x) * view.scale, py = canvas.y + canvas.height / 2 - (y - view.y) * view.scale;
+    return document.elementFromPoint(px, py)?.tagName !== "CANVAS";
+  });
+}"""
+"""Corners of the grid, about (5, 0) m, that something lies over on the map."""
+
+
+@pytest.fixture(scope="module")
+def fleet() -> Iterator[tuple[StagedRun, str]]:
+    run = StagedRun(past_s=10.0, scenario=GRID)
+    run.percent_of = {"drone17": 8.0, "drone4": 15.0}
+    with staged_console(run, hz=DRAWN_HZ) as address:
+        yield run, address
+
+
+def rows(page: BrowserPage) -> list[str]:
+    return page.page.evaluate(ROWS_JS)
+
+
+def tap(page: BrowserPage, drone: str, cell: int) -> None:
+    page.page.mouse.click(*page.page.evaluate(CELL_JS, [drone, cell]))
+
+
+def field(page: BrowserPage, label: str) -> Any:
+    """Return where one types what a label names."""
+    return page.page.locator(f"label:text-is('{label}')").locator("xpath=ancestor::div[2]").locator("input").last
+
+
+def choose(page: BrowserPage, label: str, option: str) -> None:
+    page.page.get_by_label(label, exact=True).first.click()
+    page.page.get_by_role("option", name=option, exact=True).click()
+
+
+def test_thirty_drones_are_sorted_filtered_and_commanded_together(
+    fleet: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
+) -> None:
+    run, address = fleet
+    page = opened(address, SCREENS[1])
+    page.page.wait_for_function(f"() => ({ROWS_JS})().length === 30")
+    page.page.wait_for_function(f"() => ({ROWS_JS})().slice(0, 2).join() === 'drone17,drone4'")  # the worst first
+    choose(page, "sort by", "as in the scenario")
+    page.page.wait_for_function(f"() => ({ROWS_JS})()[0] === 'drone1'")
+    field(page, "filter").fill("drone2")
+    page.page.wait_for_function(f"() => ({ROWS_JS})().length === 11")  # 2, and 20 to 29
+
+    # a row chooses, its box selects; a command goes to all that are selected
+    tap(page, "drone20", 1)
+    page.page.locator("[data-zsim-chosen][data-zsim-drone=drone20]").first.wait_for()
+    page.page.locator(".zsim-instruments").wait_for()
+    tap(page, "drone21", 0)
+    tap(page, "drone29", 0)
+    land = page.page.get_by_role("button", name="Land 2 drones", exact=True)
+    land.wait_for()
+    run.link.asked.clear()
+    land.click()
+    page.page.wait_for_function(f"() => ({ROWS_JS})().length === 11")
+    acquired = lambda: [args["drone"] for op, args in list(run.link.asked) if op == "acquire"]  # noqa: E731
+    while len(acquired()) < 2:
+        page.page.wait_for_timeout(50)
+    assert sorted(acquired()) == ["drone21", "drone29"]
+
+    # a target is shown before it is flown
+    page.page.get_by_label("Preview first").check()
+    number = field(page, "x_c [m]")
+    page.page.locator("#zsim-flight .map").click()
+    run.link.asked.clear()
+    number.fill("9")
+    number.press("Enter")
+    fly = page.page.get_by_role("button", name="Fly what is previewed", exact=True)
+    fly.wait_for()
+    page.page.wait_for_function("() => Number(document.getElementById('zsim-map').dataset.previews) === 30")
+    assert [op for op, _ in run.link.asked if op == "target"] == []
+    fly.click()
+    while not run.link.asked:
+        page.page.wait_for_timeout(50)
+    assert run.link.asked == [("target", {"values": {"x_c": 9.0}})]
+    page.page.wait_for_function("() => Number(document.getElementById('zsim-map').dataset.previews) === 0")
+    page.page.get_by_label("Preview first").uncheck()
+
+    # the formation returns: over the middle of its starts first
+    run.link.asked.clear()
+    page.press("Return")
+    while not run.link.asked:
+        page.page.wait_for_timeout(50)
+    assert run.link.asked[0] == ("target", {"values": {"x_c": 0.0, "y_c": 0.0}})
+    assert page.faults == []
+
+
+def test_under_a_thumb_everything_is_large_enough_and_nothing_is_under_a_bar(
+    fleet: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
+) -> None:
+    _, address = fleet
+    page = opened(address, SCREENS[-1])
+    page.wait_for_text("running")
+    page.wait_for_notice()
+    page.page.wait_for_function(f"() => ({BARS_JS})().length === 0")
+    page.close_notice()
+    found: dict[str, Any] = {}
+    for tab in ("Fly", "Plots", "Faults", "Run", "Drones", "Events"):
+        page.select_tab(tab)
+        page.open_folders()
+        page.page.wait_for_timeout(500)  # of what folds open
+        if small := page.page.evaluate(SMALL_JS):
+            found[tab] = small
+    assert found == {}
+    for button in (".map", ".fly"):
+        page.page.locator(f"#zsim-flight {button}").click()
+    page.page.wait_for_function(f"() => ({BARS_JS})().length === 0")
+    page.page.wait_for_function(f"() => ({DRONES_JS})().length === 0")
+    assert page.page.evaluate(SMALL_JS) == []
+    assert page.page.evaluate(IN_SIGHT)
