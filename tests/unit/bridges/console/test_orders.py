@@ -179,14 +179,16 @@ def test_a_paused_run_has_the_order_and_is_not_sent_it_again():
 def test_a_controller_that_answers_confirms_or_refuses_and_one_that_does_not_is_asked_again():
     desk = Desk()
     desk.place("hold")
-    assert not desk.end("main", "hold", "no answer came within 5 s", unanswered=True)
+    told = desk.end("main", "hold", "no answer came within 5 s", unanswered=True)
+    assert not told
     order = desk.after(REPEAT_S)
     assert (order["state"], len(desk.client.sent)) == ("sent", 2)
     assert has_terms(order["reason"], "main", "no answer")
     assert desk.end("main", "hold")
     assert desk.after(0.1)["state"] == "confirmed"
     desk.place("land", "two")
-    assert desk.end("main", "land", "all drones are on the ground", order="two")
+    told = desk.end("main", "land", "all drones are on the ground", order="two")
+    assert told
     desk.happen("mode", "drone3", mode="land")
     order = desk.after(0.1, drone3="landing")
     assert order["state"] == "refused"
