@@ -280,7 +280,7 @@ class AlarmBoard:
     def rows(self, wall_s: float) -> list[dict[str, object]]:
         """Return the alarms as plain data, red ones first, with how long each stands or has been over [s; wall]."""
         with self._lock:
-            ordered = sorted(self._standing.values(), key=lambda each: (each.over_s is not None, *_rank(each.alarm)))
+            ordered = sorted(self._standing.values(), key=lambda each: _rank(each.alarm, each.over_s is not None))
             return [
                 {
                     **each.alarm._asdict(),
@@ -297,5 +297,5 @@ class AlarmBoard:
         return next((each.severity for each in self.alarms if each.subject == subject), None)
 
 
-def _rank(alarm: Alarm) -> tuple[bool, str, str]:
-    return alarm.severity != "red", alarm.subject, alarm.name
+def _rank(alarm: Alarm, is_over: bool = False) -> tuple[bool, bool, str, str]:
+    return alarm.severity != "red", is_over, alarm.subject, alarm.name

@@ -44,7 +44,7 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
     checks = [_battery(drone), _upright(drone), _estimator(drone, in_formation)]
     if drone.is_external:
         checks.append(_link(drone))
-    control = f"flown by {foreign}; must be given back" if foreign else drone.commander or "nobody flies it"
+    control = f"flown by {foreign}; must be given back" if foreign else drone.commander or "free"
     return (*checks, Check("control", control, not foreign, blocks=in_formation))
 
 

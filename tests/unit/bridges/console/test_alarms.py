@@ -41,6 +41,8 @@ def test_a_red_alarm_that_is_over_stays_until_it_is_acknowledged():
     board.update([], 4.0)
     assert shown(board) == [(DEAD.subject, 5.0, False, 1)]
     assert board.severity_of(DEAD.subject) is None  # nothing is wrong with it now
+    board.update([LOW], 4.5)
+    assert [row[0] for row in shown(board)] == [DEAD.subject, LOW.subject]  # red ones first
     board.update([DEAD], 5.0)
     assert shown(board) == [(DEAD.subject, None, False, 2)]
     board.update([], 6.0)
@@ -210,7 +212,7 @@ def test_the_check_of_a_fit_drone_names_all_its_points():
     assert [check.name for check in checks] == ["battery", "upright", "estimator", "link", "control"]
     assert takeoff_refusal("drone1", checks) == ""
     lines = preflight_lines({"drone1": checks})
-    assert has_terms(without_tags(lines), "✓", "73 %", "σ 0.20 m", "armed", "nobody")
+    assert has_terms(without_tags(lines), "✓", "73 %", "σ 0.20 m", "armed", "free")
     assert "<b>" not in preflight_lines({"drone1": (Check("control", "<b>x</b>", False),)}).partition("</b>")[2]
 
 

@@ -51,15 +51,20 @@ class Pages:
 
     def open(self, client_id: int) -> None:
         """Open a page, whose dropdowns show what they began with."""
-        figures, gui = Figures(), MagicMock()
-        others = [SimpleNamespace(content="") for _ in range(3)]
-        gui.add_html.side_effect = (*others[:2], figures, others[2])  # control, reasons, figures, events
+        made: list[Figures] = []
+        gui = MagicMock()
+
+        def add_html(*_: Any, **__: Any) -> Figures:
+            made.append(Figures())
+            return made[-1]
+
+        gui.add_html.side_effect = add_html
         gui.add_dropdown.side_effect = lambda _, options, **__: SimpleNamespace(
             value=options[0], on_update=lambda _: None
         )
-        self.figures[client_id] = figures
         self.clients[client_id] = SimpleNamespace(client_id=client_id, gui=gui, scene=MagicMock())
         self.add(self.clients[client_id])
+        *_, self.figures[client_id], _ = made  # the events are last
 
 
 def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
@@ -238,17 +243,17 @@ def test_a_page_that_is_not_in_control_lands_and_stops_a_drone_and_lets_none_tak
     desk, gui, client = Desk(), ControlGui(), MagicMock()
     shown: Any = gui
     form = DroneForm(shown, client, NAMES, lambda drone, use: (desk.use if use else desk.refusal)(7, part_of(drone)))
-    takeoff, land, emergency, reset = gui.buttons
+    takeoff, back, reset = gui.buttons  # to land and to stop are orders of the page's own
     run = RunCondition("running", drones={"drone1": "landed", "drone2": "landed"})
     form.refresh(run)
     assert not takeoff.disabled
     desk.use(4, "main")
-    for button in (takeoff, land, emergency, reset):
+    for button in (takeoff, back, reset):
         button.press()
-    assert [call.args[1] for call in client.send_mode.call_args_list] == ["land", "emergency"]
+    assert not client.send_mode.called
     form.refresh(run)
     assert has_terms(takeoff.hint, ONE)
-    assert not emergency.disabled
+    assert not any("disabled" in each.content for each in gui.html if 'data-zsim-order="emergency"' in each.content)
     desk.release(4, "main")
     takeoff.press()
     assert desk.holders() == [TWO, ""]
