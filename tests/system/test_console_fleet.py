@@ -74,7 +74,9 @@ def tap(page: BrowserPage, drone: str, cell: int) -> None:
 
 def field(page: BrowserPage, label: str) -> Any:
     """Return where one types what a label names."""
-    return page.page.locator(f"label:text-is('{label}')").locator("xpath=ancestor::div[2]").locator("input").last
+    return (
+        page.page.locator(f"label:text-is('{label}')").locator("xpath=ancestor::div[.//input][1]").locator("input").last
+    )
 
 
 def choose(page: BrowserPage, label: str, option: str) -> None:
