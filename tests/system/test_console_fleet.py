@@ -74,7 +74,8 @@ def tap(page: BrowserPage, drone: str, cell: int) -> None:
 
 def field(page: BrowserPage, label: str) -> Any:
     """Return where one types what a label names."""
-    return page.page.locator(f"label:text-is('{label}')").locator("xpath=ancestor::div[2]").locator("input").last
+    named = page.page.get_by_text(label, exact=True).and_(page.page.locator(":visible")).first
+    return named.locator("xpath=ancestor::div[.//input][1]").locator("input").last
 
 
 def choose(page: BrowserPage, label: str, option: str) -> None:

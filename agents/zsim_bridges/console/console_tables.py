@@ -193,7 +193,7 @@ def _instruments(figures: FlightFigures) -> str:
         f"<path d='M0 -20L8 14L0 8L-8 14Z' fill='{BLUE}'/></g>"
     )
     gauges = "".join(
-        f"<text x=0 y={y}>{label}</text><text x=92 y={y} text-anchor=end font-weight=700 font-size=14>{value}</text>"
+        f"<text x=0 y={y}>{label}</text><text x=122 y={y} text-anchor=end font-weight=700 font-size=14>{value}</text>"
         for y, label, value in (
             (16, "speed", f"{figures.speed_m_s:.1f} m/s"),
             (40, "height", f"{figures.position_m[2]:.1f} m"),
@@ -201,7 +201,7 @@ def _instruments(figures: FlightFigures) -> str:
         )
     )
     return (
-        "<svg class=zsim-instruments role=img viewBox='0 0 280 84' style='width:100%;max-width:330px' "
+        "<svg class=zsim-instruments role=img viewBox='0 0 310 84' style='width:100%;max-width:340px' "
         "fill=currentColor font-size=11 aria-label='attitude, heading, speed, height, climb'>"
         f"<g transform='translate(42 42)'>{horizon}</g>"
         f"<g transform='translate(130 42)'>{compass}</g><g transform='translate(182 4)'>{gauges}</g></svg>"

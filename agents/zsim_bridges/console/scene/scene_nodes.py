@@ -84,7 +84,7 @@ class SceneNodes:
         self._ellipsoids = self._batch("/estimates", airframe.ball(), len(names), ELLIPSOID, opacity=0.35)
         if robots:
             self._preview_ends = self._batch("/preview_ends", ghost, robots, PREVIEW, opacity=0.6)
-            self._preview_lines = self._scene.add_line_segments(
+            self._preview_lines: Any = self._scene.add_line_segments(
                 "/preview", np.tile(HIDDEN, (1, 2, 1)), PREVIEW, thickness=PREVIEW_PX, thickness_units="screen",
                 visible=False,
             )  # fmt: skip
