@@ -477,15 +477,15 @@ def default(section: str, entry: Any) -> str:
     value = entry.default_factory() if entry.default is msgspec.NODEFAULT else entry.default
     if value is msgspec.UNSET:
         return "–"
-    return "see there" if isinstance(value, msgspec.Struct) else f"`{shown(value)}`"
+    return "see section" if isinstance(value, msgspec.Struct) else f"`{shown(value)}`"
 
 
 def _required(section: str, name: str) -> str:
     if section == "Sensors" and name == "preset":
         return "`ardrone2`"
     if section in ("Sensor", "Sensors") and name in BY_PRESET:
-        return "of the preset"
-    return "of the scenario" if (section, name) == ("Drone", "sensors") else "required"
+        return "from the preset"
+    return "from the scenario" if (section, name) == ("Drone", "sensors") else "required"
 
 
 def shown(value: Any) -> str:
