@@ -6,8 +6,8 @@ sweep.parquet    finished runs, a row each
 runs/000012/     record of run 12, where records are kept
 """
 
-import fcntl
 import os
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +17,8 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from zsim.errors import ReportError, RunError
-from zsim.output_folder import refuse_others
+from zsim.errors import ReportError, RunError, printable
+from zsim.output_folder import no_locks, refuse_others, take_lock
 from zsim_analysis.sweep.axes import SEED, Axis, Grid
 from zsim_analysis.sweep.design import PLAN, SweepDesign, SweepPlan, difference, is_sweep
 from zsim_analysis.sweep.sweep_run import FIXED, Row
@@ -98,10 +98,10 @@ def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFo
     except OSError as error:
         raise RunError(f"{path}: cannot be made ({error.strerror}); give --out another folder") from error
     with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunError(f"{path}: another sweep is at work there; give --out another folder") from error
+        if not take_lock(lock):
+            raise RunError(f"{path}: another sweep is at work there; give --out another folder")
+        if warning := no_locks(path):
+            print(printable(warning), file=sys.stderr)
         _write_plan(path, plan)
         yield SweepFolder(path, plan)
 
