@@ -2,13 +2,16 @@
 
 import errno
 import os
+import shlex
 import subprocess
 from pathlib import Path
 
 import pytest
-from federation import ONE, PAIR, compiled
-from forked_commands import COLUMNS, ROOT, ZSIM
+from federation import PAIR, compiled, free_port
+from forked_commands import COLUMNS, ROOT, USER_FAULT, ZSIM
 from wire import PATIENCE_S
+
+from zsim.record import RecordReader, completeness
 
 __all__ = ["compiled"]
 SHORT = ("--duration", "1", "--no-report")
@@ -27,6 +30,50 @@ def zsim(*arguments: str, prefix: tuple[str, ...] = (), **variables: str) -> "su
     return subprocess.run(
         command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
+    """The folder of a run of a second that several tests look at; its scenario is beside it."""
+    folder = tmp_path_factory.mktemp("flown")
+    (folder / "pair.yaml").write_text(PAIR)
+    done = zsim("run", str(folder / "pair.yaml"), "--in-process", *SHORT, "--out", str(folder / "run"))
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
+STREAMED = {  # command: its exit code whatever becomes of its output
+    "--version": 0,
+    "validate {scenario}": 0,
+    "validate nowhere.yaml": USER_FAULT,
+    "nonsense": USER_FAULT,
+    "keys --connect tcp/127.0.0.1:9 --wait 0.1": USER_FAULT,
+    "export {run} --format csv --out {out}/csv": 0,
+    "replay {run} --rate 0 --listen tcp/127.0.0.1:{port}": 0,
+    "run {scenario} --duration 1 --no-report --out {out}/run": 0,
+}
+
+
+@pytest.mark.parametrize("streams", [">&- 2>&- <&-", ">/dev/full 2>/dev/full"])
+def test_what_a_stream_does_not_take_is_lost_and_nothing_else(tmp_path: Path, flown: Path, streams: str) -> None:
+    """A stream that is closed leaves its number to the next file that is opened, such as the record."""
+    names = {"scenario": flown.parent / "pair.yaml", "run": flown, "out": tmp_path, "port": free_port()}
+    for command, code in STREAMED.items():
+        line = f"{shlex.join(ZSIM)} {command.format(**names)} {streams}"
+        done = subprocess.run(
+            ["sh", "-c", line], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
+        assert done.returncode == code, (command, done)
+        assert "Traceback" not in done.stdout + done.stderr
+    with RecordReader(tmp_path / "run" / "run.mcap") as record:
+        assert completeness(record).complete
+
+
+def test_a_full_output_is_a_line_on_the_other_stream() -> None:
+    done = subprocess.run(
+        f"{shlex.join(ZSIM)} --help >/dev/full", shell=True, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == f"standard output cannot be written ({os.strerror(errno.ENOSPC)}); what follows is lost\n"
 
 
 @pytest.fixture

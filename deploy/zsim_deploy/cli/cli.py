@@ -4,7 +4,6 @@ import os
 import sys
 from contextlib import nullcontext
 from functools import cache
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -240,7 +239,6 @@ def command() -> Any:
 
 def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
-    _replace_unprintable()
     code = _exit_code()
     try:
         sys.stdout.flush()
@@ -288,13 +286,6 @@ def _drop_output() -> None:
     into = os.open(os.devnull, os.O_WRONLY)
     for stream in filter(is_unread, STREAMS):
         os.dup2(into, stream)
-
-
-def _replace_unprintable() -> None:
-    """Print a question mark for a character that the terminal's encoding lacks, rather than end the command."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")
 
 
 def _show_usage(error: Any) -> None:
