@@ -1,14 +1,16 @@
 """Machines that lack what others have: locks, shared memory, a home, streams, room for odd paths."""
 
+import csv
 import errno
 import os
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 from federation import PAIR, compiled, free_port
-from forked_commands import COLUMNS, ROOT, USER_FAULT, ZSIM
+from forked_commands import COLUMNS, ROOT, USER_FAULT, ZSIM, refusal
 from wire import PATIENCE_S
 
 from zsim.record import RecordReader, completeness
@@ -74,6 +76,65 @@ def test_a_full_output_is_a_line_on_the_other_stream() -> None:
         f"{shlex.join(ZSIM)} --help >/dev/full", shell=True, capture_output=True, text=True, check=True
     )
     assert done.stderr == f"standard output cannot be written ({os.strerror(errno.ENOSPC)}); what follows is lost\n"
+
+
+ODD = os.fsdecode(b"lab:3 'a' \"b\" $HOME `x` [red]%s;&| \xc3\xbc\xe9\xa3\x9b \xff")  # the last is no UTF-8
+
+
+@pytest.mark.slow
+def test_any_path_will_do(tmp_path: Path, flown: Path) -> None:
+    folder = tmp_path / (ODD + "n" * 150)
+    folder.mkdir()
+    scenario, run = folder / f"{ODD}.yaml", folder / "run"
+    shutil.copy(flown.parent / "pair.yaml", scenario)
+    flight = ("--duration", "1", "--no-report")
+    for arguments in (
+        ("run", scenario, *flight, "--out", run),
+        *(("export", run, "--format", form) for form in ("csv", "parquet", "mat", "foxglove")),
+        ("report", run, "--format", "svg"),
+        ("report", run, flown, "--out", folder / f"{ODD}.html"),
+        ("rerun", run),
+        ("sweep", scenario, *flight, "--vary", "seed=1,2", "--keep-records", "--out", folder / "sweep"),
+        ("report", folder / "sweep"),
+    ):
+        done = zsim(*map(str, arguments))
+        assert done.returncode == 0, (arguments, done.stderr)
+        assert "Traceback" not in done.stderr
+    for name in ("csv/truth.csv", "parquet/truth.parquet", "run.mat", "foxglove.mcap", "foxglove.rbl", "report.html"):
+        assert (run / name).stat().st_size > 1000, name
+
+
+@pytest.mark.parametrize("path", ["n" * 300, "/tmp/" + "nnnnnnnnn/" * 450])
+def test_a_path_that_is_too_long_is_a_line(flown: Path, path: str) -> None:
+    for arguments in (
+        ("validate", path),
+        ("run", path),
+        ("run", str(flown.parent / "pair.yaml"), "--out", path),
+        ("report", path),
+        ("export", path, "--format", "csv"),
+        ("export", str(flown), "--format", "mat", "--out", path),
+        ("rerun", path),
+        ("replay", path),
+        ("sweep", str(flown.parent / "pair.yaml"), "--out", path),
+        ("world", str(flown.parent / "pair.yaml"), "--journal", path),
+        ("certs", "init", path),
+    ):
+        assert os.strerror(errno.ENAMETOOLONG) in refusal(*arguments)
+
+
+def test_a_table_of_each_drone_has_increasing_time(tmp_path: Path, flown: Path) -> None:
+    """PlotJuggler reads a table as one series of time."""
+    done = zsim("export", str(flown), "--format", "csv", "--by-name", "--out", str(tmp_path / "csv"))
+    assert done.returncode == 0, done.stderr
+    assert {"truth.drone1.csv", "truth.drone2.csv", "clock.world.csv"} <= {
+        each.name for each in (tmp_path / "csv").iterdir()
+    }
+    for drone in ("drone1", "drone2"):
+        rows = list(csv.DictReader((tmp_path / "csv" / f"truth.{drone}.csv").open()))
+        assert {row["name"] for row in rows} == {drone}
+        times = [int(row["t_ns"]) for row in rows]
+        assert times == list(range(0, 1_000_000_001, 20_000_000))
+    assert "--format csv" in refusal("export", str(flown), "--format", "mat", "--by-name")
 
 
 @pytest.fixture

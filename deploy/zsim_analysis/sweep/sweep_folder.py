@@ -224,7 +224,8 @@ def read_table(path: Path) -> list[Row]:
     if not path.exists():
         return []
     try:
-        table = pq.read_table(path)
+        with path.open("rb") as file:  # Arrow takes a path with a colon for an address
+            table = pq.read_table(file)
     except (OSError, pa.ArrowException) as error:
         reason = " ".join(str(error).split())[:200]
         raise ReportError(f"{path}: cannot be read ({reason}); remove it to go on") from error
