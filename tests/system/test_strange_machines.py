@@ -3,9 +3,11 @@
 import csv
 import errno
 import os
+import re
 import shlex
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,9 +15,11 @@ from federation import PAIR, compiled, free_port
 from forked_commands import COLUMNS, ROOT, USER_FAULT, ZSIM, refusal
 from wire import PATIENCE_S
 
+from zsim.math import compiled as kernels
 from zsim.record import RecordReader, completeness
 
 __all__ = ["compiled"]
+needs_root = pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("unshare"), reason="mounts need root")
 SHORT = ("--duration", "1", "--no-report")
 LOCKLESS = """
 import errno, fcntl, os
@@ -135,6 +139,61 @@ def test_a_table_of_each_drone_has_increasing_time(tmp_path: Path, flown: Path) 
         times = [int(row["t_ns"]) for row in rows]
         assert times == list(range(0, 1_000_000_001, 20_000_000))
     assert "--format csv" in refusal("export", str(flown), "--format", "mat", "--by-name")
+
+
+KERNEL = """
+import os, sys
+from zsim.math.compiled import kernel
+@kernel()
+def doubled(x):
+    return 2.0 * x
+doubled(1.0)
+print(sum(doubled.stats.cache_hits.values()), doubled.stats.cache_path, os.listdir("."))
+"""
+READ_ONLY = f"mount --bind {shlex.quote(str(ROOT))} {shlex.quote(str(ROOT))} && mount -o remount,ro,bind {shlex.quote(str(ROOT))}"
+
+
+@needs_root
+def test_without_a_home_kernels_are_compiled_once_on_a_machine(tmp_path: Path) -> None:
+    """As in a container: neither the package nor a home can be written."""
+    (tmp_path / "kernel.py").write_text(KERNEL)
+    (tmp_path / "empty").mkdir()
+    python = f"cd {tmp_path}/empty && env -u XDG_CACHE_HOME HOME=/proc/none {sys.executable} ../kernel.py"
+    mounts = f"mount -t tmpfs tmpfs /var/tmp && {READ_ONLY}"
+    done = subprocess.run(
+        ["unshare", "-m", "sh", "-c", f"{mounts} && ({python}) && ({python}) && stat -c %a /var/tmp/zsim-0-compiled"],
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    first, second, mode = done.stdout.splitlines()
+    assert re.fullmatch(r"0 /var/tmp/zsim-0-compiled/\S+ \[\]", first)
+    assert second == first.replace("0 ", "1 ", 1)
+    assert mode == "700"
+
+
+def test_a_folder_of_somebody_else_is_not_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What is kept is code: a folder that others can write is passed over, as is a link to one.
+
+    The user has no home that anybody knows, for which Python leaves `~` as it is.
+    """
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(kernels.os.path, "expanduser", lambda path: path)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    own = re.compile(f"{re.escape(str(tmp_path))}|~")
+    usable = kernels._is_writable
+    monkeypatch.setattr(kernels, "_is_writable", lambda folder: bool(own.match(str(folder))) and usable(folder))
+    monkeypatch.setattr(kernels.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(
+        kernels, "Path", lambda *parts: Path(*(tmp_path / "var" if part == "/var/tmp" else part for part in parts))
+    )
+    folder = tmp_path / f"zsim-{os.getuid()}-compiled"
+    assert kernels.cache_folder() == str(folder)
+    folder.chmod(0o777)
+    assert kernels.cache_folder() == ""
+    folder.rmdir()
+    folder.symlink_to("/tmp")
+    assert kernels.cache_folder() == ""
+    assert not Path("~").exists()
 
 
 @pytest.fixture
