@@ -141,6 +141,21 @@ def test_a_table_of_each_drone_has_increasing_time(tmp_path: Path, flown: Path) 
     assert "--format csv" in refusal("export", str(flown), "--format", "mat", "--by-name")
 
 
+@needs_root
+@pytest.mark.parametrize("options", ["ro", "size=64k"])
+def test_shared_memory_is_not_needed(tmp_path: Path, flown: Path, options: str) -> None:
+    """Containers have little of it, or none that can be written."""
+    words = [*ZSIM, "run", str(flown.parent / "pair.yaml"), *SHORT, "--out", str(tmp_path / "run")]
+    line = f"mount -t tmpfs -o {options} tmpfs /dev/shm && {shlex.join(words)} && ls -A /dev/shm"
+    done = subprocess.run(
+        ["unshare", "-m", "sh", "-c", line], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    with RecordReader(tmp_path / "run" / "run.mcap") as record:
+        assert completeness(record).complete
+
+
 KERNEL = """
 import os, sys
 from zsim.math.compiled import kernel

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from refused import has_terms
+import zenoh
+from refused import has_terms, refused
 
 from zsim.errors import NoWorldError, SessionError
 from zsim.transport import connection
@@ -108,3 +109,48 @@ def test_a_port_that_is_taken_is_refused_with_the_option_that_gives_another() ->
         with pytest.raises(SessionError) as caught, connection.listen([endpoint], "zsim", "lockstep"):
             pass
     assert has_terms(str(caught.value), endpoint, "--listen")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "terms"),
+    [
+        ("tcp/192.0.2.1:7447", ("no address of this machine", "--listen")),
+        ("tcp/no-such-host.invalid:7447", ("the name is not known", "--listen")),
+        ("tcp/127.0.0.1:99999", ("from 1 to 65535", "--listen")),
+        ("tcp/127.0.0.1:7447#iface=no-such", ("no such network interface",)),
+    ],
+)
+def test_every_cause_of_not_listening_has_its_line(endpoint: str, terms: tuple[str, ...]) -> None:
+    identity = Identity(insecure=True)
+    with (
+        refused(SessionError, f"cannot listen on {endpoint}: ", *terms),
+        connection.listen([endpoint], "f", "lockstep", identity),
+    ):
+        pass
+
+
+def test_causes_that_the_system_numbers_are_told_apart() -> None:
+    texts = {
+        number: connection.no_listening(["tcp/h:1"], f"no listener: [h:1: some words (os error {number}))")
+        for number in connection._LISTEN_FAULTS
+    }
+    assert len(set(texts.values())) == len(texts)
+    assert not any("some words" in text for text in texts.values())
+    assert "(some words (os error 5)); another is given" in connection.no_listening(
+        ["tcp/h:1"], "some words (os error 5)"
+    )
+
+
+def test_a_panic_of_zenoh_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    class PanicException(BaseException):
+        """As of pyo3, which exports none."""
+
+    def fail(_: Any) -> None:
+        raise PanicException("failed to spawn thread: no memory")
+
+    monkeypatch.setattr(zenoh, "open", fail)
+    with (
+        refused(SessionError, "cannot listen on tcp/127.0.0.1:7447", "failed to spawn thread"),
+        connection.listen(["tcp/127.0.0.1:7447"], "f", "lockstep"),
+    ):
+        pass
