@@ -1,9 +1,11 @@
 """What is said when no world answers: nobody is there, or somebody is who does not let us in."""
 
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import pytest
@@ -11,7 +13,8 @@ import zenoh
 from refused import has_terms, refused
 
 from zsim.errors import NoWorldError, SessionError
-from zsim.transport import connection
+from zsim.scenario.scenario import DRONES_MAX
+from zsim.transport import connection, zenoh_settings
 from zsim.transport.connection import find_world
 from zsim.transport.permissions import Permissions
 from zsim.transport.tls import Identity
@@ -154,3 +157,20 @@ def test_a_panic_of_zenoh_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
         connection.listen(["tcp/127.0.0.1:7447"], "f", "lockstep"),
     ):
         pass
+
+
+def test_the_hub_adds_nothing_to_a_message_and_has_room_for_the_largest_run() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    stamps: SimpleQueue[str | None] = SimpleQueue()
+    with (
+        connection.listen([endpoint], "f", "lockstep") as hub,
+        connection.connect(endpoint, "f", wait_s=10.0) as client,
+    ):
+        client.declare_subscriber("own", lambda sample: stamps.put(sample.timestamp))
+        while not hub.has_subscribers("own"):
+            time.sleep(0.01)
+        hub.put_sample("own", b"1", "")
+        assert stamps.get(timeout=10.0) is None
+    assert zenoh_settings.SESSIONS_MAX > DRONES_MAX + 100  # estimators, and who else comes
