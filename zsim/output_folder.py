@@ -1,11 +1,49 @@
-"""Folders that commands write into: what somebody else has put there is not mixed up with it unasked."""
+"""Folders that commands write into: what somebody else has put there is not mixed up with it unasked.
+
+Two processes that write into one are kept apart by locks. Some file systems have none (Lustre, some of NFS, FUSE).
+"""
 
 from collections.abc import Collection
 from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, Any
 
 from zsim.errors import RunError
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
 OTHERS_NAMED = 3  # in a refusal
+
+
+def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
+    """Lock an open file for as long as it stays open, whatever ends the process; return False if another holds it.
+
+    Where the file system has no locks nobody holds one, and True is returned; see `no_locks`.
+    """
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # ENOLCK, ENOSYS, EOPNOTSUPP: what a file system answers differs
+        return True
+    return True
+
+
+def no_locks(folder: Path) -> str | None:
+    """Return a warning if the file system of a folder has no locks, so that `take_lock` keeps nobody away."""
+    if fcntl is None:
+        return None
+    try:
+        with TemporaryFile(dir=folder) as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return f"{folder}: cannot be locked ({error.strerror}); do not let two commands write there at a time"
+    return None
 
 
 def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> None:

@@ -15,6 +15,9 @@ def main() -> None:
     takes_interrupts = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where a shell has it ignored
     if takes_interrupts:
         signal.signal(signal.SIGINT, _leave)
+    from zsim_deploy.roles.closed_output import renew_streams
+
+    renew_streams()
     from zsim_deploy.cli import cli
 
     if takes_interrupts:
@@ -26,8 +29,10 @@ def main() -> None:
 
 
 def _leave(*_: object) -> None:
-    os.write(2, b"interrupted\n")
-    os._exit(INTERRUPTED)  # nothing has been started or written yet
+    try:
+        os.write(2, b"interrupted\n")
+    finally:  # standard error may be closed
+        os._exit(INTERRUPTED)  # nothing has been started or written yet
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ drones:
   - {name: drone1, position_m: [0, 0, 0]}
 """
 OWN = "mavlink.main"
+UNIQUE_ID = 2**63 + 1
 M = TypeVar("M", bound=WireMessage)
 
 
@@ -32,7 +33,9 @@ class FlownDrone:
         self.commands: list[Any] = []
         sender = CommandSender("drone1", OWN, lambda _, command: self.commands.append(command))
         (drone,) = scenario_file.from_text(SCENARIO).drones
-        self.vehicle = MavlinkVehicle(drone, ORIGIN, sender, Options(1, PERSONALITIES[autopilot], "normal", OWN))
+        self.vehicle = MavlinkVehicle(
+            drone, ORIGIN, sender, Options(1, PERSONALITIES[autopilot], "normal", OWN, UNIQUE_ID)
+        )
         self.sent: list[WireMessage] = []
         self.state = "landed"
         self.position = [0.0, 0.0, 0.0]

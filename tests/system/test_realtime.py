@@ -1,6 +1,8 @@
 """Realtime: paced by the wall clock, nobody is waited for, everything late is counted."""
 
+import os
 import signal
+import time
 
 import pytest
 from federation import ONE, PAIR, PAIR_ROLES, Federation, Role
@@ -53,6 +55,26 @@ def test_nobody_is_waited_for(federation: Federation) -> None:
     stop(client, run)
     end = federation.record().end()
     assert end["deadline_misses_by"]["estimator.drone1"] >= 150  # of the 200 gates that it slept through
+
+
+def test_a_run_that_is_frozen_goes_on_where_it_stood(federation: Federation) -> None:
+    """As by a machine that is suspended: no time is made up for in a burst that nobody could follow or record."""
+    rate, duration_s, frozen_s = 5, 40, 4.0
+    run = federation.run(PAIR, "--realtime", "--rate", str(rate), "--duration", str(duration_s))
+    federation.client().subscribe("clock").until(lambda m: m["t_ns"] > 6e9)
+    pids = {run.process.pid, *(pid for pid, _ in federation._processes())}
+    for number in (signal.SIGSTOP, signal.SIGCONT):
+        for pid in pids:
+            os.kill(pid, number)
+        time.sleep(frozen_s if number == signal.SIGSTOP else 0.0)
+    run.ends(with_code=0)
+    run.line(r"standstill: time stood still for \d")
+    record = federation.record()
+    (event,) = record.events("standstill")
+    assert event["data"]["wall_s"] > 0.9 * frozen_s
+    gates = [clock["t_ns"] for clock in record.all("clock") if clock["state"] == "running"]
+    assert gates == list(range(0, duration_s * 10**9 + 1, GATE_NS))
+    assert record.end()["wall_s"] > 0.99 * (duration_s / rate + frozen_s)
 
 
 def test_a_dead_controller_means_hover(federation: Federation) -> None:

@@ -24,7 +24,7 @@ from zsim_world.server import world_process
 
 STANDING_NS = 100_000_000  # instead of a second
 FILES_MAX = 256  # more than a launcher has open before it starts a role
-RENEW_STREAMS = forkserver._renew_streams
+RENEW_STREAMS = forkserver.renew_streams
 
 
 class ForkedServer:
@@ -64,7 +64,7 @@ def serve(line: int, run: str) -> NoReturn:
         os.closerange(3, FILES_MAX)
         sys.argv = ["forkserver", run]
         forkserver._prepare = lambda: None  # it is
-        forkserver._renew_streams = RENEW_STREAMS
+        forkserver.renew_streams = RENEW_STREAMS
         forkserver.main()
         code = None
     except BaseException:
@@ -80,7 +80,7 @@ def end_with_parent() -> None:
 
 
 if __name__ == "__main__":
-    forkserver._renew_streams = end_with_parent
+    forkserver.renew_streams = end_with_parent
     role_launcher.RoleLauncher._start_forkserver = start
     world_process.CLOCK_STANDING_NS = STANDING_NS
     forkserver.main()

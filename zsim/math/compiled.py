@@ -16,8 +16,11 @@ fifth of a gate's time, calls of functions that were not inlined another.
 """
 
 import hashlib
+import os
 import re
+import stat
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -34,6 +37,44 @@ COMPILES = njit is not None  # whether anything is compiled here
 _EXACT: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}  # numba's name for doing without its counts; making an array is refused
 _IMPORTS = re.compile(r"^from (zsim[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
+
+
+def cache_folder() -> str:
+    """Return where compiled code is kept on a machine where numba finds no place; empty where it finds one, or none is.
+
+    It keeps it beside the source, or in the user's cache. Where neither may be written, as in many containers and for
+    users without a home, everything was compiled again in every process; and without HOME the cache of a user whom
+    the system does not know is a folder named `~` in the current one. What is kept is run: the folder is ours alone.
+    """
+    home_cache = Path(os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache")), "numba")
+    if _is_writable(Path(__file__).parent / "__pycache__") or (home_cache.is_absolute() and _is_writable(home_cache)):
+        return ""
+    for base in ("/var/tmp", tempfile.gettempdir()):
+        folder = Path(base, f"zsim-{os.getuid()}-compiled")
+        try:
+            folder.mkdir(0o700, exist_ok=True)
+            status = folder.lstat()
+        except OSError:
+            continue
+        is_ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
+        if is_ours and _is_writable(folder):
+            return str(folder)
+    return ""
+
+
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+if njit is not None and hasattr(os, "getuid"):  # not on Windows
+    import numba
+
+    numba.config.CACHE_DIR = numba.config.CACHE_DIR or cache_folder()  # type: ignore[attr-defined]
 
 
 def compiled(function: Function) -> Function:

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from io import FileIO
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -16,14 +15,10 @@ from mcap.records import Channel, Schema
 from zsim.contract import messages
 from zsim.contract.framing import GateMessages, PerPattern
 from zsim.errors import RecordError
+from zsim.output_folder import take_lock
 from zsim.record.mcap_layout import chunk, groups, opening, packed, unpacked
 from zsim.record.open_chunk import OpenChunk
 from zsim.record.record_end import cut_off, finish, finish_bare, write_all
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits longer than 0.5 s
@@ -262,28 +257,18 @@ def _opened(path: Path, mode: str) -> FileIO:
         raise RecordError(f"{path}: exists; a record is never overwritten, name another place") from error
     except OSError as error:
         raise RecordError(f"{path}: cannot be written ({error.strerror})") from error
-    if fcntl is not None:
-        with suppress(OSError):  # of a file system without locks
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                file.close()
-                raise RecordError(f"{path}: another process writes it; end that one, or name another place") from error
+    if not take_lock(file):
+        file.close()
+        raise RecordError(f"{path}: another process writes it; end that one, or name another place")
     return file
 
 
 def is_being_written(path: Path) -> bool:
     """Tell whether a process is writing the record at a path; there may be none."""
-    if fcntl is None or not path.exists():
+    if not path.exists():
         return False
     with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        except OSError:  # of a file system without locks
-            return False
-    return False
+        return not take_lock(file, shared=True)
 
 
 def _message_encoding(media: str) -> str:

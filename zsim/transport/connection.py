@@ -3,6 +3,8 @@
 `find_world` connects, reads `world/info`, and waits with progress while there is no world yet.
 """
 
+import errno
+import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +22,24 @@ from zsim.transport.zenoh_settings import Mode, Settings
 ATTEMPT_S = 1.0  # one try to connect, so that waiting can be shown and interrupted
 PAUSE_S = 0.1  # between two questions to a hub where no world answers: another federation's, or one on its way up
 ANSWER_S = 1.0  # a hub that is there answers within milliseconds, unless it still compiles
+_OS_ERROR = re.compile(r"(?:os error |code: )(\d+)")
+_OTHER = "another is given by --listen, and to the other commands by --connect"
+_LISTEN_FAULTS = {  # by errno
+    errno.EADDRINUSE: f"another process listens there; {_OTHER}",
+    errno.EADDRNOTAVAIL: f"that is no address of this machine, whose own `ip address` shows; {_OTHER}",
+    errno.EACCES: f"this user may not open it, as ports below 1024 without being root; {_OTHER}",
+    errno.EPERM: f"this process may not open it; {_OTHER}",
+    errno.EINVAL: f"the address lacks its network interface, as in tcp/[fe80::1%eth0]:7447; {_OTHER}",
+    errno.ENODEV: "there is no such network interface, of those that `ip address` shows",
+    errno.EMFILE: "this process has too many files open; allow more by `ulimit -n`",
+    errno.ENFILE: "this machine has too many files open; end other programs, or raise fs.file-max",
+    errno.EAFNOSUPPORT: f"this machine has no addresses of that kind (IPv6 is off); {_OTHER}",
+    errno.ENOMEM: "this machine has too little memory left",
+}
+_LISTEN_TEXTS = {  # of Zenoh, where the system has no number
+    "lookup address": f"the name is not known on this machine; {_OTHER}",
+    "invalid port": f"the port must be from 1 to 65535; {_OTHER}",
+}
 
 
 @contextmanager
@@ -99,16 +119,20 @@ def _listening(
 ) -> Iterator[Session]:
     check_listening(endpoints, identity)
     settings = zenoh_settings.common("router", mode) | zenoh_settings.listening(endpoints, identity) | others
-    shown = ", ".join(endpoints)
-    remedy = "another is given by --listen, and to the other commands by --connect"
-
-    def refusal(error: object) -> str:
-        return f"cannot listen on {shown} ({error}); {remedy}"
-
-    with open_session(settings, federation, identity, refusal) as session:
+    with open_session(settings, federation, identity, partial(no_listening, endpoints)) as session:
         if identity.access is not None:
             _answer_permissions(session, identity)
         yield session
+
+
+def no_listening(endpoints: Sequence[str], error: str) -> str:
+    """Return why nobody can listen on endpoints, and what to do; `error` is Zenoh's text."""
+    found = _OS_ERROR.search(error)
+    why = _LISTEN_FAULTS.get(int(found[1]) if found else 0)
+    if why is None:
+        why = next((words for text, words in _LISTEN_TEXTS.items() if text in error), None)
+    text = f"cannot listen on {', '.join(endpoints)}"
+    return f"{text}: {why}" if why else f"{text} ({error}); {_OTHER}"
 
 
 def _answer_permissions(session: Session, identity: Identity) -> None:

@@ -102,9 +102,9 @@ def key_errors(expression: str) -> Iterator[None]:
         raise SessionError(f"key is {expression!r} ({first_sentence(error).split('`: ')[-1]}); {instead}") from error
 
 
-def first_sentence(error: Exception) -> str:
+def first_sentence(error: BaseException) -> str:
     """Return the first sentence of a Zenoh error without its source location."""
-    return str(error).split(" at ", 1)[0].split("\n", 1)[0][:160]
+    return str(error).split(" at ", 1)[0].split("\n", 1)[0][:240]
 
 
 class Subscription:
@@ -580,6 +580,10 @@ def open_session(
     try:
         raw = zenoh.open(config)
     except zenoh.ZError as error:
+        raise SessionError(explain(first_sentence(error))) from error
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":  # of Rust, which no module exports: no thread, no memory
+            raise
         raise SessionError(explain(first_sentence(error))) from error
     session = Session(raw, federation, identity)
     try:

@@ -23,6 +23,7 @@ CONNECT_RETRY_MS = 100
 # Connections that say nothing keep joiners out while so many of them are open and not yet given up: of Zenoh's own 100
 # for 10 s each, a hundred kept them out for 10 s. A handshake takes a few round trips; with TLS over a satellite 2 s.
 ACCEPT_PENDING, ACCEPT_MS = 1000, 3_000
+SESSIONS_MAX = 4_000  # at a hub; of Zenoh's own 1000 a run of as many drones needs two more
 QUEUE_LOCKSTEP = 16  # batches of 48 kB; Zenoh's limit, 2 its default
 
 _CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_close"
@@ -49,6 +50,7 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
         "connect/retry": f"{{period_init_ms: {CONNECT_RETRY_MS}, period_max_ms: {2 * CONNECT_RETRY_MS}}}",
         "transport/link/tx/lease": str(lease),
         "transport/shared_memory/enabled": "false",  # on by default; needs /dev/shm, and leaves its segments there
+        "timestamping/enabled": "false",  # a router's default; messages have their own time, and nobody reads Zenoh's
         _CLOSE_AFTER: str(CLOSE_AFTER_US),
     }
 
@@ -64,6 +66,7 @@ def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
         "listen/exit_on_failure": "true",
         "transport/unicast/accept_timeout": str(ACCEPT_MS),
         "transport/unicast/accept_pending": str(ACCEPT_PENDING),
+        "transport/unicast/max_sessions": str(SESSIONS_MAX),
         _CLOSE_AFTER: str(HUB_CLOSE_AFTER_US),
         **_security(identity, endpoints, "listen on"),
     }

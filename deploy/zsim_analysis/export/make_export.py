@@ -12,8 +12,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
-
 from zsim import __version__
 from zsim.errors import ReportError
 from zsim.record import RecordReader
@@ -60,6 +58,7 @@ def export(
     selection: MessageSelection | None = None,
     force: bool = False,
     progress: Progress = lambda done, of: None,
+    by_name: bool = False,
 ) -> ExportResult:
     """Write the record of a run in the form of another tool, all of it or nothing.
 
@@ -70,6 +69,7 @@ def export(
         selection: which messages, None for all.
         force: replace what an earlier export has written.
         progress: called now and then.
+        by_name: whether each drone, cluster and process has tables of its own, of CSV and Parquet.
 
     Raises:
         RunError, RecordError: there is no record.
@@ -82,11 +82,16 @@ def export(
         if form is Format.FOXGLOVE:
             return _foxglove(reader, chosen, target, force, progress)
         check_free(target, force, record)
-        return _tables(reader, form, chosen, target, progress)
+        return _tables(reader, form, chosen, target, progress, by_name)
 
 
 def _tables(
-    reader: RecordReader, form: Format, selection: MessageSelection, target: Path, progress: Progress
+    reader: RecordReader,
+    form: Format,
+    selection: MessageSelection,
+    target: Path,
+    progress: Progress,
+    by_name: bool,
 ) -> ExportResult:
     survey = TableSurvey(reader, selection)
     total = sum(survey.rows.values())
@@ -95,7 +100,7 @@ def _tables(
     with placed(target) as (new,):
         sink = _sink(form, new, survey)
         with sink:
-            for batch in batches(hat_by_hat(decoded), sink.columns):
+            for batch in batches(hat_by_hat(decoded), sink.columns, by_name):
                 sink.write(batch)
             written = sink.finish()
         if not written:
@@ -166,7 +171,7 @@ def _manifest(reader: RecordReader, selection: MessageSelection, written: list[A
         "notes": notes,
         "tables": {table.file: {"rows": table.rows, "columns": table.columns} for table in written},
     }
-    return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
+    return f"{json.dumps(content, indent=2)}\n".encode()  # not msgspec's: a path may hold bytes that are no UTF-8
 
 
 def check_free(target: Path, force: bool, record: Path) -> None:

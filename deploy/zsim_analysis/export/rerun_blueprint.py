@@ -7,9 +7,11 @@ with it. Made by Rerun's own library where it is installed; established with 0.4
 """
 
 import os
+import shutil
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,7 +92,10 @@ def write_blueprint(
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
-    blueprint.save(application, path)
+    with TemporaryDirectory() as folder:  # Rerun takes no path that is not UTF-8
+        new = Path(folder) / "new.rbl"
+        blueprint.save(application.encode(errors="replace").decode(), new)
+        shutil.copyfile(new, path)
 
 
 def panels(

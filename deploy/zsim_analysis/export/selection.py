@@ -174,12 +174,14 @@ class RowBatch(NamedTuple):
         names: subject of each.
         messages: decoded.
         wall_ns: when each reached the recorder.
+        only: the subject of all of them, where each has a table of its own.
     """
 
     kind: type[Struct]
     names: list[str]
     messages: list[Any]
     wall_ns: list[int]
+    only: str = ""
 
 
 class DecodedMessages:
@@ -213,20 +215,24 @@ class DecodedMessages:
                 yield recorded, message
 
 
-def batches(decoded: Iterable[tuple[Recorded, Any]], columns: Callable[[type[Struct]], int]) -> Iterator[RowBatch]:
+def batches(
+    decoded: Iterable[tuple[Recorded, Any]], columns: Callable[[type[Struct]], int], by_name: bool = False
+) -> Iterator[RowBatch]:
     """Yield all rows; a table's batches come in order of time.
 
     Args:
         decoded: messages in order of time.
         columns: number of columns of a table: wide ones have fewer rows in a batch.
+        by_name: whether each drone, cluster and process has tables of its own.
     """
-    incomplete: dict[type[Struct], RowBatch] = {}
+    incomplete: dict[tuple[type[Struct], str], RowBatch] = {}
     for recorded, message in decoded:
-        kind = type(message)
-        batch = incomplete.setdefault(kind, RowBatch(kind, [], [], []))
-        batch.names.append(subject(recorded.key))
+        kind, name = type(message), subject(recorded.key)
+        table = kind, name if by_name and kind is not Foreign else ""  # foreign names may be no names of files
+        batch = incomplete.setdefault(table, RowBatch(kind, [], [], [], table[1]))
+        batch.names.append(name)
         batch.messages.append(message)
         batch.wall_ns.append(recorded.wall_ns)
         if len(batch.names) * columns(kind) >= CELLS:
-            yield incomplete.pop(kind)
+            yield incomplete.pop(table)
     yield from incomplete.values()

@@ -1,9 +1,9 @@
-"""A table per message type, as CSV or Parquet: as pandas, MATLAB's readtable and others read it."""
+"""A table per message type, or of each name too, as CSV or Parquet: pandas, MATLAB and PlotJuggler read it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -24,6 +24,7 @@ _TYPES: dict[str, pa.DataType] = {
 _BEFORE = (("name", pa.string()), ("t_s", pa.float64()), ("t_ns", pa.int64()))
 _AFTER = ("wall_ns", pa.int64())
 _SEQ = ("seq", pa.int64())
+_Table = tuple[type[Struct], str]  # a message type, and the name of all its rows, empty where they have several
 
 
 class WrittenTable(NamedTuple):
@@ -54,8 +55,8 @@ class TableFolder:
         self._suffix = suffix
         self._fields = fields
         self._layouts: dict[type[Struct], _Layout] = {}
-        self._sinks: dict[type[Struct], _Sink] = {}
-        self._rows: dict[type[Struct], int] = {}
+        self._sinks: dict[_Table, _Sink] = {}
+        self._rows: dict[_Table, int] = {}
         self._stack = ExitStack()
 
     def columns(self, kind: type[Struct]) -> int:
@@ -64,30 +65,35 @@ class TableFolder:
 
     def write(self, batch: RowBatch) -> None:
         """Add rows to their table."""
-        if batch.kind not in self._sinks:
-            self._sinks[batch.kind] = self._open(batch.kind)
-        self._sinks[batch.kind].write(self._layout(batch.kind).arrow(batch))
-        self._rows[batch.kind] = self._rows.get(batch.kind, 0) + len(batch.names)
+        table = batch.kind, batch.only
+        if table not in self._sinks:
+            self._sinks[table] = self._open(table)
+        self._sinks[table].write(self._layout(batch.kind).arrow(batch))
+        self._rows[table] = self._rows.get(table, 0) + len(batch.names)
 
     def finish(self) -> list[WrittenTable]:
         """End all files; return the tables that were written."""
         self._stack.close()
-        return [
-            WrittenTable(self._file(kind), rows, self._layout(kind).schema.names)
-            for kind, rows in sorted(self._rows.items(), key=lambda item: table_name(item[0]))
+        written = [
+            WrittenTable(self._file(table), rows, self._layout(table[0]).schema.names)
+            for table, rows in self._rows.items()
         ]
+        return sorted(written, key=lambda each: each.file)
 
     def _layout(self, kind: type[Struct]) -> "_Layout":
         if kind not in self._layouts:
             self._layouts[kind] = _Layout(kind, self._fields(kind))
         return self._layouts[kind]
 
-    def _file(self, kind: type[Struct]) -> str:
-        return f"{table_name(kind)}.{self._suffix}"
+    def _file(self, table: "_Table") -> str:
+        kind, only = table
+        return ".".join([table_name(kind), *([only] if only else []), self._suffix])
 
-    def _open(self, kind: type[Struct]) -> _Sink:
-        path, schema = self._folder / self._file(kind), self._layout(kind).schema
-        sink = _Csv(path, schema) if self._suffix == "csv" else _Parquet(path, schema)
+    def _open(self, table: "_Table") -> _Sink:
+        schema = self._layout(table[0]).schema
+        # an open file: Arrow takes a path with a colon for an address, and knows no names that are not UTF-8
+        file = self._stack.enter_context((self._folder / self._file(table)).open("wb"))
+        sink = _Csv(file, schema) if self._suffix == "csv" else _Parquet(file, schema)
         self._stack.callback(sink.close)
         return sink
 
@@ -131,11 +137,11 @@ def _columns(field: FieldColumns, messages: Sequence[Any]) -> Iterator[Any]:
 class _Csv:
     """A CSV file: names in the first line, flags as 0 and 1, empty where there is no value."""
 
-    def __init__(self, path: Path, schema: pa.Schema) -> None:
+    def __init__(self, file: BinaryIO, schema: pa.Schema) -> None:
         plain = [pa.field(each.name, pa.int8() if each.type == pa.bool_() else each.type) for each in schema]
         self._schema = pa.schema(plain)
         options = pacsv.WriteOptions(include_header=True, quoting_style="needed")
-        self._writer = pacsv.CSVWriter(path, self._schema, write_options=options)
+        self._writer = pacsv.CSVWriter(file, self._schema, write_options=options)
 
     def write(self, batch: pa.RecordBatch) -> None:
         self._writer.write(batch.cast(self._schema))
@@ -147,9 +153,9 @@ class _Csv:
 class _Parquet:
     """A Parquet file; rows are held until there are enough for a row group."""
 
-    def __init__(self, path: Path, schema: pa.Schema) -> None:
+    def __init__(self, file: BinaryIO, schema: pa.Schema) -> None:
         self._schema = schema
-        self._writer = pq.ParquetWriter(path, schema, compression="zstd")
+        self._writer = pq.ParquetWriter(file, schema, compression="zstd")
         self._held: list[pa.RecordBatch] = []
 
     def write(self, batch: pa.RecordBatch) -> None:

@@ -45,11 +45,14 @@ class ComparedRun:
 
 
 def run_names(directories: Sequence[Path]) -> list[str]:
-    """Return short names, no two the same: the folders' own, with as many parents as it takes, then a number."""
+    """Return short names, no two the same: the folders' own, with as many parents as it takes, then a number.
+
+    What is no UTF-8 is a question mark: matplotlib can draw nothing else.
+    """
     paths = [directory.resolve() for directory in directories]
     longest = max(len(path.parts) for path in paths)
     for depth in range(1, longest + 1):
-        names = ["/".join(path.parts[-depth:]) for path in paths]
+        names = ["/".join(path.parts[-depth:]).encode(errors="replace").decode() for path in paths]
         if len(set(names)) == len(names):
             return names
     return [f"{path.name} ({number})" for number, path in enumerate(paths, start=1)]

@@ -6,8 +6,8 @@ sweep.parquet    finished runs, a row each
 runs/000012/     record of run 12, where records are kept
 """
 
-import fcntl
 import os
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +17,8 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from zsim.errors import ReportError, RunError
-from zsim.output_folder import refuse_others
+from zsim.errors import ReportError, RunError, printable
+from zsim.output_folder import no_locks, refuse_others, take_lock
 from zsim_analysis.sweep.axes import SEED, Axis, Grid
 from zsim_analysis.sweep.design import PLAN, SweepDesign, SweepPlan, difference, is_sweep
 from zsim_analysis.sweep.sweep_run import FIXED, Row
@@ -98,10 +98,10 @@ def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFo
     except OSError as error:
         raise RunError(f"{path}: cannot be made ({error.strerror}); give --out another folder") from error
     with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunError(f"{path}: another sweep is at work there; give --out another folder") from error
+        if not take_lock(lock):
+            raise RunError(f"{path}: another sweep is at work there; give --out another folder")
+        if warning := no_locks(path):
+            print(printable(warning), file=sys.stderr)
         _write_plan(path, plan)
         yield SweepFolder(path, plan)
 
@@ -224,7 +224,8 @@ def read_table(path: Path) -> list[Row]:
     if not path.exists():
         return []
     try:
-        table = pq.read_table(path)
+        with path.open("rb") as file:  # Arrow takes a path with a colon for an address
+            table = pq.read_table(file)
     except (OSError, pa.ArrowException) as error:
         reason = " ".join(str(error).split())[:200]
         raise ReportError(f"{path}: cannot be read ({reason}); remove it to go on") from error

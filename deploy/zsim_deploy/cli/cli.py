@@ -1,10 +1,10 @@
 """The command line: thin commands that read options, call one function, and print one line for a fault."""
 
+import errno
 import os
 import sys
 from contextlib import nullcontext
 from functools import cache
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -64,6 +64,10 @@ app = typer.Typer(
 
 UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
 UNREAD = 128 + 13  # exit code of a command whose output nobody reads any more: that of SIGPIPE
+FILE_FAULTS = {  # of a path that a person gave, or of its disk, wherever it is looked at first
+    *(errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.EROFS, errno.EIO, errno.ESTALE),
+}
+PATH_SHOWN = 200  # characters
 EXIT_CODES = {  # of what is no wrong input
     SupersededError: 3,
     BehindError: 1,
@@ -240,7 +244,6 @@ def command() -> Any:
 
 def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
-    _replace_unprintable()
     code = _exit_code()
     try:
         sys.stdout.flush()
@@ -276,6 +279,13 @@ def _run() -> NoReturn:
             raise
         print(printable(f"{' '.join(sys.argv[1:2])}: {lacking}"), file=sys.stderr)
         sys.exit(USER_FAULT)
+    except OSError as error:
+        if error.errno not in FILE_FAULTS or error.filename is None:
+            raise
+        path = os.fsdecode(error.filename)
+        shown = path if len(path) <= PATH_SHOWN else f"{path[: PATH_SHOWN // 2]}…{path[-PATH_SHOWN // 2 :]}"
+        print(printable(f"{shown}: cannot be used ({error.strerror}); give another path"), file=sys.stderr)
+        sys.exit(USER_FAULT)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     if code == INTERRUPTED:
@@ -288,13 +298,6 @@ def _drop_output() -> None:
     into = os.open(os.devnull, os.O_WRONLY)
     for stream in filter(is_unread, STREAMS):
         os.dup2(into, stream)
-
-
-def _replace_unprintable() -> None:
-    """Print a question mark for a character that the terminal's encoding lacks, rather than end the command."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")
 
 
 def _show_usage(error: Any) -> None:

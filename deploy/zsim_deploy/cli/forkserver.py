@@ -19,9 +19,10 @@ import threading
 import traceback
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from zsim.errors import printable
+from zsim_deploy.roles.closed_output import renew_streams
 
 READY = b"ready"
 PACKET_MAX = 1 << 17  # bytes, of a command line
@@ -95,7 +96,7 @@ def _run_role(arguments: list[str], files: list[int]) -> NoReturn:
     for number, file in enumerate(standard):
         os.dup2(file, number)
         os.close(file)
-    _renew_streams()
+    renew_streams()
     _show_as(arguments[0], [sys.executable, "-m", "zsim_deploy.cli", *arguments])
     sys.argv = ["zsim", *arguments]
     code: object = 1
@@ -126,14 +127,6 @@ def finish(code: object) -> NoReturn:
         with suppress(BaseException):
             stream.flush()
     os._exit(code if isinstance(code, int) else 0 if code is None else 1)
-
-
-def _renew_streams() -> None:
-    """Open Python's standard streams again: their files are others now."""
-    how: dict[str, Any] = {"encoding": sys.stdout.encoding, "closefd": False}
-    sys.stdin = os.fdopen(0, errors=sys.stdin.errors, **how)
-    sys.stdout = os.fdopen(1, "w", errors=sys.stdout.errors, **how)
-    sys.stderr = os.fdopen(2, "w", buffering=1, errors=sys.stderr.errors, **how)
 
 
 def _show_as(name: str, command: list[str]) -> None:

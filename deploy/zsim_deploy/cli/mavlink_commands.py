@@ -30,14 +30,27 @@ def serve(
     reach: WorldAccess,
     autopilot: Annotated[Literal["px4", "ardupilot"], typer.Option(help="Whose modes and parameters.")] = "px4",
     gcs: Annotated[str, typer.Option(help="The ground station, HOST:PORT.")] = f"127.0.0.1:{GCS_PORT}",
-    api: Annotated[str, typer.Option(help="Programs, HOST:PORT of the first; +1 each.")] = f"127.0.0.1:{API_PORT}",
+    api: Annotated[
+        str | None, typer.Option(help=f"Programs, HOST:PORT of the first; +1 each (default 127.0.0.1:{API_PORT}).")
+    ] = None,
     listen: Annotated[str, typer.Option(help="Address on which the vehicles' ports are opened.")] = "127.0.0.1",
     gcs_local: Annotated[
-        int, typer.Option(help="First port that talks with the ground station; +1 each.", min=1, max=PORT_MAX)
-    ] = GCS_LOCAL_PORT,
+        int | None,
+        typer.Option(
+            help=f"First port that talks with the ground station; +1 each (default {GCS_LOCAL_PORT}).",
+            min=1,
+            max=PORT_MAX,
+        ),
+    ] = None,
     api_local: Annotated[
-        int, typer.Option(help="First port that talks with programs; +1 each.", min=1, max=PORT_MAX)
-    ] = API_LOCAL_PORT,
+        int | None,
+        typer.Option(
+            help=f"First port that talks with programs; +1 each (default {API_LOCAL_PORT}).", min=1, max=PORT_MAX
+        ),
+    ] = None,
+    first_system_id: Annotated[
+        int, typer.Option(help="Of the first drone; +1 each. The default ports move with it.", min=1, max=254)
+    ] = 1,
     signing_key: Annotated[
         Path | None, typer.Option(help="File with the key of MAVLink 2 signatures; unsigned messages are refused.")
     ] = None,
@@ -54,17 +67,19 @@ def serve(
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import serve_runs
 
+    ahead = first_system_id - 1  # as of PX4's simulation, whose ports go by the system id too
     options = MavlinkOptions(
         autopilot=autopilot,
         level=telemetry,
         listen=listen,
         gcs=_endpoint("--gcs", gcs, listen),
-        gcs_local=gcs_local,
-        api=_endpoint("--api", api, listen),
-        api_local=api_local,
+        gcs_local=gcs_local or GCS_LOCAL_PORT + ahead,
+        api=_endpoint("--api", api or f"127.0.0.1:{API_PORT + ahead}", listen),
+        api_local=api_local or API_LOCAL_PORT + ahead,
         key=read_key(signing_key) if signing_key else None,
         version=1 if protocol == 1 else 2,
         rate=rate,
+        first_system_id=first_system_id,
     )
     if options.key and options.version == 1:
         raise typer.BadParameter("--signing-key needs MAVLink 2; leave out --protocol 1")

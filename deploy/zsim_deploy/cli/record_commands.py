@@ -285,8 +285,14 @@ def export(
         typer.Option(help="Where (default DIR/csv, DIR/parquet, DIR/run.mat, DIR/foxglove.mcap).", show_default=False),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier export.")] = False,
+    by_name: Annotated[
+        bool,
+        typer.Option("--by-name", help="A table of each drone, cluster and process: time in it only increases."),
+    ] = False,
 ) -> None:
     """Write the record of a run as tables, for MATLAB, or for Foxglove and Rerun."""
+    if by_name and form not in (Format.CSV, Format.PARQUET):
+        raise typer.BadParameter("--by-name is for tables; leave it out, or say --format csv or parquet")
     require("export", {"export": ("mcap", "zstandard", WRITERS[form])})
     from rich.console import Console
     from rich.progress import Progress
@@ -308,6 +314,7 @@ def export(
             MessageSelection(tuple(keys or ()), from_, to),
             force,
             lambda count, of: bar.update(task, description="reading messages", completed=count, total=of),
+            by_name,
         )
     _show(done)
 

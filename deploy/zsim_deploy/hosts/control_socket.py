@@ -4,12 +4,12 @@ One request and one answer per connection, a JSON line each: {op, args} and {ok,
 """
 
 import contextlib
-import fcntl
 import inspect
 import json
 import os
 import socket
 import stat
+import sys
 import tempfile
 import threading
 from collections.abc import Callable
@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from zsim import __version__
-from zsim.errors import RunError, ZsimError
+from zsim.errors import RunError, ZsimError, printable
+from zsim.output_folder import no_locks, take_lock
 
 REQUEST_S = 5.0  # from the same machine
 ANSWER_S = 150.0  # a move connects to a host, asks it about itself, and brings a certificate: 135 s at most
@@ -174,14 +175,14 @@ def _lock(federation: str, path: Path) -> int:
         lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     except OSError as error:
         raise RunError(f"{path}: cannot be made ({error.strerror}); set XDG_RUNTIME_DIR to another folder") from error
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+    if not take_lock(lock):
         os.close(lock)
         raise RunError(
             f"federation {federation!r} is up already on this machine; end it with "
             f"`zsim down --federation {federation}`, or fly in another one: --set federation=NAME"
-        ) from error
+        )
+    if "@" not in path.stem and (warning := no_locks(path.parent)):  # a run has a name of its own
+        print(printable(warning), file=sys.stderr)
     return lock
 
 

@@ -1,5 +1,6 @@
 """A run that was interrupted: how it was launched, kept beside the journal of its world, and where it goes on."""
 
+import json
 from contextlib import suppress
 from pathlib import Path
 
@@ -35,7 +36,8 @@ def keep(folder: Path, launch: Launch) -> None:
         OSError: it cannot be written.
     """
     (folder / JOURNAL).mkdir(exist_ok=True)
-    (folder / JOURNAL / LAUNCH).write_bytes(msgspec.json.encode(launch))
+    content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold bytes that are no UTF-8
+    (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
 
 
 def forget(folder: Path) -> None:
@@ -53,11 +55,11 @@ def launch_of(folder: Path) -> Launch:
     """
     place = folder / JOURNAL / LAUNCH
     try:
-        return msgspec.json.decode(place.read_bytes(), type=Launch)
+        return msgspec.convert(json.loads(place.read_bytes()), Launch)
     except FileNotFoundError as error:
         state = "is over" if (folder / RECORD).exists() else "is not there"
         raise RunError(f"{folder}: the run {state}; must be the folder of one that was interrupted") from error
-    except (OSError, msgspec.MsgspecError) as error:
+    except (OSError, ValueError, msgspec.MsgspecError) as error:
         raise RunError(f"{place}: cannot be read ({error}); must be as zsim run has left it") from error
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from zsim.errors import RecordError, RunError, RunFailedError, SessionError
+from zsim.output_folder import no_locks
 from zsim.record import repair
 from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
@@ -226,8 +227,9 @@ def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
 def _say_headline(options: RunOptions, screen: Screen) -> None:
     scenario = options.scenario
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    for line in unflown_plans(scenario):
-        screen.say(line)
+    for line in (*unflown_plans(scenario), no_locks(options.out)):
+        if line:
+            screen.say(line)
 
 
 def _interrupt(number: int, _: object) -> None:

@@ -161,6 +161,8 @@ class Installer:
             raise HostsError(
                 f"{self._name}: its folder cannot be used ({why}); correct hosts.{self._name}.folder, or make it there"
             )
+        if why := message.get("unlocked"):
+            progress(f"its folder cannot be locked ({why}); do not let two commands push to it at a time")
 
     async def ask(self, act: str, timeout_s: float, **order: Any) -> dict[str, Any]:
         """Give an order and return the answer.

@@ -129,24 +129,27 @@ def install(folder: Path, order: dict, children: CommandRunner) -> None:
 
 
 @contextlib.contextmanager
-def locked(folder: Path, who: str) -> Iterator[None]:
-    """Work in a folder alone; while another does, report who, and wait.
+def locked(folder: Path, who: str) -> Iterator[str]:
+    """Work in a folder alone; while another does, report who, and wait. Yield why that cannot be, empty if it can.
 
     Raises:
         OSError: the folder cannot be made or written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / LOCK, "a+") as file:
+        fault = ""
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
             say({"waits": file.read() or "another"})
             fcntl.flock(file, fcntl.LOCK_EX)
+        except OSError as error:  # of a file system without locks
+            fault = str(error.strerror)
         file.truncate(0)
         file.write(f"{who} (process {os.getpid()} there)")
         file.flush()
-        yield
+        yield fault
 
 
 def say(answer: dict) -> None:
@@ -205,11 +208,11 @@ def main(folder: Path, who: str, silent_s: float) -> None:
         threading.Thread(target=each, daemon=True).start()
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(locked(folder, who))
+            fault = stack.enter_context(locked(folder, who))
         except OSError as error:
             say({"unwritable": f"{error.filename or folder}: {error.strerror}"})
             exit_now(children)
-        say({"locked": True})
+        say({"locked": not fault, "unlocked": fault})
         while True:
             say(execute(folder, orders.get(), children))
 

@@ -208,7 +208,12 @@ class HostInstallation:
 
 def default_cache() -> Path:
     """Return the folder of the wheelhouse on this machine (XDG Base Directory Specification)."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
+    except RuntimeError as error:  # HOME is not set, and the system does not know the user
+        raise HostsError(
+            "push: this user has no home for what is downloaded; set XDG_CACHE_HOME to a folder"
+        ) from error
 
 
 class PushProgress:

@@ -34,6 +34,7 @@ from zsim_deploy.launch.role_launcher import SINGLE_THREADED
 TARGET = "zsim.target"
 STATE = "/var/lib/zsim"  # StateDirectory=zsim
 CACHE = "/var/cache/zsim"  # CacheDirectory=zsim
+PATH_MAX = 4000  # bytes; Linux takes 4095, and what is in the folder has names too
 
 # Not among them: MemoryDenyWriteExecute (numba compiles) and ProcSubset (the fingerprint reads /proc/cpuinfo).
 HARDENING = (
@@ -100,6 +101,8 @@ def _lacks(host: Host) -> Iterator[str]:
     for name, path in (("folder", host.folder), ("python", host.python or "/")):
         if not path.isprintable():
             yield f"{name} is {show(path)}; must be of printable characters, in a unit a line is an option"
+        if len(path.encode(errors="replace")) > PATH_MAX:
+            yield f"{name} has {len(path.encode(errors='replace'))} bytes; must have at most {PATH_MAX}"
     if host.python is not None and not host.python.startswith("/"):
         yield f"python is {show(host.python)}; a unit needs an absolute path, or none given"
 
@@ -163,7 +166,8 @@ def _run(scenario: Scenario, process: PlannedProcess, host: Host) -> list[str]:
         out=f"{STATE}/runs/{scenario.name}-{RUN_ID}",
     )
     python = _absolute(host, inv.python(host))
-    words = map(_word, (python, *command(process, files)))
+    # ":": no variables are put in. Doubled, a $ would stay one in the arguments and be two in the path of the program
+    words = map(_word, (f":{python}", *command(process, files)))
     settings = {**SINGLE_THREADED, "NUMBA_CACHE_DIR": CACHE}
     return [
         "Type=exec",
@@ -178,7 +182,7 @@ def _run(scenario: Scenario, process: PlannedProcess, host: Host) -> list[str]:
 
 def _word(text: str) -> str:
     """Return a word as ExecStart= takes it literally."""
-    text = text.replace("%", "%%").replace("$", "$$")
+    text = text.replace("%", "%%")
     if re.fullmatch(r"[^\s\"'\\;]+", text):
         return text
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

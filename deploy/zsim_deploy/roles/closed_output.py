@@ -1,14 +1,62 @@
-"""Output that nobody reads any more: the terminal was closed, or the end of a pipe is gone."""
+"""Output that nobody reads any more, or that nobody can take: a closed terminal, the end of a pipe, a full disk."""
 
 import contextlib
+import io
 import os
 import select
 import stat
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 STREAMS = 1, 2  # standard output and error
 CLOSED = "the terminal was closed"
+
+
+class _Output(io.FileIO):
+    """A standard stream that loses what its file does not take; only that nobody is at the end of a pipe is raised."""
+
+    _lost = False
+
+    def write(self, data: Any, /) -> int | None:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            raise
+        except OSError as error:  # a full disk, a terminal that is gone
+            if not self._lost and self.fileno() != STREAMS[-1]:
+                write_error(f"standard output cannot be written ({error.strerror}); what follows is lost")
+            self._lost = True
+            return len(data)
+
+
+def write_error(text: str) -> None:
+    """Write a line to standard error without Python's stream, as from a signal handler; it may be lost."""
+    with contextlib.suppress(OSError):
+        os.write(STREAMS[-1], f"{text}\n".encode(errors="replace"))
+
+
+def renew_streams() -> None:
+    """Open Python's standard streams anew, so that nothing ends because one of them is closed, or its disk full.
+
+    To be called before any file is opened: it would take the number of a stream that is closed, and then also what a
+    library prints.
+    """
+    for number in (0, *STREAMS):
+        try:
+            os.fstat(number)
+        except OSError:
+            empty = os.open(os.devnull, os.O_RDWR)
+            if empty != number:
+                os.dup2(empty, number)
+                os.close(empty)
+    encodings = [getattr(stream, "encoding", None) for stream in (sys.stdin, sys.stdout, sys.stderr)]
+    sys.stdin = os.fdopen(0, encoding=encodings[0], errors=getattr(sys.stdin, "errors", None), closefd=False)
+    out, error = (io.BufferedWriter(_Output(number, "w", closefd=False)) for number in STREAMS)
+    # a question mark for a character that the terminal's encoding lacks, rather than the end of the command
+    sys.stdout = io.TextIOWrapper(out, encodings[1], "replace", line_buffering=os.isatty(STREAMS[0]))
+    sys.stderr = io.TextIOWrapper(error, encodings[2], "replace", line_buffering=True)
 
 
 def is_unread(stream: int) -> bool:
@@ -30,8 +78,7 @@ def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOS
         into = os.open(os.devnull, os.O_WRONLY)
     lost = [stream for stream in streams if not _is_file(stream)]
     if lost:
-        with contextlib.suppress(OSError):
-            os.write(STREAMS[-1], f"{why}; what there is still to say is in {log}\n".encode())
+        write_error(f"{why}; what there is still to say is in {log}")
     for stream in lost:
         os.dup2(into, stream)
     os.close(into)

@@ -15,6 +15,7 @@ from pathlib import Path
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
 from zsim.errors import NoWorldError, SessionError, SupersededError, UserCodeError, ZsimError, printable
+from zsim.output_folder import no_locks
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
 from zsim.runtime.inbox import output_hold_ns
@@ -138,6 +139,8 @@ def recorder(out: Path, reach: WorldAccess) -> None:
     with connection as (link, info):
         folder = record_folder(out, info.run_id)
         make(folder)
+        if not launched and (warning := no_locks(folder)):
+            say(f"recorder: {warning}")
         path = folder / RECORD
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned)

@@ -22,7 +22,7 @@ from typing import Any
 
 from zsim.transport.tls import KEY, Identity
 from zsim_deploy import INTERRUPTED
-from zsim_deploy.roles.closed_output import CLOSED, redirect_output
+from zsim_deploy.roles.closed_output import CLOSED, redirect_output, write_error
 
 REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
 HANGUP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()  # not on Windows
@@ -149,7 +149,7 @@ class StopChannel:
 
     def _on_interrupt(self, *_: object) -> None:
         if self._reason is not None:
-            os.write(2, f"{TWICE_INTERRUPTED}\n".encode())
+            write_error(TWICE_INTERRUPTED)
             os._exit(INTERRUPTED)
         self._stop(REASONS[signal.SIGINT])
 
@@ -175,8 +175,7 @@ class StopChannel:
             self._lease.release()
         self._stop(reason)
         time.sleep(GRACE_S)
-        with contextlib.suppress(OSError):  # its log may be gone too
-            os.write(2, f"{reason}; this process did not end within {GRACE_S:g} s and is ended\n".encode())
+        write_error(f"{reason}; this process did not end within {GRACE_S:g} s and is ended")
         os._exit(1)
 
 

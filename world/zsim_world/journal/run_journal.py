@@ -23,13 +23,9 @@ import msgspec
 from zsim.contract.messages import REFUSALS
 from zsim.contract.snapshot import State, pack, unpack
 from zsim.errors import DecodeError, RunError
+from zsim.output_folder import take_lock
 from zsim_world.journal import journal_entries
 from zsim_world.journal.journal_entries import Entry
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 VERSION = 2  # of the files, and of the states in them
 CHECKPOINT_NS = 5_000_000_000  # simulated time between two; the history that a replay refills reaches back as far
@@ -201,21 +197,13 @@ class RunJournal:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._truth = os.open(self._folder / "truth", os.O_RDWR | os.O_CREAT, 0o644)
-            self._lock()
+            if not take_lock(self._truth):
+                raise RunError(f"{self._folder}: another world keeps its journal there; end that one")
             found = self._newest()
             self._file = self._open_entries(self._number)
         except OSError as error:
             raise RunError(f"{self._folder}: no journal can be kept there ({error.strerror})") from error
         return found
-
-    def _lock(self) -> None:
-        """Keep others from this journal for as long as this process lives."""
-        if fcntl is None:
-            return
-        try:
-            fcntl.flock(self._truth, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunError(f"{self._folder}: another world keeps its journal there; end that one") from error
 
     def _newest(self) -> Checkpoint | None:
         """Return the newest checkpoint but one: the history is refilled from there."""

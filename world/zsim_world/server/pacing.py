@@ -39,8 +39,12 @@ class Pacer:
             self._start_wall_ns, self._start_sim_ns = wall_ns, clock.next_ns
         due_ns = self._start_wall_ns + round((clock.next_ns - self._start_sim_ns) / clock.rate)
         if clock.mode == "lockstep" and wall_ns - due_ns > STOOD_STILL_NS:
-            self._pace = (0.0, 0)
+            self.restart()
         return due_ns
+
+    def restart(self) -> None:
+        """Let the pace start anew with the next gate, which is due at once."""
+        self._pace = (0.0, 0)
 
 
 class Pipelining:

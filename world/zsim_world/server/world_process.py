@@ -26,7 +26,7 @@ from zsim_world.journal.run_journal import RunJournal
 from zsim_world.server.admission import Admission
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
-from zsim_world.server.pacing import Pacer, Pipelining
+from zsim_world.server.pacing import STOOD_STILL_NS, Pacer, Pipelining
 from zsim_world.server.query_service import QueryService
 from zsim_world.server.resumption import Resumption
 from zsim_world.server.slow_readers import SlowReaders
@@ -175,7 +175,9 @@ class WorldProcess:
     # The loop
 
     def _turn(self) -> None:
-        self._turn_wall_ns = time.monotonic_ns()
+        former_wall_ns, self._turn_wall_ns = self._turn_wall_ns, time.monotonic_ns()
+        if former_wall_ns and self._turn_wall_ns - former_wall_ns > STOOD_STILL_NS:  # the ticker begins ten a second
+            self._go_on_after_standstill(self._turn_wall_ns - former_wall_ns)
         self._take_in()
         if reason := self._stopped():
             self._clock.stop(reason)
@@ -194,6 +196,17 @@ class WorldProcess:
                 self._served_wall_ns = 0
         else:
             self._stand_still(wall_ns)
+
+    def _go_on_after_standstill(self, stood_ns: int) -> None:
+        """Go on in realtime where time stood still, rather than fly in a burst what the wall clock is ahead by."""
+        if self._clock.mode == "realtime" and self._clock.state == "running":
+            self._pacer.restart()
+            why = "this process or its machine was stopped, or nothing could be published"
+            text = f"time stood still for {stood_ns / 1e9:.1f} s of wall time: {why}"
+            seq, data = self._world.outbox.next_seq(keys.EVENT), {"wall_s": stood_ns / 1e9}
+            event = run_messages.Event(self._world.now_ns, seq, "standstill", WORLD, WORLD, text, data)
+            self._outputs.publish(Output(keys.EVENT, event))
+            self._on_message(keys.EVENT, event)
 
     def _take_in(self) -> None:
         for wall_ns, sample in self._inputs.drain():

@@ -169,8 +169,8 @@ class HttpProxy:
         return web.Response(body=self._pages[role], content_type="text/html", charset="utf-8", headers=headers)
 
     def _set_cookie(self, page_request: PageRequest) -> web.Response:
-        """Put the token into a cookie, and out of the address."""
-        response = web.Response(status=303, headers={**HEADERS, "Location": page_request.path})
+        """Put the token into a cookie, and out of the address; a proxy may show the page below a path of its own."""
+        response = web.Response(status=303, headers={**HEADERS, "Location": f".{page_request.path}"})
         role = self._tokens.role_of_address(page_request)
         if role is not None:
             name = self._tokens.cookie(role)

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import hashlib
 import sys
 import time
 from collections.abc import Callable
@@ -48,6 +49,7 @@ class MavlinkOptions(NamedTuple):
         key: of signatures; None for none.
         version: of MAVLink in what is sent.
         rate: pace that is asked of a run as fast as possible; None for none.
+        first_system_id: of the first drone; +1 each.
     """
 
     autopilot: str
@@ -60,6 +62,7 @@ class MavlinkOptions(NamedTuple):
     key: bytes | None
     version: Version
     rate: float | None
+    first_system_id: int
 
 
 def serve(
@@ -109,15 +112,19 @@ class MavlinkServer:
         self._counted: dict[str, int] = {}
         self._requests = ThreadPoolExecutor(1)  # one after the other
         drones = scenario_file.from_text(info.scenario).drones
-        if len(drones) > SYSTEM_IDS:
-            raise RunError(f"{observer.name}: the run has {len(drones)} drones; MAVLink has {SYSTEM_IDS} system ids")
+        first = options.first_system_id
+        if first + len(drones) - 1 > SYSTEM_IDS:
+            allowed = f"MAVLink has {SYSTEM_IDS} system ids, of which --first-system-id is {first}"
+            raise RunError(f"{observer.name}: the run has {len(drones)} drones; {allowed}")
         self._served = {drone.name: self._offer(i, drone) for i, drone in enumerate(drones)}
         self._routes = {key: route for drone in self._served for key, route in _routes(drone)}
 
     def _offer(self, index: int, drone: Drone) -> Served:
-        options, system_id = self._options, index + 1
+        options, system_id = self._options, self._options.first_system_id + index
         sender = CommandSender(drone.name, self._observer.name, self._link.put)
-        shown = Options(system_id, PERSONALITIES[options.autopilot], options.level, self._observer.name)
+        shown = Options(
+            system_id, PERSONALITIES[options.autopilot], options.level, self._observer.name, self._unique_id(drone)
+        )
         vehicle = MavlinkVehicle(drone, self._info.origin, sender, shown)
 
         def on_received(received: Received) -> None:
@@ -134,6 +141,10 @@ class MavlinkServer:
         packer = Link(system_id, COMPONENT_AUTOPILOT, self._signing, options.version)
         served = Served(vehicle, VehiclePorts(ports, packer))
         return served
+
+    def _unique_id(self, drone: Drone) -> int:
+        """Return the 64 bits by which programs know a vehicle again: those of no other run are equal."""
+        return int.from_bytes(hashlib.sha256(f"{self._info.run_id}/{drone.name}".encode()).digest()[:8])
 
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Serve until the run is over or a stop is requested."""

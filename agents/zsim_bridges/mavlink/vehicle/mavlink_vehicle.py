@@ -36,12 +36,13 @@ NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 
 
 class Options(NamedTuple):
-    """How a vehicle shows itself: its system id, its autopilot, its telemetry, and the name of this process."""
+    """How a vehicle shows itself: system id, autopilot, telemetry, name of this process, and its id of 64 bits."""
 
     system_id: int
     personality: Personality
     level: Level
     source: str
+    unique_id: int
 
 
 class MavlinkVehicle:
@@ -273,5 +274,5 @@ class MavlinkVehicle:
         return dialect.AutopilotVersion(
             capabilities=capabilities,
             flight_sw_version=major << 24 | minor << 16 | patch << 8 | type_,
-            uid=self._options.system_id,
+            uid=self._options.unique_id,
         )

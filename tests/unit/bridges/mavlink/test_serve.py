@@ -124,13 +124,35 @@ def test_a_port_that_is_taken_is_told() -> None:
             VehiclePort(("127.0.0.1", port), GCS, None, lambda _: None)
 
 
+def server_of(link: Any, first_system_id: int = 1, run_id: str = "r") -> MavlinkServer:
+    info: Any = SimpleNamespace(scenario=SCENARIO, origin=ORIGIN, run_id=run_id)
+    options = MavlinkOptions("px4", "normal", "127.0.0.1", GCS, 0, GCS, 0, None, 2, None, first_system_id)
+    observer: Any = SimpleNamespace(name="mavlink.main")
+    return MavlinkServer(link, info, observer, lambda _: None, options)
+
+
+def test_vehicles_of_two_simulations_are_told_apart_by_one_ground_station() -> None:
+    addresses, unique_ids = set(), set()
+    for run_id, first in (("one", 1), ("two", 11)):
+        served = server_of(SimpleNamespace(put=lambda *_: None), first, run_id)._served["drone1"]
+        vehicle = served.vehicle
+        heartbeat = served.ports._link.pack(dialect.Heartbeat())
+        addresses.add(next(iter(Parser().feed(heartbeat))).system_id)
+        assert vehicle._parameters["MAV_SYS_ID"] == first
+        version: Any = vehicle._version()
+        unique_ids.add(version.uid)
+        for port in served.ports._ports:
+            port._socket.close()
+    assert addresses == {1, 11}
+    assert len(unique_ids) == 2
+    with pytest.raises(RunError, match="1 drones; MAVLink has 254 system ids, of which --first-system-id is 255"):
+        server_of(SimpleNamespace(put=lambda *_: None), 255)
+
+
 def test_how_far_a_mission_was_flown_is_reported_to_the_world_in_order() -> None:
     asked: list[tuple[Any, ...]] = []
     link = SimpleNamespace(request=lambda *arguments: asked.append(arguments), put=lambda *_: None)
-    info = SimpleNamespace(scenario=SCENARIO, origin=ORIGIN)
-    options = MavlinkOptions("px4", "normal", "127.0.0.1", GCS, 0, GCS, 0, None, 2, None)
-    observer: Any = SimpleNamespace(name="mavlink.main")
-    server = MavlinkServer(link, info, observer, lambda _: None, options)  # type: ignore[arg-type]
+    server = server_of(link)
     served = server._served["drone1"]
     reports = [MissionReport("active", 5, 3), MissionReport("aborted", 5, 3, "it left its geofence", failsafe=True)]
     served.vehicle.flight.mission.reports += reports

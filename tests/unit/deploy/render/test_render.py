@@ -276,7 +276,7 @@ def test_units_run_the_host_s_python_as_its_user(hosts: InventoryFile, step: Sce
     ]:
         options = options_of(texts[path])
         assert options["User"] == [user]
-        assert options["ExecStart"][0].split()[0] == python
+        assert options["ExecStart"][0].split()[0] == f":{python}"
 
 
 def test_units_read_certificates_and_write_nowhere_else(hosts: InventoryFile, step: Scenario) -> None:
@@ -348,11 +348,11 @@ def test_the_target_wants_every_unit_of_its_host_and_they_stop_with_it(hosts: In
 
 
 def test_words_reach_the_process_as_they_are(tmp_path: Path, step: Scenario) -> None:
-    """systemd expands % and $, and splits at spaces."""
+    """systemd expands %, and $ where no colon is before the program, and splits at spaces."""
     text = HOSTS.replace("/opt/zsim}", '"/opt/my zsim/100%$A\'"}').replace("192.168.1.10", "fe80::1%eth0")
     texts = systemd.render(placed(tmp_path, text), step)
     (line,) = options_of(texts["lab/zsim-world.service"])["ExecStart"]
-    assert line.startswith(""""/opt/my zsim/100%%$$A'/venv/bin/python" -m """)
+    assert line.startswith("""":/opt/my zsim/100%%$A'/venv/bin/python" -m """)
     assert "tls/[fe80::1%%eth0]:7447" in line
 
 
@@ -372,6 +372,10 @@ def test_no_line_of_an_inventory_becomes_an_option(field: str, tmp_path: Path, s
     text = HOSTS.replace("folder: /opt/zsim", f'{field}: "/opt/zsim\\nUser=root"')
     with refused(InventoryError, f"hosts.lab.{field}", "printable"):
         systemd.render(placed(tmp_path, text), step)
+    with refused(InventoryError, f"hosts.lab.{field}", "4009 bytes", "4000"):
+        systemd.render(
+            placed(tmp_path, HOSTS.replace("folder: /opt/zsim", f"{field}: /opt/zsim{'/' + 3999 * 'n'}")), step
+        )
 
 
 # Compose

@@ -1,16 +1,20 @@
 """What is said when no world answers: nobody is there, or somebody is who does not let us in."""
 
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import pytest
-from refused import has_terms
+import zenoh
+from refused import has_terms, refused
 
 from zsim.errors import NoWorldError, SessionError
-from zsim.transport import connection
+from zsim.scenario.scenario import DRONES_MAX
+from zsim.transport import connection, zenoh_settings
 from zsim.transport.connection import find_world
 from zsim.transport.permissions import Permissions
 from zsim.transport.tls import Identity
@@ -108,3 +112,65 @@ def test_a_port_that_is_taken_is_refused_with_the_option_that_gives_another() ->
         with pytest.raises(SessionError) as caught, connection.listen([endpoint], "zsim", "lockstep"):
             pass
     assert has_terms(str(caught.value), endpoint, "--listen")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "terms"),
+    [
+        ("tcp/192.0.2.1:7447", ("no address of this machine", "--listen")),
+        ("tcp/no-such-host.invalid:7447", ("the name is not known", "--listen")),
+        ("tcp/127.0.0.1:99999", ("from 1 to 65535", "--listen")),
+        ("tcp/127.0.0.1:7447#iface=no-such", ("no such network interface",)),
+    ],
+)
+def test_every_cause_of_not_listening_has_its_line(endpoint: str, terms: tuple[str, ...]) -> None:
+    identity = Identity(insecure=True)
+    with (
+        refused(SessionError, f"cannot listen on {endpoint}: ", *terms),
+        connection.listen([endpoint], "f", "lockstep", identity),
+    ):
+        pass
+
+
+def test_causes_that_the_system_numbers_are_told_apart() -> None:
+    texts = {
+        number: connection.no_listening(["tcp/h:1"], f"no listener: [h:1: some words (os error {number}))")
+        for number in connection._LISTEN_FAULTS
+    }
+    assert len(set(texts.values())) == len(texts)
+    assert not any("some words" in text for text in texts.values())
+    assert "(some words (os error 5)); another is given" in connection.no_listening(
+        ["tcp/h:1"], "some words (os error 5)"
+    )
+
+
+def test_a_panic_of_zenoh_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    class PanicException(BaseException):
+        """As of pyo3, which exports none."""
+
+    def fail(_: Any) -> None:
+        raise PanicException("failed to spawn thread: no memory")
+
+    monkeypatch.setattr(zenoh, "open", fail)
+    with (
+        refused(SessionError, "cannot listen on tcp/127.0.0.1:7447", "failed to spawn thread"),
+        connection.listen(["tcp/127.0.0.1:7447"], "f", "lockstep"),
+    ):
+        pass
+
+
+def test_the_hub_adds_nothing_to_a_message_and_has_room_for_the_largest_run() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    stamps: SimpleQueue[str | None] = SimpleQueue()
+    with (
+        connection.listen([endpoint], "f", "lockstep") as hub,
+        connection.connect(endpoint, "f", wait_s=10.0) as client,
+    ):
+        client.declare_subscriber("own", lambda sample: stamps.put(sample.timestamp))
+        while not hub.has_subscribers("own"):
+            time.sleep(0.01)
+        hub.put_sample("own", b"1", "")
+        assert stamps.get(timeout=10.0) is None
+    assert zenoh_settings.SESSIONS_MAX > DRONES_MAX + 100  # estimators, and who else comes

@@ -1,0 +1,235 @@
+"""Machines that lack what others have: locks, shared memory, a home, streams, room for odd paths."""
+
+import csv
+import errno
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from federation import PAIR, compiled, free_port
+from forked_commands import COLUMNS, ROOT, USER_FAULT, ZSIM, refusal
+from wire import PATIENCE_S
+
+from zsim.math import compiled as kernels
+from zsim.record import RecordReader, completeness
+
+__all__ = ["compiled"]
+needs_root = pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("unshare"), reason="mounts need root")
+SHORT = ("--duration", "1", "--no-report")
+LOCKLESS = """
+import errno, fcntl, os
+def flock(*_):
+    raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+fcntl.flock = flock
+"""
+
+
+def zsim(*arguments: str, prefix: tuple[str, ...] = (), **variables: str) -> "subprocess.CompletedProcess[str]":
+    """Run a command to its end as a user would start it, with these variables of the environment."""
+    environment = {**os.environ, **COLUMNS, **variables}
+    command = [*prefix, *ZSIM, *arguments]
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
+    """The folder of a run of a second that several tests look at; its scenario is beside it."""
+    folder = tmp_path_factory.mktemp("flown")
+    (folder / "pair.yaml").write_text(PAIR)
+    done = zsim("run", str(folder / "pair.yaml"), "--in-process", *SHORT, "--out", str(folder / "run"))
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
+STREAMED = {  # command: its exit code whatever becomes of its output
+    "--version": 0,
+    "validate {scenario}": 0,
+    "validate nowhere.yaml": USER_FAULT,
+    "nonsense": USER_FAULT,
+    "keys --connect tcp/127.0.0.1:9 --wait 0.1": USER_FAULT,
+    "export {run} --format csv --out {out}/csv": 0,
+    "replay {run} --rate 0 --listen tcp/127.0.0.1:{port}": 0,
+    "run {scenario} --duration 1 --no-report --out {out}/run": 0,
+}
+
+
+@pytest.mark.parametrize("streams", [">&- 2>&- <&-", ">/dev/full 2>/dev/full"])
+def test_what_a_stream_does_not_take_is_lost_and_nothing_else(tmp_path: Path, flown: Path, streams: str) -> None:
+    """A stream that is closed leaves its number to the next file that is opened, such as the record."""
+    names = {"scenario": flown.parent / "pair.yaml", "run": flown, "out": tmp_path, "port": free_port()}
+    for command, code in STREAMED.items():
+        line = f"{shlex.join(ZSIM)} {command.format(**names)} {streams}"
+        done = subprocess.run(
+            ["sh", "-c", line], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
+        assert done.returncode == code, (command, done)
+        assert "Traceback" not in done.stdout + done.stderr
+    with RecordReader(tmp_path / "run" / "run.mcap") as record:
+        assert completeness(record).complete
+
+
+def test_a_full_output_is_a_line_on_the_other_stream() -> None:
+    done = subprocess.run(
+        f"{shlex.join(ZSIM)} --help >/dev/full", shell=True, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == f"standard output cannot be written ({os.strerror(errno.ENOSPC)}); what follows is lost\n"
+
+
+ODD = os.fsdecode(b"lab:3 'a' \"b\" $HOME `x` [red]%s;&| \xc3\xbc\xe9\xa3\x9b \xff")  # the last is no UTF-8
+
+
+@pytest.mark.slow
+def test_any_path_will_do(tmp_path: Path, flown: Path) -> None:
+    folder = tmp_path / (ODD + "n" * 150)
+    folder.mkdir()
+    scenario, run = folder / f"{ODD}.yaml", folder / "run"
+    shutil.copy(flown.parent / "pair.yaml", scenario)
+    flight = ("--duration", "1", "--no-report")
+    for arguments in (
+        ("run", scenario, *flight, "--out", run),
+        *(("export", run, "--format", form) for form in ("csv", "parquet", "mat", "foxglove")),
+        ("report", run, "--format", "svg"),
+        ("report", run, flown, "--out", folder / f"{ODD}.html"),
+        ("rerun", run),
+        ("sweep", scenario, *flight, "--vary", "seed=1,2", "--keep-records", "--out", folder / "sweep"),
+        ("report", folder / "sweep"),
+    ):
+        done = zsim(*map(str, arguments))
+        assert done.returncode == 0, (arguments, done.stderr)
+        assert "Traceback" not in done.stderr
+    for name in ("csv/truth.csv", "parquet/truth.parquet", "run.mat", "foxglove.mcap", "foxglove.rbl", "report.html"):
+        assert (run / name).stat().st_size > 1000, name
+
+
+@pytest.mark.parametrize("path", ["n" * 300, "/tmp/" + "nnnnnnnnn/" * 450])
+def test_a_path_that_is_too_long_is_a_line(flown: Path, path: str) -> None:
+    for arguments in (
+        ("validate", path),
+        ("run", path),
+        ("run", str(flown.parent / "pair.yaml"), "--out", path),
+        ("report", path),
+        ("export", path, "--format", "csv"),
+        ("export", str(flown), "--format", "mat", "--out", path),
+        ("rerun", path),
+        ("replay", path),
+        ("sweep", str(flown.parent / "pair.yaml"), "--out", path),
+        ("world", str(flown.parent / "pair.yaml"), "--journal", path),
+        ("certs", "init", path),
+    ):
+        assert os.strerror(errno.ENAMETOOLONG) in refusal(*arguments)
+
+
+def test_a_table_of_each_drone_has_increasing_time(tmp_path: Path, flown: Path) -> None:
+    """PlotJuggler reads a table as one series of time."""
+    done = zsim("export", str(flown), "--format", "csv", "--by-name", "--out", str(tmp_path / "csv"))
+    assert done.returncode == 0, done.stderr
+    assert {"truth.drone1.csv", "truth.drone2.csv", "clock.world.csv"} <= {
+        each.name for each in (tmp_path / "csv").iterdir()
+    }
+    for drone in ("drone1", "drone2"):
+        rows = list(csv.DictReader((tmp_path / "csv" / f"truth.{drone}.csv").open()))
+        assert {row["name"] for row in rows} == {drone}
+        times = [int(row["t_ns"]) for row in rows]
+        assert times == list(range(0, 1_000_000_001, 20_000_000))
+    assert "--format csv" in refusal("export", str(flown), "--format", "mat", "--by-name")
+
+
+@needs_root
+@pytest.mark.parametrize("options", ["ro", "size=64k"])
+def test_shared_memory_is_not_needed(tmp_path: Path, flown: Path, options: str) -> None:
+    """Containers have little of it, or none that can be written."""
+    words = [*ZSIM, "run", str(flown.parent / "pair.yaml"), *SHORT, "--out", str(tmp_path / "run")]
+    line = f"mount -t tmpfs -o {options} tmpfs /dev/shm && {shlex.join(words)} && ls -A /dev/shm"
+    done = subprocess.run(
+        ["unshare", "-m", "sh", "-c", line], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    with RecordReader(tmp_path / "run" / "run.mcap") as record:
+        assert completeness(record).complete
+
+
+KERNEL = """
+import os, sys
+from zsim.math.compiled import kernel
+@kernel()
+def doubled(x):
+    return 2.0 * x
+doubled(1.0)
+print(sum(doubled.stats.cache_hits.values()), doubled.stats.cache_path, os.listdir("."))
+"""
+READ_ONLY = f"mount --bind {shlex.quote(str(ROOT))} {shlex.quote(str(ROOT))} && mount -o remount,ro,bind {shlex.quote(str(ROOT))}"
+
+
+@needs_root
+def test_without_a_home_kernels_are_compiled_once_on_a_machine(tmp_path: Path) -> None:
+    """As in a container: neither the package nor a home can be written."""
+    (tmp_path / "kernel.py").write_text(KERNEL)
+    (tmp_path / "empty").mkdir()
+    python = f"cd {tmp_path}/empty && env -u XDG_CACHE_HOME HOME=/proc/none {sys.executable} ../kernel.py"
+    mounts = f"mount -t tmpfs tmpfs /var/tmp && {READ_ONLY}"
+    done = subprocess.run(
+        ["unshare", "-m", "sh", "-c", f"{mounts} && ({python}) && ({python}) && stat -c %a /var/tmp/zsim-0-compiled"],
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    first, second, mode = done.stdout.splitlines()
+    assert re.fullmatch(r"0 /var/tmp/zsim-0-compiled/\S+ \[\]", first)
+    assert second == first.replace("0 ", "1 ", 1)
+    assert mode == "700"
+
+
+def test_a_folder_of_somebody_else_is_not_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What is kept is code: a folder that others can write is passed over, as is a link to one.
+
+    The user has no home that anybody knows, for which Python leaves `~` as it is.
+    """
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(kernels.os.path, "expanduser", lambda path: path)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    own = re.compile(f"{re.escape(str(tmp_path))}|~")
+    usable = kernels._is_writable
+    monkeypatch.setattr(kernels, "_is_writable", lambda folder: bool(own.match(str(folder))) and usable(folder))
+    monkeypatch.setattr(kernels.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(
+        kernels, "Path", lambda *parts: Path(*(tmp_path / "var" if part == "/var/tmp" else part for part in parts))
+    )
+    folder = tmp_path / f"zsim-{os.getuid()}-compiled"
+    assert kernels.cache_folder() == str(folder)
+    folder.chmod(0o777)
+    assert kernels.cache_folder() == ""
+    folder.rmdir()
+    folder.symlink_to("/tmp")
+    assert kernels.cache_folder() == ""
+    assert not Path("~").exists()
+
+
+@pytest.fixture
+def lockless(tmp_path: Path) -> dict[str, str]:
+    """Variables by which every Python finds a file system without locks, as some of NFS and Lustre are."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(LOCKLESS)
+    return {"PYTHONPATH": str(tmp_path / "site")}
+
+
+@pytest.mark.usefixtures("compiled")
+def test_a_run_and_a_sweep_go_on_without_locks(tmp_path: Path, lockless: dict[str, str]) -> None:
+    scenario = tmp_path / "pair.yaml"
+    scenario.write_text(PAIR)
+    reason = os.strerror(errno.EOPNOTSUPP)
+    for command, *options in (("run", *SHORT), ("run", *SHORT, "--force"), ("sweep", "--runs", "1", *SHORT)):
+        out = tmp_path / f"{command}s"
+        done = zsim(command, str(scenario), *options, "--out", str(out), **lockless)
+        assert done.returncode == 0, done.stderr
+        assert [line for line in done.stderr.splitlines() if reason in line] == [
+            f"{out}: cannot be locked ({reason}); do not let two commands write there at a time"
+        ]
+    record = (tmp_path / "runs" / "run.mcap").read_bytes()
+    assert record

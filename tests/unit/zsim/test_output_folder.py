@@ -1,0 +1,59 @@
+"""Locks of the folders that commands write into, where there are any."""
+
+import errno
+import fcntl
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsim.output_folder import no_locks, take_lock
+from zsim.record import RecordWriter
+from zsim.record.record_writer import is_being_written
+from zsim_deploy.hosts import control_socket
+from zsim_deploy.push import on_host
+from zsim_world.journal.run_journal import RunJournal
+
+LOCKLESS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # as Lustre, FUSE and some of NFS answer
+
+
+@pytest.fixture(params=LOCKLESS)
+def reason(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Why nothing can be locked."""
+
+    def flock(*_: Any) -> None:
+        raise OSError(request.param, os.strerror(request.param))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    return os.strerror(request.param)
+
+
+def test_another_is_kept_away_where_there_are_locks(tmp_path: Path) -> None:
+    with open(tmp_path / "file", "w") as one, open(tmp_path / "file") as other:
+        assert take_lock(one)
+        assert not take_lock(other)
+        assert not take_lock(other, shared=True)
+    with open(tmp_path / "file") as other:
+        assert take_lock(other)
+    assert no_locks(tmp_path) is None
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_without_locks_everything_goes_on_with_a_warning(
+    tmp_path: Path, reason: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    warning = f"{tmp_path}: cannot be locked ({reason}); do not let two commands write there at a time"
+    assert no_locks(tmp_path) == warning
+    journal = RunJournal(tmp_path / "journal", "run", "sha", print)
+    assert journal.open() is None
+    journal.close()
+    RecordWriter(tmp_path / "run.mcap").close()
+    assert not is_being_written(tmp_path / "run.mcap")
+    with on_host.locked(tmp_path, "somebody") as fault:
+        assert fault == reason
+    monkeypatch.setattr(control_socket, "place", lambda federation: tmp_path / f"{federation}.sock")
+    tmp_path.chmod(0o700)
+    for federation in ("one", "one@1"):
+        control_socket.ControlSocket(federation, {}).close()
+    assert capfd.readouterr().err.splitlines() == [warning]  # a run's own was given by the run
