@@ -87,7 +87,9 @@ def _of_processes(flight: RecordedFlight) -> Iterator[Shortfall]:
         allowed = actions.on_overdue or {} if event.kind == "overdue" else actions.on_death
         t_s = event.t_ns / 1e9
         if event.kind == "leave":
-            yield Shortfall("process", event.subject, t_s, f"{event.text}, at {t_s:.2f} s", False)
+            yield Shortfall(
+                "process", event.subject, t_s, f"{event.text}, at {t_s:.2f} s", bool(event.data.get("fails"))
+            )
         elif (is_death or event.kind in ("failure", "overdue")) and not lets_drop(allowed, event.subject):
             text = event.text if event.kind == "failure" else f"{event.text}, at {t_s:.2f} s"
             yield Shortfall("process", event.subject, t_s, text, True)
