@@ -52,6 +52,10 @@ class DocumentError(ZsimError):
         self.faults = faults
 
 
+class NotTrustedError(DocumentError):
+    """A document names code of its own, which this command was not told to import."""
+
+
 class ScenarioError(DocumentError):
     """A scenario, or an override of one, with faults."""
 

@@ -13,6 +13,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.contract.run_messages import Event
+from zsim.errors import NotTrustedError
 from zsim.scenario.rights import WORLD
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Cluster, ClusterPlan, Processes, Scenario
@@ -355,7 +356,7 @@ def _planned(states: ClusterStates, scenario: Scenario | None) -> PlannedReferen
                 named = [step.expressions, *(w["values"] for w in step.waypoints if isinstance(w["values"], Mapping))]
                 names.update(dict.fromkeys(str(name) for each in named for name in each))
         entries = np.array(sorted({variable_of(space, name, "").entry for name in names}), np.intp)
-    except (*REFUSALS, ValueError):
+    except (*REFUSALS, ValueError, NotTrustedError):
         return None
     return PlannedReference(space, reference, start_s, entries) if reference else None
 

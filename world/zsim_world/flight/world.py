@@ -122,7 +122,7 @@ class World(Coordinator):
             fingerprint=fingerprint(),
             user_sensors=_own_sensors(s) or UNSET,
             sightings=self.fleet.has_sightings or UNSET,
-            module_folders=tuple(map(str, plugin.folders())) if s.names_own_code() else UNSET,
+            module_folders=tuple(map(str, plugin.folders())) if s.own_code() else UNSET,
             changed=self._changed,
         )
 
