@@ -393,8 +393,9 @@ class Coordinator(ABC):
     def publish_end(self) -> None:
         """Put the end of the run into the outbox: event `end`, clock `stopped`."""
         self.clock.stop("ended")
-        for participant in [p for p in self.barrier.participants.values() if p.farewell]:
-            self.leave(participant, participant.farewell, 0)
+        for participant in list(self.barrier.participants.values()):
+            if participant.farewell is not None:
+                self.leave(participant, participant.farewell, 0)
         self.outbox.event("end", WORLD, self.ended or "", self.result())
         self.clock.state = "stopped"
         self.outbox.put(keys.CLOCK, self.clock_message())

@@ -167,7 +167,7 @@ def test_a_run_without_a_pace_is_refused_unless_one_is_set() -> None:
     assert asked == [("rate", "mavlink.main", {"value": 3.0})]
     with pytest.raises(RunError, match="not now"):
         set_pace(world(False, asked), run("lockstep", 0.0), "mavlink.main", 3.0)
-    gone = SimpleNamespace(request=lambda *_: Unanswered(ok=False, error="nobody answers there"))
+    gone: Any = SimpleNamespace(request=lambda *_: Unanswered(ok=False, error="nobody answers there"))
     with pytest.raises(NoWorldError, match="nobody answers there"):
         set_pace(gone, run("lockstep", 0.0), "mavlink.main", 3.0)
 

@@ -1,7 +1,7 @@
 """A vehicle as its clients see it: arming, modes, setpoints, missions, fence, parameters, what is refused."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -206,7 +206,7 @@ def test_it_returns_home_and_lands(autopilot: str) -> None:
     assert abs(drone.position[0]) < 1.0
 
 
-def upload(drone: FlownDrone, items: list[dialect.MissionItemInt], type_: int = 0) -> int:
+def upload(drone: FlownDrone, items: Sequence[dialect.MissionItemInt | dialect.MissionItem], type_: int = 0) -> int:
     drone.receive(dialect.MissionCount(1, 1, len(items), mission_type=type_))
     for item in items:
         drone.receive(item)
