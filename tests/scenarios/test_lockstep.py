@@ -308,3 +308,26 @@ def test_only_its_own_bye_ends_a_participation(federation: Federation) -> None:
     assert step.event("leave", ME).message["data"]["reason"] == "enough"
     assert "death" not in kinds(step.events.now())
     step.world.ends(with_code=0)
+
+
+def test_who_was_needed_and_leaves_early_fails_the_run(federation: Federation) -> None:
+    """An estimator leaves in flight; the run goes on without it.
+
+        estimator.drone1 ──0──────▶ bye
+        tester.one       ──0──────────────60──▶ bye ──▶ end
+
+    Expected: the terminal names it at once; the world ends with exit code 1 and says why in its last line.
+    """
+    step = Lockstep(federation)
+    estimator = step.client.join("estimator.drone1", step.info, GATE_NS)
+    step.event("join", "estimator.drone1")
+    for gate in range(5):
+        estimator.done(gate * GATE_NS)
+        step.answer(gate * GATE_NS)
+    estimator.bye(4 * GATE_NS, "enough")
+    assert step.event("leave", "estimator.drone1").message["data"]["fails"]
+    step.world.line("estimator.drone1 left: enough; .*on_death")
+    step.answer(60 * GATE_NS)
+    step.me.bye(step.now_ns)
+    step.world.ends(with_code=1)
+    assert has_terms(step.world.text().splitlines()[-1], "estimator.drone1", "enough")
