@@ -72,6 +72,6 @@ $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 # function finds it compiled
 $(VENV)/.compiled: pyproject.toml
 	@echo "compiling what flies, once on this machine: about a minute"
-	@$(BIN)/python -m zsim_deploy.roles.warm_up agents & agents=$$!; \
-		$(BIN)/python -m zsim_deploy.roles.warm_up world; world=$$?; wait $$agents && exit $$world
+	@$(BIN)/python -P -m zsim_deploy.roles.warm_up agents & agents=$$!; \
+		$(BIN)/python -P -m zsim_deploy.roles.warm_up world; world=$$?; wait $$agents && exit $$world
 	@touch $@

@@ -104,8 +104,8 @@ with zenoh.open(config) as session:
     aircraft = Aircraft(own["position_m"], 2 * math.atan2(z, w), status["state"] if status else "landed")
     queryable = session.declare_queryable(f"zsim/drone/{DRONE}/driver", answer)
     token = session.liveliness().declare_token(f"zsim/process/{ME}")
-    join = {"incarnation": int.from_bytes(os.urandom(7), "big"), "role": "driver", "host": "here", "pid": os.getpid()}
-    put(f"process/{ME}/join", t_ns=0, run_id=info["run_id"], period_ns=0, **join)
+    run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
+    put(f"process/{ME}/join", t_ns=0, **run, role="driver", host="here", pid=os.getpid(), period_ns=0)
     last_ns, link_ns, east_m = -1, -1, 111_319.49 * math.cos(math.radians(info["origin"]["latitude_deg"]))
     while (clock := msgpack.unpackb(clocks.recv().payload.to_bytes()))["state"] != "stopped":
         t_ns = clock["t_ns"]
@@ -146,4 +146,4 @@ with zenoh.open(config) as session:
         if t_ns - link_ns >= 1e9 or link_ns < 0:
             link_ns, state = t_ns, "armed" if armed else "connected"
             put(f"{key}/link", t_ns=t_ns, **link, state=state, clock_offset_ms=None, refused=0)
-    put(f"process/{ME}/bye", t_ns=last_ns, reason="the run ended")
+    put(f"process/{ME}/bye", t_ns=last_ns, **run, reason="the run ended")

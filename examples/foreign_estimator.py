@@ -102,7 +102,7 @@ class Participant:
                 gates += 1
                 self._answer(m["t_ns"], state)
             elif m.get("state") == "stopped":
-                self._put(f"zsim/process/{ME}/bye", t_ns=m["t_ns"], reason="the run ended")
+                self._put(f"zsim/process/{ME}/bye", t_ns=m["t_ns"], **self._run, reason="the run ended")
                 return gates
 
     def _next(self, gates: int) -> zenoh.Sample:

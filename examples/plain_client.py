@@ -37,4 +37,4 @@ with zenoh.open(zenoh.Config.from_json5(config)) as session:
             put(f"{DRONE}/cmd/{'velocity' if flying else 'mode'}", t_ns=t_ns, source=ME, **command)
             put(f"zsim/process/{ME}/done", t_ns=t_ns, **run, done_ns=t_ns, sent=1)
     print(f"t = {t_ns / 1e9:.2f} s, {last['status']['state']}, accelerometer {last['imu']['accel_m_s2']}")
-    put(f"zsim/process/{ME}/bye", t_ns=t_ns, reason="shown")
+    put(f"zsim/process/{ME}/bye", t_ns=t_ns, **run, reason="shown")

@@ -64,7 +64,7 @@ class RangeSensor:
                     self._answer(m["t_ns"], truths)
                     truths = {}
             elif m["state"] == "stopped":
-                self._put(f"zsim/process/{ME}/bye", t_ns=m["t_ns"], reason="the run ended")
+                self._put(f"zsim/process/{ME}/bye", t_ns=m["t_ns"], **self._run, reason="the run ended")
                 return self._seq.get(self._key(), -1) + 1
 
     def _answer(self, t_ns: int, truths: dict[str, dict[str, Any]]) -> None:

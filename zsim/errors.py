@@ -31,6 +31,7 @@ def printable(text: str) -> str:
     return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
+_FIGURE = re.compile(r"(?<![\w.:-])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w:]|\.\d)")  # a number by itself
 REASON_MAX = 300  # characters of a reason
 
 
@@ -44,12 +45,24 @@ class ZsimError(Exception):
     """Base of everything that a user can cause; the command line prints it without a traceback."""
 
 
+def without_figures(text: str) -> str:
+    """Return a reason without its numbers, by which it is known: of a flood each datagram may have another length.
+
+    Names and addresses keep theirs.
+    """
+    return _FIGURE.sub("#", text)
+
+
 class DocumentError(ZsimError):
     """A document with faults; `faults` holds a line for each."""
 
     def __init__(self, faults: list[str]) -> None:
         super().__init__("\n".join(faults))
         self.faults = faults
+
+
+class NotTrustedError(DocumentError):
+    """A document names code of its own, which this command was not told to import."""
 
 
 class ScenarioError(DocumentError):

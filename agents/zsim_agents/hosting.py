@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 from zsim.contract.messages import Info
-from zsim.errors import DocumentError, RunError, ScenarioError
+from zsim.errors import DocumentError, NotTrustedError, RunError, ScenarioError
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
 from zsim.runtime.inbox import output_hold_ns
@@ -81,6 +81,8 @@ def check_plans(scenario: Scenario, source: str) -> None:
     for cluster in scenario.clusters:
         try:
             check_plan(scenario, cluster)
+        except NotTrustedError:
+            continue  # its space says what a plan may name
         except RunError as error:
             faults.append(f"{source}: {error}")
     if faults:
@@ -105,6 +107,8 @@ def _formation_classes(scenario: Scenario, source: str) -> Iterator[Callable[[],
 def _faults(load: Callable[[], Any]) -> list[str]:
     try:
         load()
+    except NotTrustedError:
+        return []  # it is there
     except DocumentError as error:
         return error.faults
     return []

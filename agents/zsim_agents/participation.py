@@ -1,8 +1,11 @@
 """How a recorder takes part in a run: it joins, publishes how far it is, and leaves; and who else takes part."""
 
+import contextlib
 import os
 import secrets
 import time
+
+from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
@@ -35,8 +38,7 @@ class Participation:
         self._incarnations = {self._incarnation}
         self._joined_s: float | None = None  # when it joined last, until the world has taken it in
         self._seq = {"join": 0, "done": 0, "bye": 0, "health": 0}
-        self._others: set[str] = set()
-        self._leavers: set[str] = set()
+        self._others: dict[str, int] = {}  # incarnations that have joined and not left, by name
 
     # Of its own
 
@@ -59,7 +61,8 @@ class Participation:
         self.publish("done", run_messages.Done(t_ns, self.next("done"), self._run_id, self._incarnation, t_ns, 0))
 
     def bye(self, now_ns: int, reason: str) -> None:
-        self.publish("bye", run_messages.Bye(now_ns, self.next("bye"), reason))
+        seq, of = self.next("bye"), {"run_id": self._run_id, "incarnation": self._incarnation}
+        self.publish("bye", run_messages.Bye(now_ns, seq, reason, **of))
 
     def publish(self, what: str, content: message.Message) -> None:
         self._link.put(keys.process(self._name, what), content)
@@ -99,15 +102,18 @@ class Participation:
             return None  # garbage by somebody else; recorded as it came
         return event if event.subject == self._name else None
 
-    def passed(self, key: str) -> None:
-        """Take the key of a message of a process."""
-        name, what = keys.thing(key), keys.leaf(key)
-        if what == "join" and name != self._name:
-            self._others.add(name)
-            self._leavers.discard(name)
-        elif what == "bye":
-            self._leavers.add(name)
+    def passed(self, key: str, payload: bytes) -> None:
+        """Take a message of a process."""
+        name, kind = keys.thing(key), messages.type_of(key)
+        if name == self._name or kind not in (run_messages.Join, run_messages.Bye):
+            return
+        with contextlib.suppress(DecodeError):  # garbage by somebody else; recorded as it came
+            passed = messages.decode(key, payload)
+            if isinstance(passed, run_messages.Join):
+                self._others[name] = passed.incarnation
+            elif passed.incarnation in (UNSET, self._others.get(name)):
+                self._others.pop(name, None)
 
     def others_left(self) -> bool:
         """Tell whether every other process that joined has published bye."""
-        return self._others <= self._leavers
+        return not self._others

@@ -321,7 +321,7 @@ class Recorder:
             if self._part.event_received(payload):
                 self._join(again=True)
         elif key.startswith("process/"):
-            self._part.passed(key)
+            self._part.passed(key, payload)
 
     def _stamp(self, payload: bytes) -> int:
         """Return the message's own time; one that has none is recorded at the world's."""

@@ -115,7 +115,8 @@ class ObserverProcess:
         """Publish bye once, unless another process has taken over the name."""
         if not (self._superseded or self._has_left):
             self._has_left = True
-            self._link.put(keys.process(self.name, "bye"), run_messages.Bye(self.now_ns, 0, reason))
+            of = {"run_id": self._info.run_id, "incarnation": self._incarnation}
+            self._link.put(keys.process(self.name, "bye"), run_messages.Bye(self.now_ns, 0, reason, **of))
 
     def _on_event(self, sample: RawSample) -> None:
         try:

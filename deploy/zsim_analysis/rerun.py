@@ -18,6 +18,7 @@ from zsim.errors import RecordError, RunError
 from zsim.record import RecordReader
 from zsim.runtime.progress import Screen, Throttle
 from zsim.scenario.fault_check import listed
+from zsim.schema import plugin
 from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, RecordedRun, gates, open_run, recorded_agents
 from zsim_analysis.rerun_bus import RerunBus, TruthComparison
 from zsim_world.flight.world import World
@@ -61,6 +62,9 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
     with open_run(place) as record:
         if record.info.replay_of:
             raise RunError(f"{place}: is the record of a replay; rerun that of run {record.info.replay_of}")
+        if not plugin.may_import() and (names := record.scenario.own_code()):
+            reason = f"its scenario names {listed(names)}: code that a rerun runs, and only with --trust"
+            raise RunError(f"{place}: {reason}")
         if external := record.scenario.external():
             reason = f"has drones whose bodies are external ({listed(external)}); they cannot be flown again"
             raise RunError(f"{place}: {reason}")

@@ -291,7 +291,8 @@ class RerunBus(Bus):
         """Repeat what reached the world other than as a message: deaths, requests, and joins that were withheld."""
         if event.kind in JOINED and event.source not in self._rerun:
             self._admit(_joined(event))
-        if event.kind == "death" and event.subject not in self._rerun:
+        left = event.kind == "leave" and self._world.barrier.has_farewell(event.subject)
+        if (event.kind == "death" or left) and event.subject not in self._rerun:
             self._world.losses.died(event.subject, 0)
         elif event.kind == "overdue" and event.subject not in self._rerun:
             self._world.losses.expired(event.subject)

@@ -103,6 +103,10 @@ Insecure = Annotated[bool, typer.Option("--insecure", help="Without TLS, on a ne
 Keys = Annotated[
     list[str] | None, typer.Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
 ]
+Trust = Annotated[
+    bool,
+    typer.Option("--trust", help="Import the modules that the scenario names. That runs them: trust who wrote them."),
+]
 From = Annotated[
     float | None, typer.Option("--from", callback=not_negative, help="Simulated seconds of the first message.")
 ]

@@ -64,7 +64,7 @@ CONTRACT = {
     "process/*/join": "run_id incarnation role host pid period_ns version fingerprint",
     "process/*/done": "run_id incarnation done_ns sent",
     "process/*/snapshot": "source version state",
-    "process/*/bye": "reason",
+    "process/*/bye": "reason failed run_id incarnation",
     "process/*/health": "role host pid step_us lag_ns dropped refused rss_bytes",
     "view/drones": "",
     "view/cluster/*": "",

@@ -3,6 +3,7 @@
 from federation import ONE, Federation
 from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
 from refused import has_terms, parts
+from wire import kinds
 
 
 def refusal(step: Lockstep, key: str) -> tuple[str, str]:
@@ -280,3 +281,53 @@ def test_nobody_expected_and_a_stop(federation: Federation) -> None:
     assert clock.until(lambda m: m["state"] == "stopped")
     world.ends(with_code=0)
     world.line(f"ended: {reason}")
+
+
+def test_only_its_own_bye_ends_a_participation(federation: Federation) -> None:
+    """Somebody else says bye in a participant's name; then the participant itself, by the contract of before 1.1.
+
+        somebody   ── bye (no incarnation) ── bye (of another) ──
+        tester.one ──0──────────────────────────────────────20──▶ bye (no incarnation), token gone
+
+    Expected: both byes of somebody are refused with the incarnation, and time goes on waiting for the participant; its
+    own counts as soon as its token is gone, and is no death.
+    """
+    step = Lockstep(federation)
+    step.answer(10 * GATE_NS)
+    somebody, key = federation.client(), f"process/{ME}/bye"
+    somebody.put(key, t_ns=0, **{**step.me.run, "incarnation": 5}, reason="forged")
+    named = step.event("refused", key)
+    somebody.put(key, t_ns=0, reason="forged")
+    step.answer(20 * GATE_NS)
+    unnamed = step.event("refused", key)
+    for refusal, found in ((named, "is 5;"), (unnamed, "is missing;")):
+        assert has_terms(refusal.message["text"], "incarnation", found, str(step.me.run["incarnation"]))
+    step.stands_at(22 * GATE_NS)
+    step.client.put(key, t_ns=20 * GATE_NS, reason="enough")
+    step.me.die()
+    assert step.event("leave", ME).message["data"]["reason"] == "enough"
+    assert "death" not in kinds(step.events.now())
+    step.world.ends(with_code=0)
+
+
+def test_who_was_needed_and_leaves_early_fails_the_run(federation: Federation) -> None:
+    """An estimator leaves in flight; the run goes on without it.
+
+        estimator.drone1 ──0──────▶ bye
+        tester.one       ──0──────────────60──▶ bye ──▶ end
+
+    Expected: the terminal names it at once; the world ends with exit code 1 and says why in its last line.
+    """
+    step = Lockstep(federation)
+    estimator = step.client.join("estimator.drone1", step.info, GATE_NS)
+    step.event("join", "estimator.drone1")
+    for gate in range(5):
+        estimator.done(gate * GATE_NS)
+        step.answer(gate * GATE_NS)
+    estimator.bye(4 * GATE_NS, "enough")
+    assert step.event("leave", "estimator.drone1").message["data"]["fails"]
+    step.world.line("estimator.drone1 left: enough; .*on_death")
+    step.answer(60 * GATE_NS)
+    step.me.bye(step.now_ns)
+    step.world.ends(with_code=1)
+    assert has_terms(step.world.text().splitlines()[-1], "estimator.drone1", "enough")

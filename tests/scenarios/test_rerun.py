@@ -145,10 +145,11 @@ def another_wind(key: str, payload: bytes) -> bytes:
 def test_a_foreign_program_that_gates(federation: Federation) -> None:
     """One drone, flown in the lockstep by a page of zenoh and msgpack.
 
-    Expected: its commands come off the record with their stamps; the same hash.
+    Expected: its commands come off the record with their stamps; the same hash, also where it left by the contract of
+    before 1.1, so that the loss of its token decided.
     """
     record = federation.role("record", "--out", str(federation.out))
-    world = federation.world(ONE, "--expect", "recorder", "--expect", "plain.client")
+    world = federation.world(ONE, "--expect", "recorder", "--expect", "plain.client", "--duration", "12")
     federation.client().info()  # the world is there
     subprocess.run(
         [sys.executable, str(PLAIN), federation.endpoint], check=True, timeout=PATIENCE_S, capture_output=True
@@ -159,6 +160,19 @@ def test_a_foreign_program_that_gates(federation: Federation) -> None:
     role.line("agents are not run again: none of zsim's took part")
     same(role, federation.record().sha256())
     assert federation.record().positions("drone1")[-1][2] > 0.5
+    assert federation.record().events("leave")[0]["t_ns"] < federation.record().end()["last_ns"]
+    same(
+        rerun(federation, of=doctored(federation.out, federation.folder / "old", before_1_1)),
+        federation.record().sha256(),
+    )
+
+
+def before_1_1(key: str, payload: bytes) -> bytes:
+    if not key.endswith("/bye"):
+        return payload
+    return (
+        msgpack.packb({k: v for k, v in msgpack.unpackb(payload).items() if k not in ("run_id", "incarnation")}) or b""
+    )
 
 
 def test_an_estimator_that_was_killed(federation: Federation) -> None:

@@ -6,10 +6,14 @@ from pathlib import Path
 from shutil import move
 
 import pytest
+from refused import has_terms
+from typer.testing import CliRunner
 
 from zsim.errors import DocumentError, RunFailedError, UserCodeError
 from zsim.scenario import scenario_file
 from zsim.schema import plugin
+from zsim.sensors.sensor_catalogue import sensor_type
+from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_analysis.in_process import fly
 from zsim_analysis.reading.flight import read_flight
 from zsim_analysis.reading.formation import formations_of
@@ -17,6 +21,7 @@ from zsim_analysis.reading.verdict import verdict
 from zsim_analysis.rerun import rerun_record
 from zsim_analysis.sweep import sweep_run
 from zsim_analysis.sweep.sweep_run import Task
+from zsim_deploy.cli.cli import app
 
 PAIR = """
 name: pair
@@ -288,3 +293,95 @@ def test_one_that_is_nowhere_is_named(folder: Path) -> None:
     with pytest.raises(DocumentError) as raised:
         formations_of(read_flight(run / "run.mcap"))
     assert "'users_code:Space'" in str(raised.value)
+
+
+# What only reads does not run it
+
+MARKED = (
+    MODULE
+    + """
+from pathlib import Path
+
+from zsim.vehicles.ardrone2 import VEHICLE
+
+Path(__file__).with_name("executed").touch()
+
+
+class Plain(ControlLaw):
+    def rates(self, c, p_W, v_W, c_des, c_dot_des):
+        return np.zeros(self.space.size)
+
+
+class Pair(PairCluster):
+    @classmethod
+    def for_places(cls, places_m):
+        return cls()
+
+
+def distance(truth, settings, environment):
+    return [1.0]
+
+
+SENSOR = SensorType(message=RangeOf, settings=Settings, channels=(Channel("range_m", "m"),), equation=distance)
+"""
+)
+NAMED = {
+    "law": "clusters.main.law=marked:Plain",
+    "space": "clusters.main.space=marked:Pair",
+    "estimator": "estimation.algorithm=marked:PaperEstimator",
+    "sensor": "sensors.beam={module: marked}",
+    "vehicle": "drones.d1.model=marked",
+}
+
+
+@pytest.fixture
+def marked(folder: Path) -> Iterator[Path]:
+    """Yield the marker that the module leaves when it runs."""
+    (folder / "marked.py").write_text(MARKED)
+    yield folder / "executed"
+    sys.modules.pop("marked", None)
+
+
+def zsim(marked: Path, *arguments: str, runs: bool = False, code: int = 0) -> str:
+    """Run a command as a new process would; check whether it has run the module."""
+    forget(marked.parent)
+    sys.modules.pop("marked", None)
+    sensor_type.cache_clear()
+    vehicle_of.cache_clear()
+    marked.unlink(missing_ok=True)
+    done = CliRunner().invoke(app, list(arguments))
+    assert (done.exit_code, marked.exists()) == (code, runs), (arguments, done.output, done.exception)
+    return f"{done.output}\n{done.exception or ''}"
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_validate_looks_up_what_a_scenario_names_and_runs_it_only_if_told_to(marked: Path, name: str) -> None:
+    command = ["validate", str(marked.parent / "pair.yaml"), "--set", NAMED[name]]
+    text = zsim(marked, *command)
+    assert has_terms(text, "note", "marked…", "--trust")
+    assert ("name: pair" in text) is (name not in ("sensor", "vehicle"))  # their numbers are in what it resolves to
+    assert "name: pair" in zsim(marked, *command, "--trust", runs=True)
+    assert has_terms(zsim(marked, *command[:3], NAMED[name].replace("marked", "nowhere"), code=1), "'nowhere…")
+
+
+def test_kinds_of_faults_neither(marked: Path) -> None:
+    path = marked.parent / "pair.yaml"
+    path.write_text(path.read_text() + "sensors: {beam: {module: marked}}\n")
+    assert "beam" not in zsim(marked, "fault", "kinds", str(path))
+    assert "beam" in zsim(marked, "fault", "kinds", str(path), "--trust", runs=True)
+
+
+def test_nor_does_what_reads_a_record_and_a_rerun_only_if_told_to(marked: Path) -> None:
+    run = marked.parent / "run"
+    run.mkdir()
+    scenario = scenario_file.load(marked.parent / "pair.yaml", NAMED.values(), duration_s=1.0)
+    fly(scenario, run / "run.mcap")
+    assert has_terms(zsim(marked, "report", str(run)), "note", "marked:Pair", "--trust")
+    zsim(marked, "report", str(run), "--trust", runs=True)
+    assert has_terms(zsim(marked, "export", str(run), "--format", "foxglove"), "note", "marked:Pair", "--trust")
+    zsim(marked, "export", str(run), "--format", "foxglove", "--force", "--trust", runs=True)
+    assert has_terms(zsim(marked, "rerun", str(run), code=1), "marked:Plain", "--trust")
+    zsim(marked, "rerun", str(run), "--trust", runs=True)
+    with pytest.raises(DocumentError, match="come with all its numbers"):  # a record made to name a module
+        scenario_file.from_text("name: a\ndrones: [{name: d1, model: marked, position_m: [0, 0, 0]}]\n")
+    assert "marked" in sys.modules  # of the rerun

@@ -212,8 +212,8 @@ class Federation:
         role, _, thing = name.partition(".")
         role = "record" if role == "recorder" else role
         for pid, command in self._processes():
-            named = command[2:4] == ["zsim_deploy.cli", role] and (not thing or thing in command[4:])
-            hosted = command[2:4] == ["zsim_deploy.cli", "host"] and name == command[-1]
+            named = command[3:5] == ["zsim_deploy.cli", role] and (not thing or thing in command[5:])
+            hosted = command[3:5] == ["zsim_deploy.cli", "host"] and name == command[-1]
             if (named or hosted) and "--launched" in command:
                 return pid
         return pytest.fail(f"{name} does not run")

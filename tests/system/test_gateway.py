@@ -325,7 +325,7 @@ def test_connections_that_send_no_request_lock_nobody_out(gateway):
     [
         ({"Origin": "http://evil.example"}, 403),
         ({"Host": "evil.example"}, 403),
-        ({"Origin": "http://localhost:3000"}, 200),
+        ({"Origin": "http://localhost:3000"}, 403),  # another server of this machine
         ({"Origin": "null"}, 403),  # a frame that any page can make
     ],
 )

@@ -82,6 +82,8 @@ def test_the_first_program_of_the_docs(federation: Federation, tmp_path: Path) -
 
 # In a browser
 
+TOKEN = ("--token", "secret")  # the page is served on another port than the gateway
+
 
 @pytest.fixture
 def served() -> Iterator[str]:
@@ -137,7 +139,7 @@ def opened(browser: Any, served: str) -> Iterator[Callable[..., Watched]]:
     """Open the page on a gateway."""
     with ExitStack() as stack:
 
-        def open_it(gateway: GatewayProcess, query: str = "") -> Watched:
+        def open_it(gateway: GatewayProcess, query: str = "&token=secret") -> Watched:
             context = browser.new_context(viewport={"width": 1000, "height": 700})
             stack.callback(context.close)
             return Watched(context.new_page(), f"{served}?gateway=ws://127.0.0.1:{gateway.http_port}/stream{query}")
@@ -150,7 +152,7 @@ def opened(browser: Any, served: str) -> Iterator[Callable[..., Watched]]:
 def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Callable[..., Watched]) -> None:
     patient = ["--set", "silence.hover_s=2", "--set", "silence.land_s=2"]  # with a page on a busy machine
     federation.world(ONE, "--rate", "1", "--duration", "600", *patient)
-    gateway = GatewayProcess(federation)
+    gateway = GatewayProcess(federation, *TOKEN)
     other = federation.client()
     states = other.subscribe("drone/drone1/sensor/status")
     events = other.subscribe("world/event")
@@ -197,7 +199,7 @@ def test_the_page_lives_through_the_end_of_its_gateway_and_of_its_run(
     federation: Federation, opened: Callable[..., Watched]
 ) -> None:
     world = federation.world(ONE, "--rate", "2", "--duration", "600")
-    gateway = GatewayProcess(federation)
+    gateway = GatewayProcess(federation, *TOKEN)
     seen = opened(gateway)
     seen.wait_for_text(r"^run \w+, lockstep")
     world.signal(2)
@@ -215,7 +217,7 @@ def test_the_page_lives_through_the_end_of_its_gateway_and_of_its_run(
 def test_the_page_is_refused_a_command_in_words(federation: Federation, opened: Callable[..., Watched]) -> None:
     """A landed drone cannot be held: the page says what the world said, and stays."""
     federation.world(ONE, "--rate", "2", "--duration", "600")
-    seen = opened(GatewayProcess(federation))
+    seen = opened(GatewayProcess(federation, *TOKEN))
     seen.wait_for_text(r"^landed$")
     seen.press("Hold drone1")
     seen.wait_for_text("is landed; a setpoint needs it hovering or flying")
@@ -226,6 +228,6 @@ def test_the_page_is_refused_a_command_in_words(federation: Federation, opened: 
 @pytest.mark.soak
 def test_the_page_shows_a_token_where_one_is_asked_for(federation: Federation, opened: Callable[..., Watched]) -> None:
     federation.world(ONE, "--rate", "2", "--duration", "600")
-    gateway = GatewayProcess(federation, "--token", "secret")
-    opened(gateway).wait_for_text("no gateway answers there, or it wants a token")
-    opened(gateway, "&token=secret").wait_for_text(r"^landed$")
+    gateway = GatewayProcess(federation, *TOKEN)
+    opened(gateway, "").wait_for_text("no gateway answers there, or it wants a token")
+    opened(gateway).wait_for_text(r"^landed$")

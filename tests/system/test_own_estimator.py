@@ -59,8 +59,8 @@ def test_a_sweep_compares_it_with_the_others(federation: Federation, beside: Pat
 )
 def test_a_wrong_name_is_a_line(federation: Federation, beside: Path, name: str, wrong: str) -> None:
     path = federation.write(PAIR, "pair.yaml")
-    for command in ("validate", "run"):
-        role = federation.start(command, path, "--set", f"estimation.algorithm={name}")
+    for command in (("validate", "--trust"), ("run",)):
+        role = federation.start(*command, path, "--set", f"estimation.algorithm={name}")
         role.ends(with_code=2)
         (line,) = [line.text for line in role.lines if line.text.strip()]
         assert "pair.yaml: estimation.algorithm" in line

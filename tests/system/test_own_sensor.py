@@ -102,7 +102,7 @@ def test_a_record_is_flown_again(federation: Federation) -> None:
     out = federation.folder / "one"
     path = federation.write(PAIR)
     federation.start("run", path, *options(), "--in-process", "--no-report", "--out", str(out)).ends(with_code=0)
-    federation.start("rerun", str(out)).ends(with_code=0)
+    federation.start("rerun", str(out), "--trust").ends(with_code=0)
 
 
 @pytest.mark.usefixtures("examples")
@@ -125,7 +125,7 @@ def test_a_sweep_varies_it_and_no_truth_changes(federation: Federation) -> None:
 )
 @pytest.mark.usefixtures("examples")
 def test_a_faulty_one_is_a_line(federation: Federation, field: str, where: str) -> None:
-    run = federation.start("validate", federation.write(PAIR, "pair.yaml"), *options(field)[2:])
+    run = federation.start("validate", "--trust", federation.write(PAIR, "pair.yaml"), *options(field)[2:])
     run.ends(with_code=2)
     (line,) = [line.text for line in run.lines if line.text.strip()]
     assert f"pair.yaml: {where} is" in line

@@ -69,7 +69,9 @@ def test_crazyflies_fly_test_1_at_the_size_of_a_room(federation: Federation) -> 
 @pytest.mark.parametrize(("model", "rotor"), [("larger_battery", "rotor7"), ("hexacopter", "front_left")])
 def test_a_fault_of_a_rotor_that_is_not_there_is_one_line(federation: Federation, model: str, rotor: str) -> None:
     fault = f"faults=[{{kind: rotor_stuck, target: drone1, at_s: 1, rotor: {rotor}}}]"
-    role = federation.start("validate", federation.write(PAIR), "--set", f"drones.drone1.model={model}", "--set", fault)
+    role = federation.start(
+        "validate", "--trust", federation.write(PAIR), "--set", f"drones.drone1.model={model}", "--set", fault
+    )
     role.ends(with_code=2)
     (line,) = [line.text for line in role.lines if line.text.strip()]
     for part in ("faults[0].rotor", repr(rotor), *vehicle_catalogue.vehicle_of(model).rotor_names):

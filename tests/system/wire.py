@@ -180,7 +180,7 @@ class Participant:
         self.client.put(f"process/{self.name}/done", t_ns=t_ns, **self.run, done_ns=t_ns, sent=sent)
 
     def bye(self, t_ns: int, reason: str = "shown") -> None:
-        self.client.put(f"process/{self.name}/bye", t_ns=t_ns, reason=reason)
+        self.client.put(f"process/{self.name}/bye", t_ns=t_ns, **self.run, reason=reason)
 
     def die(self) -> None:
         """Let the token go without a bye, as a process does that is killed."""

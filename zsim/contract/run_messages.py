@@ -90,10 +90,16 @@ class Snapshot(Message, frozen=True):
 
 
 class Bye(Message, frozen=True):
-    """A process leaves of its own will; `failed`: since it cannot go on, and would fail again if it were restarted."""
+    """A process leaves of its own will; `failed`: since it cannot go on, and would fail again if it were restarted.
+
+    `run_id` and `incarnation` are those of the join that it ends. Clients of contract 1.0 name neither: their byes
+    count once the liveliness token is gone as well, or the run is over.
+    """
 
     reason: str
     failed: bool | UnsetType = UNSET
+    run_id: str | UnsetType = UNSET
+    incarnation: int | UnsetType = UNSET
 
 
 RUN_ENDED = "the run ended"  # reason of whoever leaves because the run is over

@@ -18,6 +18,7 @@ from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
 from zsim.runtime.routing import RoutingTable
 from zsim.scenario.fault_kinds import PROCESS_KILL
 
+INCARNATION = 0  # of every agent: in one process none comes back
 GATES_MAX = 10  # of the world in a row, where commands are delayed by as many
 
 
@@ -113,7 +114,7 @@ class Bus:
         for agent, _ in self._agents:
             agent.rehearse()
             seq, host, run_id = agent.next_seq("join"), socket.gethostname(), self._coordinator.run_id
-            join = join_of(agent.name, host, run_id, 0, seq, period_ns=agent.period_ns, serves=agent.serves)
+            join = join_of(agent.name, host, run_id, INCARNATION, seq, period_ns=agent.period_ns, serves=agent.serves)
             self._to_world(keys.process(agent.name, "join"), join)
         if any(agent.overhears for agent, _ in self._agents):
             hold_ns = output_hold_ns(self._coordinator.info())
@@ -162,7 +163,8 @@ class Bus:
         """Let an agent leave that cannot go on; it is handed nothing any more."""
         inbox.start_after(NEVER_NS)
         reason, seq = str(self._failures[agent.name]), agent.next_seq("bye")
-        self._to_world(keys.process(agent.name, "bye"), run_messages.Bye(self._t_ns, seq, reason, failed=True))
+        bye = run_messages.Bye(self._t_ns, seq, reason, True, self._coordinator.run_id, INCARNATION)
+        self._to_world(keys.process(agent.name, "bye"), bye)
 
     def end(self) -> None:
         """Let every agent leave, and publish the world's last messages.
@@ -175,7 +177,8 @@ class Bus:
         for agent, _ in self._agents:
             if agent.name in self._failures:
                 continue
-            bye = run_messages.Bye(self._t_ns, agent.next_seq("bye"), run_messages.RUN_ENDED)
+            seq, of = agent.next_seq("bye"), {"run_id": self._coordinator.run_id, "incarnation": INCARNATION}
+            bye = run_messages.Bye(self._t_ns, seq, run_messages.RUN_ENDED, **of)
             self._to_world(keys.process(agent.name, "bye"), bye)
         self._spread()
         for failure in self._failures.values():
@@ -237,7 +240,7 @@ class Bus:
                 world.count_output(agent.name)
             else:
                 world.handle(key, message, self._wall_ns())
-        done = run_messages.Done(t_ns, agent.next_seq("done"), self._coordinator.run_id, 0, t_ns, sent)
+        done = run_messages.Done(t_ns, agent.next_seq("done"), self._coordinator.run_id, INCARNATION, t_ns, sent)
         self._to_world(self._done_keys[agent.name], done)
 
     def _to_world(self, key: str, message: Struct) -> None:

@@ -211,7 +211,8 @@ class Membership:
 
     def leave(self, reason: str, failed: bool = False) -> None:
         """Publish bye; `failed` of one that cannot go on."""
-        bye = run_messages.Bye(max(0, self.done_ns), self._agent.next_seq("bye"), reason, failed or UNSET)
+        seq, of = self._agent.next_seq("bye"), (self._info.run_id, self._incarnation)
+        bye = run_messages.Bye(max(0, self.done_ns), seq, reason, failed or UNSET, *of)
         self._link.put(keys.process(self._agent.name, "bye"), bye)
 
     def _join(self) -> None:

@@ -206,7 +206,8 @@ class Screen:
             self.say(text)
 
     def event(self, line: dict[str, Any]) -> None:
-        if line["kind"] not in QUIET or (line["kind"] in COMINGS and line["text"].startswith(DRIVERS)):
+        is_coming = line["kind"] in COMINGS and line["text"].startswith(DRIVERS)
+        if line["kind"] not in QUIET or is_coming or line.get("data", {}).get("fails"):
             for text in self._repeated.lines(line["t_s"], line["kind"], line["text"]):
                 self.say(text)
 

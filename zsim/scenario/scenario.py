@@ -15,6 +15,7 @@ from zsim.sensors.camera import Hats
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight
+from zsim.vehicles.vehicle_catalogue import STOCK
 
 TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
@@ -297,11 +298,14 @@ class Scenario(Spec, frozen=True, kw_only=True):
         """Return the cluster of that name; KeyError if there is none."""
         return {cluster.name: cluster for cluster in self.clusters}[name]
 
-    def names_own_code(self) -> bool:
-        """Tell whether it names a user's class, function or sensor, whose module a reader of its record needs."""
+    def own_code(self) -> list[str]:
+        """Return the users' classes, functions, sensors and vehicles that it names, whose modules a rerun needs."""
         spaces = [part.space for cluster in self.clusters for part in (cluster, *cluster.groups)]
         names = [*spaces, *(cluster.law for cluster in self.clusters), self.estimation.chosen(), self.report.metrics]
-        return any(isinstance(name, str) and ":" in name for name in names) or any(d.sensors.own for d in self.drones)
+        classes = [name for name in names if isinstance(name, str) and ":" in name]
+        sensors = [each["module"] for drone in self.drones for each in (drone.sensors.own or {}).values()]
+        models = [drone.model for drone in self.drones if drone.model not in STOCK]
+        return sorted({*classes, *sensors, *models})
 
     def external(self) -> list[str]:
         """Return the names of the drones whose bodies are external."""

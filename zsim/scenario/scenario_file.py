@@ -9,13 +9,13 @@ from typing import Any
 
 import msgspec
 
-from zsim.errors import DocumentError, ScenarioError
+from zsim.errors import DocumentError, NotTrustedError, ScenarioError
 from zsim.scenario import overrides as override
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.scenario import DRONES_MAX, Document, Scenario
 from zsim.scenario.shared_vehicle import shared, upon
 from zsim.schema import plugin, yaml_file
-from zsim.schema.checker import Fault, faults, first_lines, sound
+from zsim.schema.checker import Fault, faults, first_lines, show, sound
 from zsim.sensors.error_units import in_channel_units
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors, flattened, separate
 from zsim.vehicles import vehicle_catalogue
@@ -53,11 +53,11 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
     return _resolve(document, source, [])
 
 
-def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenario:
+def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
     document = _share_vehicle(document)
     document, misread = _in_channel_units(document)
-    vehicles, unknown = _vehicles(document)
-    document, unsound = _separate_sensors(_expand_presets(document, vehicles))
+    vehicles, unknown = _vehicles(document, imports)
+    document, unsound = _separate_sensors(_expand_presets(document, vehicles), imports)
     between = cross_faults(sound(document, Scenario), vehicles)
     flaws = chain(misread, faults(document, Document), unknown, unsound, between)
     found = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
@@ -69,8 +69,13 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenari
 
 
 def from_text(text: str) -> Scenario:
-    """Return the scenario that `world/info` carries."""
-    return resolve(yaml_file.parse(text, "world/info", EXAMPLE, ScenarioError), source="world/info")
+    """Return the scenario that `world/info` carries; nothing that it names is imported.
+
+    Raises:
+        ScenarioError: with every fault found, a line each.
+    """
+    source = "world/info"
+    return _resolve(yaml_file.parse(text, source, EXAMPLE, ScenarioError), source, [], imports=False)
 
 
 def to_text(scenario: Scenario) -> str:
@@ -112,11 +117,11 @@ def _with_units(section: Any, where: str, misread: list[Fault]) -> Any:
     return {**section, "sensors": sensors}
 
 
-def _vehicles(document: dict[str, Any]) -> tuple[dict[str, Vehicle], list[Fault]]:
+def _vehicles(document: dict[str, Any], imports: bool) -> tuple[dict[str, Vehicle], list[Fault]]:
     """Return the vehicles that drones of a document need, by model, and where a model is none.
 
     A drone with all its numbers, as in a resolved scenario, needs no module of a user's: whoever reads `world/info`
-    imports nothing that it names.
+    imports nothing that it names. One that must not be imported is left out.
     """
     vehicles, unknown = dict(vehicle_catalogue.STOCK), []
     drones = document.get("drones")
@@ -124,8 +129,14 @@ def _vehicles(document: dict[str, Any]) -> tuple[dict[str, Vehicle], list[Fault]
     for index, drone in enumerate(entries):
         model = drone.get("model") if isinstance(drone, dict) else None
         if isinstance(model, str) and model not in vehicles and not _is_resolved(drone):
+            if not imports:
+                allowed = f"must be {', '.join(vehicle_catalogue.STOCK)}, or come with all its numbers"
+                unknown.append((f"drones[{index}].model", f"is {show(model)}; {allowed}"))
+                continue
             try:
                 vehicles[model] = vehicle_catalogue.vehicle_of(model, "")
+            except NotTrustedError:
+                continue
             except DocumentError as error:
                 unknown += [(f"drones[{index}].model", line.strip()) for line in error.faults]
     return vehicles, unknown
@@ -159,14 +170,14 @@ def _sensor_faults(section: Any) -> Iterator[Fault]:
     yield from faults(section, Sensors)
 
 
-def _separate_sensors(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
+def _separate_sensors(document: dict[str, Any], imports: bool) -> tuple[dict[str, Any], list[Fault]]:
     """Return a document with the users' sensors apart from the stock ones, and what is wrong with them."""
     unsound: list[Fault] = []
-    section = _separated(document["sensors"], "sensors", unsound)
+    section = _separated(document["sensors"], "sensors", unsound, imports)
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
         drones = [
-            {**drone, "sensors": _separated(drone["sensors"], f"drones[{index}].sensors", unsound)}
+            {**drone, "sensors": _separated(drone["sensors"], f"drones[{index}].sensors", unsound, imports)}
             if isinstance(drone, dict)
             else drone
             for index, drone in enumerate(drones)
@@ -175,10 +186,10 @@ def _separate_sensors(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fa
     return {**document, "sensors": section}, unsound
 
 
-def _separated(section: Any, where: str, unsound: list[Fault]) -> Any:
+def _separated(section: Any, where: str, unsound: list[Fault], imports: bool) -> Any:
     if not isinstance(section, dict):
         return section
-    rest, own, wrong = separate(section)
+    rest, own, wrong = separate(section, imports)
     unsound += [(f"{where}.{path}", text) for path, text in wrong]
     return {**rest, "own": own} if own else rest
 

@@ -4,14 +4,18 @@ A module is found as Python finds modules: installed beside zsim, or on PYTHONPA
 last, where `search` has named it: a module beside the scenario's file needs no installation on that machine. It hides
 nothing that is installed. On other hosts the module must be installed.
 
-Importing a module runs it: fly scenarios of others only if you trust what they name.
+Importing a module runs it: fly scenarios of others only if you trust what they name. Commands that only read what
+others have written look names up without importing anything (`names_only`).
 """
 
+import ast
 import importlib
 import os
 import sys
 import sysconfig
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.machinery import ModuleSpec, PathFinder
 from inspect import Parameter, getattr_static, isfunction, signature
 from pathlib import Path
 from traceback import walk_tb
@@ -22,10 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim import extras
-from zsim.errors import DocumentError, UserCodeError
+from zsim.errors import DocumentError, NotTrustedError, UserCodeError
 from zsim.schema.checker import show
 
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that processes started from here search there too
+IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, for the same reason, and what it then holds
 WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
 
 PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_deploy"})
@@ -52,6 +57,29 @@ def folders() -> tuple[Path, ...]:
     return tuple(map(Path, filter(None, os.environ.get(FOLDERS, "").split(os.pathsep))))
 
 
+@contextmanager
+def names_only(wanted: bool = True) -> Iterator[list[str]]:
+    """Import nothing that documents name, if so wanted, here and in processes started from here.
+
+    Yields:
+        the names of what was found and not imported, as documents have them; empty where all may be imported.
+    """
+    former, _SKIPPED[:] = os.environ.get(IMPORTS), []
+    if wanted:
+        os.environ[IMPORTS] = NO_IMPORTS
+    try:
+        yield _SKIPPED
+    finally:
+        os.environ.pop(IMPORTS, None)
+        if former is not None:
+            os.environ[IMPORTS] = former
+
+
+def may_import() -> bool:
+    """Tell whether what documents name is imported."""
+    return os.environ.get(IMPORTS) != NO_IMPORTS
+
+
 def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Callable[..., Any]:
     """Return the class of a name `package.module:Class`.
 
@@ -63,11 +91,12 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
 
     Raises:
         DocumentError: no such module or class, or a method is missing or takes other arguments; one line.
+        NotTrustedError: it is there, and must not be imported.
     """
     module_name, colon, class_name = name.partition(":")
     if not (colon and module_name and class_name):
         raise DocumentError([f"{where} is {show(name)}; must be package.module:Class"])
-    module = _imported(module_name, f"{where} is {show(name)}")
+    module = _imported(module_name, f"{where} is {show(name)}", class_name)
     loaded = getattr(module, class_name, None)
     if not isinstance(loaded, type):
         classes = ", ".join(_classes(module)) or "it has none"
@@ -93,11 +122,12 @@ def load_function(name: str, where: str) -> Callable[..., Any]:
 
     Raises:
         DocumentError: no such module or function; one line.
+        NotTrustedError: it is there, and must not be imported.
     """
     module_name, colon, function_name = name.partition(":")
     if not (colon and module_name and function_name):
         raise DocumentError([f"{where} is {show(name)}; must be package.module:function"])
-    module = _imported(module_name, f"{where} is {show(name)}")
+    module = _imported(module_name, f"{where} is {show(name)}", function_name)
     loaded = getattr(module, function_name, None)
     if not callable(loaded):
         functions = ", ".join(_functions(module)) or "it has none"
@@ -110,6 +140,7 @@ def load_module(name: str, where: str) -> ModuleType:
 
     Raises:
         DocumentError: it cannot be imported; one line.
+        NotTrustedError: it is there, and must not be imported.
     """
     return _imported(name, f"{where} is {show(name)}")
 
@@ -183,8 +214,19 @@ def _shown_path(path: str) -> str:
 _LOADED: set[str] = set()  # packages that documents have named
 
 
-def _imported(name: str, what: str) -> ModuleType:
-    _LOADED.add(name.partition(".")[0])
+_SKIPPED: list[str] = []  # what documents have named and was not imported
+
+
+def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
+    """Return a module, if it may be imported; else find it, and in its text what it is to define."""
+    package = name.partition(".")[0]
+    if not may_import() and package not in PACKAGES:
+        _find(name, what, attribute)
+        full = f"{name}:{attribute}" if attribute else name
+        if full not in _SKIPPED:
+            _SKIPPED.append(full)
+        raise NotTrustedError([f"{what}, code of the document's own, which is imported only with --trust"])
+    _LOADED.add(package)
     for folder in map(str, folders()):
         if folder not in sys.path:
             sys.path.append(folder)
@@ -195,6 +237,56 @@ def _imported(name: str, what: str) -> ModuleType:
             raise DocumentError([f"{what}, which cannot be imported: {lacking}"]) from error
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"]) from error
+
+
+def _find(name: str, what: str, attribute: str) -> None:
+    """Find a module without running any of it, and what its text binds.
+
+    Raises:
+        DocumentError: there is no such module, or nothing of that name in it; one line.
+    """
+    spec: ModuleSpec | None = None
+    parts = name.split(".")
+    for count in range(1, len(parts) + 1):
+        where = spec.submodule_search_locations if spec else None
+        if spec and where is None:
+            raise DocumentError([f"{what}, and {spec.name} is no package; {WHERE}"])
+        spec = _spec(".".join(parts[:count]), None if where is None else list(where))
+        if spec is None:
+            reason = f"ModuleNotFoundError: No module named {'.'.join(parts[:count])!r}"
+            raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"])
+    if not attribute or spec is None or not (spec.origin or "").endswith(".py"):
+        return
+    try:
+        bound = _bound(ast.parse(Path(spec.origin or "").read_bytes()))
+    except (OSError, SyntaxError, ValueError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise DocumentError([f"{what}, which cannot be imported ({reason})"]) from error
+    if attribute not in bound and "*" not in bound:
+        raise DocumentError([f"{what}; must be of {name}: {', '.join(sorted(bound)) or 'it defines nothing'}"])
+
+
+def _spec(name: str, where: list[str] | None) -> ModuleSpec | None:
+    if where is not None:
+        return PathFinder.find_spec(name, where)
+    found = (finder.find_spec(name, None) for finder in sys.meta_path)
+    return next(filter(None, found), None) or PathFinder.find_spec(name, list(map(str, folders())))
+
+
+def _bound(body: ast.AST) -> set[str]:
+    """Return the names that the text of a module binds, those in branches too; `*` for whatever another one has."""
+    names: set[str] = set()
+    for node in ast.iter_child_nodes(body):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            names |= {alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names |= {each.id for target in targets for each in ast.walk(target) if isinstance(each, ast.Name)}
+        else:
+            names |= _bound(node)
+    return names
 
 
 def _classes(module: ModuleType) -> list[str]:

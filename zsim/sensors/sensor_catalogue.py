@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_type_hints
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from zsim.errors import DocumentError
+from zsim.errors import DocumentError, NotTrustedError
 from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, field_path, show, suggestion
 from zsim.sensors import baro, flow, gps, imu, mag, sonar
@@ -142,10 +142,11 @@ def _check_settings(settings: type[Sensor]) -> None:
             raise TypeError(f"{what}; must have that of zsim.sensors.sensor.Sensor, e.g. RateHz, LatencyMs")
 
 
-def separate(section: dict[str, Any]) -> OwnSections:
+def separate(section: dict[str, Any], imports: bool = True) -> OwnSections:
     """Take the user's sensors out of a `sensors:` section, each resolved with all its settings.
 
-    One that is resolved already is taken as it is: whoever reads `world/info` imports nothing that it names.
+    One that is resolved already is taken as it is: whoever reads `world/info` imports nothing that it names. Without
+    `imports` any other is a fault; one that must not be imported (`plugin.names_only`) is left out.
     """
     rest = {name: value for name, value in section.items() if name in FIELDS}
     own: dict[str, dict[str, Any]] = {}
@@ -157,9 +158,9 @@ def separate(section: dict[str, Any]) -> OwnSections:
             allowed = f"allowed: {', '.join(sorted(FIELDS))}, or a sensor of your own with its module"
             wrong.append((field_path("", name), f"is not known; {suggestion(name, FIELDS)}{allowed}"))
             continue
-        section_faults = [*_name_faults(name)] or [*_section_faults(name, value)]
+        section_faults = [*_name_faults(name)] or [*_section_faults(name, value, imports)]
         wrong += section_faults
-        if not section_faults:
+        if not section_faults and (DECLARED in value or plugin.may_import()):
             own[name] = _resolved(value)
     return OwnSections(rest, dict(sorted(own.items())), wrong)
 
@@ -198,9 +199,12 @@ def _settings_of(section: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in section.items() if name not in (MODULE, DECLARED)}
 
 
-def _section_faults(name: str, section: dict[str, Any]) -> Iterator[Fault]:
+def _section_faults(name: str, section: dict[str, Any], imports: bool) -> Iterator[Fault]:
     if DECLARED in section:
         yield from faults(section[DECLARED], Declaration, f"{name}.{DECLARED}")
+        return
+    if not imports:
+        yield f"{name}.{DECLARED}", "is missing; must be there in a resolved scenario"
         return
     module = section[MODULE]
     if not isinstance(module, str) or not re.fullmatch(plugin.MODULE_NAME, module):
@@ -208,6 +212,8 @@ def _section_faults(name: str, section: dict[str, Any]) -> Iterator[Fault]:
         return
     try:
         kind = sensor_type(module, f"{name}.{MODULE}")
+    except NotTrustedError:
+        return
     except DocumentError as error:
         for line in error.faults:
             path, _, text = line.partition(" ")

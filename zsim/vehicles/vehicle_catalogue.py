@@ -5,7 +5,7 @@ from functools import cache
 
 import msgspec
 
-from zsim.errors import DocumentError
+from zsim.errors import DocumentError, NotTrustedError
 from zsim.schema import plugin
 from zsim.schema.checker import faults, show
 from zsim.vehicles import ardrone2, crazyflie2
@@ -34,8 +34,11 @@ def vehicle_of(model: str, where: str = "model") -> Vehicle:
         raise DocumentError([f"{where} is {show(model)}; must be one of {ALLOWED}"])
     try:
         module = plugin.load_module(model, where)
+    except NotTrustedError:
+        raise
     except DocumentError as error:
         reason = " ".join(f"{type(error.__cause__).__name__}: {error.__cause__}".split())
+        reason = reason if error.__cause__ else "it cannot be found"
         raise DocumentError([f"{where} is {show(model)}; must be one of {ALLOWED} ({reason})"]) from error
     vehicle = getattr(module, "VEHICLE", None)
     if not isinstance(vehicle, Vehicle):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from msgspec import UNSET
 
-from zsim.errors import DocumentError, RunError
+from zsim.errors import DocumentError, NotTrustedError, RunError
 from zsim.scenario.scenario import Cluster, Gains, Scenario
 from zsim.schema import plugin
 from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, ProportionalLaw
@@ -58,6 +58,8 @@ def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
         yield
     except PlanError as error:
         raise RunError(f"clusters[{scenario.clusters.index(cluster)}].{error} (cluster {cluster.name!r})") from error
+    except NotTrustedError:
+        raise
     except DocumentError as error:
         raise RunError(f"cluster {cluster.name!r}: {error}") from error
     except plugin.RAISED as error:

@@ -10,7 +10,7 @@ from aiohttp import web
 
 from zsim.errors import DecodeError, NoWorldError, SessionError, ZsimError
 from zsim_bridges.gateway.client_messages import ForbiddenError, MethodError, TooManyError, UnknownError
-from zsim_bridges.web.loopback import is_loopback, is_loopback_authority
+from zsim_bridges.web.loopback import is_loopback_authority
 from zsim_bridges.web.web_server import tokens_match
 
 HTTP_RATE_HZ = 5_000.0  # requests per wall second of one address: 500 clients that ask ten times a second
@@ -151,7 +151,7 @@ class AccessCheck:
         if not self.is_token(_token_of(request)):
             raise MissingTokenError("no token, or a wrong one; send Authorization: Bearer TOKEN, or ?token=TOKEN")
         if not self.needs_token and not _is_from_this_machine(request):
-            raise ForbiddenError("a page of another site may not ask here; give the gateway a token, and ask with it")
+            raise ForbiddenError("a page of another server may not ask here; give the gateway a token, and ask with it")
 
     def _bucket(self, address: str) -> TokenBucket:
         bucket = self._buckets.get(address)
@@ -170,14 +170,15 @@ def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.R
 
 
 def _is_from_this_machine(request: web.Request) -> bool:
-    """Return whether a program or a page of this machine sent a request: browsers give the origin of the page.
+    """Return whether a program of this machine sent a request, and no page of another server: browsers give its origin.
 
-    The Host header counts too: another site can let its own name resolve to this machine.
+    A server on another port of this machine is another one, whose pages may be anybody's. The Host header counts too:
+    another site can let its own name resolve to this machine.
     """
     origin = request.headers.get("Origin")  # "null" for a sandboxed frame: any page can make one
     try:
-        page_host = "localhost" if origin is None else urlsplit(origin).hostname or ""
-        return is_loopback(page_host) and is_loopback_authority(request.host)
+        is_own = origin is None or urlsplit(origin).netloc == request.host
+        return is_own and is_loopback_authority(request.host)
     except ValueError:
         return False
 

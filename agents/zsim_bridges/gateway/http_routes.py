@@ -23,9 +23,10 @@ _OWN_KEY = "^[A-Za-z0-9_.-]{1,64}$"  # of a client's own key; Zenoh takes more
 _ERRORS = {
     400: "an invalid key or value",
     401: "no token, or a wrong one",
-    403: "a reserved key, or a page of another site",
+    403: "a reserved key, or a page of another server",
     404: "no such drone or cluster, or no value yet",
     405: "a method that this key does not have",
+    408: "a request that did not come whole in its time",
     413: "a body that is too long",
     429: "too many requests",
     503: "there is no run now",

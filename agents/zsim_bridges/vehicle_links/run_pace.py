@@ -2,8 +2,8 @@
 
 from zsim.contract import keys
 from zsim.contract.messages import Info
-from zsim.errors import RunError
-from zsim.transport.session import Session
+from zsim.errors import NoWorldError, RunError
+from zsim.transport.session import Session, Unanswered
 
 
 def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
@@ -17,6 +17,7 @@ def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
 
     Raises:
         RunError: the run goes as fast as possible, or the world refuses the pace.
+        NoWorldError: the world went meanwhile.
     """
     if rate is None:
         if info.mode == "lockstep" and not info.rate:
@@ -26,5 +27,7 @@ def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
             )
         return
     answer = link.request(keys.CONTROL, "rate", name, {"value": rate})
+    if isinstance(answer, Unanswered):
+        raise NoWorldError(f"{name}: the world of run {info.run_id} does not answer ({answer.error})")
     if not answer.ok:
         raise RunError(f"{name}: the world does not set the pace to --rate {rate:g}: {answer.error}")

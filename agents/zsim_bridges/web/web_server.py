@@ -17,6 +17,7 @@ from zsim_bridges.web.loopback import is_loopback
 
 ANY_PORT = 0  # of the kernel's choice
 BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own
+READ_BYTES = 16_384  # of a body that no handler has read yet; a connection holds twice as many
 Resource = TypeVar("Resource")
 _NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, not logged
 
@@ -52,7 +53,7 @@ async def start_site(app: web.Application, host: str, ports: Sequence[int], shut
     """
     connections = HttpConnections()
     app.middlewares.append(connections.observe)
-    runner = web.AppRunner(app, access_log=None, logger=_NO_LOG, shutdown_timeout=shutdown_s)
+    runner = web.AppRunner(app, access_log=None, logger=_NO_LOG, shutdown_timeout=shutdown_s, read_bufsize=READ_BYTES)
     await runner.setup()
     server = runner.server
     assert server is not None
@@ -81,9 +82,10 @@ def check_token(process: str, host: str, token: str | None) -> None:
         RunError: the token is empty, or there is none and the host is not loopback.
     """
     if token == "":
-        raise RunError(f"{process}: the token is empty; give it one, or leave --token and ZSIM_TOKEN away")
+        raise RunError(f"{process}: the token is empty; give it one, or leave ZSIM_TOKEN and --token away")
     if token is None and not is_loopback(host):
-        raise RunError(f"{process}: {host} can be reached by others; give it a --token, or --listen 127.0.0.1")
+        remedy = "set ZSIM_TOKEN (or --token, which everybody on this machine can read), or --listen 127.0.0.1"
+        raise RunError(f"{process}: {host} can be reached by others; {remedy}")
 
 
 def tokens_match(received: str, token: str) -> bool:

@@ -19,6 +19,7 @@ from foxglove import layouts
 from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraInfo
 from zsim.contract.messages import Info
+from zsim.errors import NotTrustedError
 from zsim.record import Recorded, RecordReader
 from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import cross_layout
@@ -150,7 +151,7 @@ def _spaces(scenario: Scenario | None) -> dict[str, ClusterSpace]:
     for cluster in scenario.clusters:
         try:
             spaces[cluster.name] = scenario_space(scenario, cluster)
-        except ValueError:
+        except (ValueError, NotTrustedError):
             continue
     return spaces
 

@@ -6,6 +6,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from zsim.errors import NotTrustedError
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
@@ -207,7 +208,7 @@ def _space(states: ClusterStates, scenario: Scenario | None) -> ClusterSpace | N
         if scenario and states.name in clusters:
             return scenario_space(scenario, clusters[states.name])
         return cluster_space(len(states.drones))
-    except ValueError:
+    except (ValueError, NotTrustedError):
         return None
 
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zsim.errors import NotTrustedError
 from zsim.scenario.scenario import ClusterPlan, Scenario
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
@@ -34,7 +35,7 @@ def goal_errors(formation: Formation, scenario: Scenario | None) -> GoalErrors |
     try:
         space = scenario_space(scenario, cluster)
         goal = named_values(space, cluster.plan.target, "target", np.full(space.size, np.nan))
-    except (TrajectoryError, ExpressionError, ValueError):
+    except (TrajectoryError, ExpressionError, ValueError, NotTrustedError):
         return None  # it was refused in flight
     lost = (formation.t_s[:, None] >= _until_s(cluster.plan)) | ~np.isfinite(goal)
     est, true = (_against(space, each, goal, lost) for each in (formation.value, formation.true))

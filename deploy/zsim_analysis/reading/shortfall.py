@@ -13,6 +13,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.contract.run_messages import Event
+from zsim.errors import NotTrustedError
 from zsim.record.completeness import SECOND_NS
 from zsim.scenario.rights import WORLD
 from zsim.scenario.role_table import agent_names, lets_drop
@@ -90,7 +91,9 @@ def _of_processes(flight: RecordedFlight) -> Iterator[Shortfall]:
         allowed = actions.on_overdue or {} if event.kind == "overdue" else actions.on_death
         t_s = event.t_ns / 1e9
         if event.kind == "leave":
-            yield Shortfall("process", event.subject, t_s, f"{event.text}, at {t_s:.2f} s", False)
+            yield Shortfall(
+                "process", event.subject, t_s, f"{event.text}, at {t_s:.2f} s", bool(event.data.get("fails"))
+            )
         elif (is_death or event.kind in ("failure", "overdue")) and not lets_drop(allowed, event.subject):
             text = event.text if event.kind == "failure" else f"{event.text}, at {t_s:.2f} s"
             yield Shortfall("process", event.subject, t_s, text, True)
@@ -392,7 +395,7 @@ def _planned(states: ClusterStates, scenario: Scenario | None) -> PlannedReferen
                 named = [step.expressions, *(w["values"] for w in step.waypoints if isinstance(w["values"], Mapping))]
                 names.update(dict.fromkeys(str(name) for each in named for name in each))
         entries = np.array(sorted({variable_of(space, name, "").entry for name in names}), np.intp)
-    except (*REFUSALS, ValueError):
+    except (*REFUSALS, ValueError, NotTrustedError):
         return None
     return PlannedReference(space, reference, start_s, entries) if reference else None
 

@@ -208,7 +208,7 @@ def write_report(
     Raises:
         ReportError: the directory cannot be written.
     """
-    with _put_in_place(directory, directory) as new:
+    with _put_in_place(directory, directory, directory / "figures") as new:
         (new / "figures").mkdir()
         pictures = render(_kept(figures, new / "figures", formats), progress)
         progress("writing the page")
@@ -232,7 +232,7 @@ def write_page(
     Figures in other formats come into a folder beside the page, NAME-figures.
     """
     folder = f"{out.stem}-figures"
-    with _put_in_place(out.parent, out) as new:
+    with _put_in_place(out.parent, out, out.parent / folder) as new:
         (new / folder).mkdir()
         pictures = render(_kept(figures, new / folder, formats), progress)
         progress("writing the page")
@@ -257,12 +257,15 @@ def _remove_others(png: Path, formats: Sequence[str]) -> None:
 
 
 @contextmanager
-def _put_in_place(directory: Path, report: Path) -> Iterator[Path]:
+def _put_in_place(directory: Path, report: Path, figures: Path) -> Iterator[Path]:
     """Yield a folder whose files come into a directory when all are made: a full disk or Ctrl-C leaves no half of them.
 
     Raises:
-        ReportError: the directory cannot be written; the line begins with `report`.
+        ReportError: the directory cannot be written, and the line begins with `report`; or `figures` in it is a link,
+            through which files would be written, and removed, elsewhere.
     """
+    if figures.is_symlink():
+        raise ReportError(f"{figures}: is a symbolic link to {figures.readlink()}; must be a folder, remove the link")
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=directory, prefix=".report-") as folder:

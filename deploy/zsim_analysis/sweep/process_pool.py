@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from zsim_analysis.sweep.sweep_run import Row, Task
 
 READY = "ready"
+SAFE_PATH = "PYTHONSAFEPATH"  # environment variable of Python
 DEATHS_MAX = 3  # of workers in one run, or one after the other before they are ready
 EXIT_S = 5.0  # wall time that an idle worker has to exit by itself
 
@@ -64,6 +65,19 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@contextlib.contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let interpreters that are started import nothing from the working folder first."""
+    former = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[SAFE_PATH]
+        if former is not None:
+            os.environ[SAFE_PATH] = former
+
+
 class WorkerProcess:
     """One process and the task that it flies."""
 
@@ -71,7 +85,8 @@ class WorkerProcess:
         context = multiprocessing.get_context("spawn")
         self.link, far = context.Pipe()
         self.process = context.Process(target=work, args=(far,), name="zsim-sweep", daemon=True)
-        self.process.start()
+        with _safe_path():
+            self.process.start()
         far.close()  # so that the link ends when the process dies
         self.ready = False
         self.task: Task | None = None

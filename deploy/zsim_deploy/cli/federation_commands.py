@@ -12,7 +12,8 @@ import typer
 
 from zsim.errors import printable
 from zsim_deploy import INTERRUPTED
-from zsim_deploy.arguments import WorldAccess, observer_options, positive
+from zsim_deploy.arguments import Trust, WorldAccess, observer_options, positive
+from zsim_deploy.cli.record_commands import note_skipped
 
 if TYPE_CHECKING:
     from zsim.contract.messages import Info
@@ -240,17 +241,21 @@ def kinds(
     scenario: Annotated[
         Path | None, typer.Argument(help="A scenario, for the kinds of its users' sensors too.", show_default=False)
     ] = None,
+    trust: Trust = False,
 ) -> None:
     """List the kinds of faults: whom they strike, and their parameters."""
     from zsim.scenario import fault_kinds, scenario_file
+    from zsim.schema import plugin
     from zsim.sensors.sensor_catalogue import declarations
     from zsim.terminal.fitted_table import Column, FittedTable, print_table
 
-    own = declarations(scenario_file.load(scenario).drones) if scenario else {}
+    with plugin.names_only(not trust) as skipped:
+        own = declarations(scenario_file.load(scenario).drones) if scenario else {}
     rows = [
         (name, kind.strikes, "  ".join(_parameters(kind)) or "-") for name, kind in fault_kinds.kinds_of(own).items()
     ]
     print_table(FittedTable([Column("", "name"), Column(""), Column("", "text")], rows))
+    note_skipped(skipped)
 
 
 def selector(which: str, scenario: str) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from zsim.errors import printable
+from zsim_deploy import SAFE_PATH
 from zsim_deploy.roles.closed_output import renew_streams
 
 READY = b"ready"
@@ -35,7 +36,7 @@ def main() -> None:
     """Fork roles until the launcher closes the socket; in a role, run it."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # not inherited by what is forked
-    _show_as("forkserver", [sys.executable, "-m", "zsim_deploy.cli.forkserver", *sys.argv[1:2]])
+    _show_as("forkserver", [sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli.forkserver", *sys.argv[1:2]])
     launcher = socket.socket(fileno=os.dup(0))
     _prepare()
     launcher.send(READY)
@@ -97,7 +98,7 @@ def _run_role(arguments: list[str], files: list[int]) -> NoReturn:
         os.dup2(file, number)
         os.close(file)
     renew_streams()
-    _show_as(arguments[0], [sys.executable, "-m", "zsim_deploy.cli", *arguments])
+    _show_as(arguments[0], [sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli", *arguments])
     sys.argv = ["zsim", *arguments]
     code: object = 1
     try:

@@ -24,6 +24,7 @@ from zsim_deploy.arguments import (
     Seed,
     Set,
     To,
+    Trust,
     changed_fields,
     check_range,
     require,
@@ -59,6 +60,12 @@ def conclude(outcome: Any, out: Path, report: bool) -> None:
         if (out / "logs").exists():
             print(printable(f"logs are in {out / 'logs'}"), file=sys.stderr)
         raise _failed(f"ended: {fault}")
+
+
+def note_skipped(names: Sequence[str]) -> None:
+    """Print which code that a document names was found, and not imported."""
+    for name in names:
+        print(printable(f"note: {name} is there, and not imported: --trust runs it"), file=sys.stderr)
 
 
 def _failed(cause: str) -> typer.Exit:
@@ -110,9 +117,18 @@ def report(
         str | None,
         typer.Option("--format", help="pdf, svg or pdf,svg: figures are written so too.", show_default=False),
     ] = None,
+    trust: Trust = False,
 ) -> None:
     """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
     require("report", REPORT_NEEDS)
+    from zsim.schema import plugin
+
+    with plugin.names_only(not trust) as skipped:
+        _report_on(directories, out, formats)
+    note_skipped(skipped)
+
+
+def _report_on(directories: list[Path], out: Path | None, formats: str | None) -> None:
     from zsim.record.record_reader import record_in
     from zsim_analysis.sweep.design import is_sweep
 
@@ -289,6 +305,7 @@ def export(
         bool,
         typer.Option("--by-name", help="A table of each drone, cluster and process: time in it only increases."),
     ] = False,
+    trust: Trust = False,
 ) -> None:
     """Write the record of a run as tables, for MATLAB, or for Foxglove and Rerun."""
     if by_name and form not in (Format.CSV, Format.PARQUET):
@@ -298,6 +315,7 @@ def export(
     from rich.progress import Progress
 
     from zsim.record.record_reader import record_at
+    from zsim.schema import plugin
 
     check_range(from_, to)
     record_at(run)
@@ -305,7 +323,12 @@ def export(
     from zsim_analysis.export.selection import MessageSelection
 
     console = Console(stderr=True)
-    with interruptible(), Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+    hidden = not console.is_terminal
+    with (
+        interruptible(),
+        plugin.names_only(not trust) as skipped,
+        Progress(console=console, transient=True, disable=hidden) as bar,
+    ):
         task = bar.add_task("looking through the record", total=None)
         done = write(
             run,
@@ -317,6 +340,7 @@ def export(
             by_name,
         )
     _show(done)
+    note_skipped(skipped)
 
 
 def _show(done: "ExportResult") -> None:
@@ -333,9 +357,11 @@ def rerun(
     commands_only: Annotated[
         bool, typer.Option("--commands-only", help="Feed the world all recorded commands; run no agents.")
     ] = False,
+    trust: Trust = False,
 ) -> None:
     """Fly the run of a record again, from its own inputs, and print whether truth is the same; exit code 0 or 1."""
     require("rerun", FLIGHT_NEEDS)
+    from zsim.schema import plugin
     from zsim_analysis.rerun import rerun_record
 
     def show(text: str) -> None:
@@ -344,5 +370,7 @@ def rerun(
     def warn(text: str) -> None:
         print(printable(text), file=sys.stderr)
 
-    if fault := rerun_record(directory, commands_only, show, warn):
+    with plugin.names_only(not trust):
+        fault = rerun_record(directory, commands_only, show, warn)
+    if fault:
         raise _failed(fault)

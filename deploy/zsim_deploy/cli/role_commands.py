@@ -27,6 +27,7 @@ from zsim_deploy.arguments import (
     Realtime,
     Tls,
     To,
+    Trust,
     Wait,
     WorldAccess,
     check_range,
@@ -199,11 +200,13 @@ def replay(
     access: Access = None,
     insecure: Insecure = False,
     host: Host = None,
+    trust: Trust = False,
 ) -> None:
     """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
     require("replay", REPLAY_NEEDS)
     if console:
         require("console", CONSOLE_NEEDS)
+    from zsim.schema import plugin
     from zsim_deploy.launch.console_process import console_beside
     from zsim_deploy.roles.world_role import ReplayOptions, play
     from zsim_world.playback.playback import PlaybackRange
@@ -214,5 +217,5 @@ def replay(
     endpoints = tuple(listen or [DEFAULT_ENDPOINT])
     options = ReplayOptions(choice, rate, tuple(expect or ()), endpoints, federation)
     beside = console_beside(endpoints[0], directory, federation, tls) if console else nullcontext()
-    with beside:
+    with plugin.names_only(not trust), beside:
         play(directory, options, identity(host, tls, insecure, access))

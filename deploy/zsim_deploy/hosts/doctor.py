@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from zsim import __version__
 from zsim.errors import HostsError, ZsimError
 from zsim.terminal.fitted_table import FittedTable
+from zsim_deploy import SAFE_PATH
 from zsim_deploy.hosts.doctor_tables import hosts_table, paths_table
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.host_links import ProgramEndedError, RemoteProgram, open_program
@@ -76,7 +77,7 @@ def _probe_fault(link: HostLink, python: str, remedy: str, error: ProgramEndedEr
 
 def _probe(link: HostLink, python: str, *words: str) -> AbstractAsyncContextManager[RemoteProgram]:
     """Run a probe on a host as long as the block lasts."""
-    return open_program(link, f"{shell_word(python)} -m zsim_deploy.hosts.probe {shell_line(words)}")
+    return open_program(link, f"{shell_word(python)} {SAFE_PATH} -m zsim_deploy.hosts.probe {shell_line(words)}")
 
 
 async def _offset(probe: RemoteProgram) -> tuple[float, float]:

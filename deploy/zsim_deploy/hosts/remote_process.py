@@ -18,6 +18,7 @@ import asyncssh
 from zsim.errors import HostsError
 from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
 from zsim_deploy.hosts.ssh_connection import shell_line
+from zsim_deploy.inventory.processes import MODULE
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
@@ -161,7 +162,7 @@ class RemoteProcess:
             return _code(done)
 
     def _command(self) -> str:
-        words = [self._python, "-m", "zsim_deploy.cli", *self._arguments]
+        words = [self._python, *MODULE, *self._arguments]
         settings = " ".join(f"{name}={value}" for name, value in SINGLE_THREADED.items())
         return f"echo {PID}$$; exec env {settings} {shell_line(words)}"
 

@@ -7,11 +7,12 @@ from typing import NamedTuple
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.role_table import AGENTS, ROLES, agent_names, on_death
 from zsim.scenario.scenario import OnDeath, Scenario
+from zsim_deploy import SAFE_PATH
 from zsim_deploy.arguments import REALTIME
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Inventory, InventoryFile, hosts_of, spread
 
-MODULE = ("-m", "zsim_deploy.cli")  # after the interpreter
+MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # after the interpreter
 STOP_S = 15  # a world that is stopped waits 5 s for byes, and a recorder may have a disk to wait for
 
 Rendered = dict[str, str]

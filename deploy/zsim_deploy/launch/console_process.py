@@ -8,9 +8,11 @@ from pathlib import Path
 from types import TracebackType
 
 from zsim.errors import printable
+from zsim_deploy import SAFE_PATH
 from zsim_deploy.launch.supervisor import Outcome, RunProcess
 from zsim_deploy.roles.stop_channel import interruptible
 
+ZSIM = (sys.executable, SAFE_PATH, "-m", "zsim_deploy")
 END_S = 10.0  # wall; how long it may take to end
 COPIED_S = 22.0  # wall; how long one may take to end after a run: its pages may copy for 20 s
 INTERRUPTED_S = 1.0  # wall; how long after Ctrl-C: the run itself may take 2 s, the whole is promised within 3 s
@@ -75,7 +77,7 @@ def console_beside(endpoint: str, record: Path, federation: str | None, tls: Pat
     Raises:
         RunError, RecordError: there is no record.
     """
-    command = [sys.executable, "-m", "zsim_deploy", *_arguments(endpoint, federation or _federation_of(record), tls)]
+    command = [*ZSIM, *_arguments(endpoint, federation or _federation_of(record), tls)]
     process = subprocess.Popen(command)
     try:
         yield

@@ -19,6 +19,7 @@ from types import TracebackType
 from typing import IO, NamedTuple, Protocol
 
 from zsim.runtime.progress import SlowStart
+from zsim_deploy import SAFE_PATH
 
 SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
@@ -26,8 +27,8 @@ SINGLE_THREADED = {
     "MKL_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
 }  # matrices of a dozen rows: threads only cost, and would compete with the other roles
-FORKSERVER = (sys.executable, "-m", "zsim_deploy.cli.forkserver")
-COMMAND = (sys.executable, "-m", "zsim_deploy.cli")
+FORKSERVER = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli.forkserver")
+COMMAND = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli")
 ROOM = " " * 1024  # behind the fork server's command line: each role writes its own there
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
 PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from zsim_deploy import SAFE_PATH
 from zsim_deploy.push.installer import WheelTarget
 
 RETRIES = "1"  # of pip, for each page of an index; with its own 5 it takes minutes where there is no network
@@ -96,7 +97,7 @@ async def pip(*arguments: str, progress: Progress) -> None:
     """
     options = ("--disable-pip-version-check", "--no-input", "-q")
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "pip", *arguments, *options, stdin=asyncio.subprocess.DEVNULL,
+        sys.executable, SAFE_PATH, "-m", "pip", *arguments, *options, stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT, limit=LINE_BYTES,
         env={**os.environ, "PIP_RETRIES": RETRIES},
     )  # fmt: skip

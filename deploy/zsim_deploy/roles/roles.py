@@ -246,8 +246,13 @@ def serve_runs(
                 if info.run_id != served:
                     own_name = _free(link, own_name)
                     presence = ObserverProcess(link, info, own_name, stands_for(info), slack_ns(info))
-                    _serve(serve, link, presence, info, stop, say)
-                    served = info.run_id
+                    try:
+                        _serve(serve, link, presence, info, stop, say)
+                        served = info.run_id
+                    except NoWorldError as error:  # it went as this process came
+                        if launched:
+                            raise
+                        say(str(error))
                     if presence.superseded:
                         own_name, served = _next(name, presence), ""
                 else:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 
 from zsim.contract import keys, run_messages
-from zsim.errors import RunError
+from zsim.errors import RunError, RunFailedError
 from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import WORLD
@@ -85,6 +85,8 @@ def world(
         kept, progress = RunJournal(journal, run_world.run_id, sha256, screen.say, all_died), world_progress(screen)
         run(run_world, endpoints, stop.reason, progress, lambda: screen.say(listening), identity, kept)
         screen.say(f"ended: {run_world.ended}")
+    if run_world.left_early:  # a launcher reads it from the record
+        raise RunFailedError("; ".join(run_world.left_early))
 
 
 @contextmanager
@@ -125,7 +127,7 @@ def world_progress(show: ProgressSink) -> Callable[[str, Any, str], None]:
             links[about] = message.state
         elif kind == "resumed":
             show.say(f"{about}: goes on at t = {message / 1e9:.2f} s")
-        elif kind == "event" and (message.kind in VITAL or shown[0] < SHOWN_EVENTS):
+        elif kind == "event" and (message.kind in VITAL or message.data.get("fails") or shown[0] < SHOWN_EVENTS):
             shown[0] += message.kind not in QUIET
             show.event(_event_line(message))
 
@@ -147,7 +149,7 @@ def _clock_line(clock: run_messages.Clock, phase: str) -> dict[str, Any]:
 
 
 def _event_line(event: run_messages.Event) -> dict[str, Any]:
-    data = event.data if event.kind in ("end", "death", "failure", "overdue") else {}
+    data = event.data if event.kind in VITAL or event.data.get("fails") else {}
     return {
         "t_s": event.t_ns / 1e9,
         "kind": event.kind,

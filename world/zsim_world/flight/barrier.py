@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import msgspec
+from msgspec import UNSET
 
 from zsim.contract import keys
-from zsim.contract.run_messages import Done, Join, Waiting
+from zsim.contract.run_messages import Bye, Done, Join, Waiting
 from zsim.contract.snapshot import State
 from zsim.scenario.rights import WORLD
 from zsim_world.flight.run_outbox import Refusal
@@ -38,6 +39,8 @@ class Participant:
         deadline_misses: dones that were late in realtime.
         away: whether it has yet to come back to a world that was started again.
         silent_wall_ns: when its last health came, if it has fallen silent since.
+        farewell: its bye, if that names no incarnation and so may be somebody else's, until its token goes or a done
+            shows that it goes on.
     """
 
     name: str
@@ -58,6 +61,7 @@ class Participant:
     deadline_misses: int = 0
     away: bool = False
     silent_wall_ns: int | None = None
+    farewell: Bye | None = None
 
     @property
     def is_missed(self) -> bool:
@@ -256,8 +260,7 @@ class Barrier:
             return self._run_id_refusal(message.run_id)
         if message.incarnation != participant.join.incarnation:
             participant.note_refused_done(message.seq)
-            allowed = f"must be {participant.join.incarnation}, the newest to join"
-            return Refusal("incarnation", str(message.incarnation), allowed)
+            return _incarnation_refusal(participant, str(message.incarnation))
         if message.done_ns > now_ns:
             return Refusal("done_ns", str(message.done_ns), f"must be <= {now_ns}, the newest gate")
         participant.away = False
@@ -266,6 +269,27 @@ class Barrier:
             participant.since_wall_ns = wall_ns
         participant.note_done(message)
         return None
+
+    def bye_refusal(self, participant: Participant, message: Bye) -> Refusal | None:
+        """Return why a bye is none of this participation: it names another run or incarnation."""
+        if message.run_id not in (UNSET, self._run_id):
+            return self._run_id_refusal(str(message.run_id))
+        if message.incarnation not in (UNSET, participant.join.incarnation):
+            return _incarnation_refusal(participant, str(message.incarnation))
+        return None
+
+    def has_farewell(self, name: str) -> bool:
+        """Tell whether a participant leaves as soon as its token goes."""
+        participant = self.participants.get(name)
+        return participant is not None and participant.farewell is not None
+
+    def take_back_bye(self, name: str) -> Refusal | None:
+        """Take it that a participant goes on: who said bye in its name, without its incarnation, was somebody else."""
+        participant = self.participants.get(name)
+        if participant is None or participant.farewell is None:
+            return None
+        participant.farewell = None
+        return _incarnation_refusal(participant, "missing")
 
     def count_output(self, name: str) -> None:
         """Count one output of a participant that has come in."""
@@ -364,6 +388,10 @@ class Barrier:
         awaited = {p.name: p for p in (*self.away(), *self.blocking(need_ns))}.values()
         late = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
         return (*absent, *(p.waiting(wall_ns, _holders_up(p, late, feeds)) for p in late))
+
+
+def _incarnation_refusal(participant: Participant, found: str) -> Refusal:
+    return Refusal("incarnation", found, f"must be {participant.join.incarnation}, the newest to join")
 
 
 def _holders_up(victim: Participant, late: list[Participant], feeds: Callable[[str, str], bool]) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
+from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import fingerprint
@@ -17,7 +18,7 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError, RunFailedError
 from zsim.runtime.agent import Output
 from zsim.scenario.rights import WORLD
-from zsim.scenario.role_table import OnDeath, agent_names, on_death
+from zsim.scenario.role_table import OnDeath, agent_names, lets_drop, on_death
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.budgets import STRANGERS_MAX, Budgets
@@ -28,6 +29,7 @@ from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox, too_m
 from zsim_world.flight.run_statistics import RunStatistics
 
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # that change a flight
+RECORDER = "recorder"  # name and role
 _JOIN = "process/"  # before a name: what is counted of its joins
 ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
 
@@ -57,6 +59,7 @@ class Coordinator(ABC):
         external: names of the drones of which drivers publish sensors, truth and status.
         unpaced: names of the processes that step when a driver publishes, and not at every gate.
         failure: what is to be raised once the end is published, None for a run that ended well.
+        left_early: a line for each process that the run needed and that left it before the end.
     """
 
     refused_queries: tuple[str, ...] = ()
@@ -83,8 +86,9 @@ class Coordinator(ABC):
         self.barrier = Barrier(self.run_id, self.clock.gate_ns, expected)
         self.statistics = RunStatistics()
         self.failure: RunError | None = None
+        self.left_early: list[str] = []
         self._expected = expected
-        self._own_names = {"recorder", *expected, *agent_names(scenario)}
+        self._own_names = {RECORDER, *expected, *agent_names(scenario)}
         self._data_flow = DataFlow(scenario)
         self.start_wall_ns = wall_ns()
         self._operations: dict[str, Operation] = self.clock.operations()
@@ -167,6 +171,8 @@ class Coordinator(ABC):
         refusal = self.barrier.done(name, message, self.now_ns, wall_ns)
         if refusal:
             self.outbox.refuse(name, f"process/{name}/done", refusal)
+        elif refusal := self.barrier.take_back_bye(name):
+            self.outbox.refuse(name, f"process/{name}/bye", refusal)
 
     def _handle_join(self, name: str, message: run_messages.Join, wall_ns: int) -> None:
         former, replaced = self.barrier.participants.get(name), self.barrier.replaced(name, message)
@@ -218,16 +224,46 @@ class Coordinator(ABC):
             self.outbox.event("doubled", name, text, {"other": other})
 
     def _handle_bye(self, name: str, message: run_messages.Bye, wall_ns: int) -> None:
-        if message.failed is True and self.ended is None:
-            self.losses.failed(name, message.reason, wall_ns)
-            return
-        participant = self.barrier.remove(name)
+        participant = self.barrier.participants.get(name)
         if participant is None:
             return
-        self.outbox.event("leave", name, f"{name} left: {message.reason}", {"reason": message.reason}, name)
+        if refusal := self.barrier.bye_refusal(participant, message):
+            self.outbox.refuse(name, f"process/{name}/bye", refusal)
+            return
+        is_named = UNSET not in (message.run_id, message.incarnation)
+        if is_named or not participant.alive or self.ended is not None:
+            self.leave(participant, message, wall_ns)
+        else:  # of contract 1.0, or somebody else's: the loss of the token decides
+            participant.farewell = message
+
+    def leave(self, participant: Participant, bye: run_messages.Bye, wall_ns: int) -> None:
+        """Take a participant out that has said bye."""
+        name = participant.name
+        if bye.failed is True and self.ended is None:
+            self.losses.failed(name, bye.reason, wall_ns)
+            return
+        fails = self._is_missed_from_now(participant)
+        text = f"{name} left: {bye.reason}"
+        data = {"reason": bye.reason, "run_id": self.run_id, "incarnation": participant.join.incarnation}
+        if fails:
+            text += "; a run that goes on without it fails, unless processes.on_death has drop for it"
+            self.left_early.append(f"{name} left at {self.now_ns / 1e9:.2f} s, before the end: {bye.reason}")
+        self.outbox.event("leave", name, text, {**data, "fails": True} if fails else data, name)
+        self.barrier.remove(name)
         self.release_drones(name)
         self.expect_again(participant)
-        self._after_bye(participant, message.reason)
+        self._after_bye(participant, bye.reason)
+
+    def _is_missed_from_now(self, participant: Participant) -> bool:
+        """Tell whether the leave of a process fails the run: it was needed, and nobody else does its work.
+
+        The leave of a recorder ends the run.
+        """
+        if self.ended is not None or self.clock.state == "waiting" or participant.join.role == RECORDER:
+            return False
+        is_allowed = lets_drop(self.scenario.processes.on_death, participant.name)
+        is_needed = not participant.served_names.isdisjoint(self._own_names)
+        return is_needed and not is_allowed and self.barrier.substitute(participant.name) is None
 
     def expect_again(self, participant: Participant) -> None:
         """Wait at the start for whom a process that is gone has stood for."""
@@ -238,7 +274,7 @@ class Coordinator(ABC):
 
     def _after_bye(self, participant: Participant, reason: str) -> None:
         """Do what the leave of a process means for the run."""
-        if participant.join.role == "recorder":
+        if participant.join.role == RECORDER:
             self.clock.stop(f"the recorder left: {reason}")
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
@@ -357,6 +393,9 @@ class Coordinator(ABC):
     def publish_end(self) -> None:
         """Put the end of the run into the outbox: event `end`, clock `stopped`."""
         self.clock.stop("ended")
+        for participant in list(self.barrier.participants.values()):
+            if participant.farewell is not None:
+                self.leave(participant, participant.farewell, 0)
         self.outbox.event("end", WORLD, self.ended or "", self.result())
         self.clock.state = "stopped"
         self.outbox.put(keys.CLOCK, self.clock_message())

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 from msgspec import UNSET
 
-from zsim.contract.run_messages import Join
+from zsim.contract.run_messages import Bye, Join
 from zsim.scenario.role_table import ROLES, OnDeath, OnOverdue, agent_names, lets_drop, on_overdue
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Barrier, Participant
@@ -33,6 +33,7 @@ class _Run(Protocol):
     start_wall_ns: int
     release_drones: Callable[[str], None]
     expect_again: Callable[[Participant], None]
+    leave: Callable[[Participant, Bye, int], None]
 
 
 class ProcessLosses:
@@ -48,7 +49,9 @@ class ProcessLosses:
         self._outbox = run.outbox
 
     def died(self, name: str, wall_ns: int) -> None:
-        """Take the death of a process: its token is gone without a bye."""
+        """Take it that the token of a process is gone: it has died, or left where it has said bye."""
+        if self._has_left(name, wall_ns):
+            return
         participant = self._barrier.mark_dead(name, wall_ns)
         if participant is None:
             return
@@ -64,6 +67,14 @@ class ProcessLosses:
             self._run.release_drones(name)
         if action == "end":
             self._run.fail(f"{name} died")
+
+    def _has_left(self, name: str, wall_ns: int) -> bool:
+        """Let a process go of which a bye has come that waits for the loss of its token; return whether one had."""
+        participant = self._barrier.participants.get(name)
+        if participant is None or participant.farewell is None:
+            return False
+        self._run.leave(participant, participant.farewell, wall_ns)
+        return True
 
     def failed(self, name: str, reason: str, wall_ns: int) -> None:
         """Take it that a process has left since it cannot go on; started again, it would fail again."""
@@ -194,7 +205,7 @@ class ProcessLosses:
     def not_shown(self, name: str, fault: str, wall_ns: int) -> None:
         """Take it that a process which joined is not there: what it stands for is as if it had not come."""
         participant = self._barrier.participants.get(name)
-        if participant is None or not participant.alive:
+        if participant is None or not participant.alive or self._has_left(name, wall_ns):
             return
         host, pid = participant.join.host, participant.join.pid
         self._outbox.event("no_show", name, f"{name} on {host} (pid {pid}) {fault}", {"host": host, "pid": pid})

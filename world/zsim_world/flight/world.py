@@ -122,7 +122,7 @@ class World(Coordinator):
             fingerprint=fingerprint(),
             user_sensors=_own_sensors(s) or UNSET,
             sightings=self.fleet.has_sightings or UNSET,
-            module_folders=tuple(map(str, plugin.folders())) if s.names_own_code() else UNSET,
+            module_folders=tuple(map(str, plugin.folders())) if s.own_code() else UNSET,
             changed=self._changed,
         )
 
@@ -131,7 +131,8 @@ class World(Coordinator):
     def snapshot(self) -> State:
         """Return all from which the run goes on to the same bits; nothing is pending in the outbox."""
         self._hash.flush()
-        return {"requests": {"count": self.requests}, **{name: part.snapshot() for name, part in self._parts().items()}}
+        own = {"count": self.requests, "left_early": self.left_early}
+        return {"requests": own, **{name: part.snapshot() for name, part in self._parts().items()}}
 
     def restore(self, state: State) -> None:
         """Take over what `snapshot` of a world of the same scenario returned, but the hash of its truth.
@@ -139,7 +140,7 @@ class World(Coordinator):
         Raises:
             ValueError: it is of another scenario.
         """
-        self.requests = state["requests"]["count"]
+        self.requests, self.left_early = state["requests"]["count"], list(state["requests"]["left_early"])
         for name, part in self._parts().items():
             part.restore(state[name])
 

@@ -305,6 +305,9 @@ class Playback(Coordinator):
     def _after_bye(self, participant: Participant, reason: str) -> None:
         """Go on: the record is there already."""
 
+    def _is_missed_from_now(self, participant: Participant) -> bool:
+        return False
+
     def on_death(self, participant: Participant) -> OnDeath:
         return "drop"
 

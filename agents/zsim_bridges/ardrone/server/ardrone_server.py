@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import DecodeError
+from zsim.errors import DecodeError, without_figures
 from zsim.extras import install_command
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
@@ -172,9 +172,10 @@ class ArdroneServer:
         self._report(reason)
 
     def _report(self, text: str) -> None:
-        """Print a text, once."""
-        if text not in self._reported and len(self._reported) < REPORTED_MAX:
-            self._reported.add(text)
+        """Print a text once, whatever its figures."""
+        reason = without_figures(text)
+        if reason not in self._reported and len(self._reported) < REPORTED_MAX:
+            self._reported.add(reason)
             self._say(f"{self._observer.name}: {text}")
 
 

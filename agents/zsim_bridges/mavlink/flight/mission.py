@@ -36,8 +36,23 @@ COMMANDS = (
 )
 
 
+DEGREES, LOCAL_M = 1e-7, 1e-4  # what one of x and y is in messages that have them as whole numbers
+NO_INT = 2**31 - 1  # INT32_MAX: what NaN is among these
+# https://mavlink.io/en/services/mission.html#mission_item_int
+
+
+def from_int(value: int, unit: float) -> float:
+    """Return a whole number of a message in a unit; NaN for the one that stands for it."""
+    return math.nan if value == NO_INT else unit * value
+
+
+def to_int(value: float, unit: float) -> int:
+    """Return a value in a unit as the whole number of a message."""
+    return round(value / unit) if math.isfinite(value) else NO_INT
+
+
 class PlanItem(NamedTuple):
-    """An item: x and y are latitude and longitude [deg], or [m] in local frames; z is [m]."""
+    """An item: x and y are latitude and longitude [deg], or [m] in local frames; z is [m]. NaN is where one is."""
 
     frame: int
     command: int
@@ -49,8 +64,8 @@ class PlanItem(NamedTuple):
 
     @property
     def has_place(self) -> bool:
-        """Whether it names where, beside a height."""
-        return bool(self.x or self.y) and math.isfinite(self.x) and math.isfinite(self.y)
+        """Whether it names where, beside a height; one of x and y is enough."""
+        return any(math.isfinite(value) and value for value in (self.x, self.y))
 
 
 class MissionReport(NamedTuple):
@@ -81,18 +96,21 @@ class MissionStep(NamedTuple):
 
 
 def place_of(item: PlanItem, state: VehicleState) -> Vector:
-    """Return p_W [m] of an item; without a place of its own it is above or below the vehicle."""
+    """Return p_W [m] of an item; what it leaves out of x and y is where the vehicle is."""
     home = state.home_m or state.position_m
     z = item.z if math.isfinite(item.z) else 0.0
-    if item.frame == MavFrame.LOCAL_NED:
-        return ned_axes.ned((item.x, item.y, z))
-    if item.frame == MavFrame.LOCAL_ENU:
-        return item.x, item.y, z
+    if item.frame in LOCAL:
+        x, y, up = ned_axes.ned((item.x, item.y, z)) if item.frame == MavFrame.LOCAL_NED else (item.x, item.y, z)
+        own_x, own_y, _ = state.position_m
+        return x if math.isfinite(x) else own_x, y if math.isfinite(y) else own_y, up
     height_m = z if item.frame in ABSOLUTE else state.to_global(home)[2] + z
+    latitude_deg, longitude_deg, _ = state.to_global(state.position_m)
     if item.has_place:
-        return state.to_local(item.x, item.y, height_m)
+        latitude_deg = item.x if math.isfinite(item.x) else latitude_deg
+        longitude_deg = item.y if math.isfinite(item.y) else longitude_deg
+        return state.to_local(latitude_deg, longitude_deg, height_m)
     x, y, _ = state.position_m
-    return x, y, state.to_local(*state.to_global(state.position_m)[:2], height_m)[2]
+    return x, y, state.to_local(latitude_deg, longitude_deg, height_m)[2]
 
 
 class Mission:

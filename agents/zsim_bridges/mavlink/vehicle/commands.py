@@ -9,15 +9,23 @@ from typing import NamedTuple
 
 from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.autopilot import ned_axes
-from zsim_bridges.mavlink.autopilot.enums import FORCE, Cmd, Result
+from zsim_bridges.mavlink.autopilot.enums import FORCE, Cmd, MavFrame, Result
 from zsim_bridges.mavlink.autopilot.parameters import Parameters
 from zsim_bridges.mavlink.autopilot.personality import FlightMode, Personality, Settings
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.mission import ABSOLUTE, FRAMES, LOCAL, PlanItem, place_of
+from zsim_bridges.mavlink.flight.mission import (
+    ABSOLUTE,
+    DEGREES,
+    FRAMES,
+    LOCAL,
+    LOCAL_M,
+    PlanItem,
+    from_int,
+    place_of,
+)
 from zsim_bridges.mavlink.flight.position_guidance import Target, is_place
 from zsim_bridges.mavlink.flight.vehicle_flight import Flight
 from zsim_bridges.mavlink.telemetry.telemetry import Telemetry
-from zsim_bridges.mavlink.vehicle.mission_protocol import DEGREES, LOCAL_M
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.wire_message import WireMessage
 
@@ -55,7 +63,8 @@ def request_of(message: dialect.CommandLong | dialect.CommandInt) -> Request:
         place = m.param5, m.param6, m.param7
         return Request(m.command, (m.param1, m.param2, m.param3, m.param4, *place), frame=0)
     unit = LOCAL_M if m.frame in LOCAL else DEGREES
-    return Request(m.command, (m.param1, m.param2, m.param3, m.param4, unit * m.x, unit * m.y, m.z), m.frame)
+    place = from_int(m.x, unit), from_int(m.y, unit), m.z
+    return Request(m.command, (m.param1, m.param2, m.param3, m.param4, *place), m.frame)
 
 
 def answered(refusal: str | None) -> Answer:
@@ -168,8 +177,10 @@ class Commands:
             return None
         own = self._state.position_m
         if not math.isfinite(item.z):
-            absolute = self._state.to_global(own)[2]
-            item = item._replace(z=absolute, frame=ABSOLUTE[0]) if request.frame not in LOCAL else item._replace(z=0.0)
+            if request.frame in LOCAL:
+                item = item._replace(z=-own[2] if request.frame == MavFrame.LOCAL_NED else own[2])
+            else:
+                item = item._replace(z=self._state.to_global(own)[2], frame=ABSOLUTE[0])
         place = place_of(item, self._state)
         return place if is_place(place) else None
 

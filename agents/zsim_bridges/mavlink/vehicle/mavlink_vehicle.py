@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract.messages import Origin
 from zsim.contract.run_messages import Event
+from zsim.errors import without_figures
 from zsim.scenario.scenario import Drone
 from zsim.schema.quantities import G_M_S2
 from zsim_bridges.mavlink.autopilot import personality as personalities
@@ -198,8 +199,8 @@ class MavlinkVehicle:
 
     def _set_point(self, setpoint: setpoints.Setpoint | setpoints.SetpointRefusal) -> None:
         reason = setpoint.reason if isinstance(setpoint, setpoints.SetpointRefusal) else self.flight.set_point(setpoint)
-        if reason and reason not in self._refused and len(self._refused) < 100:
-            self._refused.add(reason)  # a stream would fill the operator's screen
+        if reason and without_figures(reason) not in self._refused and len(self._refused) < 100:
+            self._refused.add(without_figures(reason))  # a stream would fill the operator's screen
             self._answer(reason)
 
     def _steer(self, message: dialect.ManualControl) -> None:

@@ -15,7 +15,7 @@ from zsim_bridges.mavlink.autopilot.enums import (
     MavFrame,
     MissionResult,
 )
-from zsim_bridges.mavlink.flight.mission import COMMANDS, FRAMES, LOCAL, PlanItem
+from zsim_bridges.mavlink.flight.mission import COMMANDS, DEGREES, FRAMES, LOCAL, LOCAL_M, PlanItem, from_int, to_int
 from zsim_bridges.mavlink.flight.position_guidance import is_place
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.wire_message import WireMessage
@@ -23,7 +23,6 @@ from zsim_bridges.mavlink.wire.wire_message import WireMessage
 ITEMS_MAX = 1000  # chosen: of one mission; autopilots keep some hundreds
 RETRY_NS = 500_000_000  # ns of wall time until an item is requested again
 TRIES_MAX = 10
-DEGREES, LOCAL_M = 1e-7, 1e-4  # what one of x and y in MISSION_ITEM_INT is
 PLACED = (
     Cmd.FENCE_RETURN_POINT,
     Cmd.FENCE_POLYGON_INCLUSION,
@@ -174,11 +173,11 @@ class _Upload:
 
 def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> PlanItem:
     """Return the item in a message."""
-    unit = 1.0
+    x, y = message.x, message.y
     if isinstance(message, dialect.MissionItemInt):
         unit = LOCAL_M if message.frame in LOCAL else DEGREES
+        x, y = from_int(message.x, unit), from_int(message.y, unit)
     params = message.param1, message.param2, message.param3, message.param4
-    x, y = unit * message.x, unit * message.y
     return PlanItem(message.frame, message.command, params, x, y, message.z, bool(message.autocontinue))
 
 
@@ -189,7 +188,8 @@ def item_fault(item: PlanItem, type_: int) -> MissionResult | None:
         return MissionResult.UNSUPPORTED
     if item.frame not in FRAMES:
         return MissionResult.UNSUPPORTED_FRAME
-    return None if _has_good_place(item) and (type_ != FENCE or item.has_place) else MissionResult.INVALID
+    is_whole = item.has_place and math.isfinite(item.x) and math.isfinite(item.y)
+    return None if _has_good_place(item) and (type_ != FENCE or is_whole) else MissionResult.INVALID
 
 
 def _has_good_place(item: PlanItem) -> bool:
@@ -216,8 +216,7 @@ def message_of(item: PlanItem, request: Any, sender: tuple[int, int], as_int: bo
     if not as_int:
         return dialect.MissionItem(**fields, x=item.x, y=item.y)
     unit = LOCAL_M if item.frame in LOCAL else DEGREES
-    x, y = (round(value / unit) if math.isfinite(value) else 0 for value in (item.x, item.y))
-    return dialect.MissionItemInt(**fields, x=x, y=y)
+    return dialect.MissionItemInt(**fields, x=to_int(item.x, unit), y=to_int(item.y, unit))
 
 
 def home_item(latitude_deg: float, longitude_deg: float, height_m: float) -> PlanItem:

@@ -11,7 +11,7 @@ from zsim.math.rotation import Vector
 from zsim_bridges.mavlink.autopilot import ned_axes
 from zsim_bridges.mavlink.autopilot.enums import AttitudeMask, MavFrame, TypeMask
 from zsim_bridges.mavlink.autopilot.vehicle_state import VehicleState
-from zsim_bridges.mavlink.flight.mission import ABSOLUTE, RELATIVE
+from zsim_bridges.mavlink.flight.mission import ABSOLUTE, DEGREES, RELATIVE, from_int
 from zsim_bridges.mavlink.flight.position_guidance import NOWHERE, Axes, Target, TiltTarget, is_place
 from zsim_bridges.mavlink.wire import dialect
 
@@ -54,13 +54,16 @@ def from_global(message: dialect.SetPositionTargetGlobalInt, state: VehicleState
     """Return what SET_POSITION_TARGET_GLOBAL_INT asks for."""
     if message.coordinate_frame not in (*ABSOLUTE, *RELATIVE):
         return SetpointRefusal(f"frame {message.coordinate_frame} of a global setpoint is not flown")
-    if not math.isfinite(message.alt):
-        return _target(message, (math.nan, math.nan, math.nan), False, state)
-    place = 1e-7 * message.lat_int, 1e-7 * message.lon_int
+    own = state.to_global(state.position_m)
     height_m = message.alt
     if message.coordinate_frame in RELATIVE:
         height_m += state.to_global(state.home_m or state.position_m)[2]
-    return _target(message, state.to_local(*place, height_m), False, state)
+    given = from_int(message.lat_int, DEGREES), from_int(message.lon_int, DEGREES), height_m
+    known = [value if math.isfinite(value) else here for value, here in zip(given, own, strict=True)]
+    x, y, z = state.to_local(known[0], known[1], known[2])
+    latitude_deg, longitude_deg, _ = given
+    place = x if math.isfinite(longitude_deg) else math.nan, y if math.isfinite(latitude_deg) else math.nan
+    return _target(message, (*place, z if math.isfinite(height_m) else math.nan), False, state)
 
 
 def _from_here(offset: Vector, along_heading: bool, state: VehicleState) -> Vector:

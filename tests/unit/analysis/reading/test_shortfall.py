@@ -557,6 +557,7 @@ EXPECTS_FENCE = 'processes.expect=["estimator.drone1", "fence.main"]'
         ([process_event("death", "estimator.drone1", on_death="restart")], (), []),
         ([process_event("death", "estimator.drone1", on_death="end")], (), [True]),
         ([process_event("leave", "fence.main")], (EXPECTS_FENCE,), [False]),
+        ([process_event("leave", "estimator.drone1", fails=True)], (), [True]),
         ([process_event("end", "world"), process_event("death", "fence.main", on_death="end")], (EXPECTS_FENCE,), []),
     ],
 )

@@ -27,8 +27,9 @@ from zsim.scenario import scenario_file
 from zsim.terminal.fitted_table import FittedTable
 from zsim_analysis.reading.formation import window
 from zsim_analysis.reading.window_text import percent_text, span_text
+from zsim_analysis.report.figures.report_figures import figures
 from zsim_analysis.report.make_report import judge, make_report, page
-from zsim_analysis.report.pages import thinned
+from zsim_analysis.report.pages import thinned, write_page, write_report
 from zsim_analysis.report.paper import PAPER_TABLE_1
 from zsim_analysis.report.tables import PAPER_COLUMN, TERMINAL_COLUMNS, table, terminal_text
 
@@ -468,3 +469,28 @@ def test_several_clusters_have_a_table_and_figures_each(tmp_path):
     assert set(summary.errors) == set(pair_names)
     assert (tmp_path / "figures" / "figure_8_shape.png").exists()
     assert (tmp_path / "figures" / "figure_8_shape_main.png").exists()
+
+
+@pytest.mark.parametrize("form", ["run", "page"])
+def test_a_report_is_not_written_through_a_link(tmp_path: Path, form: str) -> None:
+    """Who sends a run's folder could have its report replace, and remove, files elsewhere."""
+    elsewhere, folder = tmp_path / "elsewhere", tmp_path / "run"
+    elsewhere.mkdir()
+    folder.mkdir()
+    (elsewhere / "drones.svg").write_text("mine")
+    link = folder / ("figures" if form == "run" else "report-figures")
+    link.symlink_to(elsewhere)
+    judged, formations, summary = judge_flown(tmp_path)
+    drawings = figures(judged, formations, summary)
+    with refused(ReportError, str(link), "link"):
+        if form == "run":
+            write_report(folder, b"{}", drawings, lambda _: "", lambda _: None)
+        else:
+            write_page(folder / "report.html", drawings, lambda _: "", lambda _: None)
+    assert [path.name for path in elsewhere.iterdir()] == ["drones.svg"]
+    assert list(folder.iterdir()) == [link]
+
+
+def judge_flown(folder: Path):
+    synthetic_record.write(folder / "run.mcap", flown())
+    return judge(folder / "run.mcap")

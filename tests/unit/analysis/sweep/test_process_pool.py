@@ -1,7 +1,9 @@
 """Many runs of a sweep, flown by workers that may die."""
 
 import multiprocessing
+import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +13,7 @@ from short_flight import ONE
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_analysis.sweep import process_pool
-from zsim_analysis.sweep.process_pool import READY
+from zsim_analysis.sweep.process_pool import READY, WorkerProcess
 from zsim_analysis.sweep.sweep_run import Row, Task
 
 
@@ -129,3 +131,18 @@ def test_a_sweep_that_is_closed_leaves_no_worker() -> None:
     next(flying)
     flying.close()
     assert FakeWorker.alive == set()
+
+
+def test_a_worker_imports_nothing_from_the_working_folder_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A spawned interpreter begins with `-c`, for which that folder comes before the standard library."""
+    (tmp_path / "signal.py").write_text("open('executed', 'w').close()\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    worker = WorkerProcess()
+    ready = worker.receive()
+    worker.stop()
+    assert ready == READY
+    assert not (tmp_path / "executed").exists()
+    assert "PYTHONSAFEPATH" not in os.environ

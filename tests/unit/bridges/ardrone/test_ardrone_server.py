@@ -34,3 +34,19 @@ def test_pictures_are_asked_for_where_they_can_be_encoded_else_the_extra_is_name
     assert len(lines) == (0 if is_installed else 1)
     assert all(install_command(["video"]) in line for line in lines)
     assert observer.health.refused == 0
+
+
+def test_a_reason_is_printed_once_whatever_its_figures_and_all_are_counted():
+    """A flood of datagrams has every length; each drone and each program that sends has a line of its own."""
+    link: Any = FakeLink()
+    origin = Origin(0.0, 0.0, 0.0)
+    info = Info(0, 0, 1, "r", "zsim", "lockstep", 1.0, 1, 1, 1, 1, origin, DRONES, (), SCENARIO, "", "", "")
+    observer, lines = ObserverProcess(link, info, "ardrone.main"), []
+    server = ArdroneServer(link, info, observer, lines.append, ArdroneOptions("127.0.0.2", frozenset(), None))
+    for size in range(40):
+        for drone in ("drone1", "drone2"):
+            server._refuse(f"{drone}: a datagram of {size} bytes on the navdata port does not ask for navdata")
+    for host in ("10.0.0.7", "10.0.0.8", "fe80::1", "fe80::2"):
+        server._refuse(f"{host} sends datagrams, and is no --peer")
+    assert len(lines) == 2 + 4
+    assert observer.health.refused == 2 * 40 + 4

@@ -12,7 +12,8 @@ import typer
 from mavlink_drone import ORIGIN, SCENARIO
 
 from zsim.contract.run_messages import ControlAnswer
-from zsim.errors import RunError
+from zsim.errors import NoWorldError, RunError
+from zsim.transport.session import Unanswered
 from zsim_bridges.mavlink.flight.mission import MissionReport
 from zsim_bridges.mavlink.serve.mavlink_server import MavlinkOptions, MavlinkServer
 from zsim_bridges.mavlink.serve.peers import LEARNT_MAX, SILENT_S, Peers
@@ -188,6 +189,9 @@ def test_a_run_without_a_pace_is_refused_unless_one_is_set() -> None:
     assert asked == [("rate", "mavlink.main", {"value": 3.0})]
     with pytest.raises(RunError, match="not now"):
         set_pace(world(False, asked), run("lockstep", 0.0), "mavlink.main", 3.0)
+    gone: Any = SimpleNamespace(request=lambda *_: Unanswered(ok=False, error="nobody answers there"))
+    with pytest.raises(NoWorldError, match="nobody answers there"):
+        set_pace(gone, run("lockstep", 0.0), "mavlink.main", 3.0)
 
 
 def test_endpoints_are_hosts_and_ports_that_can_be_reached() -> None:

@@ -1,16 +1,17 @@
 """A vehicle as its clients see it: arming, modes, setpoints, missions, fence, parameters, what is refused."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import msgspec
 import pytest
 from mavlink_drone import FlownDrone
 
 from zsim.contract.flight_messages import Mode as ModeCommand
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Event
-from zsim_bridges.mavlink.autopilot.enums import FENCE, FORCE, Cmd, MavFrame, Result, TypeMask
+from zsim_bridges.mavlink.autopilot.enums import FENCE, FORCE, Cmd, MavFrame, MissionResult, Result, TypeMask
 from zsim_bridges.mavlink.autopilot.personality import COPTER_MODES, PX4_MODES, FlightMode
 from zsim_bridges.mavlink.wire import dialect
 
@@ -188,6 +189,13 @@ def test_a_frame_that_is_not_flown_is_refused_once(frame: int) -> None:
     assert sum(text.startswith("Denied: frame") for text in drone.texts()) == 1
 
 
+def test_frames_that_are_not_flown_are_one_reason() -> None:
+    drone = flying("ardupilot")
+    for frame in range(100, 140):
+        drone.receive(velocity_setpoint(1.0, 0.0, 0.0, frame))
+    assert sum(text.startswith("Denied: frame") for text in drone.texts()) == 1
+
+
 @AUTOPILOTS
 def test_it_returns_home_and_lands(autopilot: str) -> None:
     drone = flying(autopilot)
@@ -198,7 +206,7 @@ def test_it_returns_home_and_lands(autopilot: str) -> None:
     assert abs(drone.position[0]) < 1.0
 
 
-def upload(drone: FlownDrone, items: list[dialect.MissionItemInt], type_: int = 0) -> int:
+def upload(drone: FlownDrone, items: Sequence[dialect.MissionItemInt | dialect.MissionItem], type_: int = 0) -> int:
     drone.receive(dialect.MissionCount(1, 1, len(items), mission_type=type_))
     for item in items:
         drone.receive(item)
@@ -313,6 +321,109 @@ def test_a_mission_is_downloaded_as_it_was_uploaded() -> None:
     drone.receive(dialect.MissionClearAll(1, 1))
     drone.receive(dialect.MissionRequestList(1, 1))
     assert drone.all(dialect.MissionCount)[-1].count == 0
+
+
+NO_INT = 2**31 - 1  # INT32_MAX
+
+
+@AUTOPILOTS
+def test_int32_max_in_an_item_is_the_nan_of_the_other_kind_of_items_and_back(autopilot: str) -> None:
+    """https://mavlink.io/en/services/mission.html: a waypoint without a place is above where the vehicle is."""
+    drone = flying(autopilot)
+    drone.position[:2] = [7.0, -4.0]
+    climb = dialect.MissionItemInt(
+        1,
+        1,
+        1,
+        MavFrame.GLOBAL_RELATIVE_ALT_INT,
+        Cmd.NAV_WAYPOINT,
+        autocontinue=1,
+        x=NO_INT,
+        y=NO_INT,
+        z=6.0,
+        param4=NAN,
+    )
+    first = [item(0, Cmd.NAV_TAKEOFF, 0, 3)]
+    assert upload(drone, [*first, climb]) == 0
+    drone.receive(dialect.MissionRequestInt(1, 1, 1))
+    drone.receive(dialect.MissionRequest(1, 1, 1))
+    as_int, as_float = drone.all(dialect.MissionItemInt)[-1], drone.all(dialect.MissionItem)[-1]
+    assert (as_int.x, as_int.y) == (NO_INT, NO_INT)
+    assert math.isnan(as_float.x)
+    assert math.isnan(as_float.y)
+    assert upload(drone, [*first, as_float]) == 0
+    drone.receive(dialect.MissionRequestInt(1, 1, 1))
+    assert (drone.all(dialect.MissionItemInt)[-1].x, drone.all(dialect.MissionItemInt)[-1].y) == (NO_INT, NO_INT)
+    assert drone.command(Cmd.MISSION_START, 1) == Result.ACCEPTED
+    drone.until(lambda: drone.position[2] > 4.8)  # within the radius in which it is reached
+    assert drone.position[:2] == pytest.approx([7.0, -4.0], abs=0.5)
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize(
+    ("frame", "x", "y", "place"),
+    [
+        (MavFrame.GLOBAL_RELATIVE_ALT_INT, NO_INT, NO_INT, (7.0, -4.0)),
+        (MavFrame.GLOBAL_RELATIVE_ALT_INT, round(47.4e7), NO_INT, (7.0, 0.0)),
+        (MavFrame.GLOBAL_RELATIVE_ALT_INT, NO_INT, round(8.5e7), (0.0, -4.0)),
+        (MavFrame.LOCAL_NED, NO_INT, NO_INT, (7.0, -4.0)),
+        (MavFrame.LOCAL_NED, NO_INT, 20_000, (2.0, -4.0)),
+    ],
+)
+def test_int32_max_in_a_command_keeps_the_place(
+    autopilot: str, frame: int, x: int, y: int, place: tuple[float, float]
+) -> None:
+    drone = flying(autopilot)
+    drone.position[:2] = [7.0, -4.0]
+    drone.step()
+    up = -5.0 if frame == MavFrame.LOCAL_NED else 5.0
+    drone.receive(dialect.CommandInt(1, 1, frame, Cmd.DO_REPOSITION, param1=-1.0, param4=NAN, x=x, y=y, z=up))
+    assert drone.all(dialect.CommandAck)[-1].result == Result.ACCEPTED
+    drone.step(700)
+    assert drone.position == pytest.approx([*place, 5.0], abs=0.6)
+
+
+@AUTOPILOTS
+def test_a_command_without_a_height_in_a_local_frame_keeps_the_height(autopilot: str) -> None:
+    drone = flying(autopilot)
+    drone.receive(
+        dialect.CommandInt(1, 1, MavFrame.LOCAL_NED, Cmd.DO_REPOSITION, param1=-1.0, param4=NAN, x=0, y=30_000, z=NAN)
+    )
+    drone.step(500)
+    assert drone.position == pytest.approx([3.0, 0.0, 3.0], abs=0.6)
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize("whole", [{"x": NO_INT}, {"y": NO_INT}, {"x": NO_INT, "y": NO_INT}])
+def test_a_fence_needs_all_of_a_place(autopilot: str, whole: dict[str, int]) -> None:
+    circle = item(0, Cmd.FENCE_CIRCLE_INCLUSION, 0, 0, 2.0, type_=FENCE)
+    assert upload(FlownDrone(autopilot), [msgspec.structs.replace(circle, **whole)], FENCE) == MissionResult.INVALID
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize(
+    ("lat", "lon", "alt", "place"),
+    [
+        (NO_INT, NO_INT, 5.0, (7.0, -4.0, 5.0)),
+        (round(47.4e7), NO_INT, 5.0, (7.0, 0.0, 5.0)),
+        (NO_INT, round(8.5e7), NAN, (0.0, -4.0, 3.0)),
+    ],
+)
+def test_int32_max_in_a_setpoint_is_an_axis_that_is_not_given(
+    autopilot: str, lat: int, lon: int, alt: float, place: tuple[float, float, float]
+) -> None:
+    drone = flying(autopilot)
+    drone.position[:2] = [7.0, -4.0]
+    drone.step()
+    frame = MavFrame.GLOBAL_RELATIVE_ALT_INT
+    to = dialect.SetPositionTargetGlobalInt(0, 1, 1, frame, POSITION_ONLY, lat, lon, alt)
+    drone.receive(to)
+    set_mode(drone, (PX4_MODES if autopilot == "px4" else COPTER_MODES)[FlightMode.OFFBOARD])
+    for _ in range(700):
+        drone.receive(to)
+        drone.step()
+    assert drone.position == pytest.approx(place, abs=0.6)
+    assert not any(text.startswith("Denied") for text in drone.texts())
 
 
 def test_an_item_that_is_not_flown_ends_an_upload() -> None:

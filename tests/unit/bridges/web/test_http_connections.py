@@ -7,7 +7,7 @@ from typing import Any
 
 from aiohttp import ClientSession, web
 
-from zsim_bridges.web.http_connections import HttpConnections
+from zsim_bridges.web.http_connections import BODY_BYTES_MAX, SMALL_BYTES, HttpConnections
 
 HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\n"  # the head never ends
 WHOLE = HALF + b"\r\n"
@@ -30,12 +30,15 @@ STARTED = web.AppKey("started", asyncio.Semaphore)
 
 
 @asynccontextmanager
-async def server(head_s: float = LONG_S) -> AsyncIterator[tuple[Callable[[], Coroutine[Any, Any, Stream]], str, Any]]:
+async def server(
+    request_s: float = LONG_S, body_bytes_max: int = BODY_BYTES_MAX
+) -> AsyncIterator[tuple[Callable[[], Coroutine[Any, Any, Stream]], str, Any]]:
     """Yield what connects, the URL, and the application."""
-    connections = HttpConnections(STRANGERS, CONNECTIONS, head_s)
+    connections = HttpConnections(STRANGERS, CONNECTIONS, request_s, body_bytes_max)
     app = web.Application(middlewares=[connections.observe])
     app[RELEASE], app[STARTED] = asyncio.Event(), asyncio.Semaphore(0)
     app.router.add_get("/{path:.*}", answer)
+    app.router.add_post("/{path:.*}", answer)
     runner = web.AppRunner(app)
     await runner.setup()
     http = runner.server
@@ -87,7 +90,7 @@ def test_the_oldest_head_that_does_not_end_makes_room_for_the_next_connection() 
 
 def test_a_head_that_does_not_end_in_time_ends_its_connection() -> None:
     async def test() -> None:
-        async with server(head_s=0.05) as (connect, _, _):
+        async with server(request_s=0.05) as (connect, _, _):
             half = await connect()
             half[1].write(HALF)
             assert await is_cut(half)
@@ -124,3 +127,66 @@ def test_a_request_under_way_is_answered_however_many_connections_there_are() ->
             assert [await status(stream, b"") for stream in busy] == [200] * CONNECTIONS
 
     asyncio.run(test())
+
+
+# Bodies
+
+SHORT_S = 0.2  # wall time
+
+
+def head_of(size: int, path: str = "/") -> bytes:
+    return b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % (path.encode(), size)
+
+
+def test_a_request_whose_body_does_not_end_is_answered_and_its_connection_closed() -> None:
+    async def scenario() -> None:
+        async with server(request_s=SHORT_S) as (connect, _, _):
+            slow, known = await connect(), await connect()
+            assert await status(known, WHOLE) == 200
+            for stream in (slow, known):  # who was answered before may not take longer
+                assert await status(stream, head_of(100) + b"half") == 408
+            for reader, _ in (slow, known):
+                await reader.read()  # to the end of the connection
+
+    asyncio.run(scenario())
+
+
+def test_a_known_connection_does_not_begin_requests_that_never_end() -> None:
+    async def scenario() -> None:
+        async with server(request_s=SHORT_S) as (connect, _, _):
+            reader, writer = known = await connect()
+            assert await status(known, WHOLE) == 200
+            writer.write(HALF)
+            assert await reader.read() == b""
+
+    asyncio.run(scenario())
+
+
+def test_large_bodies_wait_for_room_and_small_ones_do_not() -> None:
+    async def scenario() -> None:
+        size = 2 * SMALL_BYTES
+        async with server(body_bytes_max=size) as (connect, _, app):
+            first, second, small = await connect(), await connect(), await connect()
+            first[1].write(head_of(size, "/wait") + bytes(size))
+            await app[STARTED].acquire()
+            waiting = asyncio.create_task(status(second, head_of(size) + bytes(size)))
+            for _ in range(3):
+                assert await status(small, head_of(SMALL_BYTES) + bytes(SMALL_BYTES)) == 200
+            assert not waiting.done()
+            app[RELEASE].set()
+            assert await waiting == 200
+
+    asyncio.run(scenario())
+
+
+def test_or_are_refused_when_there_is_none_in_their_time() -> None:
+    async def scenario() -> None:
+        size = 2 * SMALL_BYTES
+        async with server(request_s=SHORT_S, body_bytes_max=size) as (connect, _, app):
+            first, second = await connect(), await connect()
+            first[1].write(head_of(size, "/wait") + bytes(size))
+            await app[STARTED].acquire()
+            assert await status(second, head_of(size) + bytes(size)) == 408
+            app[RELEASE].set()
+
+    asyncio.run(scenario())

@@ -14,6 +14,8 @@ from refused import has_terms
 
 from zsim import __version__
 from zsim.runtime import progress
+from zsim_deploy.inventory.processes import MODULE
+from zsim_deploy.launch import console_process
 from zsim_deploy.launch import role_launcher as module
 from zsim_deploy.launch.role_launcher import ForkedProcess, RoleLauncher, RoleProcess
 
@@ -99,7 +101,7 @@ def test_it_is_a_child_of_its_own_session_under_its_own_name(role_launcher: Role
     await_words(log)
     seen = psutil.Process(role.pid)
     assert seen.ppid() == psutil.Process().pid
-    assert [word for word in seen.cmdline() if word] == [sys.executable, "-m", "zsim_deploy.cli", *WAITING]
+    assert [word for word in seen.cmdline() if word] == [sys.executable, "-P", "-m", "zsim_deploy.cli", *WAITING]
     end(role)
 
 
@@ -222,3 +224,22 @@ def test_an_exit_code_that_somebody_else_took_is_no_error() -> None:
         gone = ForkedProcess(child.pid, child.stdin, None)
         assert gone.poll() == 0
         gone.kill()
+
+
+STARTS = {
+    "fork server": module.FORKSERVER,
+    "role": module.COMMAND,
+    "console": console_process.ZSIM,
+    "service and remote role": (sys.executable, *MODULE),
+}
+
+
+@pytest.mark.parametrize("command", STARTS.values(), ids=STARTS)
+def test_nothing_that_is_started_imports_from_the_working_folder_first(
+    command: tuple[str, ...], tmp_path: Path
+) -> None:
+    """`python -m` alone imports a file there that is named as a module of the standard library."""
+    for name in ("argparse", "typing_extensions", "typer", "json", "socket"):
+        (tmp_path / f"{name}.py").write_text("open('executed', 'w').close()\n")
+    subprocess.run([*command, "--version"], cwd=tmp_path, stdin=subprocess.DEVNULL, capture_output=True, timeout=END_S)
+    assert sorted(place.suffix for place in tmp_path.iterdir()) == [".py"] * 5

@@ -98,8 +98,8 @@ def of_kubernetes(texts: dict[str, str]) -> Words:
 
 
 def cli_words(words: list[str]) -> list[str]:
-    assert words[:2] == ["-m", "zsim_deploy.cli"]
-    return words[2:]
+    assert words[:3] == ["-P", "-m", "zsim_deploy.cli"]
+    return words[3:]
 
 
 def projects(texts: dict[str, str]) -> dict[str, Any]:
@@ -352,7 +352,7 @@ def test_words_reach_the_process_as_they_are(tmp_path: Path, step: Scenario) -> 
     text = HOSTS.replace("/opt/zsim}", '"/opt/my zsim/100%$A\'"}').replace("192.168.1.10", "fe80::1%eth0")
     texts = systemd.render(placed(tmp_path, text), step)
     (line,) = options_of(texts["lab/zsim-world.service"])["ExecStart"]
-    assert line.startswith("""":/opt/my zsim/100%%$A'/venv/bin/python" -m """)
+    assert line.startswith("""":/opt/my zsim/100%%$A'/venv/bin/python" -P -m """)
     assert "tls/[fe80::1%%eth0]:7447" in line
 
 

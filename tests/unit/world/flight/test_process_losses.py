@@ -3,10 +3,11 @@
 from typing import Any
 
 import pytest
+from msgspec import UNSET
 from refused import has_terms
 
 from zsim.contract import keys
-from zsim.contract.run_messages import Bye, Event, Join
+from zsim.contract.run_messages import Bye, Done, Event, Join
 from zsim.errors import RunFailedError, ScenarioError
 from zsim.scenario import scenario_file
 from zsim_world.flight.world import World
@@ -190,8 +191,124 @@ def test_one_that_cannot_go_on_is_named_and_on_death_says_what_follows(
     on_death: str, kinds: list[str], ends: bool, waits: bool
 ) -> None:
     made = world(f"on_death: {{estimator: {on_death}}}")
-    made.handle(keys.process(ME, "bye"), Bye(0, 0, "mine:Law.rates raised", failed=True), 5)
+    made.handle(keys.process(ME, "bye"), Bye(0, 0, "mine:Law.rates raised", True, "run1", 1), 5)
     assert [kind for kind, name in events(made) if name == ME] == kinds
     assert made.ended == ("mine:Law.rates raised" if ends else None)
     assert (made.failure is not None) is ends
     assert made.may_advance() is not (ends or waits)
+
+
+# Who leaves
+
+
+def say_bye(made: World, reason: str = "enough", **of: Any) -> None:
+    made.handle(keys.process(ME, "bye"), Bye(0, 0, reason, **of), 5)
+
+
+def texts(made: World) -> list[tuple[str, str]]:
+    """Return kinds and texts of the events since the last look."""
+    return [(each.kind, each.text) for _, each in made.take_outbox() if isinstance(each, Event)]
+
+
+@pytest.mark.parametrize(
+    ("of", "wrong"),
+    [
+        ({"run_id": "run1", "incarnation": 2}, ("process/estimator.d1/bye", "incarnation", "2", "1")),
+        ({"run_id": "run0", "incarnation": 1}, ("process/estimator.d1/bye", "run_id", "'run0'", "'run1'")),
+        ({"incarnation": 2}, ("process/estimator.d1/bye", "incarnation", "2", "1")),
+        ({"run_id": "run0"}, ("process/estimator.d1/bye", "run_id", "'run0'", "'run1'")),
+    ],
+)
+@pytest.mark.parametrize("failed", [UNSET, True])
+def test_a_bye_of_another_incarnation_or_run_is_refused(
+    of: dict[str, Any], wrong: tuple[str, ...], failed: Any
+) -> None:
+    made = world("on_death: {}")
+    say_bye(made, failed=failed, **of)
+    ((kind, text),) = texts(made)
+    assert kind == "refused"
+    assert has_terms(text, *wrong)
+    assert made.barrier.participants[ME].alive
+    assert made.ended is None
+
+
+def test_a_late_bye_of_a_former_incarnation_ends_nothing() -> None:
+    made = world("on_death: {}")
+    made.losses.died(ME, 1)
+    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 2, "estimator", "h", 8, GATE_NS), 2)
+    say_bye(made, run_id="run1", incarnation=1)
+    assert [kind for kind, _ in events(made)] == ["death", "restart", "refused"]
+    assert made.barrier.participants[ME].join.incarnation == 2
+
+
+@pytest.mark.parametrize("failed", [UNSET, True])
+def test_a_bye_without_an_incarnation_counts_when_the_token_is_gone_as_well(failed: Any) -> None:
+    made = world("on_death: {estimator: drop}")
+    say_bye(made, failed=failed)
+    assert events(made) == []
+    made.losses.died(ME, 6)
+    assert [kind for kind, _ in events(made)] == (["failure", "drop"] if failed is True else ["leave"])
+    assert ME not in made.barrier.participants
+
+
+def test_or_when_nobody_ever_showed_a_token() -> None:
+    made = world("on_death: {}")
+    say_bye(made)
+    made.losses.not_shown(ME, "has no liveliness token", 6)
+    assert events(made) == [("leave", ME)]
+
+
+def test_or_when_the_run_is_over() -> None:
+    made = world("on_death: {}")
+    say_bye(made)
+    made.publish_end()
+    assert events(made) == [("leave", ME), ("end", "world")]
+    assert not made.is_waiting_to_leave()
+    assert made.left_early == []
+
+
+def test_who_says_done_after_such_a_bye_has_not_said_it() -> None:
+    """A living estimator that somebody else says bye for takes part as before, and its death is a death."""
+    made = world("on_death: {}")
+    say_bye(made)
+    made.handle(keys.process(ME, "done"), Done(0, 0, "run1", 1, 0, 0), 6)
+    ((kind, text),) = texts(made)
+    assert kind == "refused"
+    assert has_terms(text, "process/estimator.d1/bye", "incarnation", "missing", "1")
+    made.losses.died(ME, 7)
+    assert events(made) == [("death", ME)]
+
+
+@pytest.mark.parametrize(
+    ("processes", "serves", "fails"),
+    [
+        ("on_death: {}", (), True),
+        ("on_death: {estimator: drop}", (), False),
+        ("on_death: {estimator.d1: drop}", (), False),
+        ("on_death: {}", (ME,), False),
+    ],
+)
+def test_who_leaves_early_is_named_and_fails_the_run_unless_that_is_allowed(
+    processes: str, serves: tuple[str, ...], fails: bool
+) -> None:
+    made = world(processes)
+    if serves:
+        made.handle(keys.process("host.b", "join"), Join(0, 0, "run1", 9, "host", "h", 9, 0, serves=serves), 0)
+    made.take_outbox()
+    say_bye(made, run_id="run1", incarnation=1)
+    (event,) = [each for _, each in made.take_outbox() if isinstance(each, Event)]
+    assert event.data == {"reason": "enough", "run_id": "run1", "incarnation": 1, **({"fails": True} if fails else {})}
+    assert [has_terms(line, ME, "0.02 s", "enough") for line in made.left_early] == [True] * fails
+    assert made.ended is None
+    restored = world(processes)
+    restored.restore(made.snapshot())
+    assert restored.left_early == made.left_early
+
+
+@pytest.mark.parametrize(("name", "role"), [("console.1", "console"), ("recorder", "recorder")])
+def test_who_is_not_needed_may_leave_and_a_recorder_ends_the_run(name: str, role: str) -> None:
+    made = world("on_death: {}")
+    made.handle(keys.process(name, "join"), Join(0, 0, "run1", 4, role, "h", 8, 0), 0)
+    made.handle(keys.process(name, "bye"), Bye(0, 0, "enough", UNSET, "run1", 4), 5)
+    assert made.left_early == []
+    assert (made.ended is not None) is (role == "recorder")

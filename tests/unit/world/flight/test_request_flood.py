@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+from msgspec import UNSET
 from msgspec.structs import replace
 from refused import has_terms
 
@@ -77,7 +78,7 @@ def test_a_process_joins_and_leaves_so_often_only(world: World, period_ns: int) 
     for number in range(FLOOD):
         join = Join(0, number, "run1", number, "console", "here", 1, period_ns)
         world.handle(keys.process("console.x", "join"), join, 0)
-        world.handle(keys.process("console.x", "bye"), Bye(0, number, "flood"), 0)
+        world.handle(keys.process("console.x", "bye"), Bye(0, number, "flood", UNSET, "run1", number), 0)
     kinds = [event.kind for event in events(world)]
     assert {kind: kinds.count(kind) for kind in set(kinds)} == {
         "join": CHANGES_MAX,
@@ -167,7 +168,7 @@ def test_newcomers_join_so_often_only_all_names_together(world: World, period_ns
     assert world.result()["refused"] == 2 * FLOOD - STRANGERS_MAX
     join(world, "estimator.d1", period_ns)
     join(world, "console.0", period_ns)
-    world.handle(keys.process("console.0", "bye"), Bye(0, 0, "over"), 0)
+    world.handle(keys.process("console.0", "bye"), Bye(0, 0, "over", UNSET, "run1", 1), 0)
     join(world, "console.0", period_ns)
     assert kinds(world) == {"join": 3, "leave": 1}
 

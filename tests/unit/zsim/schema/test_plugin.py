@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import pytest
 from refused import has_terms
 
-from zsim.errors import DocumentError
+from zsim.errors import DocumentError, NotTrustedError
 from zsim.schema import plugin
 
 
@@ -124,3 +124,60 @@ def test_a_folder_is_named_once_and_hides_nothing(beside: Path) -> None:
     assert plugin.load_module("json", "").__file__ != str(beside / "json.py")
     plugin.load_module("plugin_meter", "")
     assert sys.path.count(str(beside)) == 1
+
+
+# Names without imports
+
+
+@pytest.mark.parametrize(
+    "name", ["plugin_meter:Good", "plugin_broken:Any", "plugin_exits:Any", "plugin_package.inner:Inner"]
+)
+def test_a_name_is_found_without_running_its_module(beside: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, name.partition(":")[0], raising=False)
+    (beside / "plugin_package").mkdir()
+    (beside / "plugin_package" / "__init__.py").write_text("1 / 0\n")
+    (beside / "plugin_package" / "inner.py").write_text("1 / 0\nif True:\n    class Inner: pass\n")
+    for broken in ("plugin_broken", "plugin_exits"):
+        with (beside / f"{broken}.py").open("a") as file:
+            file.write("from typing import Any\n")
+    former = list(sys.path)
+    with plugin.names_only() as skipped:
+        with pytest.raises(NotTrustedError) as raised:
+            plugin.load(name, "a.yaml: meter", Meter)
+        assert skipped == [name]
+        assert not plugin.may_import()
+    assert has_terms(raised.value.faults[0], "a.yaml: meter", repr(name), "--trust")
+    assert name.partition(":")[0] not in sys.modules
+    assert sys.path == former  # else what zsim imports later, and is not installed, would be found there
+    assert plugin.may_import()
+
+
+@pytest.mark.parametrize(
+    ("name", "terms"),
+    [
+        ("plugin_nowhere:Good", ("'plugin_nowhere:Good'", "ModuleNotFoundError")),
+        ("plugin_meter.inner:Good", ("'plugin_meter.inner:Good'", "no package")),
+        ("plugin_meter:Bad", ("'plugin_meter:Bad'", "Good, Half")),
+        ("plugin_unread:Good", ("'plugin_unread:Good'", "SyntaxError")),
+    ],
+)
+def test_and_refused_where_it_is_not_there(beside: Path, name: str, terms: tuple[str, ...]) -> None:
+    (beside / "plugin_unread.py").write_text("class\n")
+    with plugin.names_only() as skipped:
+        with pytest.raises(DocumentError) as raised:
+            plugin.load(name, "a.yaml: meter", Meter)
+        assert skipped == []
+    assert not isinstance(raised.value, NotTrustedError)
+    assert has_terms(raised.value.faults[0], "a.yaml: meter", *terms)
+
+
+def test_code_of_zsim_is_imported_whoever_names_it() -> None:
+    with plugin.names_only():
+        assert plugin.load_module("zsim.errors", "a.yaml: module") is sys.modules["zsim.errors"]
+
+
+def test_processes_that_are_started_import_nothing_either(beside: Path) -> None:
+    code = "from zsim.schema import plugin; plugin.load_module('plugin_meter', 'a.yaml: module')"
+    with plugin.names_only():
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert has_terms(done.stderr.splitlines()[-1], "a.yaml: module", "'plugin_meter'", "--trust")
