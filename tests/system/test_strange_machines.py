@@ -9,9 +9,10 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-from federation import PAIR, compiled, free_port
+from federation import ONE, PAIR, Federation, compiled, free_port
 from forked_commands import COLUMNS, ROOT, USER_FAULT, ZSIM, refusal
 from wire import PATIENCE_S
 
@@ -19,6 +20,7 @@ from zsim.math import compiled as kernels
 from zsim.record import RecordReader, completeness
 
 __all__ = ["compiled"]
+pytestmark = pytest.mark.xdist_group("strange_machines")  # one flight for all
 needs_root = pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("unshare"), reason="mounts need root")
 SHORT = ("--duration", "1", "--no-report")
 LOCKLESS = """
@@ -29,10 +31,10 @@ fcntl.flock = flock
 """
 
 
-def zsim(*arguments: str, prefix: tuple[str, ...] = (), **variables: str) -> "subprocess.CompletedProcess[str]":
+def zsim(*arguments: str, **variables: str) -> "subprocess.CompletedProcess[str]":
     """Run a command to its end as a user would start it, with these variables of the environment."""
     environment = {**os.environ, **COLUMNS, **variables}
-    command = [*prefix, *ZSIM, *arguments]
+    command = [*ZSIM, *arguments]
     return subprocess.run(
         command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
@@ -233,3 +235,59 @@ def test_a_run_and_a_sweep_go_on_without_locks(tmp_path: Path, lockless: dict[st
         ]
     record = (tmp_path / "runs" / "run.mcap").read_bytes()
     assert record
+
+
+NGINX = """
+daemon off; pid {folder}/nginx.pid; error_log {folder}/error.log; worker_processes 1;
+events {{}}
+http {{
+  access_log off; client_body_temp_path {folder}/b; proxy_temp_path {folder}/p; fastcgi_temp_path {folder}/f;
+  uwsgi_temp_path {folder}/u; scgi_temp_path {folder}/s;
+  map $http_upgrade $connection_upgrade {{ default upgrade; '' close; }}
+  server {{
+    listen 127.0.0.1:{port};
+    location /zsim/ {{ {passed} proxy_pass http://127.0.0.1:{console}/; }}
+    location = /zsim {{ {passed} if ($http_upgrade) {{ rewrite ^ / break; proxy_pass http://127.0.0.1:{console}; }} return 301 /zsim/; }}
+    location /gateway/ {{ {passed} proxy_pass http://127.0.0.1:{gateway}/; }}
+  }}
+}}
+"""
+PASSED = (
+    "proxy_http_version 1.1; proxy_set_header Host $http_host; proxy_set_header Upgrade $http_upgrade; "
+    "proxy_set_header Connection $connection_upgrade;"
+)
+
+
+@pytest.mark.skipif(not shutil.which("nginx"), reason="nginx is missing; on Debian: apt-get install nginx-light")
+def test_the_console_and_the_gateway_behind_a_path_of_a_proxy(federation: Federation, browser: Any) -> None:
+    ports = {name: free_port() for name in ("port", "console", "gateway")}
+    folder = federation.folder
+    (folder / "nginx.conf").write_text(NGINX.format(folder=folder, passed=PASSED, **ports))
+    federation.world(ONE, "--rate", "1", "--duration", "600")
+    console = federation.role("console", "--port", str(ports["console"]), "--token", "secret")
+    gateway = federation.role("gateway", "--http", str(ports["gateway"]), "--lines", str(free_port()))
+    console.line("steer at")
+    gateway.line(f":{ports['gateway']}")
+    nginx = subprocess.Popen(["nginx", "-c", str(folder / "nginx.conf"), "-p", str(folder)])
+    try:
+        base = f"http://127.0.0.1:{ports['port']}"
+        page = browser.new_page()
+        requested: list[str] = []
+        page.on("request", lambda request: requested.append(request.url))
+        page.on("websocket", lambda socket: requested.append(socket.url))
+        for path in ("/zsim/", "/zsim/view"):
+            page.goto(f"{base}{path}?token=secret")
+            assert page.url.partition("?")[0] == f"{base}{path}"
+            assert "token" not in page.url
+            page.get_by_text("drone1").first.wait_for(timeout=1000 * PATIENCE_S)  # told by viser's socket
+            page.wait_for_function("() => document.querySelector('#zsim-head')?.innerText.match(/\\d/)")
+        places = {url.partition(f"127.0.0.1:{ports['port']}")[2] for url in requested if url.startswith(("http", "ws"))}
+        assert {"/zsim/head", "/zsim/actions", "/zsim/view/head", "/zsim/view/actions"} <= places
+        assert all(place.startswith("/zsim") for place in places), places
+        answer = page.request.get(f"{base}/gateway/zsim/world/info")
+        assert answer.ok
+        description = page.request.get(f"{base}/gateway/openapi.json").json()
+        assert description["servers"] == [{"url": "."}]
+    finally:
+        nginx.terminate()
+        nginx.wait(PATIENCE_S)

@@ -45,6 +45,7 @@ def description() -> dict[str, Any]:
     return {
         "openapi": "3.1.0",
         "info": {"title": "zsim gateway", "version": __version__, "description": "See docs/gateway.md."},
+        "servers": [{"url": "."}],  # beside this description, below whatever path a proxy has it
         "paths": {
             **paths,
             **dict(map(_control_path, CONTROL_PATHS)),
