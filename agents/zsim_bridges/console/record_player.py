@@ -8,7 +8,7 @@ from typing import Any
 from zsim_bridges.console.command_client import CommandClient, PastInstant
 from zsim_bridges.console.monitoring.run_condition import RunCondition, run_refusals
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
-from zsim_bridges.console.page.variable_history import INTERVAL_S, SPAN_S
+from zsim_bridges.console.scene.variable_history import INTERVAL_S, SPAN_S
 
 PIECE_S = 10.0  # simulated; of what is read at once: the replay stands meanwhile, 0.15 s with thirty drones
 INSTANT_DRONES_MAX = 9_000  # in a piece; a replay answers fewer than 10 000

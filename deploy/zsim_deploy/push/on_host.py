@@ -212,6 +212,7 @@ def main(folder: Path, who: str, silent_s: float) -> None:
         except OSError as error:
             say({"unwritable": f"{error.filename or folder}: {error.strerror}"})
             exit_now(children)
+            return
         say({"locked": not fault, "unlocked": fault})
         while True:
             say(execute(folder, orders.get(), children))

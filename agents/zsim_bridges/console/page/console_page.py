@@ -13,12 +13,12 @@ from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition
 from zsim_bridges.console.page.control_desk import EVERY, RUN
-from zsim_bridges.console.page.flight_preview import FlightPreview
 from zsim_bridges.console.page.formation_form import FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.page_forms import set_theme
 from zsim_bridges.console.page.run_forms import FaultForm, FleetForm, RunForm
 from zsim_bridges.console.page.variable_plots import VariablePlots, flight_history
+from zsim_bridges.console.scene.flight_preview import FlightPreview
 from zsim_bridges.console.scene.picture import TRAIL_S, TRAILS_S
 
 PANEL_PX = 350

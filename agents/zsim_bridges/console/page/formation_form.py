@@ -15,7 +15,6 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.console_tables import preflight_lines
 from zsim_bridges.console.monitoring.run_condition import RunCondition, formation_refusals, is_held_by_fault
 from zsim_bridges.console.page import operator_input
-from zsim_bridges.console.page.flight_preview import FlightPreview, preview_of
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables, range_refusal
 from zsim_bridges.console.page.run_forms import (
     ORDERS,
@@ -27,6 +26,7 @@ from zsim_bridges.console.page.run_forms import (
     set_refusals,
 )
 from zsim_bridges.console.page.variable_slider import VariableSlider
+from zsim_bridges.console.scene.flight_preview import FlightPreview, PreviewError, preview_of
 from zsim_bridges.console.scene.picture import SHAPED_PHASES
 
 PREVIEW_STYLE = "font-size:12px;line-height:1.3;padding:2px 10px;color:#d9480f"
@@ -188,7 +188,7 @@ class FormationForm:
         apart_m = self._cluster.gains.separation_min_m
         try:
             preview = preview_of(self._space, op, args, np.array(self._shown), apart_m)
-        except operator_input.InputError as error:
+        except PreviewError as error:
             self._report(RequestOutcome(f"{self._cluster.name}: {op}", str(error)))
             return
         self._previewed = op, shown, args

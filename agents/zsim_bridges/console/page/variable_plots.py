@@ -13,8 +13,8 @@ from zsim.contract.views import EstimateView
 from zsim.math import frames
 from zsim.scenario.scenario import Cluster
 from zsim_bridges.console.page.operator_input import SliderRange
-from zsim_bridges.console.page.variable_history import SERIES, SPAN_S, VariableHistory
 from zsim_bridges.console.scene.picture import Array, DronePoses
+from zsim_bridges.console.scene.variable_history import SERIES, SPAN_S, VariableHistory
 
 PLOTS_SHOWN = 3  # plots
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # of SERIES

@@ -12,8 +12,8 @@ from zsim.math import frames
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
-from zsim_bridges.console.page.flight_preview import FlightPreview
 from zsim_bridges.console.scene.camera_follow import CameraFollow
+from zsim_bridges.console.scene.flight_preview import FlightPreview
 from zsim_bridges.console.scene.picture import (
     Array,
     CanvasTrails,

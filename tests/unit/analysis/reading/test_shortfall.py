@@ -15,7 +15,7 @@ from rich.console import Console
 from synthetic_record import Flown
 
 from zsim.contract import keys, messages
-from zsim.contract.flight_messages import ClusterState
+from zsim.contract.flight_messages import ClusterState, Truth
 from zsim.contract.run_messages import Clock, ClusterRequest, Event
 from zsim.record import RecordWriter
 from zsim_agents.formation.flight_data import HELD_ON_REQUEST
@@ -337,7 +337,11 @@ def test_a_drone_that_is_truly_far_from_its_place_is_one(
     events = [Event(2_000_000_000, 0, "commander", "joystick" if others else "controller.main", "drone2", "")]
     with RecordWriter(tmp_path / "run.mcap") as writer:
         for key, message, wall_ns in traffic(lambda t_s: {"phase": "engaged" if t_s > 4 else "assembling"}, events):
-            if key == keys.truth("drone2") and span_s[0] <= message.t_ns / 1e9 <= span_s[1]:
+            if (
+                isinstance(message, Truth)
+                and key == keys.truth("drone2")
+                and span_s[0] <= message.t_ns / 1e9 <= span_s[1]
+            ):
                 moved = tuple(np.add(message.position_m, away_m).tolist())
                 message = msgspec.structs.replace(message, position_m=moved)
             writer.add_message(key, message, wall_ns)

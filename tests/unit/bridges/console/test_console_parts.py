@@ -25,9 +25,9 @@ from zsim_bridges.console.monitoring.event_log import EventRow
 from zsim_bridges.console.monitoring.sensor_rates import SensorRates
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import primary_variables, slider_ranges
-from zsim_bridges.console.page.variable_history import HISTORY_POINTS_MAX, INTERVAL_S, SPAN_S, VariableHistory
 from zsim_bridges.console.scene import picture as pic
 from zsim_bridges.console.scene.picture import SPACING_M, TRAIL_POINTS_MAX, TRAILS_S, CanvasTrails
+from zsim_bridges.console.scene.variable_history import HISTORY_POINTS_MAX, INTERVAL_S, SPAN_S, VariableHistory
 from zsim_bridges.console.server.http_proxy import ListenAddress
 from zsim_bridges.console.server.page_messages import PageControls, ViewerCamera, is_permitted
 from zsim_bridges.console.server.page_tokens import OPERATOR, VIEWER, PageRequest, PageTokens

@@ -122,5 +122,5 @@ def test_a_record_that_has_no_number_left_for_a_key_takes_the_others(
     monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
     with RecordWriter(tmp_path / "run.mcap") as writer:
         writer.add_gate(flown[0], 5)
-    assert writer.messages + writer.refused == len(flown[0])
+    assert writer.refused == len(flown[0]) - len(list(RecordReader(tmp_path / "run.mcap")))
     assert len({message.key for message in RecordReader(tmp_path / "run.mcap")}) == 2

@@ -120,7 +120,7 @@ def test_numbers_are_read_as_they_are_decoded(fields: list[tuple[int, int, int]]
     payloads = [encode({"t_ns": t_ns, "seq": seq, **{f"f{k}": k for k in range(more)}}) for t_ns, seq, more in fields]
     ends = np.cumsum([len(payload) for payload in payloads])
     starts = np.array([0, *ends[:-1]])
-    spans = MessageSpans(b"".join(payloads), np.zeros(len(payloads), np.int64), starts, ends)
+    spans = MessageSpans(b"".join(payloads), np.zeros(len(payloads), np.int64), starts, ends, starts)
     assert sequence_numbers(spans).tolist() == [decode(payload)["seq"] for payload in payloads]
 
 
@@ -137,7 +137,8 @@ def test_numbers_are_read_as_they_are_decoded(fields: list[tuple[int, int, int]]
     ],
 )
 def test_what_is_written_otherwise_is_left_to_the_decoder(garbage: bytes) -> None:
-    spans = MessageSpans(garbage, np.zeros(1, np.int64), np.zeros(1, np.int64), np.array([len(garbage)]))
+    none = np.zeros(1, np.int64)
+    spans = MessageSpans(garbage, none, none, np.array([len(garbage)]), none)
     assert sequence_numbers(spans).tolist() == [UNREAD]
 
 

@@ -23,7 +23,6 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.monitoring.run_condition import RunCondition, fleet_refusals
 from zsim_bridges.console.page.console_page import SWITCHES, ConsolePage
-from zsim_bridges.console.page.flight_preview import FlightPreview
 from zsim_bridges.console.page.formation_form import OPERATIONS, REST_S, FormationForm
 from zsim_bridges.console.page.operator_input import slider_ranges
 from zsim_bridges.console.page.run_forms import (
@@ -35,6 +34,7 @@ from zsim_bridges.console.page.run_forms import (
     RunForm,
 )
 from zsim_bridges.console.page.variable_slider import STILL_S
+from zsim_bridges.console.scene.flight_preview import FlightPreview
 
 SCENARIOS = Path(__file__).parents[5] / "scenarios"
 PERSON, NOBODY = 1, None  # who moved a slider

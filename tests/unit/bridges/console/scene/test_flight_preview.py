@@ -8,8 +8,7 @@ from refused import has_terms
 
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_bridges.console.page.flight_preview import preview_of
-from zsim_bridges.console.page.operator_input import InputError
+from zsim_bridges.console.scene.flight_preview import PreviewError, preview_of
 
 SCENARIO = scenario_file.load(Path(__file__).parents[5] / "scenarios" / "step.yaml")
 SPACE = scenario_space(SCENARIO, SCENARIO.clusters[0])
@@ -58,6 +57,6 @@ def test_drones_that_would_come_too_near_are_named():
     ],
 )
 def test_what_no_formation_can_fly_has_no_preview(op: str, args: dict[str, object], finding: str):
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(PreviewError) as refused:
         preview_of(SPACE, op, args, BASE, APART_M)
     assert finding in str(refused.value)

@@ -9,13 +9,16 @@ import numpy as np
 from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, read_request
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.trajectory import Reference
-from zsim_bridges.console.page.operator_input import InputError
 from zsim_bridges.console.scene.picture import Array
 
 POINTS = 121  # of a way; chosen: a curve in 3-D looks smooth
 WAY_SHARE = 0.25  # of them, on the way to the start of a trajectory
 ENDLESS_S = 120.0  # simulated; how far one without an end is shown
 SPEED_POINTS_MIN = 2
+
+
+class PreviewError(ValueError):
+    """What is asked for cannot be flown from where the formation is."""
 
 
 class FlightPreview(NamedTuple):
@@ -40,7 +43,7 @@ def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Arra
         apart_min_m: least distance of two drones, which the controller asks for.
 
     Raises:
-        InputError: it can be flown by no formation of this space.
+        PreviewError: it can be flown by no formation of this space.
     """
     try:
         request = read_request(op, args)
@@ -53,7 +56,7 @@ def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Arra
         timed = _preview(space, flown, f"{span_s:g} s{'' if reference.duration_s else ' of it'}", apart_min_m, span_s)
         return FlightPreview(np.concatenate((_places(space, way), timed.paths_W), axis=1), timed.text)
     except REFUSALS as error:
-        raise InputError(str(error)) from None
+        raise PreviewError(str(error)) from None
 
 
 def _way(space: ClusterSpace, start: Array, goal: Array, count: int) -> Array:
