@@ -11,6 +11,7 @@ from staged_console import StagedRun, staged_console
 
 pytestmark = [
     needs_browser,
+    pytest.mark.soak,
     pytest.mark.filterwarnings("ignore:Queued a "),  # of viser, where a page is closed just then
 ]
 

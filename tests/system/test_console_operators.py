@@ -18,6 +18,7 @@ from zsim_bridges.console.page import control_desk
 pytestmark = [
     needs_browser,
     pytest.mark.slow,
+    pytest.mark.soak,
     pytest.mark.filterwarnings("ignore:Queued a "),  # of viser, where a page is closed just then
 ]
 

@@ -2,6 +2,7 @@
 
 import csv
 import errno
+import io
 import os
 import re
 import shlex
@@ -123,7 +124,7 @@ def test_a_path_that_is_too_long_is_a_line(flown: Path, path: str) -> None:
         ("replay", path),
         ("sweep", str(flown.parent / "pair.yaml"), "--out", path),
         ("world", str(flown.parent / "pair.yaml"), "--journal", path),
-        ("certs", "init", path),
+        ("certs", "init", path, "--scenario", str(flown.parent / "pair.yaml")),
     ):
         assert os.strerror(errno.ENAMETOOLONG) in refusal(*arguments)
 
@@ -136,7 +137,7 @@ def test_a_table_of_each_drone_has_increasing_time(tmp_path: Path, flown: Path) 
         each.name for each in (tmp_path / "csv").iterdir()
     }
     for drone in ("drone1", "drone2"):
-        rows = list(csv.DictReader((tmp_path / "csv" / f"truth.{drone}.csv").open()))
+        rows = list(csv.DictReader(io.StringIO((tmp_path / "csv" / f"truth.{drone}.csv").read_text())))
         assert {row["name"] for row in rows} == {drone}
         times = [int(row["t_ns"]) for row in rows]
         assert times == list(range(0, 1_000_000_001, 20_000_000))

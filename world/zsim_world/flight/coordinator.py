@@ -255,14 +255,14 @@ class Coordinator(ABC):
         self._after_bye(participant, bye.reason)
 
     def _is_missed_from_now(self, participant: Participant) -> bool:
-        """Tell whether the leave of a process fails the run: it was needed, and nobody else does its work.
+        """Tell whether the leave of a process fails the run: it flew by the scenario, and nobody else does its work.
 
-        The leave of a recorder ends the run.
+        A program of somebody's own leaves when it is through; the leave of a recorder ends the run.
         """
         if self.ended is not None or self.clock.state == "waiting" or participant.join.role == RECORDER:
             return False
         is_allowed = lets_drop(self.scenario.processes.on_death, participant.name)
-        is_needed = not participant.served_names.isdisjoint(self._own_names)
+        is_needed = not participant.served_names.isdisjoint(agent_names(self.scenario))
         return is_needed and not is_allowed and self.barrier.substitute(participant.name) is None
 
     def expect_again(self, participant: Participant) -> None:
