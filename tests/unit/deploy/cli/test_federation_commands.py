@@ -130,7 +130,7 @@ def test_the_list_of_kinds_fits_a_terminal(
 
 
 def test_with_a_scenario_those_of_its_users_sensors_are_listed(mine: Path, capsys: pytest.CaptureFixture[str]):
-    federation_commands.kinds(mine)
+    federation_commands.kinds(mine, trust=True)
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     own = [kind for kind in listed if kind not in KINDS]
     assert own == [f"my_uwb_{fault}" for fault in ("dropout", "stuck", "bias", "noise")]
