@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
+from zsim.contract.flight_messages import Quaternion
 from zsim.schema.message import Count, Message, Number, Vector3, Whole
 
 PICTURE_MAX = 4_000_000  # bytes; a JPEG of 1920 x 1080 at full quality is below it
@@ -11,7 +12,6 @@ SEEN_MAX = 1000  # of one picture
 JPEG_BEGINS = b"\xff\xd8\xff"  # SOI, then the next marker: ISO/IEC 10918-1, B.1
 
 SidePx = Annotated[int, Meta(ge=1, le=16_384)]
-Quaternion = tuple[Number, Number, Number, Number]
 
 
 class CameraImage(Message, frozen=True, kw_only=True):
