@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from zsim.contract import flight_messages, keys, messages, run_messages
-from zsim.contract.camera_messages import Sightings
+from zsim.contract.flight_messages import Sightings
 from zsim.contract.framing import GateMessages
 from zsim.contract.run_messages import ControlRequest
 from zsim.errors import RunError, RunFailedError

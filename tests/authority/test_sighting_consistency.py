@@ -15,7 +15,7 @@ import pytest
 from consistency import band, feed
 from numpy.typing import NDArray
 
-from zsim.contract.camera_messages import Sightings
+from zsim.contract.flight_messages import Sightings
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import SightingModel

@@ -19,7 +19,7 @@ from msgspec import inspect as types
 from refused import has_terms, refused
 
 from zsim.contract import messages, run_messages
-from zsim.contract.camera_messages import JPEG_BEGINS
+from zsim.contract.flight_messages import JPEG_BEGINS
 from zsim.errors import DecodeError
 
 # Fields besides t_ns and seq, in the contract's order.

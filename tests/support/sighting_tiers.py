@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pictures import FRONT, HATS, Look, bodies, renderer, scene
 
-from zsim.contract.camera_messages import Seen
+from zsim.contract.flight_messages import Seen
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario

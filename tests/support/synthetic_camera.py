@@ -9,7 +9,7 @@ import numpy as np
 from meanwhile import meanwhile
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraImage, CameraInfo, Seen, Sightings
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Seen, Sightings
 from zsim.sensors.camera import BottomCamera, Camera, FrontCamera
 from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix, camera_pose, lens_of, pixel
 

@@ -5,7 +5,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from zsim.contract.camera_messages import CameraImage, CameraInfo, Seen, Sightings
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Seen, Sightings
 
 WIDTH_PX, HEIGHT_PX = 64, 36
 FRONT_P_BK = (0.162, 0.0, 0.012)

@@ -8,7 +8,7 @@ import pytest
 from federation import Federation, Record
 from wire import Client
 
-from zsim.contract.camera_messages import CameraInfo
+from zsim.contract.flight_messages import CameraInfo
 from zsim.math.frames import rotation_matrix
 from zsim.math.interpolation import pose_between
 from zsim.sensors.camera import FrontCamera, Hats

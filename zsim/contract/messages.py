@@ -12,7 +12,7 @@ from typing import Any, Literal, NoReturn
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from zsim.contract import camera_messages, flight_messages, keys, run_messages, views
+from zsim.contract import flight_messages, keys, run_messages, views
 from zsim.errors import DecodeError
 from zsim.schema.checker import first_fault
 from zsim.schema.message import Count, Message, Number
@@ -132,7 +132,7 @@ _FIXED: dict[str, type[Struct]] = {
 }
 _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     **{("drone", f"sensor/{name}"): kind.message for name, kind in STOCK.items()},
-    ("drone", f"sensor/{keys.SIGHTINGS}"): camera_messages.Sightings,
+    ("drone", f"sensor/{keys.SIGHTINGS}"): flight_messages.Sightings,
     ("drone", "sensor/status"): flight_messages.Status,
     ("drone", "truth"): flight_messages.Truth,
     ("drone", "cmd/velocity"): flight_messages.Velocity,
@@ -147,9 +147,9 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("drone", "accepted/mode"): flight_messages.Mode,
     ("drone", "link"): flight_messages.LinkState,
     ("drone", "estimate"): flight_messages.Estimate,
-    ("drone", "sightings"): camera_messages.Sightings,
-    **{("drone", f"camera/{name}"): camera_messages.CameraImage for name in CAMERAS},
-    **{("drone", f"camera/{name}/info"): camera_messages.CameraInfo for name in CAMERAS},
+    ("drone", "sightings"): flight_messages.Sightings,
+    **{("drone", f"camera/{name}"): flight_messages.CameraImage for name in CAMERAS},
+    **{("drone", f"camera/{name}/info"): flight_messages.CameraInfo for name in CAMERAS},
     ("cluster", "state"): flight_messages.ClusterState,
     ("cluster", "request"): run_messages.ClusterRequest,
     ("process", "join"): run_messages.Join,
@@ -165,7 +165,7 @@ KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, ga
 
 RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
 """What agents publish for each other; the world counts it, as it does commands."""
-OUTPUTS = (*RELAYED, camera_messages.Sightings, camera_messages.CameraInfo)
+OUTPUTS = (*RELAYED, flight_messages.Sightings, flight_messages.CameraInfo)
 
 
 def _plain(value: Any) -> Any:

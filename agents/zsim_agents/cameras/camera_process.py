@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from itertools import count
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraImage, CameraInfo
+from zsim.contract.flight_messages import CameraImage, CameraInfo
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED
 from zsim.errors import DecodeError

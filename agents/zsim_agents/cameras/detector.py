@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.camera_messages import Seen
+from zsim.contract.flight_messages import Seen
 from zsim.sensors.camera_model import CameraPose, Lens
 from zsim_agents.cameras.hat_outline import WHOLE_CENTRE, Outline, outline
 from zsim_agents.cameras.rendering.view import View

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings
 from zsim.errors import DecodeError
 from zsim.math.frames import rotation_matrix
 from zsim.sensors.camera import CAMERAS

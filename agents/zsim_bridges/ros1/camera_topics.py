@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rosbags.typesys.stores import ros1_noetic as ros
 
-from zsim.contract.camera_messages import CameraImage, CameraInfo
+from zsim.contract.flight_messages import CameraImage, CameraInfo
 from zsim.math.rotation import Quaternion, Vector
 from zsim.sensors.camera import CAMERAS
 from zsim_bridges.ros1.connections import PublishedTopic

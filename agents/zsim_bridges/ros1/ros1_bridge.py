@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraImage, CameraInfo
+from zsim.contract.flight_messages import CameraImage, CameraInfo
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file

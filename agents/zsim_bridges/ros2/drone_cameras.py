@@ -11,7 +11,7 @@ import numpy as np
 from rosbags.typesys.stores import ros2_jazzy as ros
 
 from zsim.contract import keys
-from zsim.contract.camera_messages import CameraImage, CameraInfo
+from zsim.contract.flight_messages import CameraImage, CameraInfo
 from zsim.sensors.camera import CAMERAS
 from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.conversions import camera_frame, header

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraInfo
+from zsim.contract.flight_messages import CameraInfo
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription
 from zsim_bridges.ros2.rmw_zenoh import Publisher

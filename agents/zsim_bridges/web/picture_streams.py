@@ -12,7 +12,7 @@ from typing import NamedTuple
 from aiohttp import web
 
 from zsim.contract import messages
-from zsim.contract.camera_messages import CameraImage
+from zsim.contract.flight_messages import CameraImage
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample
 

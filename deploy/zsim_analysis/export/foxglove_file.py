@@ -17,7 +17,7 @@ import msgspec
 from foxglove import layouts
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraInfo
+from zsim.contract.flight_messages import CameraInfo
 from zsim.contract.messages import Info
 from zsim.errors import NotTrustedError
 from zsim.record import Recorded, RecordReader

@@ -25,8 +25,7 @@ from foxglove.messages import (
     PointCloud,
 )
 
-from zsim.contract.camera_messages import CameraImage, CameraInfo
-from zsim.contract.flight_messages import Estimate, Status, Truth
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Estimate, Status, Truth
 from zsim.contract.messages import Gps
 from zsim.contract.run_messages import Event
 from zsim.math.frames import heading, quaternion_from_rpy

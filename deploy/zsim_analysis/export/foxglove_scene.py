@@ -29,8 +29,7 @@ from foxglove.messages import (
 )
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraImage, CameraInfo
-from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth
+from zsim.contract.flight_messages import CameraImage, CameraInfo, ClusterState, Estimate, Status, Truth
 from zsim.contract.messages import Gps, Info
 from zsim.contract.run_messages import Event
 from zsim.drone_colours import colours_of

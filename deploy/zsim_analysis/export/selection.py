@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraImage, Sightings
+from zsim.contract.flight_messages import CameraImage, Sightings
 from zsim.contract.messages import REFUSALS
 from zsim.record import Recorded, RecordReader
 from zsim_analysis.export.message_columns import FieldColumns, fields, json_text, open_fields

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract import encoding, flight_messages, keys, messages
-from zsim.contract.camera_messages import Sightings
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
+from zsim.contract.flight_messages import Sightings
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError, reason_of

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings
 from zsim.record import Recorded
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Participant

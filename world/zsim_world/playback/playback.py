@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from zsim.contract import flight_messages, keys, messages, run_messages
-from zsim.contract.camera_messages import CameraInfo
+from zsim.contract.flight_messages import CameraInfo
 from zsim.contract.framing import KINDS, GateMessages, run_key_table
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError

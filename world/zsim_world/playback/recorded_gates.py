@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from zsim.contract import flight_messages, keys, messages, run_messages
-from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings
 from zsim.contract.messages import REFUSALS
 from zsim.contract.views import (
     DroneView,

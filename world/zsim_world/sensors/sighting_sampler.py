@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from zsim.contract.camera_messages import Seen
+from zsim.contract.flight_messages import Seen
 from zsim.contract.snapshot import State
 from zsim.math.compiled import Held, hold, kernel
 from zsim.math.random_streams import stream

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from zsim.contract import camera_messages, flight_messages, keys, messages, run_messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
@@ -29,7 +29,7 @@ TICK_S = 0.1  # how often a standing world looks at the wall clock
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
 REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take until a process can be asked
 PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
-OF_CAMERAS = (camera_messages.CameraInfo, camera_messages.Sightings)  # relayed too, from whoever has a camera
+OF_CAMERAS = (flight_messages.CameraInfo, flight_messages.Sightings)  # relayed too, from whoever has a camera
 OF_DRIVERS = ("truth", "link")  # what they publish of an external drone beside its sensors
 PROCESSES, VIEWS = "process/", "view/"  # the last are nothing to the world
 OWN = keys.process(WORLD, "")

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import Sightings
-from zsim.contract.flight_messages import Estimate
+from zsim.contract.flight_messages import Estimate, Sightings
 from zsim.contract.framing import GateMessages, PerPattern
 from zsim.contract.snapshot import State
 from zsim.errors import DecodeError

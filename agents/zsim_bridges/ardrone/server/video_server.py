@@ -5,7 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-from zsim.contract.camera_messages import CameraImage
+from zsim.contract.flight_messages import CameraImage
 from zsim_bridges.ardrone.server.addresses import AllowedHosts
 from zsim_bridges.ardrone.server.stream_port import StreamPort, read_until_end
 from zsim_bridges.ardrone.wire.pave import FrameType, PaveHeader

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
+from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings
 from zsim.errors import DecodeError, ZsimError
 from zsim.sensors.camera import CAMERAS
 from zsim.sensors.jpeg_header import PictureError

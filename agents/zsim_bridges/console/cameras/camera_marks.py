@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 from msgspec import Struct
 
-from zsim.contract.camera_messages import CameraInfo, Seen, Sightings
+from zsim.contract.flight_messages import CameraInfo, Seen, Sightings
 from zsim.math import rotation
 from zsim.sensors.camera_model import Lens, pixel, undistorted
 

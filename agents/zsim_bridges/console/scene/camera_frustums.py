@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import viser
 
-from zsim.contract.camera_messages import CameraImage, CameraInfo
+from zsim.contract.flight_messages import CameraImage, CameraInfo
 from zsim.math import frames, rotation
 from zsim_bridges.console.cameras.camera_marks import field_of_view
 from zsim_bridges.console.scene.page_camera import bring_into_view

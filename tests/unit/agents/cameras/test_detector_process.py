@@ -11,7 +11,7 @@ from refused import has_terms
 from synthetic_pictures import NO_JPEG, WIDTH_PX, image, info, jpeg
 
 from zsim.contract import keys
-from zsim.contract.camera_messages import Sightings
+from zsim.contract.flight_messages import Sightings
 from zsim.contract.messages import Info, Origin
 from zsim_agents.cameras import detector_process
 from zsim_agents.cameras.detector_process import REPORTS_MAX, DetectorProcess

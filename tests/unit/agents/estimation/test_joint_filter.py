@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from zsim.contract.camera_messages import Seen, Sightings
+from zsim.contract.flight_messages import Seen, Sightings
 from zsim.contract.messages import Baro, Flow, Gps, Imu, Mag
 from zsim.math.rotation import matrix, normalised
 from zsim.scenario import scenario_file

@@ -27,7 +27,7 @@ from synthetic_pictures import image, info, sightings
 from typer.testing import CliRunner
 
 from zsim.contract import flight_messages, keys, messages
-from zsim.contract.camera_messages import CameraImage, Sightings
+from zsim.contract.flight_messages import CameraImage, Sightings
 from zsim.errors import ReportError, RunError
 from zsim.record import RecordReader, RecordWriter
 from zsim.sensors.sensor import message_type

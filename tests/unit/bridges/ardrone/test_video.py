@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 import synthetic_pictures
 
-from zsim.contract.camera_messages import CameraImage
+from zsim.contract.flight_messages import CameraImage
 from zsim_bridges.ardrone.server.addresses import AllowedHosts
 from zsim_bridges.ardrone.wire import pave
 from zsim_bridges.ardrone.wire.pave import FrameType, PaveHeader

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import Sightings
-from zsim.contract.flight_messages import Estimate, Status
+from zsim.contract.flight_messages import Estimate, Sightings, Status
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import Baro, Imu
 from zsim.runtime.inbox import GAP_MAX, Inbox

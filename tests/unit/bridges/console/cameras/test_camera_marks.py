@@ -10,7 +10,7 @@ import synthetic_camera
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim.contract.camera_messages import CameraInfo, Seen, Sightings
+from zsim.contract.flight_messages import CameraInfo, Seen, Sightings
 from zsim_bridges.console.cameras.camera_marks import (
     AGE_MAX_NS,
     RADIUS_MIN_PX,
