@@ -17,10 +17,10 @@ from msgspec.structs import replace
 from refused import refused
 
 from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.flight_messages import ViewCluster, ViewEstimates
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.contract.snapshot import State, pack, unpack
-from zsim.contract.views import ViewCluster, ViewEstimates
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.inbox import Inbox

@@ -15,10 +15,9 @@ from federation import free_port
 from wire import PATIENCE_S
 
 from zsim.contract import keys, messages
-from zsim.contract.flight_messages import DroneState
+from zsim.contract.flight_messages import DroneState, DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, ControlAnswer, Event
-from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.console_server import Console

@@ -12,7 +12,7 @@ from typing import Any, Literal, NoReturn
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from zsim.contract import flight_messages, keys, run_messages, views
+from zsim.contract import flight_messages, keys, run_messages
 from zsim.errors import DecodeError
 from zsim.schema.checker import first_fault
 from zsim.schema.message import Count, Message, Number
@@ -128,7 +128,7 @@ _FIXED: dict[str, type[Struct]] = {
     "clock": run_messages.Clock,
     "world/event": run_messages.Event,
     "world/faults": run_messages.Faults,
-    "view/drones": views.ViewDrones,
+    "view/drones": flight_messages.ViewDrones,
 }
 _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     **{("drone", f"sensor/{name}"): kind.message for name, kind in STOCK.items()},
@@ -160,7 +160,10 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest Info has them
-_VIEWS: dict[str, type[Struct]] = {"view/cluster/": views.ViewCluster, "view/estimates/": views.ViewEstimates}
+_VIEWS: dict[str, type[Struct]] = {
+    "view/cluster/": flight_messages.ViewCluster,
+    "view/estimates/": flight_messages.ViewEstimates,
+}
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
 
 RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)

@@ -7,9 +7,9 @@ from typing import Any, cast
 from msgspec import UNSET, Struct
 
 from zsim.contract import flight_messages, keys, messages
+from zsim.contract.flight_messages import ViewEstimates, estimate_view
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.snapshot import State
-from zsim.contract.views import ViewEstimates, estimate_view
 from zsim.errors import RunError
 from zsim.math.compiled import COMPILES
 from zsim.runtime.agent import Agent, Output

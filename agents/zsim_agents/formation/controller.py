@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.flight_messages import cluster_view
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.contract.snapshot import State
-from zsim.contract.views import cluster_view
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario

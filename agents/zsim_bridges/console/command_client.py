@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from zsim.contract import flight_messages, keys, messages
-from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
+from zsim.contract.flight_messages import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import ZsimError
 from zsim.transport.session import Session, Unanswered
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer, arguments_text

@@ -10,9 +10,9 @@ from typing import Any
 import viser
 from msgspec import UNSET
 
+from zsim.contract.flight_messages import EstimateView, ViewCluster
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
-from zsim.contract.views import EstimateView, ViewCluster
 from zsim.errors import DocumentError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario

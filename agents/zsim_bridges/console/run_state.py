@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from zsim.contract.flight_messages import ViewCluster, ViewDrones
 from zsim.contract.run_messages import Fault
-from zsim.contract.views import ViewCluster, ViewDrones
 from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
 from zsim_bridges.console.scene.picture import FormationShape

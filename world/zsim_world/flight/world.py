@@ -11,10 +11,9 @@ from msgspec import UNSET
 from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import TruthHash, fingerprint
-from zsim.contract.flight_messages import Status
+from zsim.contract.flight_messages import DroneView, Status, ViewDrones
 from zsim.contract.framing import GateMessages
 from zsim.contract.snapshot import State
-from zsim.contract.views import DroneView, ViewDrones
 from zsim.errors import UserCodeError
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file

@@ -8,17 +8,19 @@ from typing import Any, NamedTuple
 import msgspec
 
 from zsim.contract import flight_messages, keys, messages, run_messages
-from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings
-from zsim.contract.messages import REFUSALS
-from zsim.contract.views import (
+from zsim.contract.flight_messages import (
+    CameraImage,
+    CameraInfo,
     DroneView,
     EstimateView,
+    Sightings,
     ViewCluster,
     ViewDrones,
     ViewEstimates,
     cluster_view,
     estimate_view,
 )
+from zsim.contract.messages import REFUSALS
 from zsim.errors import DecodeError
 from zsim.record import Recorded, RecordReader
 from zsim.record.record_reader import OVERLAP_NS

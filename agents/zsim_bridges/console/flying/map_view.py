@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from zsim.contract.views import ViewCluster
+from zsim.contract.flight_messages import ViewCluster
 from zsim.drone_colours import drone_colours
 from zsim.math import frames
 from zsim.scenario.scenario import Obstacle, Scenario

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zsim.contract.views import ViewCluster
+from zsim.contract.flight_messages import ViewCluster
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.console.command_client import CommandClient
 from zsim_bridges.console.flying.flight_conditions import DroneSight

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+from zsim.contract.flight_messages import ViewCluster
 from zsim.contract.run_messages import Event, Fault, Health
-from zsim.contract.views import ViewCluster
 from zsim_agents.formation.flight_data import HELD_ON_REQUEST, TOO_NEAR
 from zsim_agents.formation.spaces.cluster_space import unit
 

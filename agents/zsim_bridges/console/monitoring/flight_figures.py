@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zsim.contract.views import DroneView, ViewDrones
+from zsim.contract.flight_messages import DroneView, ViewDrones
 from zsim.math import frames
 
 SPEED_S = 0.2  # simulated, over which a speed is taken: shorter, and it is that of a rounding

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from zsim.contract.views import ViewCluster
+from zsim.contract.flight_messages import ViewCluster
 from zsim_agents.formation.spaces.cluster_space import unit
 
 PHASES_DONE = {

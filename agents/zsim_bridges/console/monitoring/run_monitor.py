@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from zsim.contract.views import DroneView, ViewCluster
+from zsim.contract.flight_messages import DroneView, ViewCluster
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.console.monitoring import alarms
 from zsim_bridges.console.monitoring.alarms import Alarm, AlarmBoard, DroneCondition

@@ -12,10 +12,9 @@ import msgspec
 from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.flight_messages import LinkState
+from zsim.contract.flight_messages import EstimateView, LinkState, ViewCluster, ViewDrones, ViewEstimates
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event, Fault, Health
-from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample, Session
 from zsim_bridges.console.monitoring.alarms import Losses

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from zsim.contract.views import ViewCluster
+from zsim.contract.flight_messages import ViewCluster
 from zsim.scenario.scenario import Cluster, Trajectory
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome

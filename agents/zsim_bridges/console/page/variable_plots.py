@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from viser import uplot
 
-from zsim.contract.views import EstimateView
+from zsim.contract.flight_messages import EstimateView
 from zsim.math import frames
 from zsim.scenario.scenario import Cluster
 from zsim_bridges.console.page.operator_input import SliderRange

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.views import EstimateView, ViewCluster, ViewDrones
+from zsim.contract.flight_messages import EstimateView, ViewCluster, ViewDrones
 from zsim.math import frames
 from zsim.vehicles.vehicle import ROTORS_MAX
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import viser
 
+from zsim.contract.flight_messages import ViewDrones
 from zsim.contract.messages import Info
-from zsim.contract.views import ViewDrones
 from zsim.math import frames
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace

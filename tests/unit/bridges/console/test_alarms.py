@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from refused import has_terms, without_tags
 
+from zsim.contract.flight_messages import ViewCluster
 from zsim.contract.run_messages import Event, Fault, Health
-from zsim.contract.views import ViewCluster
 from zsim_bridges.console.console_tables import preflight_lines
 from zsim_bridges.console.monitoring import alarms
 from zsim_bridges.console.monitoring.alarms import Alarm, AlarmBoard, DroneCondition, Losses

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from refused import has_terms, refused, without_tags
 
+from zsim.contract.flight_messages import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.contract.run_messages import Event
-from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file

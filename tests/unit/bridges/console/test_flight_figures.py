@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from zsim.contract.views import DroneView, ViewDrones
+from zsim.contract.flight_messages import DroneView, ViewDrones
 from zsim.math import frames
 from zsim_bridges.console.monitoring.flight_figures import FlightMeter
 

@@ -12,9 +12,9 @@ import pytest
 from refused import has_terms, without_tags
 
 from zsim.contract import keys, messages
+from zsim.contract.flight_messages import DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.contract.messages import DroneInfo, RotorInfo
 from zsim.contract.run_messages import ControlAnswer, Event
-from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables

@@ -8,10 +8,9 @@ import pytest
 from refused import has_terms, without_tags
 
 from zsim.contract import keys, messages
-from zsim.contract.flight_messages import LinkState
+from zsim.contract.flight_messages import DroneView, EstimateView, LinkState, ViewDrones, ViewEstimates
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Waiting
-from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.monitoring.page_head import page_head

@@ -10,10 +10,9 @@ from refused import has_terms, parts, refused
 from synthetic_pictures import image, info, sightings
 
 from zsim.contract import keys, messages
-from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth, Velocity
+from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth, Velocity, ViewDrones
 from zsim.contract.messages import Gps, Imu
 from zsim.contract.run_messages import Bye, Clock, ControlRequest, Done, Event, Fault, Faults, Join
-from zsim.contract.views import ViewDrones
 from zsim.errors import RecordError
 from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.scenario import scenario_file

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from zsim.contract.flight_messages import ClusterState, Estimate
-from zsim.contract.views import cluster_view, estimate_view
+from zsim.contract.flight_messages import ClusterState, Estimate, cluster_view, estimate_view
 
 
 def test_an_estimate_is_shown_with_the_upper_triangle_of_its_position():

@@ -11,10 +11,9 @@ from msgspec import Struct
 from refused import refused
 
 from zsim.contract import keys
-from zsim.contract.flight_messages import ClusterState, Estimate, Status, Velocity
+from zsim.contract.flight_messages import ClusterState, Estimate, Status, Velocity, ViewCluster
 from zsim.contract.messages import Imu, Info
 from zsim.contract.run_messages import Bye, Done, Join, Waiting
-from zsim.contract.views import ViewCluster
 from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus

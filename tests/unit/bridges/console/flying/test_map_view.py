@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from zsim.contract.views import DroneView, ViewCluster, ViewDrones
+from zsim.contract.flight_messages import DroneView, ViewCluster, ViewDrones
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_bridges.console.flying import map_view

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from zsim.contract.views import ViewCluster
+from zsim.contract.flight_messages import ViewCluster
 from zsim.scenario import scenario_file
 from zsim_bridges.console.flying.flight_conditions import DroneSight, FlightAnswer
 from zsim_bridges.console.flying.flown_velocity import DronePose

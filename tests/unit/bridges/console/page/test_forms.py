@@ -11,7 +11,7 @@ import msgspec
 import pytest
 from refused import has_terms, without_tags
 
-from zsim.contract.views import ViewCluster
+from zsim.contract.flight_messages import ViewCluster
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_check import Known, flaws
 from zsim.scenario.fault_kinds import KINDS

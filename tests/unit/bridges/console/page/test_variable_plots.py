@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim.contract.views import EstimateView
+from zsim.contract.flight_messages import EstimateView
 from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim_bridges.console.page.operator_input import SliderRange
