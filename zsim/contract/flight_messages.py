@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from operator import itemgetter
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal, Protocol, get_args
 
 from msgspec import Meta, Struct
 
@@ -306,3 +306,24 @@ def estimate_view(drone: str, estimate: Estimated) -> EstimateView:
 def cluster_view(state: ClusterState, t_ns: int, seq: int) -> ViewCluster:
     """Return a formation's state for displays, as message number `seq` of the view."""
     return ViewCluster(t_ns, seq, state.phase, state.names, state.value, state.desired, state.reason)
+
+
+_ALL: frozenset[DroneState] = frozenset(get_args(DroneState))
+_RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
+    "takeoff": ("a take-off needs it landed", frozenset({"landed"})),
+    "land": ("a landing needs it in the air", _ALL - {"landed", "emergency"}),
+    "emergency": ("", _ALL),
+    "reset": ("a reset needs an emergency", frozenset({"emergency"})),
+}
+_SETPOINT = ("a setpoint needs it hovering or flying", frozenset[DroneState]({"hovering", "flying"}))
+
+
+def state_refusal(name: str, state: str, asked: str) -> str | None:
+    """Return why a drone does not take a command in its state, None if it does.
+
+    Args:
+        name: of the drone.
+        asked: mode that it is to enter, or any other word for a setpoint.
+    """
+    need, states = _RULES.get(asked, _SETPOINT)
+    return None if state in states else f"{name} is {state}; {need}"

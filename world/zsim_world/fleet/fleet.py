@@ -14,10 +14,9 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from zsim.contract.flight_messages import DroneState
+from zsim.contract.flight_messages import DroneState, state_refusal
 from zsim.contract.messages import RotorInfo
 from zsim.contract.snapshot import State
-from zsim.contract.state_rules import state_refusal
 from zsim.errors import RunError
 from zsim.math.compiled import hold
 from zsim.scenario.scenario import Drone, Scenario

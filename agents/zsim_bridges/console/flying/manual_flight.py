@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from zsim.contract.state_rules import state_refusal
+from zsim.contract.flight_messages import state_refusal
 from zsim.vehicles.vehicle import Limits
 from zsim_bridges.console.command_client import CommandClient, NoAnswer
 from zsim_bridges.console.flying.flight_conditions import DroneSight, FlightAnswer, RunSight, too_fast

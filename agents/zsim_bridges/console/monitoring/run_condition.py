@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from zsim.contract.state_rules import state_refusal
+from zsim.contract.flight_messages import state_refusal
 from zsim_agents.formation.flight_data import (
     AIRBORNE,
     DOWN,
