@@ -46,7 +46,7 @@ class WorldEvent(NamedTuple):
     data: Struct
 
 
-_DATA: dict[str, type[Struct]] = {
+_EVENT_DATA: dict[str, type[Struct]] = {
     "end": RunEnd,
     "join": ProcessEntry,
     "restart": ProcessEntry,
@@ -56,14 +56,14 @@ _DATA: dict[str, type[Struct]] = {
 }
 
 
-def read(payload: bytes) -> WorldEvent | None:
+def read_event(payload: bytes) -> WorldEvent | None:
     """Return the notice in an event, None for an event of another kind.
 
     Raises:
         DecodeError: it is no event, or its data is not what its kind has.
     """
     event: run_messages.Event = messages.decode(keys.EVENT, payload)
-    kind = _DATA.get(event.kind)
+    kind = _EVENT_DATA.get(event.kind)
     if kind is None:
         return None
     try:

@@ -178,7 +178,7 @@ class RunnerInputs:
 
     def _on_event(self, sample: RawSample) -> None:
         try:
-            read = world_events.read(sample.payload)
+            read = world_events.read_event(sample.payload)
         except DecodeError:
             self._health.refused += 1  # somebody else's; the world's own events can be read
             return
