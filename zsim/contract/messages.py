@@ -7,7 +7,7 @@ Every message is a msgpack map with exactly these field names, SI units and radi
 import re
 from collections.abc import Callable, Iterable
 from functools import cache, lru_cache
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NamedTuple, NoReturn
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
@@ -15,7 +15,7 @@ from msgspec import UNSET, Struct, UnsetType
 from zsim.contract import flight_messages, keys, run_messages
 from zsim.errors import DecodeError
 from zsim.schema.checker import first_fault
-from zsim.schema.message import Count, Message, Number
+from zsim.schema.message import Count, Message, Number, Whole
 from zsim.sensors.baro import Baro as Baro
 from zsim.sensors.camera import CAMERAS
 from zsim.sensors.flow import Flow as Flow
@@ -324,3 +324,64 @@ def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -
         first = ("", f"({len(payload)} bytes) is not msgpack ({fault}); must be a map, the {kind.__name__}")
     path, text = first or ("", f"is refused ({error}); must be the {kind.__name__}")
     return DecodeError(f"{where}: {path or 'the payload'} {text}")
+
+
+class NoData(Struct, frozen=True):
+    """Data of which nothing is used."""
+
+
+class RunEnd(Struct, frozen=True):
+    """The run is over; `last_ns` is its last gate."""
+
+    last_ns: Count
+
+
+class ProcessEntry(Struct, frozen=True):
+    """A process has been taken in.
+
+    Attributes:
+        from_ns: first gate that it is waited for.
+        done_ns: newest gate that it, or its former incarnation, is through with; -1 for none.
+        former_pid: of the incarnation whose place it takes.
+    """
+
+    incarnation: int
+    host: str
+    pid: int
+    from_ns: Count
+    done_ns: Whole = -1
+    former_pid: int | None = None
+
+
+class WorldEvent(NamedTuple):
+    """An event of a kind that processes act on."""
+
+    kind: str
+    subject: str
+    data: Struct
+
+
+_EVENT_DATA: dict[str, type[Struct]] = {
+    "end": RunEnd,
+    "join": ProcessEntry,
+    "restart": ProcessEntry,
+    "superseded": ProcessEntry,
+    "leave": NoData,
+    "drop": NoData,
+}
+
+
+def read_event(payload: bytes) -> WorldEvent | None:
+    """Return the notice in an event, None for an event of another kind.
+
+    Raises:
+        DecodeError: it is no event, or its data is not what its kind has.
+    """
+    event: run_messages.Event = decode(keys.EVENT, payload)
+    kind = _EVENT_DATA.get(event.kind)
+    if kind is None:
+        return None
+    try:
+        return WorldEvent(event.kind, event.subject, msgspec.convert(event.data, kind))
+    except REFUSALS as error:
+        raise DecodeError(f"{keys.EVENT}: data of {event.kind!r} is refused ({error}); see docs/protocol.md") from error

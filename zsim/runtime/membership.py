@@ -14,8 +14,8 @@ from msgspec import UNSET
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import Pairs
+from zsim.contract.messages import ProcessEntry
 from zsim.contract.snapshot import VERSION, pack, unpack
-from zsim.contract.world_events import ProcessEntry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.inbox import output_hold_ns

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 
 from zsim.contract import keys, messages, run_messages
+from zsim.contract.messages import ProcessEntry, RunEnd, WorldEvent
 from zsim.contract.run_messages import ControlAnswer
-from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
 from zsim.runtime.collector import rare_collections

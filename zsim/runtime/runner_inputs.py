@@ -8,9 +8,9 @@ from typing import Any
 
 from msgspec import UNSET
 
-from zsim.contract import flight_messages, keys, messages, run_messages, world_events
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.framing import GateMessages, run_key_table
-from zsim.contract.world_events import WorldEvent
+from zsim.contract.messages import WorldEvent
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Agent
 from zsim.runtime.health import HealthMeter
@@ -178,7 +178,7 @@ class RunnerInputs:
 
     def _on_event(self, sample: RawSample) -> None:
         try:
-            read = world_events.read_event(sample.payload)
+            read = messages.read_event(sample.payload)
         except DecodeError:
             self._health.refused += 1  # somebody else's; the world's own events can be read
             return

@@ -10,10 +10,9 @@ from refused import refused
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import decode_batch, pairs_of
-from zsim.contract.messages import Info, Origin
+from zsim.contract.messages import Info, Origin, ProcessEntry
 from zsim.contract.run_messages import Clock, ControlAnswer, Snapshot
 from zsim.contract.snapshot import VERSION, pack
-from zsim.contract.world_events import ProcessEntry
 from zsim.errors import DecodeError, NoWorldError
 from zsim.runtime import membership
 from zsim.runtime.agent import Agent, Output
