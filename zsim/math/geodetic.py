@@ -3,17 +3,13 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zsim.math.compiled import kernel
-from zsim.math.frames import WGS84_A_M, WGS84_F, enu_rows, geodetic_to_ecef
+from zsim.math.frames import _E2, WGS84_A_M, WGS84_F, Array, enu_rows, geodetic_to_ecef
 
-_E2 = WGS84_F * (2.0 - WGS84_F)
 _B_M = WGS84_A_M * (1.0 - WGS84_F)
 _CURVATURE_M = (WGS84_A_M**2 - _B_M**2) / _B_M
 _STEPS = 4  # each gains a factor of about 300: 1e-15 rad after four for heights below 1000 km
-
-Array = NDArray[np.float64]
 
 
 def anchor(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[Array, Array]:
