@@ -12,7 +12,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.contract.snapshot import State
-from zsim.math import geodetic
+from zsim.math import frames
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import Held, hold, inlined, kernel
 from zsim.scenario.scenario import Scenario
@@ -78,7 +78,7 @@ class Sampler:
     def __init__(self, scenario: Scenario, sensors: FleetSensors, senses: Senses) -> None:
         place = scenario.environment
         latency_ns = sensor_set.latencies(sensors)
-        anchor = geodetic.anchor(place.latitude_deg, place.longitude_deg, place.height_m)
+        anchor = frames.anchor(place.latitude_deg, place.longitude_deg, place.height_m)
         self._log = SampledLog(senses.whose, senses.value, latency_ns, *anchor)
         self._held = hold(self._log)
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
@@ -138,7 +138,7 @@ def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
         index[m, WHOSE.sensor], index[m, WHOSE.drone], index[m, WHOSE.t_sample] = s, i, whose[m, 2] * tick_ns
         index[m, WHOSE.t] = index[m, WHOSE.t_sample] + latency_ns[i, s]
         if s == sensor_set.GPS:
-            values[m, 0:3] = geodetic.geodetic(value[m : m + 1, 0:3], rows, place)[0]
+            values[m, 0:3] = frames.geodetic(value[m : m + 1, 0:3], rows, place)[0]
             first = 3
         for k in range(sensor_set.CHANNELS_MAX):
             values[m, first + k] = value[m, k]

@@ -8,7 +8,7 @@ import numpy as np
 from zsim.contract import flight_messages, messages
 from zsim.contract.messages import Origin
 from zsim.math import frames
-from zsim.math.geodetic import anchor, geodetic
+from zsim.math.frames import anchor, geodetic
 from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Drone
 from zsim_bridges.mavlink.autopilot import ned_axes

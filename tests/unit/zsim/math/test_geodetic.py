@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 import zsim
 import zsim_world
-from zsim.math.frames import WGS84_A_M, WGS84_F, geodetic_to_enu
-from zsim.math.geodetic import anchor, geodetic
+from zsim.math.frames import WGS84_A_M, WGS84_F, anchor, geodetic, geodetic_to_enu
 
 ORIGIN = (-34.603, -58.368, 25.0)
 few = settings(max_examples=100, deadline=None)
@@ -66,7 +65,7 @@ def test_small_steps_follow_the_radii_of_curvature():
 
 ASK = """
 import numpy as np
-from zsim.math.geodetic import geodetic
+from zsim.math.frames import geodetic
 print(geodetic(np.zeros((1, 3)), np.eye(3), np.array((6_378_144.0, 0.0, 0.0)))[0, 2])
 """
 
