@@ -10,7 +10,7 @@ from wire import Client
 
 from zsim.contract.flight_messages import CameraInfo
 from zsim.math.frames import rotation_matrix
-from zsim.math.interpolation import pose_between
+from zsim.math.rotation import pose_between
 from zsim.sensors.camera import FrontCamera, Hats
 from zsim.sensors.camera_model import camera_pose
 from zsim_agents.cameras.jpeg import decoded

@@ -14,8 +14,21 @@ from numpy.typing import NDArray
 from zsim.math.circle import spread
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined, kernel
-from zsim.math.interpolation import attitude_between, position_between
-from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
+from zsim.math.rotation import (
+    Quaternion,
+    Vector,
+    add,
+    attitude_between,
+    axpy,
+    cross,
+    dot,
+    norm,
+    position_between,
+    rotate,
+    rotate_back,
+    scaled,
+    subtract,
+)
 from zsim.scenario import obstacle
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of, pixel

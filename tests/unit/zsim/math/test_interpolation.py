@@ -3,8 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from zsim.math.interpolation import pose_between
-from zsim.math.rotation import Quaternion, Vector, about_z, from_rotation_vector, multiply
+from zsim.math.rotation import Quaternion, Vector, about_z, from_rotation_vector, multiply, pose_between
 
 P0, V0 = (1.0, -2.0, 3.0), (0.5, 0.0, -1.0)
 P1, V1 = (1.02, -1.99, 2.97), (0.7, 0.4, -1.2)
