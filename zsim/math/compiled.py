@@ -21,10 +21,12 @@ import re
 import stat
 import sys
 import tempfile
+from collections import namedtuple
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
+from itertools import accumulate
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 try:
     from numba import njit
@@ -219,3 +221,31 @@ def _holder(module: str) -> Callable[[Any], Held]:
 
     holder.__module__ = module
     return portable(holder)
+
+
+class Field(NamedTuple):
+    """Numbers of one name in a row: their unit ("1" for none), and how many there are."""
+
+    name: str
+    unit: str
+    width: int = 1
+
+
+class Columns(Protocol):
+    """First columns by the names of the fields, and `size`."""
+
+    def __getattr__(self, name: str) -> int: ...
+
+
+def columns(name: str, fields: Iterable[Field]) -> Columns:
+    """Return the first column of every field by its name, and the columns in all as `size`.
+
+    It is a named tuple of integers: compiled code reads its attributes as constants.
+
+    Raises:
+        ValueError: two fields have one name.
+    """
+    listed = tuple(fields)
+    first = [0, *accumulate(field.width for field in listed)]
+    made: Any = namedtuple(name, [*(field.name for field in listed), "size"])  # type: ignore[misc]
+    return made(*first)

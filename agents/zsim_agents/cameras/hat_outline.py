@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.circle import spread
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import portable
+from zsim.math.compiled import Field, columns, portable
 from zsim.math.rotation import Vector, add, cross, dot, norm, scaled
 
 DIRECTIONS = 32

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.keys import SENSORS
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Matrix, Quaternion, Vector
 from zsim_agents.estimation.dead_reckoning import Reckoning, vector
 

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import add, rotate
 from zsim.schema.quantities import G_M_S2
 from zsim_world.physics.ground import POINTS, contact_point

@@ -4,8 +4,7 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Vector
 from zsim_world.state.fleet_arrays import Row
 

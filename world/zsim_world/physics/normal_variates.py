@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import Field, columns, inlined
 
 WORDS = columns("StreamWords", (Field("state", "1", 2), Field("step", "1", 2)))  # of a stream, uint64: high, low
 

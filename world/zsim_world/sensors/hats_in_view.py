@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.circle import spread
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined, kernel
+from zsim.math.compiled import Field, columns, inlined, kernel
 from zsim.math.rotation import (
     Quaternion,
     Vector,

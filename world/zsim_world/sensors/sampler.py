@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.snapshot import State
 from zsim.math import frames
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import Held, hold, inlined, kernel
+from zsim.math.compiled import Field, Held, columns, hold, inlined, kernel
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import SensorType
 from zsim_world.sensors import sensor_set

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from zsim.math.columns import Field, columns
+from zsim.math.compiled import Field, columns
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.imu import BOARD_RATE_HZ

@@ -10,8 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import compiled, inlined
+from zsim.math.compiled import Field, columns, compiled, inlined
 from zsim.math.rotation import Vector
 from zsim.sensors.camera_model import Lens, undistorted
 from zsim_world.physics.normal_variates import fill

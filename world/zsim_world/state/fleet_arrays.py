@@ -15,8 +15,7 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import Field, columns, inlined
 from zsim.scenario.scenario import Drone, Environment
 from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
 from zsim.vehicles.vehicle import Aerodynamics, Vehicle, allocation, lift_shares, mixing

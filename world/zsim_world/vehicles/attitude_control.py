@@ -3,8 +3,7 @@
 import math
 
 from zsim.math import rotation as rot
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
 from zsim.vehicles.vehicle import Firmware
 from zsim_world.physics.rigid_body import vector

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState
 from zsim.math import rotation as rot
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
 from zsim.vehicles.vehicle import ROTORS_MAX
 from zsim_world.physics.rigid_body import four, vector

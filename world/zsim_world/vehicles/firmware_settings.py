@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.columns import Field, columns
+from zsim.math.compiled import Field, columns
 from zsim.scenario.scenario import Drone
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.vehicles.attitude_control import DRIVE, lag_shares, loop_gains

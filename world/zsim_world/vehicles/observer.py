@@ -9,8 +9,7 @@ import math
 from numpy.typing import NDArray
 
 from zsim.math import rotation as rot
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import inlined
+from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
 from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim_world.physics.rigid_body import four, put, put_four, vector

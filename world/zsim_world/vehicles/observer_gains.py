@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from zsim.math.columns import Field, columns
+from zsim.math.compiled import Field, columns
 from zsim.scenario.scenario import Drone, Environment
 from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.sensors.sensor import ErrorModel, Sensor, noise_sigma, scaled

@@ -8,8 +8,7 @@ import math
 
 import numpy as np
 
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import portable
+from zsim.math.compiled import Field, columns, portable
 from zsim.math.rotation import Vector, add, cross, dot, matrix, norm, product, scaled, subtract, transposed
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
 from zsim_agents.estimation.filter_state import COUNT, SETTING, Moment, Rows, moment, vector

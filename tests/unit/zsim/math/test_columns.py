@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from zsim.math.columns import Field, columns
-from zsim.math.compiled import portable
+from zsim.math.compiled import Field, columns, portable
 
 ROW = columns("Row", (Field("p_WB", "m", 3), Field("energy", "J"), Field("q_WB", "1", 4)))
 
