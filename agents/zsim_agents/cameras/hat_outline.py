@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.circle import spread
 from zsim.math.compiled import Field, columns, portable
 from zsim.math.rotation import Vector, add, cross, dot, norm, scaled
+from zsim.sensors.camera_model import spread
 
 DIRECTIONS = 32
 STEP_PX = 0.5  # along a direction

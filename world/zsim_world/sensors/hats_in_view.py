@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.circle import spread
 from zsim.math.compiled import Field, columns, inlined, kernel
 from zsim.math.rotation import (
     Quaternion,
@@ -30,7 +29,7 @@ from zsim.math.rotation import (
 )
 from zsim.scenario import obstacle
 from zsim.sensors.camera import Camera
-from zsim.sensors.camera_model import Lens, camera_pose, lens_of, pixel
+from zsim.sensors.camera_model import Lens, camera_pose, lens_of, pixel, spread
 
 POSE = columns(  # of a drone at an instant
     "PoseColumns", (Field("p_WB", "m", 3), Field("v_WB", "m/s", 3), Field("q_WB", "1", 4), Field("w_WB_B", "rad/s", 3))
