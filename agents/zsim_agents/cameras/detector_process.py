@@ -11,9 +11,8 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings
 from zsim.errors import DecodeError
 from zsim.math.frames import rotation_matrix
-from zsim.sensors.camera import CAMERAS
+from zsim.sensors.camera import CAMERAS, PictureError
 from zsim.sensors.camera_model import CameraPose, Lens, folds
-from zsim.sensors.jpeg_header import PictureError
 from zsim.transport.session import RawSample, Session
 from zsim_agents.cameras import hat_outline
 from zsim_agents.cameras.detector import HatDetector

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.sensors.jpeg_header import PictureError, frame_of
+from zsim.sensors.camera import PictureError, frame_of
 
 PIXELS_MAX = 1920 * 1080 * 2  # of a picture that is decoded; twice what a camera of a scenario may have
 

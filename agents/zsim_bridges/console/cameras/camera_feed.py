@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import CameraImage, CameraInfo, Sightings
 from zsim.errors import DecodeError, ZsimError
-from zsim.sensors.camera import CAMERAS
-from zsim.sensors.jpeg_header import PictureError
+from zsim.sensors.camera import CAMERAS, PictureError
 from zsim.transport.session import RawSample, Session
 from zsim_bridges.console.cameras import camera_marks
 from zsim_bridges.console.cameras.camera_marks import Mark

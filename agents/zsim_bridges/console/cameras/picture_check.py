@@ -1,6 +1,6 @@
 """What is let through to a browser as a picture: pictures of others are looked at before."""
 
-from zsim.sensors.jpeg_header import PictureError, frame_of
+from zsim.sensors.camera import PictureError, frame_of
 
 PICTURE_BYTES_MAX = 1_000_000  # of a picture that is shown: ten a second of it fill 80 Mbit/s
 PIXELS_MAX = 1920 * 1200  # chosen: the largest camera of a scenario; a browser needs 4 bytes for each

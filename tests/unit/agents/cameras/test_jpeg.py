@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from refused import has_terms
 
-from zsim.sensors.jpeg_header import PictureError, frame_of
+from zsim.sensors.camera import PictureError, frame_of
 from zsim_agents.cameras.jpeg import decoded
 
 PICTURE = np.random.default_rng(1).integers(0, 255, (48, 64, 3), dtype=np.uint8)
