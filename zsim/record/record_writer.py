@@ -31,6 +31,7 @@ from zsim.record.mcap_layout import (
     unpacked,
 )
 from zsim.record.record_end import cut_off, finish, finish_bare, write_all
+from zsim.record.record_reader import RecordReader
 
 CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits longer than 0.5 s
@@ -411,3 +412,29 @@ class Content:
 
 def _column(values: array) -> NDArray:
     return np.frombuffer(values, values.typecode)
+
+
+def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
+    """Take the last message of a key off a record, and all that was written after it; return whether there was one.
+
+    Args:
+        key: of the message.
+        is_it: returns, by the payload, whether it is the one that is meant.
+
+    Raises:
+        RecordError: no record, it cannot be written, or another process writes it.
+    """
+    with RecordReader(path) as reader:
+        cut = reader.last_chunk(key, is_it)
+    if cut is None:
+        return False
+    start, before = cut
+    try:
+        with open(path, "r+b") as file:
+            file.truncate(start)
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be cut ({error.strerror})") from error
+    with RecordWriter(path, goes_on=True) as writer:
+        for each in before:
+            writer.add(each.key, each.payload, messages.encoding(each.key), each.t_ns, each.wall_ns)
+    return True
