@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from zsim.errors import RunError
-from zsim.extras import install_command
+from zsim.errors import RunError, install_command
 
 if TYPE_CHECKING:
     from zsim.transport.tls import Identity

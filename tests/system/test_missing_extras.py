@@ -11,7 +11,7 @@ import pytest
 from refused import has_terms
 from synthetic_record import SCENARIOS, Flown, write
 
-from zsim.extras import EXTRA_OF, install_command
+from zsim.errors import EXTRA_OF, install_command
 
 ROOT = Path(__file__).parents[2]
 STEP = str(SCENARIOS / "step.yaml")

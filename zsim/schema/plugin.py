@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim import extras
+from zsim import errors
 from zsim.errors import DocumentError, NotTrustedError, UserCodeError
 from zsim.schema.checker import show
 
@@ -233,7 +233,7 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
     try:
         return importlib.import_module(name)
     except RAISED as error:
-        if isinstance(error, ModuleNotFoundError) and (lacking := extras.missing(error)):
+        if isinstance(error, ModuleNotFoundError) and (lacking := errors.missing(error)):
             raise DocumentError([f"{what}, which cannot be imported: {lacking}"]) from error
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"]) from error

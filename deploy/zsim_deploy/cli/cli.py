@@ -11,7 +11,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.main import get_command
 
-from zsim import __version__, extras
+from zsim import __version__, errors
 from zsim.errors import (
     BehindError,
     RequestRefusedError,
@@ -283,7 +283,7 @@ def _run() -> NoReturn:
         _show_usage(error)
         sys.exit(2)
     except ModuleNotFoundError as error:
-        if (lacking := extras.missing(error)) is None:
+        if (lacking := errors.missing(error)) is None:
             raise
         print(printable(f"{' '.join(sys.argv[1:2])}: {lacking}"), file=sys.stderr)
         sys.exit(USER_FAULT)

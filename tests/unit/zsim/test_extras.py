@@ -4,7 +4,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from zsim.extras import install_command
+from zsim.errors import install_command
 
 ROOT = Path(__file__).parents[3]
 WRITTEN = ("README.md", "docs/**/*.md", "deploy/**/*.py", "agents/**/*.py", "world/**/*.py", "zsim/**/*.py")

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import DecodeError, without_figures
-from zsim.extras import install_command
+from zsim.errors import DecodeError, install_command, without_figures
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges.ardrone.server.addresses import AllowedHosts, drone_addresses

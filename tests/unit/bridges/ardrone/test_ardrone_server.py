@@ -7,7 +7,7 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.contract.messages import DroneInfo, Info, Origin
-from zsim.extras import install_command
+from zsim.errors import install_command
 from zsim_bridges.ardrone.server import ardrone_server
 from zsim_bridges.ardrone.server.ardrone_server import ArdroneOptions, ArdroneServer
 from zsim_bridges.observer_process import ObserverProcess

@@ -10,8 +10,7 @@ import typer
 from refused import has_terms, refused
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from zsim.errors import RunError
-from zsim.extras import install_command
+from zsim.errors import RunError, install_command
 from zsim_bridges.ros2.ros_types import MESSAGES, RosTypes
 from zsim_deploy.cli.bridge_commands import console, gateway, ros1, ros2
 
