@@ -11,8 +11,7 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest, Fault, Fau
 from zsim.contract.snapshot import State
 from zsim.runtime.link_faults import KINDS as LINK_KINDS
 from zsim.scenario import fault_kinds
-from zsim.scenario.fault_check import Known, flaws
-from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim.scenario.fault_kinds import PROCESS_KILL, Known, flaws
 from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import FAULTS_MAX, Scenario
 from zsim.schema.checker import show
