@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim.scenario.fault_kinds import planned
+from zsim.scenario.faults import planned
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
 

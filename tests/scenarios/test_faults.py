@@ -17,7 +17,7 @@ from zsim.errors import RunError
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
 from zsim.scenario import scenario_file
-from zsim.scenario.fault_kinds import KINDS
+from zsim.scenario.faults import KINDS
 from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.formation.controller import Controller
 from zsim_analysis.in_process import agents

@@ -16,7 +16,7 @@ from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
 from zsim.runtime.routing import RoutingTable
-from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim.scenario.faults import PROCESS_KILL
 
 INCARNATION = 0  # of every agent: in one process none comes back
 GATES_MAX = 10  # of the world in a row, where commands are delayed by as many

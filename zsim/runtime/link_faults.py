@@ -17,7 +17,7 @@ from zsim.contract.flight_messages import Estimate
 from zsim.contract.run_messages import Fault, Faults
 from zsim.contract.snapshot import State
 from zsim.runtime.routing import Input, canonical
-from zsim.scenario import fault_kinds
+from zsim.scenario import faults as fault_kinds
 
 WORLD, RADIO = "world", "radio"
 KINDS = frozenset(name for name, kind in fault_kinds.KINDS.items() if kind.strikes in ("link", RADIO))

@@ -17,7 +17,7 @@ from zsim.runtime.collector import rare_collections
 from zsim.runtime.health import HealthMeter
 from zsim.runtime.membership import Membership
 from zsim.runtime.runner_inputs import RunnerInputs
-from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim.scenario.faults import PROCESS_KILL
 from zsim.schema import plugin
 from zsim.transport.session import Query, Session
 

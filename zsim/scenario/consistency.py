@@ -12,8 +12,8 @@ import numpy as np
 from msgspec import UNSET
 
 from zsim.contract import messages
-from zsim.scenario import fault_kinds
-from zsim.scenario.fault_kinds import kinds_of
+from zsim.scenario import faults
+from zsim.scenario.faults import kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
@@ -358,7 +358,7 @@ def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
             if name in owner:
                 yield path, f"is {name!r}, which {owner[name]!r} flies already; a drone is in one cluster"
             elif judged and name not in known:
-                yield path, f"is {name!r}; must be one of the drones {fault_kinds.listed(list(dict.fromkeys(known)))}"
+                yield path, f"is {name!r}; must be one of the drones {faults.listed(list(dict.fromkeys(known)))}"
             owner.setdefault(name, called)
 
 
@@ -443,7 +443,7 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
         kind, entries = things.get(role, ("", []))
         known = _names(entries)
         if kind and thing not in known and len(known) == len(entries):
-            named = fault_kinds.listed(known) or f"a {kind}, and there is none"
+            named = faults.listed(known) or f"a {kind}, and there is none"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
 
@@ -466,9 +466,9 @@ def _injected_faults(
     kinds = kinds_of(declarations([drone for _, drone in drones]))
     rotors = {drone.name: vehicles[drone.model].rotor_names if drone.model in vehicles else () for _, drone in drones}
     external = tuple(drone.name for _, drone in drones if drone.body == EXTERNAL)
-    known = fault_kinds.Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds, rotors, external)
+    known = faults.Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds, rotors, external)
     for index, fault in _entries(scenario.faults):
-        for path, text in fault_kinds.flaws(fault, known):
+        for path, text in faults.flaws(fault, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from zsim.contract.flight_messages import Truth
 from zsim.errors import ScenarioError
-from zsim.scenario.fault_kinds import listed
+from zsim.scenario.faults import listed
 from zsim.scenario.rights import DRIVER
 from zsim.scenario.scenario import Scenario
 

@@ -14,7 +14,7 @@ from msgspec import UNSET, Struct, inspect
 from numpy.typing import NDArray
 
 from zsim.contract.messages import REFUSALS
-from zsim.scenario.fault_kinds import ROTORS
+from zsim.scenario.faults import ROTORS
 from zsim.sensors.sensor import sensor_of
 
 Kind = Literal["whole", "number", "flag", "text"]

@@ -17,7 +17,7 @@ from zsim.errors import DecodeError, RecordError, ZsimError
 from zsim.record import Recorded, RecordReader
 from zsim.record.record_reader import record_at
 from zsim.scenario import scenario_file
-from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin

@@ -18,7 +18,7 @@ from zsim_deploy.cli.record_commands import note_skipped
 if TYPE_CHECKING:
     from zsim.contract.messages import Info
     from zsim.contract.run_messages import Fault
-    from zsim.scenario.fault_kinds import FaultKind
+    from zsim.scenario.faults import FaultKind
     from zsim.transport.session import Session
 
 PANEL = "Look and poke"
@@ -158,7 +158,7 @@ def seconds(text: str | None) -> float | None:
     """Return the duration in a text such as 10s, 500ms or 2min."""
     if text is None:
         return None
-    from zsim.scenario.fault_kinds import typed_duration_s
+    from zsim.scenario.faults import typed_duration_s
 
     try:
         return typed_duration_s(text)
@@ -244,7 +244,8 @@ def kinds(
     trust: Trust = False,
 ) -> None:
     """List the kinds of faults: whom they strike, and their parameters."""
-    from zsim.scenario import fault_kinds, scenario_file
+    from zsim.scenario import faults as fault_kinds
+    from zsim.scenario import scenario_file
     from zsim.schema import plugin
     from zsim.sensors.sensor_catalogue import declarations
     from zsim.terminal.fitted_table import Column, FittedTable, print_table
@@ -260,7 +261,8 @@ def kinds(
 
 def selector(which: str, scenario: str) -> dict[str, Any]:
     """Return the arguments of `fault_clear` that a word means in the run of a scenario, given as text."""
-    from zsim.scenario import fault_kinds, scenario_file
+    from zsim.scenario import faults as fault_kinds
+    from zsim.scenario import scenario_file
     from zsim.sensors.sensor_catalogue import declarations
 
     if which == ALL:
@@ -285,7 +287,7 @@ def _is_over(fault: "Fault", now_ns: int) -> bool:
 
 
 def _parameters(kind: "FaultKind") -> list[str]:
-    from zsim.scenario.fault_kinds import expected
+    from zsim.scenario.faults import expected
 
     parameters = [f"{p.name}: {expected(p)}{'' if p.required else ' (may be left out)'}" for p in kind.parameters]
     return [*parameters, *(["--for is needed"] if kind.lasts == "ends" else [])]
@@ -293,7 +295,7 @@ def _parameters(kind: "FaultKind") -> list[str]:
 
 def _values(parameters: Sequence[str]) -> dict[str, Any]:
     """Return the map that texts NAME=VALUE make; values are YAML."""
-    from zsim.scenario.fault_kinds import typed_parameters
+    from zsim.scenario.faults import typed_parameters
 
     try:
         return typed_parameters(parameters)

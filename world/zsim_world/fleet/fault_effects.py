@@ -9,7 +9,7 @@ from scipy.special import ndtr, ndtri
 
 from zsim.contract.run_messages import Fault
 from zsim.contract.snapshot import State
-from zsim.scenario.fault_kinds import sensor_parts
+from zsim.scenario.faults import sensor_parts
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics.air import WIND
 from zsim_world.sensors import sensor_set as ss

@@ -10,8 +10,8 @@ from zsim.contract import keys
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Fault, Faults
 from zsim.contract.snapshot import State
 from zsim.runtime.link_faults import KINDS as LINK_KINDS
-from zsim.scenario import fault_kinds
-from zsim.scenario.fault_kinds import PROCESS_KILL, Known, flaws
+from zsim.scenario import faults
+from zsim.scenario.faults import PROCESS_KILL, Known, flaws
 from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import FAULTS_MAX, Scenario
 from zsim.schema.checker import show
@@ -40,7 +40,7 @@ class FaultInjector:
     ) -> None:
         self._scenario, self._clock, self._barrier, self._outbox = scenario, clock, barrier, outbox
         self._effects = effects
-        self._kinds = fault_kinds.kinds_of(declarations(scenario.drones))
+        self._kinds = faults.kinds_of(declarations(scenario.drones))
         self._faults: dict[int, Fault] = {}
         self._begun: set[int] = set()
         self._over: set[int] = set()  # ended or cleared, kept for those who still work on gates in which it acted
@@ -59,7 +59,7 @@ class FaultInjector:
 
     def acting(self, gate_ns: int) -> list[Fault]:
         """Return the faults that act in a gate."""
-        return [fault for fault in self.all if fault_kinds.acts(fault, gate_ns)]
+        return [fault for fault in self.all if faults.acts(fault, gate_ns)]
 
     def of_links(self, gate_ns: int) -> tuple[Fault, ...]:
         """Return the faults of links and radios that act in a gate; used for every command."""
@@ -67,7 +67,7 @@ class FaultInjector:
             return ()
         acting = self._of_links_at.get(gate_ns)
         if acting is None:
-            acting = tuple(fault for fault in self._of_links if fault_kinds.acts(fault, gate_ns))
+            acting = tuple(fault for fault in self._of_links if faults.acts(fault, gate_ns))
             self._of_links_at[gate_ns] = acting
         return acting
 
@@ -230,7 +230,7 @@ class FaultInjector:
 
     def _plan(self, args: Mapping[str, Any], source: str) -> Fault:
         self._count += 1
-        fault = fault_kinds.planned(args, self._count, source, self._clock.now_ns, self._clock.gate_ns, self._kinds)
+        fault = faults.planned(args, self._count, source, self._clock.now_ns, self._clock.gate_ns, self._kinds)
         self._faults[fault.id] = fault
         return fault
 
@@ -270,7 +270,7 @@ def _arguments(request: ControlRequest) -> dict[str, Any]:
 
 def _is_instant(fault: Fault) -> bool:
     """Tell whether a fault is over as soon as it has begun."""
-    kind = fault_kinds.KINDS.get(fault.kind)
+    kind = faults.KINDS.get(fault.kind)
     return kind is not None and kind.lasts == "once"
 
 

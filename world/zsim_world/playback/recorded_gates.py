@@ -26,7 +26,7 @@ from zsim.record import Recorded, RecordReader
 from zsim.record.record_reader import OVERLAP_NS
 from zsim.runtime.agent import Output
 from zsim.scenario import rights
-from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim.scenario.faults import PROCESS_KILL
 
 SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # say who published them
 VIEWS = (ViewDrones, ViewCluster, ViewEstimates)  # made anew, as often as they are shown

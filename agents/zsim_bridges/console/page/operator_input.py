@@ -5,7 +5,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from zsim.scenario.fault_kinds import FaultKind, expected, typed_rest, unstated
+from zsim.scenario.faults import FaultKind, expected, typed_rest, unstated
 from zsim.scenario.scenario import Cluster, Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
 from zsim_agents.formation.variable_values import DEGREES

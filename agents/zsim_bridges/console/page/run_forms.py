@@ -8,7 +8,7 @@ import viser
 
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX
-from zsim.scenario.fault_kinds import PROCESS_KILL, ROTORS, FaultKind, expected, kinds_of, unstated
+from zsim.scenario.faults import PROCESS_KILL, ROTORS, FaultKind, expected, kinds_of, unstated
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from msgspec import Struct
 
 from zsim.contract.run_messages import Event
-from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim.scenario.faults import PROCESS_KILL
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.pages import DARK, GREEN, ORANGE, PURPLE, SKY, VERMILION

@@ -12,7 +12,7 @@ from zsim.contract import keys
 from zsim.contract.run_messages import Fault
 from zsim.errors import SessionError
 from zsim.scenario import scenario_file
-from zsim.scenario.fault_kinds import COMMON, KINDS, OPTION_OF
+from zsim.scenario.faults import COMMON, KINDS, OPTION_OF
 from zsim.transport.session import Session
 from zsim_deploy.cli import federation_commands
 from zsim_deploy.cli.federation_commands import row, seconds, selector

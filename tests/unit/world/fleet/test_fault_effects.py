@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zsim.contract.run_messages import Fault
-from zsim.scenario.fault_kinds import ROTORS, planned
+from zsim.scenario.faults import ROTORS, planned
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fault_effects import gust_m_s
 from zsim_world.fleet.fleet import Fleet

@@ -16,7 +16,7 @@ from zsim.contract.snapshot import pack, unpack
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.link_faults import LinkFaults, place_of, reception_probability, senders, uniform
 from zsim.scenario import scenario_file
-from zsim.scenario.fault_kinds import planned
+from zsim.scenario.faults import planned
 from zsim_agents.formation.controller import REQUESTS_MAX, Controller
 from zsim_world.flight.world import World
 

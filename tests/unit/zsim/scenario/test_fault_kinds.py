@@ -11,7 +11,7 @@ from refused import has_terms
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
-from zsim.scenario.fault_kinds import KINDS, FaultParameter, Known, acts, expected, flaws, planned
+from zsim.scenario.faults import KINDS, FaultParameter, Known, acts, expected, flaws, planned
 from zsim.scenario.scenario_file import resolve
 
 GATE_NS = 20_000_000

@@ -9,7 +9,7 @@ from zsim.contract import keys, messages
 from zsim.contract.framing import key_table
 from zsim.errors import DecodeError, DocumentError, ScenarioError
 from zsim.scenario import scenario_file
-from zsim.scenario.fault_kinds import kinds_of
+from zsim.scenario.faults import kinds_of
 from zsim.scenario.scenario import Scenario
 from zsim.sensors import sensor_catalogue
 from zsim.sensors.sensor import as_fields, field_types, message_type

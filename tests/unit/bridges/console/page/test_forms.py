@@ -13,7 +13,7 @@ from refused import has_terms, without_tags
 
 from zsim.contract.flight_messages import ViewCluster
 from zsim.scenario import scenario_file
-from zsim.scenario.fault_kinds import KINDS, Known, flaws
+from zsim.scenario.faults import KINDS, Known, flaws
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.engagement_setup import gains_of
 from zsim_agents.formation.flight_check import place_fault
