@@ -18,7 +18,7 @@ _FIRST = re.compile(r"[^.\[\]]+")
 _PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
 
 
-def apply(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> str | None:
+def apply_override(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> str | None:
     """Apply one override to a raw document; return the fault if there is one, and then nothing has changed.
 
     Args:
@@ -28,13 +28,13 @@ def apply(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> s
     """
     path, equals, value_text = text.partition("=")
     if len(path) > PATH_MAX:
-        return f"{_name(text)}: is a path of {len(path)} characters; must have at most {PATH_MAX}"
+        return f"{_shown_override(text)}: is a path of {len(path)} characters; must have at most {PATH_MAX}"
     if not equals or not _PATH.fullmatch(path):
-        return f"{_name(text)}: is no assignment; must be {SYNTAX}"
+        return f"{_shown_override(text)}: is no assignment; must be {SYNTAX}"
     try:
         _assign(document, steps_of(path, document), parse(value_text))
     except ValueError as error:
-        return f"{_name(text)}: {error}"
+        return f"{_shown_override(text)}: {error}"
     return None
 
 
@@ -64,10 +64,10 @@ def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
     sections = {field.name: field for field in _fields(Document)}
     if first is None or first[0] in sections:
         return path
-    owners = [name for name, field in sections.items() if first[0] in _names(field.type)]
+    owners = [name for name, field in sections.items() if first[0] in _field_names(field.type)]
     if owners:
         return f"{owners[0]}.{path}" if len(owners) == 1 else path
-    lists = [name for name, field in sections.items() if any(first[0] in _names(each) for each in get_args(field.type))]
+    lists = [name for name, field in sections.items() if any(first[0] in _field_names(each) for each in get_args(field.type))]
     return _in_entry(path, lists[0], document.get(lists[0])) if len(lists) == 1 else path
 
 
@@ -86,7 +86,7 @@ def _is_step(name: Any) -> bool:
     return isinstance(name, str) and _FIRST.fullmatch(name) is not None
 
 
-def _names(kind: Any) -> list[str]:
+def _field_names(kind: Any) -> list[str]:
     return [field.name for field in _fields(kind)]
 
 
@@ -132,5 +132,5 @@ def _index(place: list[Any], step: str, path: list[str]) -> int:
     raise ValueError(f"{step[:40]} is not in {'.'.join(path)}; {suggestion(step, texts)}allowed: {allowed}")
 
 
-def _name(text: str) -> str:
+def _shown_override(text: str) -> str:
     return f"--set {text if len(text) <= 80 and text.isprintable() else show(text)}"

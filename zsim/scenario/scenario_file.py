@@ -40,7 +40,7 @@ def load(path: str | Path, overrides: Iterable[str] = (), modules: Iterable[Path
     plugin.search(path.parent, *modules)
     document = yaml_file.read(path, EXAMPLE, ScenarioError)
     document.update({key: value for key, value in values.items() if value is not None})
-    applied = [override.apply(document, text, yaml_file.value) for text in overrides]
+    applied = [override.apply_override(document, text, yaml_file.value) for text in overrides]
     return _resolve(document, path.name, [fault for fault in applied if fault])
 
 

@@ -292,7 +292,7 @@ def _faults(make: Callable[[int], Scenario], run: int) -> list[str]:
 
 def _assign(document: dict[str, Any], path: str, value: Any) -> str | None:
     """Set a field of a document to a copy of a value; return the fault if there is one."""
-    fault = overrides.apply(document, f"{path}={text_of(value)}", lambda _: copy.deepcopy(value))
+    fault = overrides.apply_override(document, f"{path}={text_of(value)}", lambda _: copy.deepcopy(value))
     return f"--vary {fault.removeprefix('--set ')}" if fault else None
 
 
@@ -310,5 +310,5 @@ def read_document(path: Path, set_texts: list[str], **values: Any) -> tuple[dict
     plugin.search(path.parent)
     document = yaml_file.read(path, EXAMPLE, ScenarioError)
     document.update({key: value for key, value in values.items() if value is not None})
-    applied = [overrides.apply(document, text, yaml_file.value) for text in set_texts]
+    applied = [overrides.apply_override(document, text, yaml_file.value) for text in set_texts]
     return document, [fault for fault in applied if fault]
