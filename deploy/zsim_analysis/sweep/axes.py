@@ -12,8 +12,8 @@ import numpy as np
 from msgspec import Struct
 
 from zsim.math.random_streams import stream
-from zsim.scenario.overrides import NOTHING, steps_of, whole_path
 from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario_file import NOTHING, steps_of, whole_path
 from zsim.schema import yaml_file
 from zsim.schema.checker import first_fault, show
 

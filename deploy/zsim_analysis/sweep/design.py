@@ -13,11 +13,10 @@ from msgspec import Struct
 
 from zsim import __version__
 from zsim.errors import ScenarioError
-from zsim.scenario import overrides, scenario_file
+from zsim.scenario import scenario_file
 from zsim.scenario.external_bodies import check_pace
-from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import Scenario
-from zsim.scenario.scenario_file import EXAMPLE
+from zsim.scenario.scenario_file import EXAMPLE, whole_path
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import first_lines
 from zsim_agents.hosting import check_classes
@@ -292,7 +291,7 @@ def _faults(make: Callable[[int], Scenario], run: int) -> list[str]:
 
 def _assign(document: dict[str, Any], path: str, value: Any) -> str | None:
     """Set a field of a document to a copy of a value; return the fault if there is one."""
-    fault = overrides.apply_override(document, f"{path}={text_of(value)}", lambda _: copy.deepcopy(value))
+    fault = scenario_file.apply_override(document, f"{path}={text_of(value)}", lambda _: copy.deepcopy(value))
     return f"--vary {fault.removeprefix('--set ')}" if fault else None
 
 
@@ -310,5 +309,5 @@ def read_document(path: Path, set_texts: list[str], **values: Any) -> tuple[dict
     plugin.search(path.parent)
     document = yaml_file.read(path, EXAMPLE, ScenarioError)
     document.update({key: value for key, value in values.items() if value is not None})
-    applied = [overrides.apply_override(document, text, yaml_file.value) for text in set_texts]
+    applied = [scenario_file.apply_override(document, text, yaml_file.value) for text in set_texts]
     return document, [fault for fault in applied if fault]

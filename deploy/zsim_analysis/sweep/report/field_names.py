@@ -50,7 +50,7 @@ WORDS = {
     "takeoff": "take-off",
 }
 OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
-_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
+_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.scenario_file
 
 
 class FieldName(Struct, frozen=True):

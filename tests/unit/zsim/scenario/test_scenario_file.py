@@ -18,8 +18,8 @@ from refused import has_terms
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.consistency import unflown_plans
-from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import DRONES_MAX, Scenario
+from zsim.scenario.scenario_file import whole_path
 from zsim.schema.checker import FAULTS_MAX
 from zsim.schema.quantities import G_M_S2
 from zsim.schema.yaml_file import FILE_SIZE_MAX
