@@ -15,16 +15,16 @@ class BaroConfig(Sensor, frozen=True, kw_only=True):
     altitude_m: ErrorModel = ErrorModel()
 
 
-PRESET = {
+BARO_PRESET = {
     "rate_hz": 25.0,  # Hz, chosen as the sonar's
     "altitude_m": {"noise": 0.1},  # m, chosen: twice Paparazzi's model of the ardrone2, for the wash of the rotors
 }
 
-SENSOR = SensorType(
+BARO = SensorType(
     label="barometer",
     message=Baro,
     settings=BaroConfig,
     channels=(Channel("altitude_m", "m", axes="of height", bias_max=1e4),),
     exact=1,
-    presets=dict.fromkeys(("ardrone2", "paper", "crazyflie2"), PRESET),  # the paper is silent
+    presets=dict.fromkeys(("ardrone2", "paper", "crazyflie2"), BARO_PRESET),  # the paper is silent
 )

@@ -15,21 +15,21 @@ class FlowConfig(Sensor, frozen=True, kw_only=True):
     velocity_m_s: ErrorModel = ErrorModel()
 
 
-PRESET = {
+FLOW_PRESET = {
     "rate_hz": 15.0,  # Hz, of the reduced navdata in which the drone sends its velocity
     "velocity_m_s": {"noise": 0.1},  # m/s, chosen: nothing is published for the aircraft's flow
 }
-PRESETS = {
-    "ardrone2": PRESET,
-    "paper": PRESET,  # it is silent
+FLOW_PRESETS = {
+    "ardrone2": FLOW_PRESET,
+    "paper": FLOW_PRESET,  # it is silent
     "crazyflie2": {"rate_hz": 25.0, "velocity_m_s": {"noise": 0.1}},  # chosen; nothing is published for the deck
 }
 
-SENSOR = SensorType(
+FLOW = SensorType(
     label="optical flow",
     message=Flow,
     settings=FlowConfig,
     channels=(Channel("velocity_m_s", "m/s", 3, axes="forward, left, up", bias_max=1e3),),
     exact=1,
-    presets=PRESETS,
+    presets=FLOW_PRESETS,
 )

@@ -3,7 +3,7 @@
 from zsim.schema.message import Count, Number, Vector3
 from zsim.sensors.sensor import Channel, ErrorModel, Sample, Sensor, SensorType
 
-RATE_HZ = 5.0  # Hz, Paparazzi's model of the ardrone2
+GPS_RATE_HZ = 5.0  # Hz, Paparazzi's model of the ardrone2
 SPEED_NOISE = {"noise": 0.43}  # m/s, ehve of a real navdata packet; the paper is silent
 
 
@@ -28,15 +28,15 @@ class GpsConfig(Sensor, frozen=True, kw_only=True):
     velocity_m_s: ErrorModel = ErrorModel()
 
 
-PRESETS = {
+GPS_PRESETS = {
     "ardrone2": {
-        "rate_hz": RATE_HZ,
+        "rate_hz": GPS_RATE_HZ,
         "latency_ms": 200.0,  # ms, Paparazzi's model of the ardrone2
         "position_m": {"noise": 2.0},  # m, likewise
         "velocity_m_s": SPEED_NOISE,
     },
     "paper": {
-        "rate_hz": RATE_HZ,
+        "rate_hz": GPS_RATE_HZ,
         "position_m": {"noise": 2.0},  # m, section VI
         "velocity_m_s": SPEED_NOISE,
     },
@@ -47,7 +47,7 @@ PRESETS = {
     },
 }
 
-SENSOR = SensorType(
+GPS = SensorType(
     label="GPS",
     message=Gps,
     settings=GpsConfig,
@@ -55,5 +55,5 @@ SENSOR = SensorType(
         Channel("position_m", "m", 3, axes="east, north, up", bias_max=1e5),
         Channel("velocity_m_s", "m/s", 3),
     ),
-    presets=PRESETS,
+    presets=GPS_PRESETS,
 )

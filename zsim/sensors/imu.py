@@ -21,7 +21,7 @@ class ImuConfig(Sensor, frozen=True, kw_only=True):
     gyro_deg_s: ErrorModel = ErrorModel()
 
 
-PRESETS = {
+IMU_PRESETS = {
     "ardrone2": {
         "rate_hz": BOARD_RATE_HZ,
         "accel_m_s2": {
@@ -58,10 +58,10 @@ PRESETS = {
         },
     },
 }
-AS_PRINTED = {"accel_m_s2": {"noise": 0.35 * G_M_S2}}  # m/s^2, section VI: "std errors 0.35 g"
+IMU_AS_PRINTED = {"accel_m_s2": {"noise": 0.35 * G_M_S2}}  # m/s^2, section VI: "std errors 0.35 g"
 
 # The greatest biases are chosen: about ten times what any such sensor can show, so that only slips are refused.
-SENSOR = SensorType(
+IMU = SensorType(
     label="IMU",
     message=Imu,
     settings=ImuConfig,
@@ -69,5 +69,5 @@ SENSOR = SensorType(
         Channel("accel_m_s2", "m/s^2", 3, 1.0, "accel", "accelerometer", "in the sensor's axes", 500.0),
         Channel("gyro_deg_s", "deg/s", 3, math.pi / 180.0, "gyro", "gyroscope", "in the sensor's axes", 5700.0),
     ),
-    presets=PRESETS,
+    presets=IMU_PRESETS,
 )

@@ -22,12 +22,12 @@ from zsim.sensors.sensor import VALUES_MAX, Declaration, Sample, Sensor, SensorT
 from zsim.sensors.sonar import SonarConfig
 
 STOCK: dict[str, SensorType] = {
-    "imu": imu.SENSOR,
-    "gps": gps.SENSOR,
-    "mag": mag.SENSOR,
-    "baro": baro.SENSOR,
-    "sonar": sonar.SENSOR,
-    "flow": flow.SENSOR,
+    "imu": imu.IMU,
+    "gps": gps.GPS,
+    "mag": mag.MAG,
+    "baro": baro.BARO,
+    "sonar": sonar.SONAR,
+    "flow": flow.FLOW,
 }
 
 
@@ -72,7 +72,7 @@ PRESETS = {
     preset: {name: kind.presets[preset] for name, kind in STOCK.items()}
     for preset in ("ardrone2", "paper", "crazyflie2")
 }
-AS_PRINTED = {"imu": imu.AS_PRINTED}
+AS_PRINTED = {"imu": imu.IMU_AS_PRINTED}
 
 MODULE, DECLARED = "module", "declared"  # what the section of a user's sensor says beside its settings
 FIELDS = tuple(name for name in Sensors.__struct_fields__ if name != "own")

@@ -18,13 +18,13 @@ class SonarConfig(Sensor, frozen=True, kw_only=True):
     max_m: Positive = 6.0
 
 
-PRESET = {
+SONAR_PRESET = {
     "rate_hz": 25.0,  # Hz, ultrasound_freq 8 of the AR.Drone's configuration
     "range_m": {"noise": 0.01},  # m, chosen: what grass and tilt add to the 0.5 mm per LSB of the converter
 }
-PRESETS = {
-    "ardrone2": PRESET,
-    "paper": PRESET,  # it is silent
+SONAR_PRESETS = {
+    "ardrone2": SONAR_PRESET,
+    "paper": SONAR_PRESET,  # it is silent
     "crazyflie2": {
         "rate_hz": 25.0,  # Hz, chosen as the AR.Drone's
         "range_m": {"noise": 0.02},  # m, chosen, with floor and tilt; crazyflie-firmware, zranger2.c, has 2.5 mm
@@ -32,11 +32,11 @@ PRESETS = {
     },
 }
 
-SENSOR = SensorType(
+SONAR = SensorType(
     label="sonar",
     message=Sonar,
     settings=SonarConfig,
     channels=(Channel("range_m", "m", axes="of range", bias_max=1e4),),
     exact=1,
-    presets=PRESETS,
+    presets=SONAR_PRESETS,
 )
