@@ -20,8 +20,8 @@ from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_n
 from zsim.schema.checker import Fault, show
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
-from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations, own_sections
+from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle, lift_shares
 
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step

@@ -11,18 +11,18 @@ from msgspec import UNSET, Struct, UnsetType
 from zsim.errors import DocumentError, NotTrustedError
 from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, field_path, show, suggestion
-from zsim.sensors import baro, flow, gps, imu, mag, sonar
+from zsim.sensors import baro, flow, gps, mag, sonar, stock_sensors
 from zsim.sensors.baro import BaroConfig
 from zsim.sensors.camera import CAMERAS, BottomCamera, Camera, FrontCamera, SightingModel
 from zsim.sensors.flow import FlowConfig
 from zsim.sensors.gps import GpsConfig
-from zsim.sensors.imu import ImuConfig
 from zsim.sensors.mag import MagConfig
 from zsim.sensors.sensor import VALUES_MAX, Declaration, Sample, Sensor, SensorType, as_fields
 from zsim.sensors.sonar import SonarConfig
+from zsim.sensors.stock_sensors import ImuConfig
 
 STOCK: dict[str, SensorType] = {
-    "imu": imu.IMU,
+    "imu": stock_sensors.IMU,
     "gps": gps.GPS,
     "mag": mag.MAG,
     "baro": baro.BARO,
@@ -72,7 +72,7 @@ PRESETS = {
     preset: {name: kind.presets[preset] for name, kind in STOCK.items()}
     for preset in ("ardrone2", "paper", "crazyflie2")
 }
-AS_PRINTED = {"imu": imu.IMU_AS_PRINTED}
+AS_PRINTED = {"imu": stock_sensors.IMU_AS_PRINTED}
 
 MODULE, DECLARED = "module", "declared"  # what the section of a user's sensor says beside its settings
 FIELDS = tuple(name for name in Sensors.__struct_fields__ if name != "own")

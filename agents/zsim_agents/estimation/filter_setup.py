@@ -16,9 +16,9 @@ from scipy.special import chdtri
 from zsim.contract.keys import SENSORS
 from zsim.math.rotation import LEVEL, matrix_from_rpy
 from zsim.scenario.scenario import Drone, Environment, Estimation
-from zsim.sensors.imu import ImuConfig
 from zsim.sensors.sensor import ErrorModel, Sensor, scaled
 from zsim.sensors.sensor_catalogue import Sensors
+from zsim.sensors.stock_sensors import ImuConfig
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from zsim_agents.estimation.filter_state import (
     BIAS,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from zsim.math.compiled import kernel
 from zsim.math.random_streams import stream
 from zsim.scenario.scenario import Scenario
-from zsim.sensors.imu import BOARD_RATE_HZ
+from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim_world.physics.normal_variates import WORDS, fill, words
 from zsim_world.sensors.sensor_set import CHANNELS, CHANNELS_MAX, SENSORS, channels, noise_width, rate_of
 

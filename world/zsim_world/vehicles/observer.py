@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from zsim.math import rotation as rot
 from zsim.math.compiled import Field, columns, inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
-from zsim.sensors.imu import BOARD_RATE_HZ
+from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import free_thrust, lagged
 from zsim_world.sensors.sensor_set import FIELD_MIN_UT

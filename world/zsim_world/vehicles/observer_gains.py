@@ -19,8 +19,8 @@ from scipy.linalg import expm
 
 from zsim.math.compiled import Field, columns
 from zsim.scenario.scenario import Drone, Environment
-from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.sensors.sensor import ErrorModel, Sensor, noise_sigma, scaled
+from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.sensors.sensor_set import heading_sigma
 from zsim_world.state.fleet_arrays import REFERENCE_DENSITY_KG_M3
