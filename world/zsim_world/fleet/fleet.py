@@ -20,8 +20,8 @@ from zsim.contract.snapshot import State
 from zsim.errors import RunError
 from zsim.math.compiled import hold
 from zsim.scenario.scenario import Drone, Scenario
-from zsim.sensors.gps import GpsConfig
 from zsim.sensors.sensor import noise_sigma
+from zsim.sensors.stock_sensors import GpsConfig
 from zsim.vehicles.vehicle import Vehicle
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.fleet import kernel
