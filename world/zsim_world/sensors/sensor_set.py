@@ -12,11 +12,10 @@ from scipy.special import ndtri
 from zsim.math.compiled import Field, columns
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario.scenario import Scenario
-from zsim.sensors.mag import MagConfig
 from zsim.sensors.sensor import VALUES_MAX, ErrorModel, Sensor, SensorType, noise_sigma
 from zsim.sensors.sensor_catalogue import STOCK, Sensors
 from zsim.sensors.sonar import SonarConfig
-from zsim.sensors.stock_sensors import BOARD_RATE_HZ
+from zsim.sensors.stock_sensors import BOARD_RATE_HZ, MagConfig
 
 SENSORS = tuple(STOCK)  # the contract's order; a user's own count on from there
 IMU, GPS, MAG, BARO, SONAR, FLOW = range(len(SENSORS))
