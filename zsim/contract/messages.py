@@ -20,11 +20,11 @@ from zsim.sensors.camera import CAMERAS
 from zsim.sensors.flow import Flow as Flow
 from zsim.sensors.sensor import FieldType, Sample, message_type
 from zsim.sensors.sensor_catalogue import STOCK
-from zsim.sensors.sonar import Sonar as Sonar
 from zsim.sensors.stock_sensors import Baro as Baro
 from zsim.sensors.stock_sensors import Gps as Gps
 from zsim.sensors.stock_sensors import Imu as Imu
 from zsim.sensors.stock_sensors import Mag as Mag
+from zsim.sensors.stock_sensors import Sonar as Sonar
 
 PAYLOAD_MAX = 16_000_000  # bytes; a scenario of 1000 drones in world/info is below this
 REFUSALS = (ValueError, TypeError, RecursionError, OverflowError, MemoryError, msgspec.MsgspecError)

@@ -11,19 +11,18 @@ from msgspec import UNSET, Struct, UnsetType
 from zsim.errors import DocumentError, NotTrustedError
 from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, field_path, show, suggestion
-from zsim.sensors import flow, sonar, stock_sensors
+from zsim.sensors import flow, stock_sensors
 from zsim.sensors.camera import CAMERAS, BottomCamera, Camera, FrontCamera, SightingModel
 from zsim.sensors.flow import FlowConfig
 from zsim.sensors.sensor import VALUES_MAX, Declaration, Sample, Sensor, SensorType, as_fields
-from zsim.sensors.sonar import SonarConfig
-from zsim.sensors.stock_sensors import BaroConfig, GpsConfig, ImuConfig, MagConfig
+from zsim.sensors.stock_sensors import BaroConfig, GpsConfig, ImuConfig, MagConfig, SonarConfig
 
 STOCK: dict[str, SensorType] = {
     "imu": stock_sensors.IMU,
     "gps": stock_sensors.GPS,
     "mag": stock_sensors.MAG,
     "baro": stock_sensors.BARO,
-    "sonar": sonar.SONAR,
+    "sonar": stock_sensors.SONAR,
     "flow": flow.FLOW,
 }
 

@@ -3,7 +3,7 @@
 import math
 
 from zsim.schema.message import Count, Number, Vector3
-from zsim.schema.quantities import G_M_S2
+from zsim.schema.quantities import G_M_S2, NonNegative, Positive
 from zsim.sensors.sensor import Channel, ErrorModel, Sample, Sensor, SensorType
 
 BOARD_RATE_HZ = 200.0  # Hz, navigation board of the AR.Drone 2.0: its IMU samples and its firmware steps
@@ -184,4 +184,41 @@ BARO = SensorType(
     channels=(Channel("altitude_m", "m", axes="of height", bias_max=1e4),),
     exact=1,
     presets=dict.fromkeys(("ardrone2", "paper", "crazyflie2"), BARO_PRESET),  # the paper is silent
+)
+
+
+class Sonar(Sample, frozen=True):
+    """Distance to the ground along the beam [m]; without an echo it is not `valid`."""
+
+    range_m: Number
+    valid: bool
+
+
+class SonarConfig(Sensor, frozen=True, kw_only=True):
+    range_m: ErrorModel = ErrorModel()
+    min_m: NonNegative = 0.03
+    max_m: Positive = 6.0
+
+
+SONAR_PRESET = {
+    "rate_hz": 25.0,  # Hz, ultrasound_freq 8 of the AR.Drone's configuration
+    "range_m": {"noise": 0.01},  # m, chosen: what grass and tilt add to the 0.5 mm per LSB of the converter
+}
+SONAR_PRESETS = {
+    "ardrone2": SONAR_PRESET,
+    "paper": SONAR_PRESET,  # it is silent
+    "crazyflie2": {
+        "rate_hz": 25.0,  # Hz, chosen as the AR.Drone's
+        "range_m": {"noise": 0.02},  # m, chosen, with floor and tilt; crazyflie-firmware, zranger2.c, has 2.5 mm
+        "max_m": 4.0,  # m, VL53L1x; at 4 m zranger2.c has 0.2 m
+    },
+}
+
+SONAR = SensorType(
+    label="sonar",
+    message=Sonar,
+    settings=SonarConfig,
+    channels=(Channel("range_m", "m", axes="of range", bias_max=1e4),),
+    exact=1,
+    presets=SONAR_PRESETS,
 )

@@ -29,7 +29,7 @@ from zsim.schema.message import Vector3
 from zsim.sensors.camera_model import camera_pose
 from zsim.sensors.sensor import ErrorModel, Mount, noise_sigma
 from zsim.sensors.sensor_catalogue import Sensors
-from zsim.sensors.sonar import SonarConfig
+from zsim.sensors.stock_sensors import SonarConfig
 from zsim_bridges.ros_frames import xyzw
 
 MAP = "map"

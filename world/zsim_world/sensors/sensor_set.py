@@ -14,8 +14,7 @@ from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import VALUES_MAX, ErrorModel, Sensor, SensorType, noise_sigma
 from zsim.sensors.sensor_catalogue import STOCK, Sensors
-from zsim.sensors.sonar import SonarConfig
-from zsim.sensors.stock_sensors import BOARD_RATE_HZ, MagConfig
+from zsim.sensors.stock_sensors import BOARD_RATE_HZ, MagConfig, SonarConfig
 
 SENSORS = tuple(STOCK)  # the contract's order; a user's own count on from there
 IMU, GPS, MAG, BARO, SONAR, FLOW = range(len(SENSORS))
