@@ -17,10 +17,10 @@ from zsim.errors import DecodeError
 from zsim.schema.checker import first_fault
 from zsim.schema.message import Count, Message, Number, Whole
 from zsim.sensors.camera import CAMERAS
-from zsim.sensors.flow import Flow as Flow
 from zsim.sensors.sensor import FieldType, Sample, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.sensors.stock_sensors import Baro as Baro
+from zsim.sensors.stock_sensors import Flow as Flow
 from zsim.sensors.stock_sensors import Gps as Gps
 from zsim.sensors.stock_sensors import Imu as Imu
 from zsim.sensors.stock_sensors import Mag as Mag

@@ -11,11 +11,10 @@ from msgspec import UNSET, Struct, UnsetType
 from zsim.errors import DocumentError, NotTrustedError
 from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, field_path, show, suggestion
-from zsim.sensors import flow, stock_sensors
+from zsim.sensors import stock_sensors
 from zsim.sensors.camera import CAMERAS, BottomCamera, Camera, FrontCamera, SightingModel
-from zsim.sensors.flow import FlowConfig
 from zsim.sensors.sensor import VALUES_MAX, Declaration, Sample, Sensor, SensorType, as_fields
-from zsim.sensors.stock_sensors import BaroConfig, GpsConfig, ImuConfig, MagConfig, SonarConfig
+from zsim.sensors.stock_sensors import BaroConfig, FlowConfig, GpsConfig, ImuConfig, MagConfig, SonarConfig
 
 STOCK: dict[str, SensorType] = {
     "imu": stock_sensors.IMU,
@@ -23,7 +22,7 @@ STOCK: dict[str, SensorType] = {
     "mag": stock_sensors.MAG,
     "baro": stock_sensors.BARO,
     "sonar": stock_sensors.SONAR,
-    "flow": flow.FLOW,
+    "flow": stock_sensors.FLOW,
 }
 
 
