@@ -17,8 +17,8 @@ from zsim.contract.fingerprint import fingerprint
 from zsim.errors import RecordError, RunError
 from zsim.record import RecordReader
 from zsim.runtime.progress import Screen, Throttle
-from zsim.scenario.faults import listed
 from zsim.schema import plugin
+from zsim.schema.checker import listed
 from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, RecordedRun, gates, open_run, recorded_agents
 from zsim_analysis.rerun_bus import RerunBus, TruthComparison
 from zsim_world.flight.world import World

@@ -17,6 +17,7 @@ from zsim.scenario.faults import kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
+from zsim.schema import checker
 from zsim.schema.checker import Fault, show
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
@@ -358,7 +359,7 @@ def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
             if name in owner:
                 yield path, f"is {name!r}, which {owner[name]!r} flies already; a drone is in one cluster"
             elif judged and name not in known:
-                yield path, f"is {name!r}; must be one of the drones {faults.listed(list(dict.fromkeys(known)))}"
+                yield path, f"is {name!r}; must be one of the drones {checker.listed(list(dict.fromkeys(known)))}"
             owner.setdefault(name, called)
 
 
@@ -443,7 +444,7 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
         kind, entries = things.get(role, ("", []))
         known = _names(entries)
         if kind and thing not in known and len(known) == len(entries):
-            named = faults.listed(known) or f"a {kind}, and there is none"
+            named = checker.listed(known) or f"a {kind}, and there is none"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
 

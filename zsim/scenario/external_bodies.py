@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 from zsim.contract.flight_messages import Truth
 from zsim.errors import ScenarioError
-from zsim.scenario.faults import listed
 from zsim.scenario.rights import DRIVER
 from zsim.scenario.scenario import Scenario
+from zsim.schema.checker import listed
 
 POSE_AGE_MAX_NS = 500_000_000  # contract; 25 gates, as an estimate that is flown on: 1 m at 2 m/s
 DISTANCE_MAX_M = 100_000.0  # of each coordinate, as places in a scenario: beyond it a tangent plane is no map

@@ -15,7 +15,7 @@ from zsim.contract.run_messages import Fault
 from zsim.scenario.role_table import AGENTS
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault as Flaw
-from zsim.schema.checker import show, suggestion
+from zsim.schema.checker import listed, show, suggestion
 from zsim.sensors.sensor import Channel, Declaration, SensorType
 from zsim.sensors.sensor_catalogue import STOCK
 
@@ -462,11 +462,6 @@ def _takes_part(name: str, known: Known) -> bool:
 
 def _example(known: Known) -> str:
     return f"estimator.{known.drones[0]}" if known.drones else "estimator.drone1"
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names for an error, the first 20 of them."""
-    return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")
 
 
 def _time_flaws(fault: Mapping[str, Any], kind: FaultKind) -> Iterator[Flaw]:

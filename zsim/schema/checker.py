@@ -6,7 +6,7 @@ msgspec stops at the first fault; a user who corrects a scenario needs them all 
 import math
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from functools import lru_cache
 from itertools import islice
@@ -301,3 +301,8 @@ def _as_json(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return names[value]
     return repr(value) if isinstance(value, int | float | str) else " ".join(repr(value).split())
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names for an error, the first 20 of them."""
+    return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")
