@@ -15,7 +15,7 @@ from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
 from zsim.runtime.collector import rare_collections
 from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
-from zsim.scenario.role_table import agent_names, lets_drop
+from zsim.scenario.role_table import agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World
@@ -36,7 +36,7 @@ class FlightObserver(Protocol):
 def agents(world: World) -> list[Agent]:
     """Return the agents that a scenario expects as one, built from `world/info` as any process would."""
     known = agent_names(world.scenario)
-    names = [name for name in world.scenario.expected() if name in known]
+    names = [name for name in expected_processes(world.scenario) if name in known]
     return [hosted(world.info(), world.scenario, names)] if names else []
 
 
@@ -59,7 +59,7 @@ class InProcessFlight:
                 "fly it as processes, or with --set processes.gating=[]"
             )
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)
-        for name in set(scenario.expected()) - set(agent_names(scenario)):
+        for name in set(expected_processes(scenario)) - set(agent_names(scenario)):
             if lets_drop(scenario.processes.on_overdue or {}, name):
                 self.world.losses.expired(name)  # nobody else can come here
         self._agents = agents(self.world)

@@ -4,10 +4,11 @@ Launchers, the world and access control read it; what a role may do on the keys 
 """
 
 from collections.abc import Collection, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-OnDeath = Literal["wait", "restart", "drop", "end"]
-OnOverdue = Literal["drop", "end"]
+from zsim.errors import ScenarioError
+from zsim.scenario.scenario import OnDeath, OnOverdue, Scenario
+from zsim.schema.checker import listed
 
 
 class Role(NamedTuple):
@@ -49,14 +50,22 @@ ROLES = {
 AGENTS = {name: role for name, role in ROLES.items() if role.about}
 
 
-def things(role: str, scenario: Any) -> list[str]:
+def things(role: str, scenario: Scenario) -> list[str]:
     """Return the names of the drones or clusters that a role with agents is about."""
     return [entry.name for entry in getattr(scenario, f"{AGENTS[role].about}s")]
 
 
-def agent_names(scenario: Any) -> list[str]:
+def agent_names(scenario: Scenario) -> list[str]:
     """Return the names of all processes with agents that a scenario has, role by role."""
     return [f"{role}.{thing}" for role in AGENTS for thing in things(role, scenario)]
+
+
+def expected_processes(scenario: Scenario) -> list[str]:
+    """Return the names of the processes without which a run does not start."""
+    if scenario.processes.expect is not None:
+        return list(scenario.processes.expect)
+    cameras = [drone.name for drone in scenario.drones if scenario.gates("camera") and drone.sensors.cameras()]
+    return [*agent_names(scenario), *(f"camera.{name}" for name in cameras)]
 
 
 def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
@@ -100,3 +109,30 @@ def is_needed(name: str) -> bool:
     """Tell whether a run cannot go on without a process, by its role, unless the scenario says so."""
     role = ROLES.get(name.partition(".")[0])
     return role is not None and role.on_overdue == "end"
+
+
+def check_pace(scenario: Scenario, mode: str) -> None:
+    """Refuse to run external drones, whose time is the wall's, otherwise than in realtime.
+
+    Raises:
+        ScenarioError: the scenario has some, and the mode is not "realtime".
+    """
+    external = scenario.external()
+    if external and mode != "realtime":
+        who = f"{listed(external)} {'is' if len(external) == 1 else 'are'} external"
+        needed = "time passes there as on the wall: run it with --realtime, on processes of its own"
+        raise ScenarioError([f"{scenario.name}: body of {who}, and the run is in {mode}; {needed}"])
+
+
+def drivers_of(scenario: Scenario) -> list[str]:
+    """Return the names of the processes that publish the external drones."""
+    return [f"driver.{drone}" for drone in scenario.external()]
+
+
+def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
+    """Return what to tell whoever starts a run of the drivers that are to be started beside it; a line, or none."""
+    drivers, awaited_names = drivers_of(scenario), expected_processes(scenario)
+    awaited, others = (listed([d for d in drivers if (d in awaited_names) is wanted]) for wanted in (True, False))
+    waits = [f"the run waits for {awaited}"] if awaited else []
+    waits += [f"{others} may come at any time"] if others else []
+    return [f"external drones: {', and '.join(waits)}; start drivers with --connect {endpoint}"] if drivers else []

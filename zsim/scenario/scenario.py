@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from zsim.scenario.role_table import OnDeath, OnOverdue, agent_names
 from zsim.scenario.shared_vehicle import SharedVehicle
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
@@ -31,6 +30,8 @@ SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure th
 
 EXTERNAL = "external"  # body of a drone that a driver publishes
 
+OnDeath = Literal["wait", "restart", "drop", "end"]
+OnOverdue = Literal["drop", "end"]
 Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
 Coordinate = Annotated[float, Meta(ge=-100_000, le=100_000)]  # m; beyond it a tangent plane is no map
 Position = tuple[Coordinate, Coordinate, Coordinate]
@@ -310,13 +311,6 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def external(self) -> list[str]:
         """Return the names of the drones whose bodies are external."""
         return [drone.name for drone in self.drones if drone.is_external]
-
-    def expected(self) -> list[str]:
-        """Return the names of the processes without which a run does not start."""
-        if self.processes.expect is not None:
-            return list(self.processes.expect)
-        cameras = [f"camera.{drone.name}" for drone in self.drones if self.gates("camera") and drone.sensors.cameras()]
-        return [*agent_names(self), *cameras]
 
     def gates(self, role: str) -> bool:
         """Tell whether the run waits for the processes of a role that is no agent's."""

@@ -7,9 +7,8 @@ from operator import attrgetter
 import numpy as np
 from msgspec.structs import replace
 
-from zsim.contract.flight_messages import Truth
+from zsim.contract.flight_messages import Truth, moved_on, truth_fault
 from zsim.math.rotation import pose_between
-from zsim.scenario.external_bodies import moved_on, truth_fault
 from zsim.scenario.scenario import Drone
 from zsim_agents.cameras.rendering.scene import DroneStates
 

@@ -12,6 +12,7 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
+from zsim.scenario.role_table import expected_processes
 from zsim.sensors.camera import CAMERAS
 from zsim.transport.session import RawSample, ReceivedSample, Session, check_expression
 from zsim.transport.traffic import Passed, Traffic
@@ -61,7 +62,7 @@ class RunAccess:
         self._traffic: Traffic | None = None
         scenario = scenario_file.from_text(info.scenario)
         self._may_write = rights.of(observer.name, scenario).writes if secured else None
-        self.required_processes = [(name, name.partition(".")[2]) for name in scenario.expected()]
+        self.required_processes = [(name, name.partition(".")[2]) for name in expected_processes(scenario)]
         self._known_names = {"drone": [d.name for d in info.drones], "cluster": [c.name for c in info.clusters]}
 
     @property

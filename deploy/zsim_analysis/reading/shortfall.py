@@ -16,7 +16,7 @@ from zsim.contract.run_messages import Event
 from zsim.errors import NotTrustedError
 from zsim.record.completeness import SECOND_NS
 from zsim.scenario.rights import WORLD
-from zsim.scenario.role_table import agent_names, lets_drop
+from zsim.scenario.role_table import agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Cluster, ClusterPlan, Processes, Scenario
 from zsim_agents.formation.flight_data import HELD_ON_REQUEST
 from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, plan_of, waiting_step
@@ -79,7 +79,7 @@ def _of_record(flight: RecordedFlight) -> Iterator[Shortfall]:
 def _of_processes(flight: RecordedFlight) -> Iterator[Shortfall]:
     """Yield the expected processes without which the run went on, or which ended it, unless the scenario says drop."""
     scenario = flight.scenario
-    expected = {*scenario.expected(), *agent_names(scenario), WORLD} if scenario else set()
+    expected = {*expected_processes(scenario), *agent_names(scenario), WORLD} if scenario else set()
     actions = scenario.processes if scenario else Processes()
     dropped = {event.subject for event in flight.events if event.kind == "drop"}  # and nobody else does their work
     for event in flight.events:

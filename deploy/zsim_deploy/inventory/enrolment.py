@@ -17,8 +17,8 @@ from typing import Any
 from zsim.contract import keys
 from zsim.errors import InventoryError, RunError
 from zsim.scenario import rights
-from zsim.scenario.external_bodies import drivers_of
 from zsim.scenario.rights import OPERATOR, ROUTER, WORLD, Rights
+from zsim.scenario.role_table import drivers_of
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import AUTHORITY, KEY
 from zsim_deploy.inventory import certificates

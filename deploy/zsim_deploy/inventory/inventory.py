@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from zsim.errors import InventoryError
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
+from zsim.scenario.role_table import expected_processes
 from zsim.scenario.scenario import DRONES_MAX, PROCESSES_MAX, Name, Scenario, Spec
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault, faults, first_lines
@@ -162,7 +163,7 @@ def _circles(document: dict[str, Any]) -> Iterator[Fault]:
 
 def roles(scenario: Scenario) -> list[str]:
     """Return the names of the processes that a scenario needs, the world first."""
-    return [WORLD, RECORDER, *(name for name in scenario.expected() if name != RECORDER)]
+    return [WORLD, RECORDER, *(name for name in expected_processes(scenario) if name != RECORDER)]
 
 
 def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:

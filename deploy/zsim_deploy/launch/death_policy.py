@@ -4,8 +4,8 @@ import time
 from collections import defaultdict, deque
 from typing import NamedTuple
 
-from zsim.scenario.role_table import OnDeath, is_needed, lets_drop, on_death, on_overdue
-from zsim.scenario.scenario import Processes
+from zsim.scenario.role_table import is_needed, lets_drop, on_death, on_overdue
+from zsim.scenario.scenario import OnDeath, Processes
 from zsim_deploy import USER_FAULT
 
 RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal

@@ -18,7 +18,7 @@ from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.consistency import unflown_plans
-from zsim.scenario.external_bodies import driver_lines
+from zsim.scenario.role_table import driver_lines, expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.transport.open_files import launcher_files, require_files
@@ -158,7 +158,7 @@ def check_open_files(options: RunOptions) -> None:
         SessionError: with how many files there must be.
     """
     cameras = {child.name for child in options.camera_children()}
-    expected = {*options.scenario.expected(), RECORDER}
+    expected = {*expected_processes(options.scenario), RECORDER}
     agents = 1 if options.hosted else len(expected - cameras) - 1
     count = 2 + agents + (options.console is not None) + len(cameras)
     require_files(launcher_files(count, len(expected)), f"{count} processes")

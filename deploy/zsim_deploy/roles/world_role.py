@@ -16,6 +16,7 @@ from zsim.errors import RunError, RunFailedError
 from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import WORLD
+from zsim.scenario.role_table import expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.transport import connection
 from zsim.transport.open_files import hub_files, require_files
@@ -60,7 +61,7 @@ def world(
     from zsim_world.journal.run_journal import RunJournal, journaled_run
     from zsim_world.server.world_process import run
 
-    clients = {*scenario.expected(), *(expect or ())}
+    clients = {*expected_processes(scenario), *(expect or ())}
     require_files(hub_files(len(clients)), f"a world of {len(clients)} processes")
     identity = identity._replace(process=WORLD)
     connection.check_listening(endpoints, identity)  # before anything is compiled

@@ -9,7 +9,7 @@ from refused import has_terms, refused
 from zsim.errors import RunError, ScenarioError
 from zsim.runtime.group import AgentGroup
 from zsim.scenario import rights, scenario_file
-from zsim.scenario.role_table import AGENTS, Role
+from zsim.scenario.role_table import AGENTS, Role, expected_processes
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, made
 from zsim_deploy.roles import process_identity, roles
@@ -62,7 +62,7 @@ def test_a_role_is_a_row_of_the_table(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setitem(AGENTS, "altimeter", Role("agents", "drop", "drone", "altimeter_of_mine:Altimeter"))
     altimeters = [f"altimeter.drone{i}" for i in (1, 2, 3)]
     assert agents_of(STEP) == [*ESTIMATORS, "controller.main", *altimeters]
-    assert STEP.expected() == agents_of(STEP)
+    assert expected_processes(STEP) == agents_of(STEP)
     group = hosted(World(STEP).info(), STEP, ["altimeter.*"])
     assert (group.name, group.serves) == (altimeters[-1], tuple(altimeters[:-1]))
     assert rights.of(altimeters[0], STEP).writes == (

@@ -10,9 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.flight_messages import DroneState, Status, Truth, state_refusal
+from zsim.contract.flight_messages import (
+    POSE_AGE_MAX_NS,
+    DroneState,
+    Status,
+    Truth,
+    moved_on,
+    state_refusal,
+    truth_fault,
+)
 from zsim.contract.snapshot import State
-from zsim.scenario.external_bodies import POSE_AGE_MAX_NS, moved_on, truth_fault
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.state.fleet_arrays import STATE, VEHICLE
 

@@ -18,8 +18,8 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError, RunFailedError
 from zsim.runtime.agent import Output
 from zsim.scenario.rights import WORLD
-from zsim.scenario.role_table import OnDeath, agent_names, lets_drop, on_death
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.role_table import agent_names, lets_drop, on_death
+from zsim.scenario.scenario import OnDeath, Scenario
 from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.budgets import STRANGERS_MAX, Budgets
 from zsim_world.flight.data_flow import DataFlow

@@ -13,6 +13,7 @@ from zsim.runtime.link_faults import KINDS as LINK_KINDS
 from zsim.scenario import faults
 from zsim.scenario.faults import PROCESS_KILL, Known, flaws
 from zsim.scenario.rights import WORLD
+from zsim.scenario.role_table import expected_processes
 from zsim.scenario.scenario import FAULTS_MAX, Scenario
 from zsim.schema.checker import show
 from zsim.sensors.sensor_catalogue import declarations
@@ -206,7 +207,7 @@ class FaultInjector:
         drones = tuple(drone.name for drone in scenario.drones)
         clusters = tuple(cluster.name for cluster in scenario.clusters)
         gating = (p.name for p in self._barrier.participants.values() if p.gating)
-        processes = (*scenario.expected(), *gating)
+        processes = (*expected_processes(scenario), *gating)
         external = tuple(scenario.external())
         known = Known(drones, clusters, processes, self._kinds, self._effects.rotors, external)
         for path, text in flaws(args, known):

@@ -7,8 +7,8 @@ from typing import Any, Protocol
 from msgspec import UNSET
 
 from zsim.contract.run_messages import Bye, Join
-from zsim.scenario.role_table import ROLES, OnDeath, OnOverdue, agent_names, lets_drop, on_overdue
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.role_table import ROLES, agent_names, lets_drop, on_overdue
+from zsim.scenario.scenario import OnDeath, OnOverdue, Scenario
 from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.budgets import Budgets
 from zsim_world.flight.run_clock import RunClock

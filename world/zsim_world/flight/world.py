@@ -17,8 +17,8 @@ from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
-from zsim.scenario.external_bodies import check_pace
 from zsim.scenario.rights import WORLD
+from zsim.scenario.role_table import check_pace, expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.sensors.sensor_catalogue import declarations
@@ -66,7 +66,7 @@ class World(Coordinator):
         changed: Sequence[str] | None = None,
     ) -> None:
         check_pace(scenario, mode)
-        super().__init__(scenario, mode, rate, wall_ns, run_id, scenario.expected())
+        super().__init__(scenario, mode, rate, wall_ns, run_id, expected_processes(scenario))
         clock, barrier, outbox = self.clock, self.barrier, self.outbox
         self._changed = UNSET if changed is None else tuple(changed)
         self.fleet = Fleet(scenario)

@@ -18,8 +18,7 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Output
-from zsim.scenario.role_table import OnDeath
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario import OnDeath, Scenario
 from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.run_clock import number, refused_argument

@@ -8,8 +8,7 @@ import pytest
 from refused import has_terms
 
 from zsim.contract import keys
-from zsim.contract.flight_messages import Ardrone, Attitude, Mode, RotorSpeeds, Status, Truth, Velocity
-from zsim.scenario.external_bodies import POSE_AGE_MAX_NS
+from zsim.contract.flight_messages import POSE_AGE_MAX_NS, Ardrone, Attitude, Mode, RotorSpeeds, Status, Truth, Velocity
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import Fleet
