@@ -474,7 +474,7 @@ def test_a_replay_brings_what_its_asker_may_read(federation: Federation, made: C
         assert "drone/drone1/truth" in {key for key, _ in everything["result"]}
         assert keys_of_mine >= {"clock", "drone/drone1/sensor/imu", "drone/drone1/sensor/status"}
         assert all(
-            permits(rights.of("estimator.drone1", scenario_file.from_text(ONE)).reads, key) for key in keys_of_mine
+            permits(rights.rights_for("estimator.drone1", scenario_file.from_text(ONE)).reads, key) for key in keys_of_mine
         )
         refusal = estimator.request("process/estimator.drone1/replay", "stop")
         assert (refusal["ok"], parts(refusal["error"])) == (False, ("op", "'stop'"))

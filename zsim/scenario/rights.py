@@ -47,10 +47,10 @@ class Rights(NamedTuple):
     watches: tuple[str, ...] = ()
 
 
-ALL = Rights(*[EVERYTHING] * len(Rights._fields))
+ALL_RIGHTS = Rights(*[EVERYTHING] * len(Rights._fields))
 
 
-def of(process: str, scenario: Scenario) -> Rights:
+def rights_for(process: str, scenario: Scenario) -> Rights:
     """Return the rights of a process by its name, role.thing; there is one world and one recorder, without a thing.
 
     A camera, or a detector, that is not named after a drone is for all that have cameras.
@@ -59,27 +59,27 @@ def of(process: str, scenario: Scenario) -> Rights:
     """
     role, _, thing = process.partition(".")
     if process == WORLD:
-        return ALL
+        return ALL_RIGHTS
     if process == RECORDER:
-        return union([_own(process), _READER])
+        return combined([_own(process), _READER])
     if role == OPERATOR:
-        return union([_own(process), _READER, _OPERATOR])
+        return combined([_own(process), _READER, _OPERATOR])
     if role == DRIVER:
-        return union([_own(process), _driver(thing, scenario)])
+        return combined([_own(process), _driver_rights(thing, scenario)])
     if role in _OF_CAMERAS:
-        return union([_own(process), *(_OF_CAMERAS[role](drone) for drone in watched(thing, scenario))])
+        return combined([_own(process), *(_OF_CAMERAS[role](drone) for drone in watched_drones(thing, scenario))])
     about = AGENTS[role].about if role in AGENTS else None
     granted = [rights(thing, scenario, role) for kind, rights in _ABOUT.items() if about in (None, kind)]
-    return union([_own(process), *granted])
+    return combined([_own(process), *granted])
 
 
-def watched(thing: str, scenario: Scenario) -> list[str]:
+def watched_drones(thing: str, scenario: Scenario) -> list[str]:
     """Return the drones of a camera or detector: the one it is named after, or all that have cameras."""
     names = [drone.name for drone in scenario.drones]
     return [thing] if thing in names else [drone.name for drone in scenario.drones if drone.sensors.cameras()]
 
 
-def union(many: Iterable[Rights]) -> Rights:
+def combined(many: Iterable[Rights]) -> Rights:
     """Return what any of several may do, as a router needs that carries them."""
     columns = zip(Rights(), *many, strict=True)
     return Rights(*(tuple(dict.fromkeys(key for keys_ in column for key in keys_)) for column in columns))
@@ -117,7 +117,7 @@ def _about_drone(thing: str, scenario: Scenario, role: str) -> Rights:
     )
 
 
-def _driver(thing: str, scenario: Scenario) -> Rights:
+def _driver_rights(thing: str, scenario: Scenario) -> Rights:
     """Return what the driver of an external drone may do: what the world does for a simulated one, for it alone."""
     if thing not in scenario.external():
         return Rights()

@@ -61,7 +61,7 @@ class RunAccess:
         self._pending = 0
         self._traffic: Traffic | None = None
         scenario = scenario_file.from_text(info.scenario)
-        self._may_write = rights.of(observer.name, scenario).writes if secured else None
+        self._may_write = rights.rights_for(observer.name, scenario).writes if secured else None
         self.required_processes = [(name, name.partition(".")[2]) for name in expected_processes(scenario)]
         self._known_names = {"drone": [d.name for d in info.drones], "cluster": [c.name for c in info.clusters]}
 

@@ -147,10 +147,10 @@ def access_control(
         the map of Zenoh's configuration; everything is denied that is not in it. Who is not named may ask that it is
         not, and nothing else.
     """
-    granted = {name: rights.of(name, scenario) for name in clients}
+    granted = {name: rights.rights_for(name, scenario) for name in clients}
     for name, behind in routers.items():
-        granted[name] = rights.union(rights.of(process, scenario) for process in behind)
-    granted |= dict.fromkeys(above, rights.ALL)
+        granted[name] = rights.combined(rights.rights_for(process, scenario) for process in behind)
+    granted |= dict.fromkeys(above, rights.ALL_RIGHTS)
     entries = [(name, list(_rules(name, right, scenario.federation))) for name, right in granted.items()]
     asking = [_rule(ANYONE, (flow,), (act,), (keys.access("*"),), scenario.federation) for flow, act in _ASKS_ACCESS]
     subjects = [{"id": name, "cert_common_names": [name]} for name, _ in entries]
@@ -165,7 +165,7 @@ def access_control(
 
 
 def _rules(name: str, right: Rights, federation: str) -> Iterator[dict[str, Any]]:
-    if right == rights.ALL:
+    if right == rights.ALL_RIGHTS:
         yield _rule(name, ("ingress", "egress"), _MESSAGES, rights.EVERYTHING, federation)
         return
     for flow, messages, field in _WIRE:

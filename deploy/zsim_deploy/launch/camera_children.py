@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from zsim.scenario.rights import watched
+from zsim.scenario.rights import watched_drones
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import BottomCamera, FrontCamera
 
@@ -39,7 +39,7 @@ def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[Cam
         cameras: whether all that have cameras are to have their pictures drawn.
         detect: whether hats are to be found in the pictures of all.
     """
-    having = watched("", scenario)
+    having = watched_drones("", scenario)
     everybody = [drone.name for drone in scenario.drones]  # a detector's cameras need not be zsim's
     return [
         *_of_role("camera", having, having, scenario, cameras),

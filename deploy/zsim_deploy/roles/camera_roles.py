@@ -6,7 +6,7 @@ from msgspec import UNSET
 
 from zsim.contract.messages import Info
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import watched
+from zsim.scenario.rights import watched_drones
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Hats
 from zsim.transport.session import Session
@@ -75,7 +75,7 @@ def of_detector(info: Info, names: Sequence[str]) -> list[str]:
     """
     scenario = scenario_file.from_text(info.scenario)
     everybody = [drone.name for drone in scenario.drones]
-    return chosen("detect: drone", names, everybody) if names else watched("", scenario) or everybody
+    return chosen("detect: drone", names, everybody) if names else watched_drones("", scenario) or everybody
 
 
 def stands_for(role: str, drones: Drones, names: Sequence[str], info: Info) -> tuple[str, ...]:

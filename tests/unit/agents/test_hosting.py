@@ -65,12 +65,12 @@ def test_a_role_is_a_row_of_the_table(tmp_path: Path, monkeypatch: pytest.Monkey
     assert expected_processes(STEP) == agents_of(STEP)
     group = hosted(World(STEP).info(), STEP, ["altimeter.*"])
     assert (group.name, group.serves) == (altimeters[-1], tuple(altimeters[:-1]))
-    assert rights.of(altimeters[0], STEP).writes == (
+    assert rights.rights_for(altimeters[0], STEP).writes == (
         *(f"process/altimeter.drone1/{what}" for what in ("join", "done", "snapshot", "bye", "health")),
         "drone/drone1/estimate",
         "view/estimates/altimeter.drone1",
     )
-    assert rights.of("altimeter.main", STEP).answers == ("process/altimeter.main/outputs",)
+    assert rights.rights_for("altimeter.main", STEP).answers == ("process/altimeter.main/outputs",)
 
 
 ALTIMETER = """

@@ -30,5 +30,5 @@ class DataFlow:
 
     def _of(self, name: str) -> rights.Rights:
         if name not in self._rights:
-            self._rights[name] = rights.of(name, self._scenario)
+            self._rights[name] = rights.rights_for(name, self._scenario)
         return self._rights[name]

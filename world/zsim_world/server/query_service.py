@@ -65,4 +65,4 @@ class QueryService:
     def _readable_by(self, process: str | None) -> tuple[str, ...]:
         if process is None or not self.link.guarded:
             return ("**",)
-        return rights.of(process, self.world.scenario).reads
+        return rights.rights_for(process, self.world.scenario).reads

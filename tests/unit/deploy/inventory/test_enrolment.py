@@ -233,7 +233,7 @@ def scenario() -> Any:
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("act", ACTS)
 def test_the_rights_of_a_role_are_those_of_the_table(scenario: Any, role: str, act: str) -> None:
-    expressions = getattr(rights.of(role, scenario), ACTS[act])
+    expressions = getattr(rights.rights_for(role, scenario), ACTS[act])
     asked = TOKENS if act in "tw" else KEYS
     assert {key for key in asked if rights.permits(expressions, key)} == keys_of(role, act)
 
@@ -293,7 +293,7 @@ def test_a_process_that_takes_the_place_of_ours_has_its_rights(scenario: Any, pr
     own = {f"{of}/{name}" for of in ("process", "view/estimates") for name in (like, process)}
 
     def of_others(name: str, act: str) -> set[str]:
-        expressions = getattr(rights.of(name, scenario), ACTS[act])
+        expressions = getattr(rights.rights_for(name, scenario), ACTS[act])
         return {expression for expression in expressions if not any(expression.startswith(key) for key in own)}
 
     assert all(of_others(process, act) == of_others(like, act) for act in ACTS)
@@ -303,7 +303,7 @@ def test_a_process_that_takes_the_place_of_ours_has_its_rights(scenario: Any, pr
     "process", ["world.spare", "recorder.spare", "fence.round", "console", "estimator.drone9", "controller.drone1"]
 )
 def test_a_process_about_nothing_known_hears_what_all_are_told(scenario: Any, process: str) -> None:
-    found = rights.of(process, scenario)
+    found = rights.rights_for(process, scenario)
     assert found.reads == ("world/info", "clock", "world/event", "world/faults")
     assert all(key.startswith(f"process/{process}/") for key in found.writes)
 
