@@ -15,7 +15,7 @@ from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
 from zsim.runtime.collector import rare_collections
 from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
-from zsim.scenario.role_table import agent_names, expected_processes, lets_drop
+from zsim.scenario.roles import agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World

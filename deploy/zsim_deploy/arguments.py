@@ -181,7 +181,7 @@ class FlightOptions(NamedTuple):
 
     def scenario(self, elsewhere: bool = False) -> Any:
         """Return the scenario, the classes that it names loaded here; `elsewhere`: it flies on other hosts."""
-        from zsim.scenario.role_table import check_pace
+        from zsim.scenario.roles import check_pace
 
         scenario = load_scenario(self.path, self.overrides, self.seed, self.duration, elsewhere)
         check_pace(scenario, self.mode_and_rate()[0])

@@ -15,7 +15,7 @@ from zsim.contract import messages
 from zsim.scenario import faults
 from zsim.scenario.faults import kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
-from zsim.scenario.role_table import AGENTS
+from zsim.scenario.roles import AGENTS
 from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
 from zsim.schema import checker
 from zsim.schema.checker import Fault, show

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from zsim.contract import keys
 from zsim.contract.run_messages import Fault
-from zsim.scenario.role_table import AGENTS
+from zsim.scenario.roles import AGENTS
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault as Flaw
 from zsim.schema.checker import listed, show, suggestion

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from zsim.contract import keys
-from zsim.scenario.role_table import AGENTS
+from zsim.scenario.roles import AGENTS
 from zsim.scenario.scenario import Scenario
 
 TOLD_TO_ALL = (keys.INFO, keys.CLOCK, keys.EVENT, keys.FAULTS)

@@ -12,7 +12,7 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
-from zsim.scenario.role_table import expected_processes
+from zsim.scenario.roles import expected_processes
 from zsim.sensors.camera import CAMERAS
 from zsim.transport.session import RawSample, ReceivedSample, Session, check_expression
 from zsim.transport.traffic import Passed, Traffic

@@ -18,7 +18,7 @@ from zsim.record import Recorded, RecordReader
 from zsim.record.record_reader import record_at
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import PROCESS_KILL
-from zsim.scenario.role_table import AGENTS
+from zsim.scenario.roles import AGENTS
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim_agents.hosting import agents_of

@@ -14,7 +14,7 @@ from msgspec import Struct
 from zsim import __version__
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
-from zsim.scenario.role_table import check_pace
+from zsim.scenario.roles import check_pace
 from zsim.scenario.scenario import Scenario
 from zsim.scenario.scenario_file import EXAMPLE, whole_path
 from zsim.schema import plugin, yaml_file

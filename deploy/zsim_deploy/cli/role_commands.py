@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from zsim.contract.run_messages import RATE_MAX
-from zsim.scenario.role_table import AGENTS, Role
+from zsim.scenario.roles import AGENTS, Role
 from zsim_deploy.arguments import (
     CHANGED,
     CONSOLE_NEEDS,

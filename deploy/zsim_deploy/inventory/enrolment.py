@@ -18,7 +18,7 @@ from zsim.contract import keys
 from zsim.errors import InventoryError, RunError
 from zsim.scenario import rights
 from zsim.scenario.rights import OPERATOR, ROUTER, WORLD, Rights
-from zsim.scenario.role_table import drivers_of
+from zsim.scenario.roles import drivers_of
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import AUTHORITY, KEY
 from zsim_deploy.inventory import certificates

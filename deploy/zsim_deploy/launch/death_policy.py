@@ -4,7 +4,7 @@ import time
 from collections import defaultdict, deque
 from typing import NamedTuple
 
-from zsim.scenario.role_table import is_needed, lets_drop, on_death, on_overdue
+from zsim.scenario.roles import is_needed, lets_drop, on_death, on_overdue
 from zsim.scenario.scenario import OnDeath, Processes
 from zsim_deploy import USER_FAULT
 

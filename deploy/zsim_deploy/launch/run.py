@@ -18,7 +18,7 @@ from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.consistency import unflown_plans
-from zsim.scenario.role_table import driver_lines, expected_processes
+from zsim.scenario.roles import driver_lines, expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.transport.open_files import launcher_files, require_files

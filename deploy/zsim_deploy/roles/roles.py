@@ -22,7 +22,7 @@ from zsim.runtime.inbox import output_hold_ns
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, ROUTER
-from zsim.scenario.role_table import AGENTS, things
+from zsim.scenario.roles import AGENTS, things
 from zsim.scenario.scenario import Scenario
 from zsim.transport import tls
 from zsim.transport.connection import find_world, route

@@ -9,7 +9,7 @@ from refused import has_terms, refused
 from zsim.errors import RunError, ScenarioError
 from zsim.runtime.group import AgentGroup
 from zsim.scenario import rights, scenario_file
-from zsim.scenario.role_table import AGENTS, Role, expected_processes
+from zsim.scenario.roles import AGENTS, Role, expected_processes
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, made
 from zsim_deploy.roles import process_identity, roles

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 from msgspec import UNSET
 
 from zsim.contract.run_messages import Bye, Join
-from zsim.scenario.role_table import ROLES, agent_names, lets_drop, on_overdue
+from zsim.scenario.roles import ROLES, agent_names, lets_drop, on_overdue
 from zsim.scenario.scenario import OnDeath, OnOverdue, Scenario
 from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.budgets import Budgets
