@@ -19,8 +19,9 @@ from refused import has_terms, parts
 from rights_table import KEYS, ROLES, SCENARIO, SIMULATED, keys_of
 from secured import HOST, PREFIX, READY, SHORT_S, SITE, Certificates, KeyLog, RawClient, hub, site, tls_endpoint
 
-from zsim.scenario import rights, scenario_file
-from zsim.scenario.rights import permits
+from zsim.scenario import roles as rights
+from zsim.scenario import scenario_file
+from zsim.scenario.roles import permits
 from zsim.transport import connection
 from zsim.transport.tls import Identity, peer_fault
 from zsim_deploy.inventory.enrolment import access_control
@@ -474,7 +475,8 @@ def test_a_replay_brings_what_its_asker_may_read(federation: Federation, made: C
         assert "drone/drone1/truth" in {key for key, _ in everything["result"]}
         assert keys_of_mine >= {"clock", "drone/drone1/sensor/imu", "drone/drone1/sensor/status"}
         assert all(
-            permits(rights.rights_for("estimator.drone1", scenario_file.from_text(ONE)).reads, key) for key in keys_of_mine
+            permits(rights.rights_for("estimator.drone1", scenario_file.from_text(ONE)).reads, key)
+            for key in keys_of_mine
         )
         refusal = estimator.request("process/estimator.drone1/replay", "stop")
         assert (refusal["ok"], parts(refusal["error"])) == (False, ("op", "'stop'"))

@@ -11,7 +11,7 @@ from zsim.contract.framing import GateMessages, run_key_table
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
-from zsim.scenario import rights, scenario_file
+from zsim.scenario import roles, scenario_file
 from zsim.scenario.roles import expected_processes
 from zsim.sensors.camera import CAMERAS
 from zsim.transport.session import RawSample, ReceivedSample, Session, check_expression
@@ -61,7 +61,7 @@ class RunAccess:
         self._pending = 0
         self._traffic: Traffic | None = None
         scenario = scenario_file.from_text(info.scenario)
-        self._may_write = rights.rights_for(observer.name, scenario).writes if secured else None
+        self._may_write = roles.rights_for(observer.name, scenario).writes if secured else None
         self.required_processes = [(name, name.partition(".")[2]) for name in expected_processes(scenario)]
         self._known_names = {"drone": [d.name for d in info.drones], "cluster": [c.name for c in info.clusters]}
 
@@ -77,7 +77,7 @@ class RunAccess:
         self._traffic = Traffic(self.link, run_key_table(self.info), self.count_refused)
         # Views do not pass the world.
         self.link.declare_subscriber("view/**", lambda sample: self._keep(self.values.add, sample))
-        for expression in rights.LAST_VALUES:
+        for expression in roles.LAST_VALUES:
             for sample in self.link.get(expression):
                 self._keep(self.values.add, sample)
                 if sample.key == keys.CLOCK:
@@ -165,7 +165,7 @@ class RunAccess:
         Raises:
             ForbiddenError: with those on which it does not.
         """
-        if self._may_write is not None and not rights.permits(self._may_write, key):
+        if self._may_write is not None and not roles.permits(self._may_write, key):
             raise ForbiddenError(
                 f"{key[:80]}: the gateway's certificate lets it write on {', '.join(self._may_write)} only"
             )

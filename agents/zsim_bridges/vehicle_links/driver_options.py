@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 from zsim.contract.messages import Info
 from zsim.errors import RunError
 from zsim.math.rotation import Vector
-from zsim.scenario.rights import DRIVER
+from zsim.scenario.roles import DRIVER
 from zsim_bridges.vehicle_links.flight_limits import FlightLimits
 from zsim_bridges.vehicle_links.vehicle_session import UdpChannel
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from zsim.contract.run_messages import Event
 from zsim.errors import NotTrustedError
 from zsim.record.completeness import SECOND_NS
-from zsim.scenario.rights import WORLD
-from zsim.scenario.roles import agent_names, expected_processes, lets_drop
+from zsim.scenario.roles import WORLD, agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Cluster, ClusterPlan, Processes, Scenario
 from zsim_agents.formation.flight_data import HELD_ON_REQUEST
 from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, plan_of, waiting_step

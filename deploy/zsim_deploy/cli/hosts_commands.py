@@ -47,7 +47,7 @@ def up(
     --only and --sort are of the table that is shown; every role is started whatever they are.
     """
     require("up", UP_NEEDS | (REPORT_NEEDS if report else {}))
-    from zsim.scenario.rights import ROUTER
+    from zsim.scenario.roles import ROUTER
     from zsim.transport.open_files import host_launcher_files, require_files
     from zsim_deploy.cli.record_commands import conclude
     from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
@@ -189,7 +189,7 @@ def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[
 
 def _silent(role: str) -> str:
     """Return why the log of a role is empty."""
-    from zsim.scenario.rights import WORLD
+    from zsim.scenario.roles import WORLD
 
     if role == WORLD:
         return "world has logged nothing; its progress and events are shown by `zsim up`, and are in the record"

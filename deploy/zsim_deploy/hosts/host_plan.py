@@ -9,7 +9,7 @@ import msgspec
 
 from zsim.errors import HostsError
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import RECORDER, ROUTER, WORLD
+from zsim.scenario.roles import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import CERTIFICATES, KEY
 from zsim_deploy.hosts.host_link import HostLink

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from zsim.errors import HostsError, RunError, ZsimError
 from zsim.record import repair
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import RECORDER, WORLD
+from zsim.scenario.roles import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.arguments import changed_options, pace_options
 from zsim_deploy.hosts.control_socket import ControlSocket

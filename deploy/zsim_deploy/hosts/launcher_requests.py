@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from zsim.errors import HostsError, RunError
-from zsim.scenario.rights import RECORDER, ROUTER, WORLD
+from zsim.scenario.roles import RECORDER, ROUTER, WORLD
 from zsim_deploy.hosts.doctor import compare_reports, host_report
 from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
 from zsim_deploy.hosts.host_links import HostLinks

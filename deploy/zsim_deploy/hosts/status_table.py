@@ -9,7 +9,7 @@ from rich.console import Console, Group
 from rich.live import Live
 
 from zsim.runtime.progress import Screen, cell, describe
-from zsim.scenario.rights import WORLD
+from zsim.scenario.roles import WORLD
 from zsim.terminal.fitted_table import Column, FittedTable
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.remote_process import RemoteProcess

@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsim.errors import RunError
-from zsim.scenario.rights import OPERATOR
+from zsim.scenario.roles import OPERATOR
 from zsim.transport.tls import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
 
 AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it

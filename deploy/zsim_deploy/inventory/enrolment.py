@@ -16,9 +16,8 @@ from typing import Any
 
 from zsim.contract import keys
 from zsim.errors import InventoryError, RunError
-from zsim.scenario import rights
-from zsim.scenario.rights import OPERATOR, ROUTER, WORLD, Rights
-from zsim.scenario.roles import drivers_of
+from zsim.scenario import roles
+from zsim.scenario.roles import OPERATOR, ROUTER, WORLD, Rights, drivers_of
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import AUTHORITY, KEY
 from zsim_deploy.inventory import certificates
@@ -147,10 +146,10 @@ def access_control(
         the map of Zenoh's configuration; everything is denied that is not in it. Who is not named may ask that it is
         not, and nothing else.
     """
-    granted = {name: rights.rights_for(name, scenario) for name in clients}
+    granted = {name: roles.rights_for(name, scenario) for name in clients}
     for name, behind in routers.items():
-        granted[name] = rights.combined(rights.rights_for(process, scenario) for process in behind)
-    granted |= dict.fromkeys(above, rights.ALL_RIGHTS)
+        granted[name] = roles.combined(roles.rights_for(process, scenario) for process in behind)
+    granted |= dict.fromkeys(above, roles.ALL_RIGHTS)
     entries = [(name, list(_rules(name, right, scenario.federation))) for name, right in granted.items()]
     asking = [_rule(ANYONE, (flow,), (act,), (keys.access("*"),), scenario.federation) for flow, act in _ASKS_ACCESS]
     subjects = [{"id": name, "cert_common_names": [name]} for name, _ in entries]
@@ -165,14 +164,14 @@ def access_control(
 
 
 def _rules(name: str, right: Rights, federation: str) -> Iterator[dict[str, Any]]:
-    if right == rights.ALL_RIGHTS:
-        yield _rule(name, ("ingress", "egress"), _MESSAGES, rights.EVERYTHING, federation)
+    if right == roles.ALL_RIGHTS:
+        yield _rule(name, ("ingress", "egress"), _MESSAGES, roles.EVERYTHING, federation)
         return
     for flow, messages, field in _WIRE:
         expressions = getattr(right, field)
         if expressions:
             yield _rule(name, (flow,), messages, expressions, federation)
-    yield _rule(name, ("egress",), _DECLARATIONS, rights.EVERYTHING, federation)
+    yield _rule(name, ("egress",), _DECLARATIONS, roles.EVERYTHING, federation)
 
 
 def _rule(

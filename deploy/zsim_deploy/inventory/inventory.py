@@ -15,8 +15,7 @@ import msgspec
 from msgspec import Meta
 
 from zsim.errors import InventoryError
-from zsim.scenario.rights import RECORDER, ROUTER, WORLD
-from zsim.scenario.roles import expected_processes
+from zsim.scenario.roles import RECORDER, ROUTER, WORLD, expected_processes
 from zsim.scenario.scenario import DRONES_MAX, PROCESSES_MAX, Name, Scenario, Spec
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault, faults, first_lines

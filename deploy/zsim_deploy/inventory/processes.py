@@ -4,8 +4,7 @@ import importlib.metadata
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from zsim.scenario.rights import RECORDER, ROUTER, WORLD
-from zsim.scenario.roles import AGENTS, ROLES, agent_names, on_death
+from zsim.scenario.roles import AGENTS, RECORDER, ROLES, ROUTER, WORLD, agent_names, on_death
 from zsim.scenario.scenario import OnDeath, Scenario
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.arguments import REALTIME

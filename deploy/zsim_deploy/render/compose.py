@@ -8,7 +8,7 @@ from typing import Any
 
 from zsim import RELEASE
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import RECORDER, WORLD
+from zsim.scenario.roles import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.inventory.processes import (

@@ -11,7 +11,7 @@ from typing import Any
 from zsim import RELEASE
 from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import ROUTER, WORLD
+from zsim.scenario.roles import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy import USER_FAULT
 from zsim_deploy.inventory.inventory import InventoryFile

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from zsim.scenario.rights import RECORDER, WORLD
+from zsim.scenario.roles import RECORDER, WORLD
 from zsim.transport.tls import CERTIFICATES as IDENTITY_FILES
 from zsim_deploy.arguments import RUN_ID
 from zsim_deploy.inventory.processes import STOP_S, PlannedProcess, ProcessFiles, command

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import ROUTER, WORLD
+from zsim.scenario.roles import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
 from zsim_deploy import USER_FAULT

@@ -6,7 +6,7 @@ from msgspec import UNSET
 
 from zsim.contract.messages import Info
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import watched_drones
+from zsim.scenario.roles import watched_drones
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Hats
 from zsim.transport.session import Session

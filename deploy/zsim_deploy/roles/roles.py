@@ -21,8 +21,7 @@ from zsim.runtime.group import AgentGroup
 from zsim.runtime.inbox import output_hold_ns
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import RECORDER, ROUTER
-from zsim.scenario.roles import AGENTS, things
+from zsim.scenario.roles import AGENTS, RECORDER, ROUTER, things
 from zsim.scenario.scenario import Scenario
 from zsim.transport import tls
 from zsim.transport.connection import find_world, route

@@ -15,8 +15,7 @@ from zsim.contract import keys, run_messages
 from zsim.errors import RunError, RunFailedError
 from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import WORLD
-from zsim.scenario.roles import expected_processes
+from zsim.scenario.roles import WORLD, expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.transport import connection
 from zsim.transport.open_files import hub_files, require_files

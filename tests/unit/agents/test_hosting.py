@@ -8,7 +8,8 @@ from refused import has_terms, refused
 
 from zsim.errors import RunError, ScenarioError
 from zsim.runtime.group import AgentGroup
-from zsim.scenario import rights, scenario_file
+from zsim.scenario import roles as rights
+from zsim.scenario import scenario_file
 from zsim.scenario.roles import AGENTS, Role, expected_processes
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, made

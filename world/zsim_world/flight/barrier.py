@@ -14,7 +14,7 @@ from msgspec import UNSET
 from zsim.contract import keys
 from zsim.contract.run_messages import Bye, Done, Join, Waiting
 from zsim.contract.snapshot import State
-from zsim.scenario.rights import WORLD
+from zsim.scenario.roles import WORLD
 from zsim_world.flight.run_outbox import Refusal
 
 

@@ -17,8 +17,7 @@ from zsim.contract.fingerprint import fingerprint
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError, RunFailedError
 from zsim.runtime.agent import Output
-from zsim.scenario.rights import WORLD
-from zsim.scenario.roles import agent_names, lets_drop, on_death
+from zsim.scenario.roles import WORLD, agent_names, lets_drop, on_death
 from zsim.scenario.scenario import OnDeath, Scenario
 from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.budgets import STRANGERS_MAX, Budgets

@@ -1,6 +1,6 @@
 """Whose outputs each process reads, by the rights of the roles: who waits for another's is the victim of that one."""
 
-from zsim.scenario import rights
+from zsim.scenario import roles
 from zsim.scenario.scenario import Scenario
 
 
@@ -13,7 +13,7 @@ class DataFlow:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self._rights: dict[str, rights.Rights] = {}
+        self._rights: dict[str, roles.Rights] = {}
         self._known: dict[tuple[str, str], bool] = {}
 
     def feeds(self, writer: str, reader: str) -> bool:
@@ -25,10 +25,10 @@ class DataFlow:
         if pair not in self._known:
             read = {*self._of(reader).reads} - {*self._of(reader).writes}  # but for its own last value
             written = [key for key in self._of(writer).writes if "*" not in key]
-            self._known[pair] = any(rights.permits(read, key) for key in written)
+            self._known[pair] = any(roles.permits(read, key) for key in written)
         return self._known[pair]
 
-    def _of(self, name: str) -> rights.Rights:
+    def _of(self, name: str) -> roles.Rights:
         if name not in self._rights:
-            self._rights[name] = rights.rights_for(name, self._scenario)
+            self._rights[name] = roles.rights_for(name, self._scenario)
         return self._rights[name]

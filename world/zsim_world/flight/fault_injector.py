@@ -12,8 +12,7 @@ from zsim.contract.snapshot import State
 from zsim.runtime.link_faults import KINDS as LINK_KINDS
 from zsim.scenario import faults
 from zsim.scenario.faults import PROCESS_KILL, Known, flaws
-from zsim.scenario.rights import WORLD
-from zsim.scenario.roles import expected_processes
+from zsim.scenario.roles import WORLD, expected_processes
 from zsim.scenario.scenario import FAULTS_MAX, Scenario
 from zsim.schema.checker import show
 from zsim.sensors.sensor_catalogue import declarations

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys, run_messages
 from zsim.contract.snapshot import State
-from zsim.scenario.rights import WORLD
+from zsim.scenario.roles import WORLD
 from zsim_world.flight.budgets import CHANGES_MAX, SECOND_NS, SUBJECTS_MAX, ChangeBudget
 
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate

@@ -17,8 +17,7 @@ from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import WORLD
-from zsim.scenario.roles import check_pace, expected_processes
+from zsim.scenario.roles import WORLD, check_pace, expected_processes
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.sensors.sensor_catalogue import declarations

@@ -25,7 +25,7 @@ from zsim.errors import DecodeError
 from zsim.record import Recorded, RecordReader
 from zsim.record.record_reader import OVERLAP_NS
 from zsim.runtime.agent import Output
-from zsim.scenario import rights
+from zsim.scenario import roles
 from zsim.scenario.faults import PROCESS_KILL
 
 SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # say who published them
@@ -145,7 +145,7 @@ def is_played(key: str, expressions: Sequence[str]) -> bool:
         expressions: that the user wants to be played.
     """
     anew = key in (keys.INFO, keys.CLOCK) or key.startswith("process/") or messages.type_of(key) in VIEWS
-    return not anew and rights.permits(expressions, key)
+    return not anew and roles.permits(expressions, key)
 
 
 def author(recorded: Recorded) -> str:

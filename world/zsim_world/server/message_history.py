@@ -15,7 +15,7 @@ from zsim.contract.framing import Pairs, pairs_of
 from zsim.contract.messages import REFUSALS
 from zsim.contract.run_messages import ClusterRequest, ControlAnswer
 from zsim.errors import DecodeError
-from zsim.scenario import rights
+from zsim.scenario import roles
 from zsim.schema.message import Count
 from zsim.transport.session import ReceivedSample
 
@@ -152,7 +152,7 @@ class MessageHistory:
             return ControlAnswer(False, f"replay: needs from_ns (whole number) and keys (list of texts): {error}")
         passed, more = self.page(
             replay.from_ns,
-            lambda key: rights.permits(replay.keys, key) and rights.permits(readable, key),
+            lambda key: roles.permits(replay.keys, key) and roles.permits(readable, key),
             replay.page,
         )
         return ControlAnswer(True, result=passed, more=more)

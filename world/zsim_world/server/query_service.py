@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError
-from zsim.scenario import rights
+from zsim.scenario import roles
 from zsim.transport.session import Query, Session
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.journal.journal_entries import Controlled
@@ -24,7 +24,7 @@ class QueryService:
 
     def answered_keys(self) -> tuple[str, ...]:
         """Return the expressions on which queries are to be taken."""
-        return (*rights.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self.world.refused_queries)
+        return (*roles.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self.world.refused_queries)
 
     def serve(self, query: Query) -> None:
         """Answer a query: with last values, a part of the history, or as a request."""
@@ -65,4 +65,4 @@ class QueryService:
     def _readable_by(self, process: str | None) -> tuple[str, ...]:
         if process is None or not self.link.guarded:
             return ("**",)
-        return rights.rights_for(process, self.world.scenario).reads
+        return roles.rights_for(process, self.world.scenario).reads

@@ -14,7 +14,7 @@ import msgspec
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.health import HealthMeter
-from zsim.scenario.rights import WORLD
+from zsim.scenario.roles import WORLD
 from zsim.transport.session import ReceivedSample, Session, Subscription
 from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator

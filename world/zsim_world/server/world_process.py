@@ -13,7 +13,7 @@ from zsim.contract import keys, run_messages
 from zsim.runtime.agent import Output
 from zsim.runtime.collector import rare_collections
 from zsim.runtime.health import HealthMeter
-from zsim.scenario.rights import WORLD
+from zsim.scenario.roles import WORLD
 from zsim.transport import connection
 from zsim.transport.session import Query, Session
 from zsim.transport.session_tokens import SessionTokens

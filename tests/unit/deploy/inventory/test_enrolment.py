@@ -15,7 +15,8 @@ from rights_table import SCENARIO as RIGHTS_SCENARIO
 from typer.testing import CliRunner
 
 from zsim.errors import BadNameError, InventoryError, RunError
-from zsim.scenario import rights, scenario_file
+from zsim.scenario import roles as rights
+from zsim.scenario import scenario_file
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
 from zsim_deploy.inventory.certificates import CertificateRequest

@@ -15,7 +15,7 @@ from zsim.contract.framing import decode_batch
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Health, Join
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
-from zsim.scenario import rights, scenario_file
+from zsim.scenario import roles, scenario_file
 from zsim.schema.message import Message
 from zsim_world.fleet.fleet import DivergedError
 from zsim_world.flight.world import DURATION_OVER, World
@@ -131,8 +131,8 @@ def test_how_a_camera_sees_is_kept_and_handed_on_and_its_pictures_are_not():
 
 
 def test_the_world_answers_how_a_camera_sees():
-    assert any(keys.matches(expression, FRONT_INFO) for expression in rights.LAST_VALUES)
-    assert not any(keys.matches(expression, FRONT) for expression in rights.LAST_VALUES)
+    assert any(keys.matches(expression, FRONT_INFO) for expression in roles.LAST_VALUES)
+    assert not any(keys.matches(expression, FRONT) for expression in roles.LAST_VALUES)
 
 
 @pytest.mark.parametrize(("key", "message"), [(FRONT_INFO, image(0)), (DETECTIONS, info()), (FRONT_INFO, info(10**12))])
