@@ -9,7 +9,7 @@ from rich.console import Group
 from rich.text import Text
 
 from zsim.errors import printable
-from zsim.terminal.fitted_table import Column, FittedTable
+from zsim.presentation import Column, FittedTable
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import ParameterErrors
 from zsim_analysis.reading.verdict import NOT_AS_PLANNED, marks_of

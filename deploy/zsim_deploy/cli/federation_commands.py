@@ -223,7 +223,7 @@ def clear(
 def list_(reach: WorldAccess) -> None:
     """List the faults that are planned or act."""
     from zsim.contract import keys, messages
-    from zsim.terminal.fitted_table import Column, FittedTable, print_table
+    from zsim.presentation import Column, FittedTable, print_table
 
     with connected(reach) as (link, _):
         now_ns = max((messages.decode(keys.CLOCK, s.payload).t_ns for s in link.get(keys.CLOCK)), default=0)
@@ -244,11 +244,11 @@ def kinds(
     trust: Trust = False,
 ) -> None:
     """List the kinds of faults: whom they strike, and their parameters."""
+    from zsim.presentation import Column, FittedTable, print_table
     from zsim.scenario import faults as fault_kinds
     from zsim.scenario import scenario_file
     from zsim.schema import plugin
     from zsim.sensors.sensor_catalogue import declarations
-    from zsim.terminal.fitted_table import Column, FittedTable, print_table
 
     with plugin.names_only(not trust) as skipped:
         own = declarations(scenario_file.load(scenario).drones) if scenario else {}

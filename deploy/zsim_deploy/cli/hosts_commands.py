@@ -108,7 +108,7 @@ def ps(
     A narrow terminal shows fewer columns, --json all of them, in a line for each run.
     """
     from zsim.errors import RunError
-    from zsim.terminal.fitted_table import print_table
+    from zsim.presentation import print_table
     from zsim_deploy.hosts import control_socket
     from zsim_deploy.hosts.status_table import table
 

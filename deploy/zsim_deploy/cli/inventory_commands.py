@@ -79,7 +79,7 @@ def init(
 def show(hosts: Inventory) -> None:
     """List the certificates that are there: for whom, for which addresses, until when."""
     from zsim.errors import RunError
-    from zsim.terminal.fitted_table import Column, FittedTable, print_table
+    from zsim.presentation import Column, FittedTable, print_table
     from zsim_deploy.inventory import certificates, inventory
     from zsim_deploy.inventory.enrolment import folder_of, init_command
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from zsim import __version__
 from zsim.errors import HostsError, ZsimError
-from zsim.terminal.fitted_table import FittedTable
+from zsim.presentation import FittedTable
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.hosts.doctor_tables import hosts_table, paths_table
 from zsim_deploy.hosts.host_link import HostLink

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from zsim.terminal.fitted_table import Column, FittedTable
+from zsim.presentation import Column, FittedTable
 from zsim_deploy.hosts.host_report import HostReport, NetworkPath
 
 HOST_COLUMNS = (

@@ -8,9 +8,9 @@ from typing import Any
 from rich.console import Console, Group
 from rich.live import Live
 
+from zsim.presentation import Column, FittedTable
 from zsim.runtime.progress import Screen, cell, describe
 from zsim.scenario.roles import WORLD
-from zsim.terminal.fitted_table import Column, FittedTable
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.remote_process import RemoteProcess
 from zsim_deploy.hosts.row_choice import RowChoice, needs_attention

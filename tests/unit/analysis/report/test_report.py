@@ -22,9 +22,9 @@ from synthetic_record import GATE_NS, SCENARIOS, Flown
 
 from zsim.contract import keys, messages, run_messages
 from zsim.errors import RecordError, ReportError
+from zsim.presentation import FittedTable
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
-from zsim.terminal.fitted_table import FittedTable
 from zsim_analysis.reading.formation import window
 from zsim_analysis.reading.window_text import percent_text, span_text
 from zsim_analysis.report.figures.report_figures import figures

@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from zsim.terminal.fitted_table import FittedTable, shortened
+from zsim.presentation import FittedTable, shortened
 from zsim_deploy.hosts.doctor_tables import hosts_table, paths_table
 from zsim_deploy.hosts.host_report import HostReport, NetworkPath
 from zsim_deploy.hosts.status_table import table

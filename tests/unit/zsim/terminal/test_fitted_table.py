@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from zsim.terminal.fitted_table import Column, FittedTable
+from zsim.presentation import Column, FittedTable
 
 COLUMNS = (
     Column("role", "name"),

@@ -1,1 +1,0 @@
-"""What commands print for people, on terminals of any width."""
