@@ -32,8 +32,8 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import CameraImage, CameraInfo, ClusterState, Estimate, Status, Truth
 from zsim.contract.messages import Gps, Info
 from zsim.contract.run_messages import Event
-from zsim.drone_colours import colours_of
 from zsim.math.frames import principal_axes
+from zsim.presentation import colours_of
 from zsim.record import Recorded
 from zsim_analysis.export.message_columns import Values
 from zsim_analysis.export.selection import subject

@@ -23,8 +23,8 @@ from foxglove.messages import PoseInFrame
 
 from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Status
-from zsim.drone_colours import colours_of
 from zsim.math.frames import heading
+from zsim.presentation import colours_of
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_analysis.export import foxglove_messages, foxglove_scene
 from zsim_analysis.export.foxglove_messages import NumericMessageType

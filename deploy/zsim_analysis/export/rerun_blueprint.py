@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zsim.drone_colours import colours_of
+from zsim.presentation import colours_of
 from zsim_analysis.export.foxglove_file import CURVES, DRONE_PLOTS, DRONES_MAX, PICTURES, PICTURES_MAX, PLOTS_MAX, TAB
 from zsim_analysis.export.foxglove_messages import PACKAGE, tidy
 from zsim_analysis.export.foxglove_scene import DARK, MAGENTA, WORLD, RotorDisc, rgb

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zsim.drone_colours import drone_colours, rgb
+from zsim.presentation import drone_colours, rgb
 
 HOME = Path(__file__).parents[3]
 DRAWN_IN = (
@@ -59,4 +59,4 @@ def test_many_drones_go_from_dark_to_light(count: int, seen: np.ndarray) -> None
 def test_all_that_draws_drones_takes_this_palette(place: str) -> None:
     tree = ast.parse((HOME / place).read_text())
     taken = [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    assert "zsim.drone_colours" in taken
+    assert "zsim.presentation" in taken

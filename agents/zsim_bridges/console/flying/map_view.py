@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from zsim.contract.flight_messages import ViewCluster
-from zsim.drone_colours import drone_colours
 from zsim.math import frames
+from zsim.presentation import drone_colours
 from zsim.scenario.scenario import Obstacle, Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.flying.geofence import Geofence

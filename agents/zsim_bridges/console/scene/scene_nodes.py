@@ -9,7 +9,7 @@ import viser
 from numpy.typing import NDArray
 
 from zsim.contract.messages import DroneInfo
-from zsim.drone_colours import drone_colours, rgb
+from zsim.presentation import drone_colours, rgb
 from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console.scene import airframe

@@ -6,7 +6,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from zsim.drone_colours import colours_of
+from zsim.presentation import colours_of
 from zsim_analysis.report.comparison import ComparedRun
 from zsim_analysis.report.figures.drone_panels import draw_drone_panels, drone_panel_heights, name_states
 from zsim_analysis.report.figures.plan_view import NAMED_MAX, draw_obstacles, draw_path

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from zsim.drone_colours import colours_of
+from zsim.presentation import colours_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight, Track
 from zsim_analysis.report.figures.plan_view import NAMED_MAX
 from zsim_analysis.report.figures.time_marks import TimeMarks, draw_marks

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, Rectangle
 from scipy.spatial import ConvexHull, QhullError
 
-from zsim.drone_colours import drone_colours
+from zsim.presentation import drone_colours
 from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, row_of
 from zsim.scenario.scenario import Scenario
 from zsim_analysis.reading.formation import Formation, common_instants

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from zsim.drone_colours import colours_of
+from zsim.presentation import colours_of
 from zsim_analysis.reading.distances import distances, separations
 from zsim_analysis.reading.drone_errors import estimate_errors, velocity_responses
 from zsim_analysis.reading.formation import Formation

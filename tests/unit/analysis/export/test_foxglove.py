@@ -22,8 +22,8 @@ from synthetic_pictures import AHEAD, FRONT_P_BK, NO_JPEG, image, info, jpeg
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState, Truth
-from zsim.drone_colours import colours_of
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
+from zsim.presentation import colours_of
 from zsim.record import RecordReader, RecordWriter
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space

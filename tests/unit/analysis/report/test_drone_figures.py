@@ -13,7 +13,7 @@ from matplotlib.text import Text
 from msgspec.structs import replace
 from synthetic_record import Flown
 
-from zsim.drone_colours import drone_colours
+from zsim.presentation import drone_colours
 from zsim_analysis.reading.distances import Distances, Separations
 from zsim_analysis.reading.drone_errors import EstimateErrors, VelocityResponse
 from zsim_analysis.reading.flight import FlightReader

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zsim.drone_colours import drone_colours, rgb
+from zsim.presentation import drone_colours, rgb
 from zsim_bridges.console.scene import airframe
 from zsim_bridges.console.scene.ground_grid import DARK, LIGHT
 from zsim_bridges.console.scene.scene_nodes import LUMINANCE_MIN, lightened, linear, luminance
