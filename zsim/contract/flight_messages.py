@@ -1,12 +1,17 @@
-"""Messages of a flight: drones' state, truth and commands, estimates, and formations. The contract, version 1."""
+"""Messages of a flight, contract version 1: drones, commands, estimates, formations, cameras, and views for displays.
+
+SI units and radians, the unit in the name. W is the world frame (ENU), B the body's (FLU); quaternions are w first and
+turn B to W.
+"""
 
 import math
 from collections.abc import Sequence
 from operator import itemgetter
-from typing import Annotated, Literal, Protocol, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from msgspec import Meta, Struct
 
+from zsim.contract.keys import on
 from zsim.schema.message import Count, Message, Number, Vector3, Whole
 
 Quaternion = tuple[Number, Number, Number, Number]
@@ -15,8 +20,17 @@ Covariance = Annotated[tuple[Number, ...], Meta(min_length=36, max_length=36)]
 DroneState = Literal["landed", "taking_off", "hovering", "flying", "landing", "emergency"]
 Connection = Literal["waiting", "connected", "armed", "lost"]
 Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"]
+PICTURE_MAX = 4_000_000  # bytes; a JPEG of 1920 x 1080 at full quality is below it
+SEEN_MAX = 1000  # of one picture
+JPEG_BEGINS = b"\xff\xd8\xff"  # SOI, then the next marker: ISO/IEC 10918-1, B.1
+
+SidePx = Annotated[int, Meta(ge=1, le=16_384)]
 
 
+# Drones
+
+
+@on("drone/*/sensor/status", writers="world driver", readers="estimator controller", last="world")
 class Status(Message, frozen=True):
     """The state of a drone, last in every gate.
 
@@ -31,6 +45,7 @@ class Status(Message, frozen=True):
     count: Count
 
 
+@on("drone/*/truth", writers="world driver", last="world")
 class Truth(Message, frozen=True):
     """The true state of a drone: position, velocity, acceleration in W, attitude B to W, rate in B, rotor speeds."""
 
@@ -42,12 +57,16 @@ class Truth(Message, frozen=True):
     rotor_rad_s: Rotors
 
 
+@on("drone/*/cmd/*", writers="controller operator", is_output=True)
+@on("drone/*/accepted/*", writers="world", readers="driver")
 class Command(Message, frozen=True):
     """Base of what is sent to a drone; `source` is the sender's process name."""
 
     source: str
 
 
+@on("drone/*/cmd/velocity", is_output=True)
+@on("drone/*/accepted/velocity")
 class Velocity(Command, frozen=True):
     """Fly a velocity [m/s] and turn at a rate [rad/s], counter-clockwise from above.
 
@@ -59,6 +78,8 @@ class Velocity(Command, frozen=True):
     frame: Literal["heading", "world"] = "heading"
 
 
+@on("drone/*/cmd/ardrone", is_output=True)
+@on("drone/*/accepted/ardrone")
 class Ardrone(Command, frozen=True):
     """Fly as the aircraft's own commands do: tilt forward and left, climb, yaw rate, each in [-1, 1] of its limit."""
 
@@ -69,6 +90,8 @@ class Ardrone(Command, frozen=True):
     hover: bool = False
 
 
+@on("drone/*/cmd/attitude", is_output=True)
+@on("drone/*/accepted/attitude")
 class Attitude(Command, frozen=True):
     """Hold the tilt of an orientation B to W, whose heading is not used, with a thrust [N] and a yaw rate."""
 
@@ -77,18 +100,23 @@ class Attitude(Command, frozen=True):
     yaw_rate_rad_s: Number
 
 
+@on("drone/*/cmd/rotors", is_output=True)
+@on("drone/*/accepted/rotors")
 class RotorSpeeds(Command, frozen=True):
     """Turn the rotors at these speeds: front left, front right, rear right, rear left."""
 
     speed_rad_s: Rotors
 
 
+@on("drone/*/cmd/mode", is_output=True)
+@on("drone/*/accepted/mode")
 class Mode(Command, frozen=True):
     """Take off, land, stop the rotors at once, or leave the emergency; open to all with the commander's priority."""
 
     mode: Literal["takeoff", "land", "emergency", "reset"]
 
 
+@on("drone/*/link", writers="driver", last="world")
 class LinkState(Message, frozen=True):
     """The link of a driver to the aircraft that flies as an external drone.
 
@@ -109,6 +137,10 @@ class LinkState(Message, frozen=True):
     refused: Count
 
 
+# Estimates and formations
+
+
+@on("drone/*/estimate", writers="estimator driver", readers="estimator controller", last="world", is_output=True)
 class Estimate(Message, frozen=True):
     """Where an estimator believes its drone to be: position and velocity in W, attitude B to W.
 
@@ -127,6 +159,7 @@ class Estimate(Message, frozen=True):
     source: str = ""
 
 
+@on("cluster/*/state", writers="controller", readers="controller", last="world", is_output=True)
 class ClusterState(Message, frozen=True):
     """Where a formation is, by the estimates, and where it is to be.
 
@@ -149,26 +182,16 @@ class ClusterState(Message, frozen=True):
     plan_step: Count = 0
 
     def fault(self) -> str | None:
-        """Return what the types do not say."""
+        """Return a fault that the types cannot express."""
         return length_fault(self, ("names", "value", "desired", "desired_rate"), 4 * len(self.drones))
 
 
-def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | None:
-    """Return the fault of the first of some fields that has not that many entries."""
-    for name in names:
-        entries = len(getattr(message, name))
-        if entries != length:
-            return f"{name} has {entries} entries; must have {length}"
-    return None
+# Cameras
 
 
-PICTURE_MAX = 4_000_000  # bytes; a JPEG of 1920 x 1080 at full quality is below it
-SEEN_MAX = 1000  # of one picture
-JPEG_BEGINS = b"\xff\xd8\xff"  # SOI, then the next marker: ISO/IEC 10918-1, B.1
-
-SidePx = Annotated[int, Meta(ge=1, le=16_384)]
-
-
+@on("drone/*/camera/*", writers="camera", readers="detector")
+@on("drone/*/camera/front")
+@on("drone/*/camera/bottom")
 class CameraImage(Message, frozen=True, kw_only=True):
     """A picture, exposed around `t_sample_ns`."""
 
@@ -180,12 +203,15 @@ class CameraImage(Message, frozen=True, kw_only=True):
     data: Annotated[bytes, Meta(max_length=PICTURE_MAX)]
 
     def fault(self) -> str | None:
-        """Return what the types do not say."""
+        """Return a fault that the types cannot express."""
         if self.data.startswith(JPEG_BEGINS):
             return None
         return f"data begins with {self.data[:8].hex(' ') or 'nothing'}; must be a JPEG, which begins with ff d8 ff"
 
 
+@on("drone/*/camera/*/info", writers="camera", readers="detector", last="writer")
+@on("drone/*/camera/front/info", is_output=True)
+@on("drone/*/camera/bottom/info", is_output=True)
 class CameraInfo(Message, frozen=True, kw_only=True):
     """What a camera's pixels mean; its last value is kept.
 
@@ -218,6 +244,8 @@ class Seen(Struct, frozen=True, gc=False):
     sigma_range_m: Number
 
 
+@on("drone/*/sightings", writers="detector", is_output=True)
+@on("drone/*/sensor/sightings", writers="world")
 class Sightings(Message, frozen=True, kw_only=True):
     """All that was seen in one picture; `camera` tells in which camera's."""
 
@@ -227,7 +255,7 @@ class Sightings(Message, frozen=True, kw_only=True):
     seen: Annotated[tuple[Seen, ...], Meta(max_length=SEEN_MAX)] = ()
 
 
-_triangle = itemgetter(0, 1, 2, 7, 8, 14)  # of the position, in the 6 x 6 covariance, row-major
+# For displays: these never gate, and may skip
 
 
 class DroneView(Struct, frozen=True):
@@ -242,8 +270,9 @@ class DroneView(Struct, frozen=True):
     commander: str | None = None
 
 
+@on("view/drones", writers="world")
 class ViewDrones(Message, frozen=True):
-    """All drones at one instant, and the wind at each in W; never gates and may skip."""
+    """All drones at one instant, and the wind at each in W."""
 
     drones: tuple[DroneView, ...]
     wind_m_s: tuple[Vector3, ...] = ()
@@ -263,14 +292,16 @@ class EstimateView(Struct, frozen=True):
     sensors: dict[str, tuple[Count, Count]]
 
 
+@on("view/estimates/*", writers="estimator")
 class ViewEstimates(Message, frozen=True):
-    """What an estimator believes of all its drones, for displays; never gates and may skip."""
+    """What an estimator believes of all its drones, for displays."""
 
     estimates: tuple[EstimateView, ...]
 
 
+@on("view/cluster/*", writers="controller")
 class ViewCluster(Message, frozen=True):
-    """A formation as it is displayed; fields as in ClusterState; never gates and may skip."""
+    """A formation as it is displayed; fields as in ClusterState."""
 
     phase: Phase
     names: tuple[str, ...]
@@ -279,27 +310,15 @@ class ViewCluster(Message, frozen=True):
     reason: str
 
     def fault(self) -> str | None:
-        """Return what the types do not say."""
+        """Return a fault that the types cannot express."""
         return length_fault(self, ("value", "desired"), len(self.names))
 
 
-class Estimated(Protocol):
-    """An estimate, on the wire or within an estimator; units and frames as in the message Estimate."""
-
-    @property
-    def position_m(self) -> Vector3: ...
-    @property
-    def covariance(self) -> Sequence[float]: ...
-    @property
-    def yaw_rad(self) -> float: ...
-    @property
-    def yaw_sigma_rad(self) -> float: ...
-    @property
-    def sensors(self) -> dict[str, tuple[int, int]]: ...
+_triangle = itemgetter(0, 1, 2, 7, 8, 14)  # of the position, in the 6 x 6 covariance, row-major
 
 
-def estimate_view(drone: str, estimate: Estimated) -> EstimateView:
-    """Return a drone's estimate for displays."""
+def estimate_view(drone: str, estimate: Any) -> EstimateView:
+    """Return a drone's estimate, a message Estimate or an object with its fields, for displays."""
     e = estimate
     return EstimateView(drone, e.position_m, _triangle(e.covariance), e.yaw_rad, e.yaw_sigma_rad, e.sensors)
 
@@ -308,6 +327,17 @@ def cluster_view(state: ClusterState, t_ns: int, seq: int) -> ViewCluster:
     """Return a formation's state for displays, as message number `seq` of the view."""
     return ViewCluster(t_ns, seq, state.phase, state.names, state.value, state.desired, state.reason)
 
+
+def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | None:
+    """Return the fault of the first of some fields that has not that many entries."""
+    for name in names:
+        entries = len(getattr(message, name))
+        if entries != length:
+            return f"{name} has {entries} entries; must have {length}"
+    return None
+
+
+# What a drone and a driver may do
 
 _ALL: frozenset[DroneState] = frozenset(get_args(DroneState))
 _RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
@@ -331,17 +361,9 @@ def state_refusal(name: str, state: str, asked: str) -> str | None:
 
 
 POSE_AGE_MAX_NS = 500_000_000  # contract; 25 gates, as an estimate that is flown on: 1 m at 2 m/s
-
-
 DISTANCE_MAX_M = 100_000.0  # of each coordinate, as places in a scenario: beyond it a tangent plane is no map
-
-
 SPEED_MAX_M_S = 200.0  # chosen: twice the fastest racing drones
-
-
 RATE_MAX_RAD_S = 100.0  # chosen: twice what a gyroscope of 2000 deg/s measures, and more
-
-
 UNIT_SLACK = 0.01  # of a quaternion's length; single precision is within 1e-6
 
 

@@ -1,11 +1,17 @@
-"""The keys of the contract: built and taken apart here, nowhere else.
+"""The keys of the contract: built, taken apart and matched here, and the table of what each of them carries.
 
 Keys inside a process are without the federation's prefix ("drone/drone1/truth"); the session adds it.
+A message class declares its keys with `on`; decoders, access rights and the last values that the world answers are
+derived from the table of these declarations, TOPICS.
 """
 
 import re
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import groupby
+from typing import Any, NamedTuple, TypeVar
+
+from msgspec import Struct
 
 from zsim.errors import BadNameError
 from zsim.sensors.sensor_catalogue import STOCK
@@ -13,7 +19,7 @@ from zsim.sensors.sensor_catalogue import STOCK
 NAME = re.compile(r"[a-z0-9_.-]{1,32}")
 PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a thing of up to 32
 SENSORS = tuple(STOCK)
-SIGHTINGS = "sightings"  # a sensor of drones with cameras, computed by the world; its messages have any length
+SIGHTINGS = "sightings"  # a sensor of drones with cameras, computed by the world; its messages vary in length
 
 INFO = "world/info"
 CLOCK = "clock"
@@ -25,6 +31,48 @@ BATCH = "@batch"  # everything that passed the hub, see zsim.contract.framing
 GATE = "@gate"  # the world's messages about all drones at a gate
 ACCESS = "@access"  # what access control lets a process do, see zsim.transport.permissions
 
+AnyMessage = TypeVar("AnyMessage", bound=type[Struct])
+
+
+class Topic(NamedTuple):
+    """What the contract says about a key.
+
+    Attributes:
+        message: type of its messages; None for a family of keys whose members declare theirs.
+        writers: roles that publish it; "each" stands for every process, on the keys of its own name.
+        readers: roles that subscribe to it, besides recorders and operators, who read everything.
+        last: who answers a get with the last message: "world", "writer", or nobody ("").
+        is_output: whether the world counts its messages among those that a process announces with its done.
+    """
+
+    message: Any
+    writers: tuple[str, ...]
+    readers: tuple[str, ...]
+    last: str
+    is_output: bool
+
+
+TOPICS: dict[str, Topic] = {}
+"""Topics by key, `*` in place of a name."""
+
+
+def on(
+    key: str, writers: str = "", readers: str = "", last: str = "", is_output: bool = False
+) -> Callable[[AnyMessage], AnyMessage]:
+    """Return the decorator that puts a message class on a key; see Topic.
+
+    Args:
+        key: with `*` in place of a name; a second `*` makes it a family, whose members are declared one by one.
+        writers, readers: roles, separated by spaces.
+    """
+
+    def declare(message: AnyMessage) -> AnyMessage:
+        kind = None if key.count("*") > 1 else message
+        TOPICS[key] = Topic(kind, tuple(writers.split()), tuple(readers.split()), last, is_output)
+        return message
+
+    return declare
+
 
 def name(text: str, what: str = "name") -> str:
     """Return `text` if it is a name of the contract.
@@ -35,6 +83,9 @@ def name(text: str, what: str = "name") -> str:
     if not isinstance(text, str) or not NAME.fullmatch(text):
         raise BadNameError(f"{what} is {text!r}; must be 1 to 32 of a-z 0-9 _ . -")
     return text
+
+
+# Keys by what they are about
 
 
 def sensor(drone: str, kind: str) -> str:
@@ -49,33 +100,12 @@ def status(drone: str) -> str:
     return f"drone/{drone}/sensor/status"
 
 
-def camera(drone: str, name: str) -> str:
-    return f"drone/{drone}/camera/{name}"
-
-
-def camera_info(drone: str, name: str) -> str:
-    return f"drone/{drone}/camera/{name}/info"
-
-
-@lru_cache(maxsize=4096)
-def is_picture(key: str) -> bool:
-    """Tell whether a key has pictures: large, and never needed by the lockstep."""
-    kind, _, what = parts(key)
-    return kind == "drone" and what.startswith("camera/") and what.count("/") == 1
-
-
-def detections(drone: str) -> str:
-    """Return the key on which a detector publishes what it found in pictures of a drone's cameras."""
-    return f"drone/{drone}/sightings"
-
-
-def gate(drone: str) -> str:
-    """Return the key of the world's messages about one drone at a gate."""
-    return f"{GATE}/{drone}"
-
-
 def truth(drone: str) -> str:
     return f"drone/{drone}/truth"
+
+
+def estimate(drone: str) -> str:
+    return f"drone/{drone}/estimate"
 
 
 def command(drone: str, kind: str) -> str:
@@ -85,12 +115,6 @@ def command(drone: str, kind: str) -> str:
 def accepted(drone: str, kind: str) -> str:
     """Return the key on which the world repeats a command to an external drone that it accepts."""
     return f"drone/{drone}/accepted/{kind}"
-
-
-def is_accepted(key: str) -> bool:
-    """Tell whether a key has commands to an external drone as the world repeats them."""
-    kind, _, what = parts(key)
-    return kind == "drone" and what.startswith("accepted/")
 
 
 def link(drone: str) -> str:
@@ -103,8 +127,22 @@ def driver(drone: str) -> str:
     return f"drone/{drone}/driver"
 
 
-def estimate(drone: str) -> str:
-    return f"drone/{drone}/estimate"
+def camera(drone: str, name: str) -> str:
+    return f"drone/{drone}/camera/{name}"
+
+
+def camera_info(drone: str, name: str) -> str:
+    return f"drone/{drone}/camera/{name}/info"
+
+
+def detections(drone: str) -> str:
+    """Return the key on which a detector publishes what it found in pictures of a drone's cameras."""
+    return f"drone/{drone}/sightings"
+
+
+def gate(drone: str) -> str:
+    """Return the key of the world's messages about one drone at a gate."""
+    return f"{GATE}/{drone}"
 
 
 def cluster_state(cluster: str) -> str:
@@ -129,12 +167,27 @@ def estimates_view(process_name: str) -> str:
     return f"view/estimates/{process_name}"
 
 
+def process(process_name: str, what: str) -> str:
+    """Return the key of `join`, `done`, `snapshot`, `bye` or `health` of a process."""
+    return f"process/{process_name}/{what}"
+
+
+def replay(process_name: str) -> str:
+    """Return the key on which the world sends a process the messages that it missed and may read."""
+    return process(process_name, "replay")
+
+
+def access(process_name: str) -> str:
+    """Return the key on which a listening process answers what the certificate of a process lets it do."""
+    return f"{ACCESS}/{process_name}"
+
+
 def token(process: str) -> str:
     return f"process/{process}"
 
 
 def session_token(process: str, session: str) -> str:
-    """Return the token by which a process says which session of Zenoh's is its own."""
+    """Return the token by which a process says which Zenoh session is its own."""
     return f"process/{process}/session/{session}"
 
 
@@ -144,9 +197,7 @@ def session_of(token_key: str) -> str:
     return session if head else ""
 
 
-def process(process_name: str, what: str) -> str:
-    """Return the key of `join`, `done`, `snapshot`, `bye` or `health` of a process."""
-    return f"process/{process_name}/{what}"
+# What a key is about
 
 
 @lru_cache(maxsize=4096)
@@ -154,37 +205,6 @@ def parts(key: str) -> tuple[str, str, str]:
     """Return what a key is about, whose it is, and what of it; empty where it is shorter: `drone`, name, `cmd/mode`."""
     kind, whose, what, *_ = *key.split("/", 2), "", ""
     return kind, whose, what
-
-
-def replay(process_name: str) -> str:
-    """Return the key on which the world answers a process for what it may read and missed."""
-    return process(process_name, "replay")
-
-
-def access(process_name: str) -> str:
-    """Return the key on which whoever listens answers what the certificate of a process lets it do."""
-    return f"{ACCESS}/{process_name}"
-
-
-def is_command(key: str) -> bool:
-    """Tell whether a key is that of commands to a drone."""
-    return key.startswith("drone/") and "/cmd/" in key
-
-
-def is_sensor(expression: str) -> bool:
-    """Tell whether a key, or an expression, is about a drone's sensors."""
-    parts = expression.split("/")
-    return len(parts) == 4 and parts[0] == "drone" and parts[2] == "sensor"
-
-
-def may_drop(key: str) -> bool:
-    """Tell whether a full link may lose messages of a key in realtime, as it may sensors: newer ones come."""
-    return "/sensor/" in key or key.startswith(GATE)
-
-
-def is_status(key: str) -> bool:
-    """Tell whether a key is a drone's status."""
-    return key.endswith("/sensor/status")
 
 
 def thing(key: str) -> str:
@@ -195,6 +215,43 @@ def thing(key: str) -> str:
 def leaf(key: str) -> str:
     """Return the last part of a key."""
     return key.rsplit("/", 1)[-1]
+
+
+def is_command(key: str) -> bool:
+    """Tell whether a key is that of commands to a drone."""
+    return key.startswith("drone/") and "/cmd/" in key
+
+
+def is_accepted(key: str) -> bool:
+    """Tell whether a key has commands to an external drone as the world repeats them."""
+    kind, _, what = parts(key)
+    return kind == "drone" and what.startswith("accepted/")
+
+
+def is_sensor(expression: str) -> bool:
+    """Tell whether a key, or an expression, is about a drone's sensors."""
+    parts = expression.split("/")
+    return len(parts) == 4 and parts[0] == "drone" and parts[2] == "sensor"
+
+
+def is_status(key: str) -> bool:
+    """Tell whether a key is a drone's status."""
+    return key.endswith("/sensor/status")
+
+
+@lru_cache(maxsize=4096)
+def is_picture(key: str) -> bool:
+    """Tell whether a key has pictures: large, and never needed by the lockstep."""
+    kind, _, what = parts(key)
+    return kind == "drone" and what.startswith("camera/") and what.count("/") == 1
+
+
+def may_drop(key: str) -> bool:
+    """Tell whether a full link may lose messages of a key in realtime, as it may sensors: newer ones come."""
+    return "/sensor/" in key or key.startswith(GATE)
+
+
+# Key expressions
 
 
 def matches(expression: str, key: str) -> bool:
@@ -214,8 +271,8 @@ _PART = "[^/]*"
 def _compiled(expression: str) -> re.Pattern[str]:
     """Return the pattern of an expression, for keys with "/" at their end.
 
-    What stands between two wildcards is matched at its first place and kept (atomic groups), so that no
-    expression, however contrived, takes more than linear time per wildcard.
+    The text between two wildcards is matched at its first occurrence, without backtracking (atomic groups), so that
+    no expression takes more than linear time per wildcard.
     """
     chunks = expression.split("/")
     runs = [list(run) for wild, run in groupby(chunks, lambda chunk: chunk == "**") if not wild]

@@ -16,7 +16,6 @@ from zsim.contract import flight_messages, keys, run_messages
 from zsim.errors import DecodeError
 from zsim.schema.checker import first_fault
 from zsim.schema.message import Count, Message, Number, Whole
-from zsim.sensors.camera import CAMERAS
 from zsim.sensors.sensor import FieldType, Sample, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.sensors.stock_sensors import Baro as Baro
@@ -81,6 +80,7 @@ class SensorInfo(Struct, frozen=True):
     fields: dict[str, FieldType]
 
 
+@keys.on("world/info", writers="world", readers="each", last="world")
 class Info(Message, frozen=True):
     """What a process needs to take part: the resolved scenario and how its time runs, `world/info`.
 
@@ -123,52 +123,17 @@ class Info(Message, frozen=True):
         return () if self.user_sensors is UNSET else self.user_sensors
 
 
-_FIXED: dict[str, type[Struct]] = {
-    "world/info": Info,
-    "clock": run_messages.Clock,
-    "world/event": run_messages.Event,
-    "world/faults": run_messages.Faults,
-    "view/drones": flight_messages.ViewDrones,
-}
-_BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
-    **{("drone", f"sensor/{name}"): kind.message for name, kind in STOCK.items()},
-    ("drone", f"sensor/{keys.SIGHTINGS}"): flight_messages.Sightings,
-    ("drone", "sensor/status"): flight_messages.Status,
-    ("drone", "truth"): flight_messages.Truth,
-    ("drone", "cmd/velocity"): flight_messages.Velocity,
-    ("drone", "cmd/ardrone"): flight_messages.Ardrone,
-    ("drone", "cmd/attitude"): flight_messages.Attitude,
-    ("drone", "cmd/rotors"): flight_messages.RotorSpeeds,
-    ("drone", "cmd/mode"): flight_messages.Mode,
-    ("drone", "accepted/velocity"): flight_messages.Velocity,
-    ("drone", "accepted/ardrone"): flight_messages.Ardrone,
-    ("drone", "accepted/attitude"): flight_messages.Attitude,
-    ("drone", "accepted/rotors"): flight_messages.RotorSpeeds,
-    ("drone", "accepted/mode"): flight_messages.Mode,
-    ("drone", "link"): flight_messages.LinkState,
-    ("drone", "estimate"): flight_messages.Estimate,
-    ("drone", "sightings"): flight_messages.Sightings,
-    **{("drone", f"camera/{name}"): flight_messages.CameraImage for name in CAMERAS},
-    **{("drone", f"camera/{name}/info"): flight_messages.CameraInfo for name in CAMERAS},
-    ("cluster", "state"): flight_messages.ClusterState,
-    ("cluster", "request"): run_messages.ClusterRequest,
-    ("process", "join"): run_messages.Join,
-    ("process", "done"): run_messages.Done,
-    ("process", "snapshot"): run_messages.Snapshot,
-    ("process", "bye"): run_messages.Bye,
-    ("process", "health"): run_messages.Health,
-}
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-_OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest Info has them
-_VIEWS: dict[str, type[Struct]] = {
-    "view/cluster/": flight_messages.ViewCluster,
-    "view/estimates/": flight_messages.ViewEstimates,
-}
-KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
+for _name, _kind in STOCK.items():
+    keys.on(f"drone/*/sensor/{_name}", writers="world")(_kind.message)
+keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # those of the users' sensors too
+TOPICS = keys.TOPICS
+"""The contract's keys, `*` in place of a name, with what travels on them; whole once this module is imported."""
 
 RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
-"""What agents publish for each other; the world counts it, as it does commands."""
-OUTPUTS = (*RELAYED, flight_messages.Sightings, flight_messages.CameraInfo)
+"""Messages that agents publish for each other; the world counts them, as it does commands."""
+KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest Info has them
 
 
 def _plain(value: Any) -> Any:
@@ -183,15 +148,21 @@ encode: Callable[[Struct], bytes] = msgspec.msgpack.Encoder(enc_hook=_plain).enc
 """Return the payload of a message; numbers and arrays of numpy's are taken."""
 
 
+def shape_of(key: str) -> str:
+    """Return a key with `*` in place of the name in it, as in TOPICS."""
+    if key in TOPICS:
+        return key
+    kind, whose, what = keys.parts(key)
+    return f"view/{whose}/*" if kind == "view" else f"{kind}/*/{what}"
+
+
 @lru_cache(maxsize=KEYS_KEPT)
 def type_of(key: str) -> type[Struct] | None:
     """Return the message type that the contract puts on a key, None for a key that it does not know."""
-    for start, message in _VIEWS.items():
-        if key.startswith(start):
-            return message
-    kind, _, what = keys.parts(key)
-    own = _OWN_SENSORS.get(what.removeprefix("sensor/")) if kind == "drone" and what.startswith("sensor/") else None
-    return _FIXED.get(key) or _BY_SHAPE.get((kind, what)) or own
+    shape = shape_of(key)
+    if shape in TOPICS:
+        return TOPICS[shape].message
+    return _OWN_SENSORS.get(shape.removeprefix("drone/*/sensor/"))
 
 
 def register_sensors(sensors: Iterable[SensorInfo]) -> None:
@@ -209,15 +180,14 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
 
 def types_by_shape() -> dict[str, type[Struct]]:
     """Return the contract's message types by the shape of their key, for documentation and for tests."""
-    shapes = {f"{kind}/*/{rest}": message for (kind, rest), message in _BY_SHAPE.items()}
-    return {**_FIXED, **shapes, **{f"{start}*": message for start, message in _VIEWS.items()}}
+    return {shape: topic.message for shape, topic in TOPICS.items() if topic.message}
 
 
 @lru_cache(maxsize=KEYS_KEPT)
 def is_output(key: str) -> bool:
     """Tell whether the world counts the messages of a key for the done of the process that publishes them."""
-    kind = type_of(key)
-    return kind is not None and (keys.is_command(key) or (kind in OUTPUTS and not keys.is_sensor(key)))
+    topic = TOPICS.get(shape_of(key))
+    return topic is not None and topic.message is not None and topic.is_output
 
 
 def output_type(key: str) -> type[Struct]:

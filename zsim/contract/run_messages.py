@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from msgspec import UNSET, Struct, UnsetType, field
 
+from zsim.contract.keys import on
 from zsim.schema.message import Count, Message, Number, Whole
 
 GATES_MAX = 1_000_000  # of one `step`: 5.5 hours at 20 ms
@@ -25,6 +26,7 @@ class Waiting(Struct, frozen=True):
     held_by: tuple[str, ...] = ()
 
 
+@on("clock", writers="world", readers="each", last="world")
 class Clock(Message, frozen=True):
     """The gate that the world has published; its `rate` is measured. `waiting_for` is filled while time stands."""
 
@@ -35,6 +37,7 @@ class Clock(Message, frozen=True):
     waiting_for: tuple[Waiting, ...] = ()
 
 
+@on("world/event", writers="world", readers="each")
 class Event(Message, frozen=True):
     """Something that happened once: what, by whom, about whom, in words, and in figures."""
 
@@ -45,10 +48,11 @@ class Event(Message, frozen=True):
     data: dict[str, Any] = field(default_factory=dict)
 
     def fault(self) -> str | None:
-        """Return what the types do not say."""
+        """Return a fault that the types cannot express."""
         return _infinite_fault("data", self.data)
 
 
+@on("process/*/join", writers="each")
 class Join(Message, frozen=True):
     """A process takes part from now on; the newest of several random incarnations counts.
 
@@ -69,6 +73,7 @@ class Join(Message, frozen=True):
     slack_ns: Count = 0
 
 
+@on("process/*/done", writers="each")
 class Done(Message, frozen=True):
     """Everything stamped up to `done_ns` is handled and answered; `sent` outputs were sent since the last done."""
 
@@ -78,6 +83,7 @@ class Done(Message, frozen=True):
     sent: Count
 
 
+@on("process/*/snapshot", writers="each", last="world")
 class Snapshot(Message, frozen=True):
     """The whole state of a participant after the gate `t_ns`, by which another incarnation of it can go on.
 
@@ -89,6 +95,7 @@ class Snapshot(Message, frozen=True):
     state: bytes
 
 
+@on("process/*/bye", writers="each")
 class Bye(Message, frozen=True):
     """A process leaves of its own will; `failed`: since it cannot go on, and would fail again if it were restarted.
 
@@ -105,6 +112,7 @@ class Bye(Message, frozen=True):
 RUN_ENDED = "the run ended"  # reason of whoever leaves because the run is over
 
 
+@on("process/*/health", writers="each")
 class Health(Message, frozen=True):
     role: str
     host: str
@@ -135,6 +143,7 @@ class Fault(Struct, frozen=True):
     rank: Count = 0
 
 
+@on("world/faults", writers="world", readers="each", last="world")
 class Faults(Message, frozen=True):
     """The faults that are planned or act, in the order of their ids; published before the gate that a change is in."""
 
@@ -149,7 +158,7 @@ class ControlRequest(Struct, frozen=True):
     source: str = ""
 
     def fault(self) -> str | None:
-        """Return what the types do not say."""
+        """Return a fault that the types cannot express."""
         return _infinite_fault("args", self.args)
 
 
@@ -162,10 +171,11 @@ class ControlAnswer(Struct, frozen=True):
     more: Count | None = None
 
     def fault(self) -> str | None:
-        """Return what the types do not say."""
+        """Return a fault that the types cannot express."""
         return _infinite_fault("result", self.result)
 
 
+@on("cluster/*/request", writers="controller", is_output=True)
 class ClusterRequest(Message, frozen=True):
     """A request on `cluster/{c}/control` as the controller took it, before its outputs of the gate `t_ns`.
 
@@ -180,7 +190,7 @@ class ClusterRequest(Message, frozen=True):
     controller: str = ""
 
     def fault(self) -> str | None:
-        """Return what the types do not say."""
+        """Return a fault that the types cannot express."""
         return _infinite_fault("args", self.args)
 
 

@@ -1,19 +1,24 @@
-"""The roles of a federation, in one table: what a process of each is named after, made of, and needs.
+"""The roles of a federation: what a process of each is named after, made of and needs, and what it may do on the keys.
 
-Launchers, the world and access control read it; what a role may do on the keys is in `rights`.
+Launchers, the world and access control read the table. Rights are the least that a role needs. They follow from the
+writers and readers that the messages of the contract declare (`zsim.contract.messages.TOPICS`): Zenoh's access control
+is made of them, and the world answers replays by them.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from zsim.contract import keys
+from zsim.contract.messages import TOPICS
 from zsim.errors import ScenarioError
 from zsim.scenario.scenario import OnDeath, OnOverdue, Scenario
 from zsim.schema.checker import listed
 
+OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "router", "driver"
+
 
 class Role(NamedTuple):
-    """What is to be known of a role.
+    """A role.
 
     Attributes:
         extra: of the distribution, that a host of it needs; empty for none.
@@ -21,7 +26,7 @@ class Role(NamedTuple):
         about: what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent.
         agent: `package.module:Class` of the agent, made of world/info, scenario and name.
         joint: one agent may do the work of many, made of all their names.
-        on_overdue: what follows where it does not come back and the scenario does not say; `drop` where nothing waits
+        on_overdue: what follows where it does not come back and the scenario does not say; `drop` where nothing waits.
     """
 
     extra: str
@@ -127,7 +132,7 @@ def check_pace(scenario: Scenario, mode: str) -> None:
 
 def drivers_of(scenario: Scenario) -> list[str]:
     """Return the names of the processes that publish the external drones."""
-    return [f"driver.{drone}" for drone in scenario.external()]
+    return [f"{DRIVER}.{drone}" for drone in scenario.external()]
 
 
 def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
@@ -139,21 +144,7 @@ def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
     return [f"external drones: {', and '.join(waits)}; start drivers with --connect {endpoint}"] if drivers else []
 
 
-TOLD_TO_ALL = (keys.INFO, keys.CLOCK, keys.EVENT, keys.FAULTS)
-EVERYTHING = ("**", keys.BATCH, keys.GATE, keys.gate("*"))  # no wildcard takes a key that begins with @
-LAST_VALUES = (
-    keys.INFO,
-    keys.CLOCK,
-    keys.FAULTS,
-    "drone/*/sensor/status",
-    "drone/*/truth",
-    "drone/*/estimate",
-    keys.link("*"),
-    keys.camera_info("*", "*"),
-    "cluster/*/state",
-    "process/*/snapshot",
-)
-OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "router", "driver"
+# Rights
 
 
 class Rights(NamedTuple):
@@ -176,7 +167,10 @@ class Rights(NamedTuple):
     watches: tuple[str, ...] = ()
 
 
+EVERYTHING = ("**", keys.BATCH, keys.GATE, keys.gate("*"))  # no wildcard takes a key that begins with @
 ALL_RIGHTS = Rights(*[EVERYTHING] * len(Rights._fields))
+LAST_VALUES = tuple(key for key, topic in TOPICS.items() if topic.last)
+_READER = Rights(reads=("**", keys.BATCH), asks=LAST_VALUES, watches=(keys.token("*"),))
 
 
 def rights_for(process: str, scenario: Scenario) -> Rights:
@@ -189,17 +183,66 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
     role, _, thing = process.partition(".")
     if process == WORLD:
         return ALL_RIGHTS
+    own = combined([_granted("each", process=[process]), _services_of(process)])
     if process == RECORDER:
-        return combined([_own(process), _READER])
+        return combined([own, _READER])
     if role == OPERATOR:
-        return combined([_own(process), _READER, _OPERATOR])
+        requests = Rights(asks=(keys.CONTROL, keys.cluster_control("*"), keys.driver("*")))
+        return combined([own, _READER, _granted(role, drone=["*"]), requests])
     if role == DRIVER:
-        return combined([_own(process), _driver_rights(thing, scenario)])
-    if role in _OF_CAMERAS:
-        return combined([_own(process), *(_OF_CAMERAS[role](drone) for drone in watched_drones(thing, scenario))])
+        is_external = thing in scenario.external()
+        return combined([own, *([_granted(role, drone=[thing]), Rights(answers=(keys.driver(thing),))] * is_external)])
+    if role in ("camera", "detector"):
+        sees = (keys.truth("*"),) if role == "camera" else ()
+        return combined([own, Rights(reads=sees, asks=sees), _granted(role, drone=watched_drones(thing, scenario))])
     about = AGENTS[role].about if role in AGENTS else None
-    granted = [rights(thing, scenario, role) for kind, rights in _ABOUT.items() if about in (None, kind)]
-    return combined([_own(process), *granted])
+    granted = [own]
+    if about != "cluster" and thing in [drone.name for drone in scenario.drones]:
+        gates = Rights(reads=(keys.gate(thing), *_sensed_by_mates(thing, scenario)))
+        granted += [_granted("estimator", drone=[thing], estimates=[process]), gates]
+    if about != "drone" and thing in [cluster.name for cluster in scenario.clusters]:
+        granted.append(_granted("controller", drone=scenario.cluster(thing).drones, cluster=[thing]))
+        granted.append(Rights(answers=(keys.cluster_control(thing),)))
+    return combined(granted)
+
+
+def _granted(role: str, **names: Sequence[str]) -> Rights:
+    """Return what the messages of the contract let a role do on the keys of some drones, clusters or processes.
+
+    Args:
+        names: of `drone`, `cluster`, `process`, and of the process itself as `estimates`.
+    """
+    reads, writes, asks, answers = [], [], [], []
+    for key, topic in TOPICS.items():
+        if role not in (*topic.readers, *topic.writers):
+            continue
+        kind = key.partition("/*")[0].rpartition("/")[2]
+        expressions = [key.replace("*", name, 1) for name in names.get(kind, ())] if "*" in key else [key]
+        reads += expressions if role in topic.readers else []
+        writes += expressions if role in topic.writers else []
+        if topic.last == "writer" and role in topic.writers:
+            answers += expressions
+        elif topic.last:
+            asks += expressions
+    return Rights(tuple(reads), tuple(writes), tuple(asks), tuple(answers))
+
+
+def _services_of(process: str) -> Rights:
+    """Return what every process may do in its own name besides its messages."""
+    return Rights(
+        asks=(keys.replay(process),),
+        answers=(keys.process(process, "outputs"),),
+        tokens=(keys.token(process), keys.session_token(process, "*")),
+    )
+
+
+def _sensed_by_mates(drone: str, scenario: Scenario) -> tuple[str, ...]:
+    """Return what an estimator that uses sightings reads: all that the drones of its cluster sense."""
+    if scenario.estimation.use_sightings is not True:
+        return ()
+    mates = next((cluster.drones for cluster in scenario.clusters if drone in cluster.drones), [drone])
+    expressions = (keys.sensors, keys.gate, keys.detections)
+    return (keys.GATE, *(expression(mate) for mate in mates for expression in expressions))
 
 
 def watched_drones(thing: str, scenario: Scenario) -> list[str]:
@@ -217,89 +260,3 @@ def combined(many: Iterable[Rights]) -> Rights:
 def permits(expressions: Iterable[str], key: str) -> bool:
     """Tell whether a key is among some expressions."""
     return any(keys.matches(expression, key) for expression in expressions)
-
-
-def _own(process: str) -> Rights:
-    """Return what every process may do in its own name."""
-    return Rights(
-        reads=TOLD_TO_ALL,
-        writes=tuple(keys.process(process, what) for what in ("join", "done", "snapshot", "bye", "health")),
-        asks=(keys.INFO, keys.CLOCK, keys.FAULTS, keys.process(process, "snapshot"), keys.replay(process)),
-        answers=(keys.process(process, "outputs"),),
-        tokens=(keys.token(process), keys.session_token(process, "*")),
-    )
-
-
-_READER = Rights(reads=("**", keys.BATCH), asks=LAST_VALUES, watches=(keys.token("*"),))
-_OPERATOR = Rights(writes=(keys.command("*", "*"),), asks=(keys.CONTROL, keys.cluster_control("*"), keys.driver("*")))
-
-
-def _about_drone(thing: str, scenario: Scenario, role: str) -> Rights:
-    """Return what an estimator of a drone may do."""
-    if thing not in {drone.name for drone in scenario.drones}:
-        return Rights()
-    estimate = (keys.estimate(thing),)
-    return Rights(
-        reads=(keys.sensors(thing), keys.gate(thing), *estimate, *_of_mates(thing, scenario)),
-        writes=(*estimate, keys.estimates_view(f"{role}.{thing}")),
-        asks=(keys.status(thing), *estimate),
-    )
-
-
-def _driver_rights(thing: str, scenario: Scenario) -> Rights:
-    """Return what the driver of an external drone may do: what the world does for a simulated one, for it alone."""
-    if thing not in scenario.external():
-        return Rights()
-    last = (keys.status(thing), keys.truth(thing), keys.estimate(thing), keys.link(thing))
-    return Rights(
-        reads=(keys.accepted(thing, "*"),),
-        writes=(keys.sensors(thing), keys.truth(thing), keys.estimate(thing), keys.link(thing)),
-        asks=last,
-        answers=(keys.driver(thing),),
-    )
-
-
-def _of_mates(thing: str, scenario: Scenario) -> tuple[str, ...]:
-    """Return what an estimator reads that uses sightings: all that the drones of its cluster sense."""
-    if scenario.estimation.use_sightings is not True:
-        return ()
-    mates = next((cluster.drones for cluster in scenario.clusters if thing in cluster.drones), [thing])
-    expressions = (keys.sensors, keys.gate, keys.detections)
-    return (keys.GATE, *(expression(mate) for mate in mates for expression in expressions))
-
-
-def _about_cluster(thing: str, scenario: Scenario, role: str) -> Rights:
-    """Return what a controller of a cluster may do."""
-    if thing not in {cluster.name for cluster in scenario.clusters}:
-        return Rights()
-    drones = scenario.cluster(thing).drones
-    estimates_and_states = [key for drone in drones for key in (keys.estimate(drone), keys.status(drone))]
-    state = keys.cluster_state(thing)
-    return Rights(
-        reads=(*estimates_and_states, state),
-        writes=(
-            *(keys.command(drone, "*") for drone in drones),
-            state,
-            keys.cluster_request(thing),
-            keys.cluster_view(thing),
-        ),
-        asks=(*estimates_and_states, state),
-        answers=(keys.cluster_control(thing),),
-    )
-
-
-def _camera(drone: str) -> Rights:
-    """Return what a camera of a drone may do: it sees all drones."""
-    info = (keys.camera_info(drone, "*"),)
-    truth = (keys.truth("*"),)
-    return Rights(reads=truth, writes=(keys.camera(drone, "*"), *info), answers=info, asks=truth)
-
-
-def _detector(drone: str) -> Rights:
-    """Return what a detector for a drone's cameras may do."""
-    info = keys.camera_info(drone, "*")
-    return Rights(reads=(keys.camera(drone, "*"), info), writes=(keys.detections(drone),), asks=(info,))
-
-
-_OF_CAMERAS = {"camera": _camera, "detector": _detector}
-_ABOUT = {"drone": _about_drone, "cluster": _about_cluster}
