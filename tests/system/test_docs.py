@@ -40,7 +40,6 @@ from msgspec import inspect as types
 
 from zsim.contract import messages
 from zsim.scenario import scenario, scenario_file
-from zsim.scenario.shared_vehicle import SharedVehicle
 from zsim.schema import quantities
 from zsim.sensors.camera import CAMERAS, BottomCamera, FrontCamera, Hats, SightingModel
 from zsim.sensors.sensor import ErrorModel, Mount, Sensor
@@ -406,7 +405,6 @@ SECTIONS = {
 } | {
     section.__name__: section
     for section in (
-        SharedVehicle,
         Sensors,
         Sensor,
         Mount,

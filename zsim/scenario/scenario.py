@@ -3,17 +3,16 @@
 A file is read by `scenario_file.load`; the limits written here are the ones that its faults quote.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
-from msgspec import UNSET, Meta, Struct, UnsetType, field
+from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 
-from zsim.scenario.shared_vehicle import SharedVehicle
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
 from zsim.sensors.camera import Hats
 from zsim.sensors.sensor_catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
-from zsim.vehicles.vehicle import Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight
+from zsim.vehicles.vehicle import Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight, Vehicle
 from zsim.vehicles.vehicle_catalogue import STOCK
 
 TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
@@ -315,6 +314,21 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def gates(self, role: str) -> bool:
         """Tell whether the run waits for the processes of a role that is no agent's."""
         return self.processes.gates(role)
+
+
+_SECTIONS = ("limits", "aerodynamics")
+_OWN = ("name", "body", "position_m", "yaw_deg", "sensors")  # fields of a drone that are not of its vehicle
+_SHARED = {name: kind for name, kind in get_type_hints(Drone, include_extras=True).items() if name not in _OWN}
+SharedVehicle: Any = defstruct(
+    "SharedVehicle",
+    [(name, kind | UnsetType, UNSET) for name, kind in _SHARED.items()],
+    bases=(Spec,),
+    frozen=True,
+    kw_only=True,
+)
+"""The `vehicle:` section: fields of a drone that all drones take where they say nothing else."""
+VEHICLE_NUMBERS = tuple(name for name in _SHARED if name in Vehicle.__struct_fields__ and name not in _SECTIONS)
+"""Fields of a drone that its model gives, besides the sections `limits` and `aerodynamics`."""
 
 
 class Document(Scenario, frozen=True, kw_only=True):

@@ -13,14 +13,14 @@ from msgspec import Struct, structs
 
 from zsim.errors import DocumentError, NotTrustedError, ScenarioError
 from zsim.scenario.consistency import cross_faults
-from zsim.scenario.scenario import DRONES_MAX, Document, Scenario
-from zsim.scenario.shared_vehicle import shared, upon
+from zsim.scenario.scenario import DRONES_MAX, VEHICLE_NUMBERS, Document, Scenario, SharedVehicle
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, first_lines, show, sound, suggestion
 from zsim.sensors.error_units import in_channel_units
-from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors, flattened, separate
+from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
 from zsim.vehicles import vehicle_catalogue
-from zsim.vehicles.vehicle import DEFAULTS, Aerodynamics, Vehicle
+from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
+from zsim.vehicles.vehicle import Aerodynamics, Vehicle
 
 EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
 
@@ -54,21 +54,6 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
     return _resolve(document, source, [])
 
 
-def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
-    document = _share_vehicle(document)
-    document, misread = _in_channel_units(document)
-    vehicles, unknown = _vehicles(document, imports)
-    document, unsound = _separate_sensors(_expand_presets(document, vehicles), imports)
-    between = cross_faults(sound(document, Scenario), vehicles)
-    flaws = chain(misread, faults(document, Document), unknown, unsound, between)
-    found = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
-    if found:
-        raise ScenarioError(found)
-    del document["sensors"]
-    document.pop("vehicle", None)
-    return msgspec.convert(document, Scenario)
-
-
 def from_text(text: str) -> Scenario:
     """Return the scenario that `world/info` carries; nothing that it names is imported.
 
@@ -92,102 +77,94 @@ def sha256(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _share_vehicle(document: dict[str, Any]) -> dict[str, Any]:
-    """Return a document whose drones have what its `vehicle:` says, as far as they say nothing else."""
-    drones, fields = document.get("drones"), shared(document)
-    if not fields or not isinstance(drones, list) or len(drones) > DRONES_MAX:
-        return document
-    return {**document, "drones": [upon(fields, drone) for drone in drones]}
+def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
+    """Return the scenario of a raw document.
 
+    Of a drone later ones win: the numbers of its model, the document's `vehicle:`, its own; of its sensors the preset,
+    the document's `sensors:`, its own. A faulty part of what drones share is not handed on to them, so that its faults
+    are told once.
 
-def _in_channel_units(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
-    """Return a document whose sensors' errors are in the units of their channels, and where they cannot be read."""
-    misread: list[Fault] = []
-    read = _with_units(document, "sensors", misread)
+    Args:
+        source: opens the lines of the faults.
+        lines: faults that were found before.
+        imports: whether modules that it names may be imported.
+    """
+    misread: list[Fault] = []  # error models in units that cannot be read
+    unknown: list[Fault] = []  # models that are no vehicles
+    unsound: list[Fault] = []  # sensors of users
+    vehicles = dict(vehicle_catalogue.STOCK)  # by model, as far as drones need one
+
+    given = _in_channel_units(document.get("sensors"), "sensors", misread)
+    shared_sensors = given or {}
+    sensors = _upon_preset(shared_sensors, ARDRONE2.sensor_preset)
+    faulty = {path.partition(".")[0] for path, _ in _sensor_faults(sensors)}
+    usable = {} if "" in faulty else {name: each for name, each in shared_sensors.items() if name not in faulty}
+    shared_vehicle = _sound_vehicle(document.get("vehicle"))
+
+    def resolved_drone(drone: Any, where: str) -> Any:
+        if not isinstance(drone, dict):
+            return drone
+        drone = with_defaults(shared_vehicle, drone)
+        vehicle = _vehicle_of(drone, f"{where}.model", vehicles, unknown, imports)
+        own = _in_channel_units(drone.get("sensors"), f"{where}.sensors", misread)
+        own = with_defaults(usable, own) if isinstance(own, dict) else usable if own is None else own
+        own = _own_apart(_upon_preset(own, vehicle.sensor_preset), f"{where}.sensors", unsound, imports)
+        return {**with_defaults(_numbers_of(vehicle), drone), "sensors": own}
+
+    document = {**document, "sensors": _own_apart(sensors, "sensors", unsound, imports)}
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
-        read = {**read, "drones": [_with_units(d, f"drones[{i}].sensors", misread) for i, d in enumerate(drones)]}
-    return read, misread
+        document["drones"] = [resolved_drone(drone, f"drones[{index}]") for index, drone in enumerate(drones)]
+
+    between = cross_faults(sound(document, Scenario), vehicles)
+    flaws = chain(misread, faults(document, Document), unknown, unsound, between)
+    found = first_lines(chain(lines, (f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws)))
+    if found:
+        raise ScenarioError(found)
+    del document["sensors"]
+    document.pop("vehicle", None)
+    return msgspec.convert(document, Scenario)
 
 
-def _with_units(section: Any, where: str, misread: list[Fault]) -> Any:
-    if not isinstance(section, dict) or not isinstance(section.get("sensors"), dict):
-        return section
-    sensors, wrong = in_channel_units(section["sensors"], STOCK, where)
+def with_defaults(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Return a section with the fields of another one that it does not give, those of sections in it one by one."""
+    merged = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = with_defaults(merged[key], value) if both else value
+    return merged
+
+
+def _in_channel_units(sensors: Any, where: str, misread: list[Fault]) -> Any:
+    """Return a `sensors:` section whose error models are in the units of their channels."""
+    if not isinstance(sensors, dict):
+        return sensors
+    read, wrong = in_channel_units(sensors, where)
     misread += wrong
-    return {**section, "sensors": sensors}
+    return read
 
 
-def _vehicles(document: dict[str, Any], imports: bool) -> tuple[dict[str, Vehicle], list[Fault]]:
-    """Return the vehicles that drones of a document need, by model, and where a model is none.
-
-    A drone with all its numbers, as in a resolved scenario, needs no module of a user's: whoever reads `world/info`
-    imports nothing that it names. One that must not be imported is left out.
-    """
-    vehicles, unknown = dict(vehicle_catalogue.STOCK), []
-    drones = document.get("drones")
-    entries = drones if isinstance(drones, list) and len(drones) <= DRONES_MAX else []
-    for index, drone in enumerate(entries):
-        model = drone.get("model") if isinstance(drone, dict) else None
-        if isinstance(model, str) and model not in vehicles and not _is_resolved(drone):
-            if not imports:
-                allowed = f"must be {', '.join(vehicle_catalogue.STOCK)}, or come with all its numbers"
-                unknown.append((f"drones[{index}].model", f"is {show(model)}; {allowed}"))
-                continue
-            try:
-                vehicles[model] = vehicle_catalogue.vehicle_of(model, "")
-            except NotTrustedError:
-                continue
-            except DocumentError as error:
-                unknown += [(f"drones[{index}].model", line.strip()) for line in error.faults]
-    return vehicles, unknown
-
-
-def _is_resolved(drone: dict[str, Any]) -> bool:
-    return all(name in drone for name in (*DEFAULTS, "limits", "sensors"))
-
-
-def _expand_presets(document: dict[str, Any], vehicles: dict[str, Vehicle]) -> dict[str, Any]:
-    """Put preset, the scenario's `sensors:` and the drone's `sensors:` together, the later ones winning.
-
-    A faulty part of the scenario's is not handed on to the drones: its faults are shown once.
-    """
-    shared = document.get("sensors") or {}
-    document = {**document, "sensors": _expanded(shared)}
-    faulty = {path.partition(".")[0] for path, _ in _sensor_faults(document["sensors"])}
-    usable = {} if "" in faulty else {name: value for name, value in shared.items() if name not in faulty}
-    drones = document.get("drones")
-    if isinstance(drones, list) and len(drones) <= DRONES_MAX:
-        document["drones"] = [_expand_drone(drone, usable, vehicles) for drone in drones]
-    return document
+def _upon_preset(sensors: Any, default: str) -> Any:
+    """Return a `sensors:` section with the values of its preset, or of the default, that it does not give."""
+    if not isinstance(sensors, dict):
+        return sensors
+    name = sensors.get("preset", default)
+    preset = PRESETS.get(name, PRESETS[default]) if isinstance(name, str) else PRESETS[default]
+    if sensors.get("as_printed") is True and name == "paper":
+        preset = with_defaults(preset, AS_PRINTED)
+    return with_defaults({"preset": name, **preset}, sensors)
 
 
 def _sensor_faults(section: Any) -> Iterator[Fault]:
-    """Yield the faults of an expanded `sensors:` section."""
+    """Yield the faults of a `sensors:` section upon its preset."""
     if isinstance(section, dict):
-        rest, _, unsound = separate(section)
+        section, _, unsound = separate(section)
         yield from unsound
-        section = rest
     yield from faults(section, Sensors)
 
 
-def _separate_sensors(document: dict[str, Any], imports: bool) -> tuple[dict[str, Any], list[Fault]]:
-    """Return a document with the users' sensors apart from the stock ones, and what is wrong with them."""
-    unsound: list[Fault] = []
-    section = _separated(document["sensors"], "sensors", unsound, imports)
-    drones = document.get("drones")
-    if isinstance(drones, list) and len(drones) <= DRONES_MAX:
-        drones = [
-            {**drone, "sensors": _separated(drone["sensors"], f"drones[{index}].sensors", unsound, imports)}
-            if isinstance(drone, dict)
-            else drone
-            for index, drone in enumerate(drones)
-        ]
-        return {**document, "sensors": section, "drones": drones}, unsound
-    return {**document, "sensors": section}, unsound
-
-
-def _separated(section: Any, where: str, unsound: list[Fault], imports: bool) -> Any:
+def _own_apart(section: Any, where: str, unsound: list[Fault], imports: bool) -> Any:
+    """Return a `sensors:` section with the users' sensors in `own`."""
     if not isinstance(section, dict):
         return section
     rest, own, wrong = separate(section, imports)
@@ -195,44 +172,45 @@ def _separated(section: Any, where: str, unsound: list[Fault], imports: bool) ->
     return {**rest, "own": own} if own else rest
 
 
-def _expand_drone(drone: Any, shared: dict[str, Any], vehicles: dict[str, Vehicle]) -> Any:
-    """Put what a drone says on top of its vehicle's numbers and of the sensors that all share."""
-    if not isinstance(drone, dict):
-        return drone
+def _sound_vehicle(section: Any) -> dict[str, Any]:
+    """Return the fields of a document's `vehicle:` that its drones may take; faulty ones are told there alone."""
+    if not isinstance(section, dict):
+        return {}
+    faulty = {path.partition(".")[0].partition("[")[0] for path, _ in faults(section, SharedVehicle)}
+    return {name: value for name, value in section.items() if name not in faulty}
+
+
+def _vehicle_of(
+    drone: dict[str, Any], where: str, vehicles: dict[str, Vehicle], unknown: list[Fault], imports: bool
+) -> Vehicle:
+    """Return the vehicle of a drone's model, the AR.Drone where it has none that is known.
+
+    A drone with all its numbers, as in a resolved scenario, needs no module of a user's: whoever reads `world/info`
+    imports nothing that it names. A vehicle that must not be imported is left out.
+    """
     model = drone.get("model", vehicle_catalogue.DEFAULT)
-    vehicle = vehicles.get(model) if isinstance(model, str) else None
-    vehicle = vehicle or vehicles[vehicle_catalogue.DEFAULT]
-    own = drone.get("sensors")
-    own_sensors = _merge(shared, own) if isinstance(own, dict) else shared if own is None else own
-    sections = {"limits": msgspec.to_builtins(vehicle.limits)}
+    if not isinstance(model, str):
+        return ARDRONE2
+    if model not in vehicles and not all(name in drone for name in (*VEHICLE_NUMBERS, "limits", "sensors")):
+        try:
+            if not imports:
+                allowed = f"must be {', '.join(vehicle_catalogue.STOCK)}, or come with all its numbers"
+                raise DocumentError([f"is {show(model)}; {allowed}"])
+            vehicles[model] = vehicle_catalogue.vehicle_of(model, "")
+        except NotTrustedError:
+            pass
+        except DocumentError as error:
+            unknown += [(where, line.strip()) for line in error.faults]
+    return vehicles.get(model, ARDRONE2)
+
+
+def _numbers_of(vehicle: Vehicle) -> dict[str, Any]:
+    """Return the fields of a drone that its vehicle gives; aerodynamics only if there are any."""
+    numbers = {name: getattr(vehicle, name) for name in VEHICLE_NUMBERS}
+    numbers["limits"] = msgspec.to_builtins(vehicle.limits)
     if vehicle.aerodynamics != Aerodynamics():
-        sections["aerodynamics"] = msgspec.to_builtins(vehicle.aerodynamics)
-    defaults = {name: getattr(vehicle, name) for name in DEFAULTS} | sections
-    merged = {name: _merge(sections[name], drone[name]) for name in sections if _has_map(drone, name)}
-    return {**defaults, **drone, "sensors": _expanded(own_sensors, vehicle.sensor_preset), **merged}
-
-
-def _has_map(section: dict[str, Any], name: str) -> bool:
-    return isinstance(section.get(name), dict)
-
-
-def _expanded(sensors: Any, default: str = vehicle_catalogue.STOCK[vehicle_catalogue.DEFAULT].sensor_preset) -> Any:
-    """Return a `sensors:` section upon its preset."""
-    if not isinstance(sensors, dict):
-        return sensors
-    name = sensors.get("preset", default)
-    preset = PRESETS.get(name, PRESETS[default]) if isinstance(name, str) else PRESETS[default]
-    if sensors.get("as_printed") is True and name == "paper":
-        preset = _merge(preset, AS_PRINTED)
-    return _merge({"preset": name, **preset}, sensors)
-
-
-def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in over.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = _merge(merged[key], value) if both else value
-    return merged
+        numbers["aerodynamics"] = msgspec.to_builtins(vehicle.aerodynamics)
+    return numbers
 
 
 def _whose(document: dict[str, Any], path: str) -> str:
@@ -245,6 +223,8 @@ def _whose(document: dict[str, Any], path: str) -> str:
     name = entry.get("name") if isinstance(entry, dict) else None
     return f" ({match[1]} {name!r})" if isinstance(name, str) and len(name) <= 40 else ""
 
+
+# Overrides: `a.b.c=value`, entries of lists by place or by name
 
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
 PATH_MAX = 1000  # characters; the longest of a scenario has a tenth of that

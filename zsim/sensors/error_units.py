@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 from zsim.schema.checker import Fault, faults
 from zsim.schema.quantities import G_M_S2, NonNegative
-from zsim.sensors.sensor import RateHz, SensorType
+from zsim.sensors.sensor import RateHz
+from zsim.sensors.sensor_catalogue import STOCK
 
 DEG = 180.0 / math.pi  # deg/rad
 HOUR_S = 3600.0  # s
@@ -60,17 +61,16 @@ KALIBR = {  # keys of Kalibr's imu.yaml, by the path in the section of the IMU
 }
 
 
-def in_channel_units(sensors: dict[str, Any], stock: dict[str, SensorType], where: str) -> tuple[Any, list[Fault]]:
+def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fault]]:
     """Return a `sensors:` section, as given, with its error models in the fields of ErrorModel, and what is wrong.
 
     Args:
         sensors: by name; what is no map, and a user's own sensors, are returned as they are.
-        stock: types of the sensors of this product.
         where: path of the section.
     """
     wrong: list[Fault] = []
     read = dict(sensors)
-    for name, kind in stock.items():
+    for name, kind in STOCK.items():
         section = sensors.get(name)
         if not isinstance(section, dict):
             continue

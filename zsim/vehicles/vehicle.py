@@ -226,21 +226,6 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError(f"{weakest}; must be >= {LIFT_MIN:g}: place them about the centre of mass, turns balanced")
 
 
-DEFAULTS = (
-    "mass_kg",
-    "inertia_kg_m2",
-    "arm_m",
-    "thrust_n_s2",
-    "torque_nm_s2",
-    "rotor_time_constant_s",
-    "rotor_min_rad_s",
-    "rotor_max_rad_s",
-    "drag_n_s_m",
-    "battery_mah",
-    "takeoff_height_m",
-)
-
-
 def cross_layout(arm_m: float) -> tuple[Rotor, ...]:
     """Return four rotors in a cross, the first and third clockwise: front left, front right, rear right, rear left."""
     xy = arm_m / math.sqrt(2.0)

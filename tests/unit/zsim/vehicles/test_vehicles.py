@@ -12,8 +12,9 @@ from msgspec.structs import replace
 
 from zsim.errors import DocumentError, ScenarioError
 from zsim.scenario import scenario_file
+from zsim.scenario.scenario import VEHICLE_NUMBERS
 from zsim.vehicles import ardrone2, vehicle_catalogue
-from zsim.vehicles.vehicle import DEFAULTS, Rotor, Vehicle, allocation, cross_layout, lift_shares, mixing
+from zsim.vehicles.vehicle import Rotor, Vehicle, allocation, cross_layout, lift_shares, mixing
 
 
 def document(**drone: Any) -> dict[str, Any]:
@@ -31,7 +32,9 @@ def fault_of(**drone: Any) -> str:
 def test_a_stock_vehicle_gives_a_drone_its_numbers(model: str):
     vehicle = vehicle_catalogue.vehicle_of(model)
     drone = scenario_file.resolve(document(model=model)).drones[0]
-    assert {name: getattr(drone, name) for name in DEFAULTS} == {name: getattr(vehicle, name) for name in DEFAULTS}
+    assert {name: getattr(drone, name) for name in VEHICLE_NUMBERS} == {
+        name: getattr(vehicle, name) for name in VEHICLE_NUMBERS
+    }
     assert drone.limits == vehicle.limits
     assert drone.sensors.preset == vehicle.sensor_preset
 
