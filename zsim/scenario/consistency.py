@@ -1,10 +1,10 @@
-"""What no single field of a scenario can know: names that must agree, distances, times that must divide.
+"""Checks between the fields of a scenario: names that must agree, distances, times that must divide, units.
 
-Works on what is sound of a document (`checker.sound`): a check whose fields are missing or faulty is left out.
+They work on the sound parts of a document (`checker.sound`): a check whose fields are missing or faulty is left out.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -12,13 +12,11 @@ import numpy as np
 from msgspec import UNSET
 
 from zsim.contract import messages
-from zsim.scenario import faults
-from zsim.scenario.faults import kinds_of
+from zsim.scenario.faults import Known, flaws, kinds_of
 from zsim.scenario.obstacle import CENTRE, HALF, nearest, row_of
 from zsim.scenario.roles import AGENTS
 from zsim.scenario.scenario import EXTERNAL, SEA_HEIGHT_MAX_M, Scenario, space_name
-from zsim.schema import checker
-from zsim.schema.checker import Fault, show
+from zsim.schema.checker import Fault, listed, show
 from zsim.schema.quantities import COULOMB_PER_MAH, G_M_S2, SEA_LEVEL_KG_M3
 from zsim.sensors.camera_model import folds, lens_of
 from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations, own_sections
@@ -28,9 +26,9 @@ from zsim.vehicles.vehicle import Vehicle, lift_shares
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
 TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
 TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
-WORLD, WORLD_DEATHS = "world", ("restart", "end")
+WORLD_DEATHS = ("restart", "end")  # of `on_death`: nobody else keeps the run
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
-UPON_COSINE, UPON_DEPTH_M = 0.999, 0.001  # of a roof's normal to the vertical; how deep a drone on it may be
+TOP_COSINE, TOP_DEPTH_M = 0.999, 0.001  # of a roof's normal to the vertical; how deep a drone on it may be
 THRUST_SHARE_MIN = 0.005  # of the rotors' lift, in a hover, chosen: racers that lift fifteen times themselves have .07
 TILT_FREE_DEG = 30.0  # deg, allowed to whatever is light enough to fly
 # Chosen, a decade or more beyond what flies: 60 to 400 W/kg from racers' hover to large rotors; 3 min to 2 h
@@ -40,9 +38,10 @@ TIP_MAX_M_S = 340.3  # m/s, speed of sound at 15 deg C, ISO 2533; propellers los
 # m/s, chosen: no multirotor falls so slowly. Falls of those of 20 g to 1 kg are tested at 7 to 24 m/s (Svaty et al.,
 # PLoS ONE 20 (2025) e0320073); by its drag an AR.Drone falls at 17 m/s, a Crazyflie at 43 m/s.
 AIR_M_S = 2.0
-INERTIA_MAX_MR2 = (
-    10.0  # of mass times arm_m squared, chosen: that of the AR.Drone about z is 0.35, of a ring of rotors 1
-)
+# of mass times arm_m squared, chosen: that of the AR.Drone about z is 0.35, of a ring of rotors 1
+INERTIA_MAX_MR2 = 10.0
+LEAST_K1 = -4 / 27  # over the squared tangent of half the diagonal: where r + k1 r^3 turns back
+SIGHTED_MAX = 12  # drones of a cluster: each of its estimators has the states of all; the cost grows by the square
 
 
 def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
@@ -60,17 +59,19 @@ def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fau
     obstacles = _entries(scenario.environment and scenario.environment.obstacles)
     yield from _obstacle_faults(obstacles, drones, vehicles)
     for index, drone in drones:
-        yield from ((f"drones[{index}].{path}", text) for path, text in _drone_faults(drone, scenario, vehicles))
+        yield from _under(f"drones[{index}]", _drone_faults(drone, scenario, vehicles))
     yield from _own_sensor_faults(drones)
-    yield from sighting_faults(scenario, drones, clusters)
+    yield from _sighting_faults(scenario, drones, clusters)
     yield from _membership_faults(drones, clusters)
     for index, cluster in clusters:
-        yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
+        yield from _under(f"clusters[{index}]", _plan_faults(cluster))
     for index, cluster in clusters:
-        yield from ((f"clusters[{index}].{path}", text) for path, text in _shape_faults(cluster, drones))
+        yield from _under(f"clusters[{index}]", _shape_faults(cluster, drones))
     yield from _process_faults(scenario.processes, drones, clusters)
     yield from _injected_faults(scenario, drones, clusters, vehicles)
-    yield from _window_faults(scenario.report)
+    window = scenario.report and scenario.report.window_s
+    if window is not None and not 0 <= window[0] < window[1]:
+        yield "report.window_s", f"is {show(list(window))}; must be [start, end] with 0 <= start < end"
 
 
 def unflown_plans(scenario: Scenario) -> list[str]:
@@ -93,6 +94,7 @@ def unflown_plans(scenario: Scenario) -> list[str]:
 
 
 _Entries = list[tuple[int, Any]]
+"""Sound entries of a list, with their places in it."""
 
 
 def _entries(items: list[Any] | None) -> _Entries:
@@ -101,6 +103,11 @@ def _entries(items: list[Any] | None) -> _Entries:
 
 def _names(entries: _Entries) -> list[str]:
     return [item.name for _, item in entries if item.name is not None]
+
+
+def _under(section: str, faults: Iterable[Fault]) -> Iterator[Fault]:
+    """Yield faults of a section with their paths in the scenario."""
+    yield from ((f"{section}.{path}", text) for path, text in faults)
 
 
 def _known(*values: Any) -> bool:
@@ -155,7 +162,7 @@ _SIZES = {"box": ("size_m",), "cylinder": ("radius_m", "height_m"), "sphere": ("
 
 
 def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
-    """Yield what is wrong with obstacles: names, sizes, and drones that start in one."""
+    """Yield what is wrong with obstacles: names, sizes, and drones that start in one or too near, not on top of it."""
     yield from _name_faults("environment.obstacles", obstacles)
     names = _names(drones)
     placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
@@ -174,25 +181,18 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
         for name in fields:
             if name not in wanted:
                 yield f"{path}.{name}", f"is given; must be left out of a {obstacle.shape}"
-        if sorted(fields) == sorted(wanted) and _known(obstacle.position_m, obstacle.yaw_deg):
-            yield from _buried_faults(obstacle, starts)
-
-
-def _buried_faults(obstacle: Any, starts: list[tuple[int, Any, float]]) -> Iterator[Fault]:
-    """Yield the drones that start in an obstacle or beside it too near, not those upon it.
-
-    `starts` has index, place and clearance of each.
-    """
-    row = row_of(obstacle)
-    x, reach = row[CENTRE], sum(row[HALF:])  # no point of it is farther from its centre, whatever its yaw
-    for index, p_W, least in starts:
-        if abs(p_W[0] - x) >= reach + least:
+        if sorted(fields) != sorted(wanted) or not _known(obstacle.position_m, obstacle.yaw_deg):
             continue
-        distance, _, _, up = nearest(row, *p_W)
-        is_upon = up > UPON_COSINE and distance > -UPON_DEPTH_M
-        if distance < least and not is_upon:
-            place = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
-            yield f"drones[{index}].position_m", f"{place}; must be >= {least:g} m"
+        row = row_of(obstacle)
+        x, reach = row[CENTRE], sum(row[HALF:])  # no point of it is farther from its centre, whatever its yaw
+        for drone, p_W, least in starts:
+            if abs(p_W[0] - x) >= reach + least:
+                continue
+            distance, _, _, up = nearest(row, *p_W)
+            is_on_top = up > TOP_COSINE and distance > -TOP_DEPTH_M
+            if distance < least and not is_on_top:
+                place = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
+                yield f"drones[{drone}].position_m", f"{place}; must be >= {least:g} m"
 
 
 def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
@@ -214,7 +214,7 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
             yield "inertia_kg_m2", f"{found}; check its unit, kg m^2"
     yield from _height_faults(drone, scenario.environment and scenario.environment.height_m)
     if drone.sensors is not None:
-        yield from ((f"sensors.{path}", text) for path, text in _sensor_faults(drone.sensors))
+        yield from _under("sensors", _sensor_faults(drone.sensors))
 
 
 def _tip_fault(drone: Any, vehicle: Vehicle) -> str | None:
@@ -359,7 +359,7 @@ def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
             if name in owner:
                 yield path, f"is {name!r}, which {owner[name]!r} flies already; a drone is in one cluster"
             elif judged and name not in known:
-                yield path, f"is {name!r}; must be one of the drones {checker.listed(list(dict.fromkeys(known)))}"
+                yield path, f"is {name!r}; must be one of the drones {listed(list(dict.fromkeys(known)))}"
             owner.setdefault(name, called)
 
 
@@ -376,7 +376,7 @@ def _shape_faults(cluster: Any, drones: _Entries) -> Iterator[Fault]:
         if group.size is None:
             return
         own, starts = starts[: group.size], starts[group.size :]
-        yield from ((f"groups[{index}].{path}", text) for path, text in _template_faults(group, own, group.size))
+        yield from _under(f"groups[{index}]", _template_faults(group, own, group.size))
         centres.append(np.array(own, dtype=float).mean(axis=0) if own and _known(*own) else None)
     robots = len(groups) or len(cluster.drones)
     yield from _template_faults(cluster, centres if groups else starts, robots)
@@ -434,7 +434,9 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
 
 
 def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
-    yield from _death_faults(processes and processes.on_death)
+    action = ((processes and processes.on_death) or {}).get("world")
+    if action is not None and action not in WORLD_DEATHS:
+        yield "processes.on_death.world", f"is {action!r}; must be {' or '.join(WORLD_DEATHS)}"
     first: dict[str, int] = {}
     things = {role: (each.about, drones if each.about == "drone" else clusters) for role, each in AGENTS.items()}
     for index, name in _entries(processes and processes.expect):
@@ -444,16 +446,9 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
         kind, entries = things.get(role, ("", []))
         known = _names(entries)
         if kind and thing not in known and len(known) == len(entries):
-            named = checker.listed(known) or f"a {kind}, and there is none"
+            named = listed(known) or f"a {kind}, and there is none"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
-
-
-def _death_faults(on_death: Mapping[str, Any] | None) -> Iterator[Fault]:
-    """Yield what the death of a world cannot mean: nobody else keeps the run, so there is nothing to go on with."""
-    action = (on_death or {}).get(WORLD)
-    if action is not None and action not in WORLD_DEATHS:
-        yield f"processes.on_death.{WORLD}", f"is {action!r}; must be {' or '.join(WORLD_DEATHS)}"
 
 
 def _injected_faults(
@@ -467,41 +462,42 @@ def _injected_faults(
     kinds = kinds_of(declarations([drone for _, drone in drones]))
     rotors = {drone.name: vehicles[drone.model].rotor_names if drone.model in vehicles else () for _, drone in drones}
     external = tuple(drone.name for _, drone in drones if drone.body == EXTERNAL)
-    known = faults.Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds, rotors, external)
+    known = Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds, rotors, external)
     for index, fault in _entries(scenario.faults):
-        for path, text in faults.flaws(fault, known):
+        for path, text in flaws(fault, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text
 
 
-def _window_faults(report: Any) -> Iterator[Fault]:
-    window = report and report.window_s
-    if window is not None and not 0 <= window[0] < window[1]:
-        yield "report.window_s", f"is {show(list(window))}; must be [start, end] with 0 <= start < end"
-
-
-LEAST_K1 = -4 / 27  # over the squared tangent of half the diagonal: where r + k1 r^3 turns back
-SIGHTED_MAX = 12  # drones of a cluster: each of its estimators has the states of all; the cost grows by the square
-
-
-def sighting_faults(scenario: Any, drones: list[tuple[int, Any]], clusters: list[tuple[int, Any]]) -> Iterator[Fault]:
-    """Yield these faults of a scenario, or of the sound parts of one."""
+def _sighting_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+    """Yield what cannot go together of cameras, sightings, hats, and estimators that use them."""
     for index, drone in drones:
         if drone.sensors is not None:
-            yield from ((f"drones[{index}].sensors.{path}", text) for path, text in _camera_faults(drone.sensors))
+            yield from _under(f"drones[{index}].sensors", _camera_faults(drone.sensors))
     hats = scenario.environment and scenario.environment.hats
     known = [drone.name for _, drone in drones]
     for place, name in enumerate(hats.covered or () if hats else ()):
         if name not in known:
             yield f"environment.hats.covered[{place}]", f"is {show(name)}; must be one of {', '.join(map(str, known))}"
-    if scenario.estimation is not None and scenario.estimation.use_sightings is True:
-        yield from _estimation_faults(scenario.estimation, drones, clusters)
+    if scenario.estimation is None or scenario.estimation.use_sightings is not True:
+        return
+    path, algorithm = "estimation.use_sightings", scenario.estimation.algorithm
+    if algorithm not in (UNSET, None, "ekf"):
+        yield path, f"is true; must be false with algorithm {show(algorithm)}: only ekf uses them"
+    sensors = [drone.sensors for _, drone in drones if drone.sensors is not None]
+    if sensors and not any(each.front_camera or each.bottom_camera for each in sensors):
+        yield path, "is true and no drone has a camera; give one sensors.front_camera, and sightings or a detector"
+    for index, cluster in clusters:
+        count = len(cluster.drones or ())
+        if count > SIGHTED_MAX:
+            where = f"clusters[{index}].drones"
+            yield where, f"has {count}; must have at most {SIGHTED_MAX} where {path} is true"
 
 
 def _camera_faults(sensors: Any) -> Iterator[Fault]:
     cameras = {"front": sensors.front_camera, "bottom": sensors.bottom_camera}
     for name, camera in cameras.items():
         if camera:
-            yield from ((f"{name}_camera.{path}", text) for path, text in _lens_faults(camera))
+            yield from _under(f"{name}_camera", _lens_faults(camera))
     looks_at = (sensors.sightings and sensors.sightings.cameras) or ()
     for place, name in enumerate(looks_at):
         path = f"sightings.cameras[{place}]"
@@ -520,19 +516,3 @@ def _lens_faults(camera: Any) -> Iterator[Fault]:
     if None not in (camera.exposure_ms, camera.rate_hz) and camera.exposure_ms * camera.rate_hz > 1e3:
         most = f"{1e3 / camera.rate_hz:.4g} ms at rate_hz {camera.rate_hz:g}"
         yield "exposure_ms", f"is {camera.exposure_ms:g}; must be <= {most}, the time from one picture to the next"
-
-
-def _estimation_faults(
-    estimation: Any, drones: list[tuple[int, Any]], clusters: list[tuple[int, Any]]
-) -> Iterator[Fault]:
-    path = "estimation.use_sightings"
-    if estimation.algorithm not in (UNSET, None, "ekf"):
-        yield path, f"is true; must be false with algorithm {show(estimation.algorithm)}: only ekf uses them"
-    sensors = [drone.sensors for _, drone in drones if drone.sensors is not None]
-    if sensors and not any(each.front_camera or each.bottom_camera for each in sensors):
-        yield path, "is true and no drone has a camera; give one sensors.front_camera, and sightings or a detector"
-    for index, cluster in clusters:
-        count = len(cluster.drones or ())
-        if count > SIGHTED_MAX:
-            where = f"clusters[{index}].drones"
-            yield where, f"has {count}; must have at most {SIGHTED_MAX} where estimation.use_sightings is true"

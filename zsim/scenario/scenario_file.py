@@ -277,15 +277,17 @@ def whole_path(path: str, document: Mapping[str, Any] = NOTHING) -> str:
         ValueError: the field is one of a list of sections, of which the document has several.
     """
     first = _FIRST.match(path)
-    sections = {field.name: field for field in _fields(Document)}
+    sections = {field.name: field.type for field in _fields(Document)}
     if first is None or first[0] in sections:
         return path
-    owners = [name for name, field in sections.items() if first[0] in _field_names(field.type)]
+
+    def has_field(kind: Any) -> bool:
+        return any(field.name == first[0] for field in _fields(kind))
+
+    owners = [name for name, kind in sections.items() if has_field(kind)]
     if owners:
         return f"{owners[0]}.{path}" if len(owners) == 1 else path
-    lists = [
-        name for name, field in sections.items() if any(first[0] in _field_names(each) for each in get_args(field.type))
-    ]
+    lists = [name for name, kind in sections.items() if any(map(has_field, get_args(kind)))]
     return _in_entry(path, lists[0], document.get(lists[0])) if len(lists) == 1 else path
 
 
@@ -294,18 +296,13 @@ def _in_entry(path: str, section: str, entries: Any) -> str:
     if not isinstance(entries, list) or not entries:
         return path
     names = [entry.get("name") if isinstance(entry, dict) else None for entry in entries]
-    places = [f"{section}.{name}" if _is_step(name) else f"{section}[{place}]" for place, name in enumerate(names)]
+    places = [
+        f"{section}.{name}" if isinstance(name, str) and _FIRST.fullmatch(name) else f"{section}[{place}]"
+        for place, name in enumerate(names)
+    ]
     if len(places) > 1:
         raise ValueError(f"is a field of each of {len(places)} {section}; give the whole path, e.g. {places[0]}.{path}")
     return f"{places[0]}.{path}"
-
-
-def _is_step(name: Any) -> bool:
-    return isinstance(name, str) and _FIRST.fullmatch(name) is not None
-
-
-def _field_names(kind: Any) -> list[str]:
-    return [field.name for field in _fields(kind)]
 
 
 @cache
@@ -316,26 +313,17 @@ def _fields(kind: Any) -> Sequence[Any]:
 
 
 def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
+    """Put a value in its place; a section on the way that is not there, or empty, begins here."""
     place: Any = document
-    for depth, step in enumerate(steps[:-1]):
-        place = _inside(place, step, steps[:depth])
-    if isinstance(place, list):
-        place[_index(place, steps[-1], steps[:-1])] = value
-    elif isinstance(place, dict):
-        place[steps[-1]] = value
-    else:
-        raise ValueError(f"{'.'.join(steps[:-1])} is {show(place)}; must be a map or a list")
-
-
-def _inside(place: Any, step: str, path: list[str]) -> Any:
-    """Return what stands at one step; a section that is not there, or empty, begins here."""
-    if isinstance(place, list):
-        return place[_index(place, step, path)]
-    if not isinstance(place, dict):
-        raise ValueError(f"{'.'.join(path)} is {show(place)}; must be a map or a list")
-    if place.get(step) is None:
-        place[step] = {}
-    return place[step]
+    for depth, step in enumerate(steps):
+        if not isinstance(place, dict | list):
+            raise ValueError(f"{'.'.join(steps[:depth])} is {show(place)}; must be a map or a list")
+        key: Any = _index(place, step, steps[:depth]) if isinstance(place, list) else step
+        if depth == len(steps) - 1:
+            place[key] = value
+        elif isinstance(place, dict) and place.get(key) is None:
+            place[key] = {}
+        place = place[key]
 
 
 def _index(place: list[Any], step: str, path: list[str]) -> int:
