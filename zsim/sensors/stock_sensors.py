@@ -1,10 +1,18 @@
-"""The inertial measurement unit: accelerometer and gyroscope of the navigation board."""
+"""The stock sensors: message, settings, channels and presets of each, one after the other.
+
+    IMU   GPS   MAG   BARO   SONAR   FLOW
+
+Their equations are compiled in zsim_world.sensors. Where the paper is silent about a sensor, its preset `paper` is
+chosen as the AR.Drone's or as said there.
+"""
 
 import math
 
 from zsim.schema.message import Count, Number, Vector3
 from zsim.schema.quantities import G_M_S2, NonNegative, Positive
 from zsim.sensors.sensor import Channel, ErrorModel, Sample, Sensor, SensorType
+
+# The inertial measurement unit: accelerometer and gyroscope of the navigation board
 
 BOARD_RATE_HZ = 200.0  # Hz, navigation board of the AR.Drone 2.0: its IMU samples and its firmware steps
 
@@ -21,45 +29,6 @@ class ImuConfig(Sensor, frozen=True, kw_only=True):
     gyro_deg_s: ErrorModel = ErrorModel()
 
 
-IMU_PRESETS = {
-    "ardrone2": {
-        "rate_hz": BOARD_RATE_HZ,
-        "accel_m_s2": {
-            "noise": 0.031,  # m/s^2, mean of three axes over 1200 s static
-            "bias": 0.05,  # m/s^2, left after six-position calibration: 2 to 3 LSB of 19 mm/s^2
-            "bias_walk": 0.0005,  # m/s^2/sqrt(s), from an Allan minimum of 0.003-0.005 m/s^2 at 10-30 s
-            "quantum": 0.019,  # m/s^2 per LSB, 12 bits
-        },
-        "gyro_deg_s": {
-            "noise": 0.06,  # deg/s at 200 Hz, 100 s static
-            "bias": 0.1,  # deg/s, left after the drone's own offset removal at start
-            "bias_walk": 0.003,  # deg/s/sqrt(s), from an Allan minimum of 0.003-0.006 deg/s at 3-5 s
-            "quantum": 0.061,  # deg/s per LSB: 16.4 LSB/(deg/s)
-        },
-    },
-    "paper": {
-        "rate_hz": BOARD_RATE_HZ,
-        "accel_m_s2": {"noise": 0.35},  # m/s^2, default of the paper's base simulator (tum_simulator)
-        "gyro_deg_s": {"noise": 0.01},  # deg/s, section VI
-    },
-    "crazyflie2": {
-        "rate_hz": BOARD_RATE_HZ,
-        "accel_m_s2": {
-            "density": 0.0017,  # m/s^2/sqrt(Hz), 175 ug/sqrt(Hz) (data sheet of the BMI088)
-            "bias": 0.05,  # m/s^2, left after calibration; chosen as the AR.Drone's
-            "bias_walk": 0.0005,  # m/s^2/sqrt(s), chosen as the AR.Drone's
-            "quantum": 0.0072,  # m/s^2 per LSB: 24 g in 16 bits (crazyflie-firmware, sensors_bmi088_bmp3xx.c)
-        },
-        "gyro_deg_s": {
-            "density": 0.014,  # deg/s/sqrt(Hz) (data sheet of the BMI088)
-            "bias": 0.1,  # deg/s, left after the firmware's own calibration at start; chosen as the AR.Drone's
-            "bias_walk": 0.003,  # deg/s/sqrt(s), chosen as the AR.Drone's
-            "quantum": 0.061,  # deg/s per LSB: 2000 deg/s in 16 bits (crazyflie-firmware, likewise)
-        },
-    },
-}
-IMU_AS_PRINTED = {"accel_m_s2": {"noise": 0.35 * G_M_S2}}  # m/s^2, section VI: "std errors 0.35 g"
-
 # The greatest biases are chosen: about ten times what any such sensor can show, so that only slips are refused.
 IMU = SensorType(
     label="IMU",
@@ -69,12 +38,48 @@ IMU = SensorType(
         Channel("accel_m_s2", "m/s^2", 3, 1.0, "accel", "accelerometer", "in the sensor's axes", 500.0),
         Channel("gyro_deg_s", "deg/s", 3, math.pi / 180.0, "gyro", "gyroscope", "in the sensor's axes", 5700.0),
     ),
-    presets=IMU_PRESETS,
+    presets={
+        "ardrone2": {
+            "rate_hz": BOARD_RATE_HZ,
+            "accel_m_s2": {
+                "noise": 0.031,  # m/s^2, mean of three axes over 1200 s static
+                "bias": 0.05,  # m/s^2, left after six-position calibration: 2 to 3 LSB of 19 mm/s^2
+                "bias_walk": 0.0005,  # m/s^2/sqrt(s), from an Allan minimum of 0.003-0.005 m/s^2 at 10-30 s
+                "quantum": 0.019,  # m/s^2 per LSB, 12 bits
+            },
+            "gyro_deg_s": {
+                "noise": 0.06,  # deg/s at 200 Hz, 100 s static
+                "bias": 0.1,  # deg/s, left after the drone's own offset removal at start
+                "bias_walk": 0.003,  # deg/s/sqrt(s), from an Allan minimum of 0.003-0.006 deg/s at 3-5 s
+                "quantum": 0.061,  # deg/s per LSB: 16.4 LSB/(deg/s)
+            },
+        },
+        "paper": {
+            "rate_hz": BOARD_RATE_HZ,
+            "accel_m_s2": {"noise": 0.35},  # m/s^2, default of the paper's base simulator (tum_simulator)
+            "gyro_deg_s": {"noise": 0.01},  # deg/s, section VI
+        },
+        "crazyflie2": {
+            "rate_hz": BOARD_RATE_HZ,
+            "accel_m_s2": {
+                "density": 0.0017,  # m/s^2/sqrt(Hz), 175 ug/sqrt(Hz) (data sheet of the BMI088)
+                "bias": 0.05,  # m/s^2, left after calibration; chosen as the AR.Drone's
+                "bias_walk": 0.0005,  # m/s^2/sqrt(s), chosen as the AR.Drone's
+                "quantum": 0.0072,  # m/s^2 per LSB: 24 g in 16 bits (crazyflie-firmware, sensors_bmi088_bmp3xx.c)
+            },
+            "gyro_deg_s": {
+                "density": 0.014,  # deg/s/sqrt(Hz) (data sheet of the BMI088)
+                "bias": 0.1,  # deg/s, left after the firmware's own calibration at start; chosen as the AR.Drone's
+                "bias_walk": 0.003,  # deg/s/sqrt(s), chosen as the AR.Drone's
+                "quantum": 0.061,  # deg/s per LSB: 2000 deg/s in 16 bits (crazyflie-firmware, likewise)
+            },
+        },
+    },
 )
+IMU_AS_PRINTED = {"accel_m_s2": {"noise": 0.35 * G_M_S2}}  # m/s^2, section VI: "std errors 0.35 g"
 
 
-GPS_RATE_HZ = 5.0  # Hz, Paparazzi's model of the ardrone2
-SPEED_NOISE = {"noise": 0.43}  # m/s, ehve of a real navdata packet; the paper is silent
+# The satellite receiver: position and velocity of its antenna
 
 
 class Gps(Sample, frozen=True):
@@ -98,25 +103,6 @@ class GpsConfig(Sensor, frozen=True, kw_only=True):
     velocity_m_s: ErrorModel = ErrorModel()
 
 
-GPS_PRESETS = {
-    "ardrone2": {
-        "rate_hz": GPS_RATE_HZ,
-        "latency_ms": 200.0,  # ms, Paparazzi's model of the ardrone2
-        "position_m": {"noise": 2.0},  # m, likewise
-        "velocity_m_s": SPEED_NOISE,
-    },
-    "paper": {
-        "rate_hz": GPS_RATE_HZ,
-        "position_m": {"noise": 2.0},  # m, section VI
-        "velocity_m_s": SPEED_NOISE,
-    },
-    "crazyflie2": {
-        "rate_hz": 10.0,  # Hz, chosen
-        "position_m": {"noise": 0.1},  # m, chosen: what ultra-wideband ranging to anchors in a room usually reaches
-        "velocity_m_s": {"noise": 0.2},  # m/s, chosen
-    },
-}
-
 GPS = SensorType(
     label="GPS",
     message=Gps,
@@ -125,11 +111,28 @@ GPS = SensorType(
         Channel("position_m", "m", 3, axes="east, north, up", bias_max=1e5),
         Channel("velocity_m_s", "m/s", 3),
     ),
-    presets=GPS_PRESETS,
+    presets={
+        "ardrone2": {
+            "rate_hz": 5.0,  # Hz, Paparazzi's model of the ardrone2
+            "latency_ms": 200.0,  # ms, likewise
+            "position_m": {"noise": 2.0},  # m, likewise
+            "velocity_m_s": {"noise": 0.43},  # m/s, ehve of a real navdata packet
+        },
+        "paper": {
+            "rate_hz": 5.0,  # Hz, as the AR.Drone's
+            "position_m": {"noise": 2.0},  # m, section VI
+            "velocity_m_s": {"noise": 0.43},  # m/s, as the AR.Drone's
+        },
+        "crazyflie2": {
+            "rate_hz": 10.0,  # Hz, chosen
+            "position_m": {"noise": 0.1},  # m, chosen: what ultra-wideband ranging to anchors in a room usually reaches
+            "velocity_m_s": {"noise": 0.2},  # m/s, chosen
+        },
+    },
 )
 
 
-MAG_RATE_HZ = 25.0  # Hz, chosen as the sonar's, the aircraft's magnetometer gives more
+# The magnetometer
 
 
 class Mag(Sample, frozen=True):
@@ -142,23 +145,23 @@ class MagConfig(Sensor, frozen=True, kw_only=True):
     field_ut: ErrorModel = ErrorModel()
 
 
-MAG_PRESETS = {
-    "ardrone2": {"rate_hz": MAG_RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.3}},  # AK8975: 0.3 uT per LSB
-    # 0.94 uT: 3 deg of a horizontal field of 18 uT; chosen, the paper is silent
-    "paper": {"rate_hz": MAG_RATE_HZ, "field_ut": {"noise": 0.94}},
-    "crazyflie2": {
-        "rate_hz": MAG_RATE_HZ,
-        "field_ut": {"noise": 0.3, "quantum": 0.15},
-    },  # AK8963 of the 2.0, 0.15 uT per LSB; the 2.1 has none (crazyflie-firmware, issue 701)
-}
-
+_MAG_RATE_HZ = 25.0  # Hz, chosen as the sonar's; the aircraft's magnetometer gives more
 MAG = SensorType(
     label="magnetometer",
     message=Mag,
     settings=MagConfig,
     channels=(Channel("field_ut", "uT", 3, axes="in the sensor's axes", bias_max=1e4),),
-    presets=MAG_PRESETS,
+    presets={
+        "ardrone2": {"rate_hz": _MAG_RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.3}},  # AK8975: 0.3 uT per LSB
+        # 0.94 uT: 3 deg of a horizontal field of 18 uT; chosen, the paper is silent
+        "paper": {"rate_hz": _MAG_RATE_HZ, "field_ut": {"noise": 0.94}},
+        # AK8963 of the 2.0, 0.15 uT per LSB; the 2.1 has none (crazyflie-firmware, issue 701)
+        "crazyflie2": {"rate_hz": _MAG_RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.15}},
+    },
 )
+
+
+# The barometer
 
 
 class Baro(Sample, frozen=True):
@@ -172,19 +175,21 @@ class BaroConfig(Sensor, frozen=True, kw_only=True):
     altitude_m: ErrorModel = ErrorModel()
 
 
-BARO_PRESET = {
+_BARO_PRESET = {
     "rate_hz": 25.0,  # Hz, chosen as the sonar's
     "altitude_m": {"noise": 0.1},  # m, chosen: twice Paparazzi's model of the ardrone2, for the wash of the rotors
 }
-
 BARO = SensorType(
     label="barometer",
     message=Baro,
     settings=BaroConfig,
     channels=(Channel("altitude_m", "m", axes="of height", bias_max=1e4),),
     exact=1,
-    presets=dict.fromkeys(("ardrone2", "paper", "crazyflie2"), BARO_PRESET),  # the paper is silent
+    presets=dict.fromkeys(("ardrone2", "paper", "crazyflie2"), _BARO_PRESET),
 )
+
+
+# The sonar, or another ranger that looks down
 
 
 class Sonar(Sample, frozen=True):
@@ -200,28 +205,29 @@ class SonarConfig(Sensor, frozen=True, kw_only=True):
     max_m: Positive = 6.0
 
 
-SONAR_PRESET = {
+_SONAR_PRESET = {
     "rate_hz": 25.0,  # Hz, ultrasound_freq 8 of the AR.Drone's configuration
     "range_m": {"noise": 0.01},  # m, chosen: what grass and tilt add to the 0.5 mm per LSB of the converter
 }
-SONAR_PRESETS = {
-    "ardrone2": SONAR_PRESET,
-    "paper": SONAR_PRESET,  # it is silent
-    "crazyflie2": {
-        "rate_hz": 25.0,  # Hz, chosen as the AR.Drone's
-        "range_m": {"noise": 0.02},  # m, chosen, with floor and tilt; crazyflie-firmware, zranger2.c, has 2.5 mm
-        "max_m": 4.0,  # m, VL53L1x; at 4 m zranger2.c has 0.2 m
-    },
-}
-
 SONAR = SensorType(
     label="sonar",
     message=Sonar,
     settings=SonarConfig,
     channels=(Channel("range_m", "m", axes="of range", bias_max=1e4),),
     exact=1,
-    presets=SONAR_PRESETS,
+    presets={
+        "ardrone2": _SONAR_PRESET,
+        "paper": _SONAR_PRESET,
+        "crazyflie2": {
+            "rate_hz": 25.0,  # Hz, chosen as the AR.Drone's
+            "range_m": {"noise": 0.02},  # m, chosen, with floor and tilt; crazyflie-firmware, zranger2.c, has 2.5 mm
+            "max_m": 4.0,  # m, VL53L1x; at 4 m zranger2.c has 0.2 m
+        },
+    },
 )
+
+
+# The optical flow: velocity over the ground, by the camera that looks down
 
 
 class Flow(Sample, frozen=True):
@@ -235,21 +241,19 @@ class FlowConfig(Sensor, frozen=True, kw_only=True):
     velocity_m_s: ErrorModel = ErrorModel()
 
 
-FLOW_PRESET = {
+_FLOW_PRESET = {
     "rate_hz": 15.0,  # Hz, of the reduced navdata in which the drone sends its velocity
     "velocity_m_s": {"noise": 0.1},  # m/s, chosen: nothing is published for the aircraft's flow
 }
-FLOW_PRESETS = {
-    "ardrone2": FLOW_PRESET,
-    "paper": FLOW_PRESET,  # it is silent
-    "crazyflie2": {"rate_hz": 25.0, "velocity_m_s": {"noise": 0.1}},  # chosen; nothing is published for the deck
-}
-
 FLOW = SensorType(
     label="optical flow",
     message=Flow,
     settings=FlowConfig,
     channels=(Channel("velocity_m_s", "m/s", 3, axes="forward, left, up", bias_max=1e3),),
     exact=1,
-    presets=FLOW_PRESETS,
+    presets={
+        "ardrone2": _FLOW_PRESET,
+        "paper": _FLOW_PRESET,
+        "crazyflie2": {"rate_hz": 25.0, "velocity_m_s": {"noise": 0.1}},  # chosen; nothing is published for the deck
+    },
 )
