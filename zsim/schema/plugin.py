@@ -1,7 +1,7 @@
-"""What a user's own package adds, named in a document: `package.module`, `package.module:Class` or `…:function`.
+"""Code of a user's own that a document names: `package.module`, `package.module:Class` or `package.module:function`.
 
-A module is found as Python finds modules: installed beside zsim, or on PYTHONPATH. The folder of the document comes
-last, where `search` has named it: a module beside the scenario's file needs no installation on that machine. It hides
+A module is found as Python finds modules: installed beside zsim, or on PYTHONPATH. The folder of the document is
+searched last (`search`), so a module beside the scenario's file needs no installation on that machine, and hides
 nothing that is installed. On other hosts the module must be installed.
 
 Importing a module runs it: fly scenarios of others only if you trust what they name. Commands that only read what
@@ -16,7 +16,7 @@ import sysconfig
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder
-from inspect import Parameter, getattr_static, isfunction, signature
+from inspect import Parameter, getattr_static, isclass, isfunction, signature
 from pathlib import Path
 from traceback import walk_tb
 from types import FrameType, ModuleType
@@ -93,15 +93,9 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
         DocumentError: no such module or class, or a method is missing or takes other arguments; one line.
         NotTrustedError: it is there, and must not be imported.
     """
-    module_name, colon, class_name = name.partition(":")
-    if not (colon and module_name and class_name):
-        raise DocumentError([f"{where} is {show(name)}; must be package.module:Class"])
-    module = _imported(module_name, f"{where} is {show(name)}", class_name)
-    loaded = getattr(module, class_name, None)
-    if not isinstance(loaded, type):
-        classes = ", ".join(_classes(module)) or "it has none"
-        raise DocumentError([f"{where} is {show(name)}; must be a class of {module_name}: {classes}"])
-    missing = [method for method in _methods(kind) if not _is_method(getattr(loaded, method, None))]
+    loaded = _attribute(name, where, "Class", isclass)
+    own = {method: getattr(loaded, method, None) for method in _methods(kind)}
+    missing = [m for m, each in own.items() if not callable(each) or getattr(each, "__isabstractmethod__", False)]
     if missing:
         lacks = f"{where} is {show(name)}, which has no {', '.join(missing)}()"
         raise DocumentError([f"{lacks}; must have the methods of {kind.__name__}"])
@@ -124,15 +118,7 @@ def load_function(name: str, where: str) -> Callable[..., Any]:
         DocumentError: no such module or function; one line.
         NotTrustedError: it is there, and must not be imported.
     """
-    module_name, colon, function_name = name.partition(":")
-    if not (colon and module_name and function_name):
-        raise DocumentError([f"{where} is {show(name)}; must be package.module:function"])
-    module = _imported(module_name, f"{where} is {show(name)}", function_name)
-    loaded = getattr(module, function_name, None)
-    if not callable(loaded):
-        functions = ", ".join(_functions(module)) or "it has none"
-        raise DocumentError([f"{where} is {show(name)}; must be a function of {module_name}: {functions}"])
-    return loaded
+    return _attribute(name, where, "function", callable)
 
 
 def load_module(name: str, where: str) -> ModuleType:
@@ -177,7 +163,8 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
     (called, _), (deepest, line) = frames[0], frames[-1]
     method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
     raised = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
-    return UserCodeError(f"{method} raised {raised} ({_shown_path(deepest.f_code.co_filename)}:{line})", where)
+    path = deepest.f_code.co_filename.removeprefix(f"{os.getcwd()}{os.sep}")
+    return UserCodeError(f"{method} raised {raised} ({path}:{line})", where)
 
 
 def numbers(returned: Any) -> NDArray[np.float64]:
@@ -205,16 +192,24 @@ def _is_user_frame(frame: FrameType) -> bool:
     return not is_library or package in _LOADED
 
 
-def _shown_path(path: str) -> str:
-    """Return a path from the working folder on, where the file is in it."""
-    folder = f"{os.getcwd()}{os.sep}"
-    return path.removeprefix(folder)
-
-
 _LOADED: set[str] = set()  # packages that documents have named
-
-
 _SKIPPED: list[str] = []  # what documents have named and was not imported
+
+
+def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool]) -> Any:
+    """Return the class or function of a name `package.module:attribute`; errors as of `load`."""
+    module_name, colon, attribute = name.partition(":")
+    if not (colon and module_name and attribute):
+        raise DocumentError([f"{where} is {show(name)}; must be package.module:{kind}"])
+    module = _imported(module_name, f"{where} is {show(name)}", attribute)
+    found = getattr(module, attribute, None)
+    if not is_kind(found):
+        is_one = isfunction if kind == "function" else isclass
+        own = [each for each in vars(module).values() if is_one(each) and each.__module__ == module.__name__]
+        names = sorted(each.__name__ for each in own if not each.__name__.startswith("_"))
+        allowed = f"must be a {kind.lower()} of {module_name}: {', '.join(names) or 'it has none'}"
+        raise DocumentError([f"{where} is {show(name)}; {allowed}"])
+    return found
 
 
 def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
@@ -289,25 +284,9 @@ def _bound(body: ast.AST) -> set[str]:
     return names
 
 
-def _classes(module: ModuleType) -> list[str]:
-    """Return the public classes that a module defines."""
-    own = (thing for thing in vars(module).values() if isinstance(thing, type) and thing.__module__ == module.__name__)
-    return sorted(thing.__name__ for thing in own if not thing.__name__.startswith("_"))
-
-
-def _functions(module: ModuleType) -> list[str]:
-    """Return the public functions that a module defines."""
-    own = (each for each in vars(module).values() if isfunction(each) and each.__module__ == module.__name__)
-    return sorted(each.__name__ for each in own if not each.__name__.startswith("_"))
-
-
 def _methods(kind: type) -> list[str]:
     """Return the public methods of a class or Protocol."""
     return [name for name in dir(kind) if not name.startswith("_") and callable(getattr(kind, name))]
-
-
-def _is_method(attribute: Any) -> bool:
-    return callable(attribute) and not getattr(attribute, "__isabstractmethod__", False)
 
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:
@@ -315,14 +294,12 @@ def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] |
     wanted, own = getattr_static(kind, method), getattr_static(loaded, method)
     if not (isfunction(wanted) and isfunction(own)) or wanted is own:
         return None  # of a builtin, or bound in its own way
-    given = [name for name, each in signature(wanted).parameters.items() if _is_required(each)]
+    positional, required = Parameter.POSITIONAL_OR_KEYWORD, Parameter.empty
+    parameters = signature(wanted).parameters.items()
+    given = [name for name, each in parameters if each.default is required and each.kind is positional]
     takes = signature(own)
     try:
         takes.bind(*given)
     except TypeError:
         return ", ".join(map(str, list(takes.parameters.values())[1:])), ", ".join(given[1:])
     return None
-
-
-def _is_required(parameter: Parameter) -> bool:
-    return parameter.default is Parameter.empty and parameter.kind is Parameter.POSITIONAL_OR_KEYWORD

@@ -1,4 +1,4 @@
-"""YAML documents that people write: read with a limit, one line per fault, no aliases, no tags, words of YAML 1.2."""
+"""YAML documents that people write: read with limits, without aliases and tags, words as in YAML 1.2, a line a fault."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -160,9 +160,9 @@ def _refusal(problem: str, event: Any) -> MarkedYAMLError:
 
 def _word(text: str) -> Any:
     """Return what a text without quotes means."""
-    for kind, pattern, first in _WORDS:
+    for _, pattern, first, meaning in _WORDS:
         if text[:1] in first and pattern.match(text):
-            return _MEANINGS[kind](text)
+            return meaning(text)
     return text
 
 
@@ -182,17 +182,12 @@ class _Dumper(yaml.SafeDumper):
 
 _DIRECTIVE = re.compile(r"^\ufeff?%", re.MULTILINE)
 _FLOAT = r"^[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
-_WORDS = (  # kind, form, and the characters with which it begins; the first that fits counts
-    ("null", re.compile(r"^(~|null|Null|NULL|)$"), [*"~nN", ""]),
-    ("bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), [*"tTfF"]),
-    ("int", re.compile(r"^([-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$"), [*"-+0123456789"]),
-    ("float", re.compile(_FLOAT), [*"-+0123456789."]),
+# kind, form, the characters with which it begins, and what it means; the first that fits counts
+_WORDS: tuple[tuple[str, re.Pattern[str], list[str], Callable[[str], Any]], ...] = (
+    ("null", re.compile(r"^(~|null|Null|NULL|)$"), [*"~nN", ""], lambda text: None),
+    ("bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), [*"tTfF"], lambda text: text.lower() == "true"),
+    ("int", re.compile(r"^([-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$"), [*"-+0123456789"], _whole),
+    ("float", re.compile(_FLOAT), [*"-+0123456789."], _real),
 )
-_MEANINGS: dict[str, Callable[[str], Any]] = {
-    "null": lambda text: None,
-    "bool": lambda text: text.lower() == "true",
-    "int": _whole,
-    "float": _real,
-}
-for _kind, _pattern, _first in _WORDS:
+for _kind, _pattern, _first, _ in _WORDS:
     _Dumper.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", _pattern, _first)
