@@ -59,39 +59,28 @@ def _type_info(description: Any) -> types.Type:
 
 def _check(value: Any, info: types.Type, path: str) -> Iterator[Fault]:
     if isinstance(info, types.Metadata):
-        yield from _check_described(value, info, path)
+        description = (info.extra_json_schema or {}).get("description")  # in place of what the type says is allowed
+        if description is None:
+            yield from _check(value, info.type, path)
+        elif any(_check(value, info.type, path)):
+            yield path, f"is {show(value)}; must be {description}"
     elif isinstance(info, types.UnionType):
-        yield from _check_union(value, info, path)
+        others = [option for option in info.types if not isinstance(option, types.NoneType)]
+        faults_of_each = [list(_check(value, option, path)) for option in others]
+        if all(faults_of_each) and not (value is None and info.includes_none):
+            yield from min(faults_of_each, key=len)
     elif isinstance(info, types.StructType):
         yield from _check_struct(value, info, path)
-    elif isinstance(info, types.ListType | types.VarTupleType):
-        yield from _check_list(value, info, path)
+    elif isinstance(info, types.ListType | types.VarTupleType | types.DictType):
+        yield from _check_many(value, info, path)
     elif isinstance(info, types.TupleType):
-        yield from _check_tuple(value, info, path)
-    elif isinstance(info, types.DictType):
-        yield from _check_dict(value, info, path)
-    else:
-        fault = _scalar_fault(value, info)
-        if fault:
-            yield path, fault
-
-
-def _check_described(value: Any, info: types.Metadata, path: str) -> Iterator[Fault]:
-    """Yield the faults of a type; its description, where it has one, is the text of what is allowed."""
-    description = (info.extra_json_schema or {}).get("description")
-    if description is None:
-        yield from _check(value, info.type, path)
-    elif any(_check(value, info.type, path)):
-        yield path, f"is {show(value)}; must be {description}"
-
-
-def _check_union(value: Any, info: types.UnionType, path: str) -> Iterator[Fault]:
-    if value is None and info.includes_none:
-        return
-    others = [option for option in info.types if not isinstance(option, types.NoneType)]
-    faults_of_each = [list(_check(value, option, path)) for option in others]
-    if all(faults_of_each):
-        yield from min(faults_of_each, key=len)
+        if not isinstance(value, list | tuple) or len(value) != len(info.item_types):
+            yield path, f"is {show(value)}; must be a list of {len(info.item_types)} entries"
+            return
+        for index, (item, item_type) in enumerate(zip(value, info.item_types, strict=True)):
+            yield from _check(item, item_type, f"{path}[{index}]")
+    elif fault := _scalar_fault(value, info):
+        yield path, fault
 
 
 def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[Fault]:
@@ -99,13 +88,10 @@ def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[Fau
         yield path, f"is {show(value)}; must be a map"
         return
     names = {entry.encode_name: entry for entry in info.fields}
-    if info.forbid_unknown_fields:
-        for key in value:
-            if key not in names:
-                yield (
-                    field_path(path, key),
-                    f"is not known; {suggestion(key, names)}allowed: {', '.join(sorted(names))}",
-                )
+    for key in value if info.forbid_unknown_fields else ():
+        if key not in names:
+            allowed = f"{suggestion(key, names)}allowed: {', '.join(sorted(names))}"
+            yield field_path(path, key), f"is not known; {allowed}"
     for name, entry in names.items():
         if name in value:
             yield from _check(value[name], entry.type, field_path(path, name))
@@ -113,48 +99,25 @@ def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[Fau
             yield field_path(path, name), f"is missing; must be {_expected(entry.type)}"
 
 
-def _check_list(value: Any, info: types.ListType | types.VarTupleType, path: str) -> Iterator[Fault]:
-    if not isinstance(value, list | tuple):
-        yield path, f"is {show(value)}; must be a list"
+def _check_many(value: Any, info: types.ListType | types.VarTupleType | types.DictType, path: str) -> Iterator[Fault]:
+    is_map = isinstance(info, types.DictType)
+    if not isinstance(value, dict if is_map else list | tuple):
+        yield path, f"is {show(value)}; must be a {'map' if is_map else 'list'}"
         return
-    yield from _length_fault(value, info, path)
-    if len(value) > (info.max_length or len(value)):
-        return
-    for index, item in enumerate(value):
-        yield from _check(item, info.item_type, f"{path}[{index}]")
-
-
-def _length_fault(value: Any, info: types.ListType | types.VarTupleType | types.DictType, path: str) -> Iterator[Fault]:
     least, most = info.min_length or 0, info.max_length
     if len(value) < least or (most is not None and len(value) > most):
-        yield path, f"has {len(value)} entries; must have {_length(least, most)}"
-
-
-def _length(least: int, most: int | None) -> str:
-    if most is None:
-        return f"at least {least}"
-    return f"{most}" if least == most else f"{least} to {most}"
-
-
-def _check_tuple(value: Any, info: types.TupleType, path: str) -> Iterator[Fault]:
-    if not isinstance(value, list | tuple) or len(value) != len(info.item_types):
-        yield path, f"is {show(value)}; must be a list of {len(info.item_types)} entries"
+        length = f"at least {least}" if most is None else f"{most}" if least == most else f"{least} to {most}"
+        yield path, f"has {len(value)} entries; must have {length}"
+    if len(value) > (most or len(value)):
         return
-    for index, (item, item_type) in enumerate(zip(value, info.item_types, strict=True)):
-        yield from _check(item, item_type, f"{path}[{index}]")
-
-
-def _check_dict(value: Any, info: types.DictType, path: str) -> Iterator[Fault]:
-    if not isinstance(value, dict):
-        yield path, f"is {show(value)}; must be a map"
-        return
-    yield from _length_fault(value, info, path)
-    if len(value) > (info.max_length or len(value)):
-        return
-    for key, item in value.items():
-        where = field_path(path, key)
-        yield from ((at, f"as a key {text}") for at, text in _check(key, info.key_type, where))
-        yield from _check(item, info.value_type, where)
+    if isinstance(info, types.DictType):
+        for key, item in value.items():
+            where = field_path(path, key)
+            yield from ((at, f"as a key {text}") for at, text in _check(key, info.key_type, where))
+            yield from _check(item, info.value_type, where)
+    else:
+        for index, item in enumerate(value):
+            yield from _check(item, info.item_type, f"{path}[{index}]")
 
 
 def _scalar_fault(value: Any, info: types.Type) -> str | None:
@@ -174,25 +137,19 @@ def _scalar_fault(value: Any, info: types.Type) -> str | None:
 
 def _number_fault(value: Any, info: types.FloatType | types.IntType) -> str | None:
     whole = isinstance(info, types.IntType)
-    if isinstance(value, bool) or not isinstance(value, int if whole else int | float) or not _finite(value):
+    is_finite = not isinstance(value, float) or math.isfinite(value)
+    if isinstance(value, bool) or not isinstance(value, int if whole else int | float) or not is_finite:
         return f"is {show(value)}; must be {_expected(info)}"
-    if not _within(value, info):
+    is_within = (
+        (info.gt is None or value > info.gt)
+        and (info.ge is None or value >= info.ge)
+        and (info.lt is None or value < info.lt)
+        and (info.le is None or value <= info.le)
+    )
+    if not is_within:
         wide = whole and not -(2**63) <= value < 2**63
         return f"is {show(value)}; must be {'a whole number of 63 bits and sign' if wide else _limits(info)}"
     return None
-
-
-def _finite(value: float) -> bool:
-    return not isinstance(value, float) or math.isfinite(value)
-
-
-def _within(value: float, info: types.FloatType | types.IntType) -> bool:
-    return not (
-        (info.gt is not None and value <= info.gt)
-        or (info.ge is not None and value < info.ge)
-        or (info.lt is not None and value >= info.lt)
-        or (info.le is not None and value > info.le)
-    )
 
 
 def _text_fault(value: Any, info: types.StrType) -> str | None:
@@ -229,12 +186,7 @@ def _expected(info: types.Type) -> str:
 def _limits(info: types.FloatType | types.IntType) -> str:
     signs = ((">", info.gt), (">=", info.ge), ("<", info.lt), ("<=", info.le))
     stated = [(sign, limit) for sign, limit in signs if limit is not None and limit not in NO_LIMITS]
-    limits = [f"{sign} {_plain(limit)}" for sign, limit in stated]
-    return " and ".join(limits)
-
-
-def _plain(limit: float) -> str:
-    return str(limit) if isinstance(limit, int) else f"{limit:g}"
+    return " and ".join(f"{sign} {limit if isinstance(limit, int) else f'{limit:g}'}" for sign, limit in stated)
 
 
 def _sound(value: Any, info: types.Type) -> Any:
@@ -243,18 +195,14 @@ def _sound(value: Any, info: types.Type) -> Any:
     if isinstance(info, types.UnionType) and value is not None:
         return _sound(value, next(option for option in info.types if not isinstance(option, types.NoneType)))
     if isinstance(info, types.StructType):
-        return _sound_struct(value, info)
+        if not isinstance(value, dict):
+            return None
+        return SimpleNamespace(**{entry.name: _sound_field(value, entry) for entry in info.fields})
     if isinstance(info, types.ListType):
         if not isinstance(value, list | tuple) or len(value) > (info.max_length or len(value)):
             return None
         return [_sound(item, info.item_type) for item in value]
     return None if any(_check(value, info, "")) else value
-
-
-def _sound_struct(value: Any, info: types.StructType) -> SimpleNamespace | None:
-    if not isinstance(value, dict):
-        return None
-    return SimpleNamespace(**{entry.name: _sound_field(value, entry) for entry in info.fields})
 
 
 def _sound_field(value: dict[str, Any], entry: types.Field) -> Any:

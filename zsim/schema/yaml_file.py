@@ -1,4 +1,4 @@
-"""YAML documents that people write: read with limits, without aliases and tags, words as in YAML 1.2, a line a fault."""
+"""YAML documents that people write, read with limits: no aliases, no tags, words as in YAML 1.2, a line for each fault."""
 
 import re
 from collections.abc import Callable, Iterator
