@@ -1,4 +1,4 @@
-"""YAML documents that people write, read with limits: no aliases, no tags, words as in YAML 1.2, a line for each fault."""
+"""YAML documents that people write, read with limits: no aliases, no tags, words as in YAML 1.2, one line per fault."""
 
 import re
 from collections.abc import Callable, Iterator
