@@ -21,7 +21,8 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Truth
 from zsim.contract.messages import Info
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
-from zsim.record.record_reader import RecordReader, record_at
+from zsim.output_folder import record_at
+from zsim.record.record_reader import RecordReader
 from zsim.scenario import scenario_file
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import camera_pose, lens_of

@@ -1,6 +1,7 @@
-"""Folders that commands write into: what somebody else has put there is not mixed up with it unasked.
+"""Folders that commands write into, and the record in the folder of a run.
 
-Two processes that write into one are kept apart by locks. Some file systems have none (Lustre, some of NFS, FUSE).
+Files of somebody else in such a folder are not mixed with a command's own unasked. Two processes that write into one
+are kept apart by locks. Some file systems have none (Lustre, some of NFS, FUSE).
 """
 
 from collections.abc import Collection
@@ -19,7 +20,7 @@ OTHERS_NAMED = 3  # in a refusal
 
 
 def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
-    """Lock an open file for as long as it stays open, whatever ends the process; return False if another holds it.
+    """Lock an open file until it is closed, also by the end of the process; return False if another process holds it.
 
     Where the file system has no locks nobody holds one, and True is returned; see `no_locks`.
     """
@@ -63,3 +64,27 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
     if others and not force:
         named = ", ".join(others[:OTHERS_NAMED]) + (", …" if len(others) > OTHERS_NAMED else "")
         raise RunError(f"{folder}: holds {named}; give --out an empty folder, or --force to {use} this one")
+
+
+RECORD = "run.mcap"  # in the folder of a run
+
+
+def record_in(folder: Path) -> Path:
+    """Return the record in a run's folder.
+
+    Raises:
+        RunError: there is none.
+    """
+    record = folder / RECORD
+    if not record.is_file():
+        raise RunError(f"{folder}: holds no {RECORD}; give the folder of a run, as `zsim run` printed it")
+    return record
+
+
+def record_at(place: Path) -> Path:
+    """Return the record that is a file, or in a run's folder.
+
+    Raises:
+        RunError: there is none.
+    """
+    return place if place.is_file() else record_in(place)

@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from zsim.errors import RecordError, RunError
+from zsim.errors import RecordError
 from zsim.record.mcap_layout import (
     HEAD,
     INDEX_ENTRY,
@@ -39,7 +39,6 @@ from zsim.record.mcap_layout import (
 )
 from zsim.record.record_end import check_magic
 
-RECORD = "run.mcap"  # in the folder of a run
 SHOWN = 3  # gaps, or damaged chunks, in one line; how many more there are is shown
 CRC = struct.Struct("<I")  # of all that stands before the data's end; MCAP has 0 where none was computed
 OVERLAP_NS = 1_000_000_000  # simulated time; a chunk begins less than that before the end of the one before it
@@ -338,31 +337,6 @@ def _mapped(path: Path) -> Source:
             return mmap(file.fileno(), 0, access=ACCESS_READ) if path.stat().st_size else b""
     except OSError as error:
         raise RecordError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def record_in(folder: Path) -> Path:
-    """Return the record in a run's folder.
-
-    Raises:
-        RunError: there is none.
-    """
-    record = folder / RECORD
-    if not record.is_file():
-        raise RunError(f"{folder}: holds no {RECORD}; give the folder of a run, as `zsim run` printed it")
-    return record
-
-
-def record_at(place: Path) -> Path:
-    """Return the record that is a file, or in a run's folder.
-
-    Raises:
-        RunError: there is none.
-    """
-    if place.is_file():
-        return place
-    if not (place / RECORD).is_file():
-        raise RunError(f"{place}: holds no {RECORD}; give the folder of a run, as `zsim run` printed it, or the file")
-    return place / RECORD
 
 
 def record_notes(reader: RecordReader) -> list[str]:

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 
 from zsim import __version__
 from zsim.errors import ReportError
+from zsim.output_folder import record_at
 from zsim.record import RecordReader
-from zsim.record.record_reader import record_at, record_notes
+from zsim.record.record_reader import record_notes
 from zsim_analysis.export import Format
 from zsim_analysis.export.selection import DecodedMessages, MessageSelection, TableSurvey, batches, hat_by_hat
 

@@ -14,8 +14,8 @@ from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
 from zsim.errors import DecodeError, RecordError, ZsimError
+from zsim.output_folder import record_at
 from zsim.record import Recorded, RecordReader
-from zsim.record.record_reader import record_at
 from zsim.scenario import scenario_file
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.roles import AGENTS

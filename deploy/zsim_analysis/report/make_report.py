@@ -9,7 +9,7 @@ from itertools import count
 from pathlib import Path
 
 from zsim.errors import RecordError, ReportError
-from zsim.record.record_reader import RECORD
+from zsim.output_folder import RECORD
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.driver_links import link_text
 from zsim_analysis.reading.flight import read_flight

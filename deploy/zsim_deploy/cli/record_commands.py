@@ -129,7 +129,7 @@ def report(
 
 
 def _report_on(directories: list[Path], out: Path | None, formats: str | None) -> None:
-    from zsim.record.record_reader import record_in
+    from zsim.output_folder import record_in
     from zsim_analysis.sweep.design import is_sweep
 
     wanted = _formats(formats)
@@ -181,7 +181,7 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
 def _compare(directories: list[Path], out: Path | None, formats: Sequence[str]) -> None:
     from rich.console import Console
 
-    from zsim.record.record_reader import record_in
+    from zsim.output_folder import record_in
     from zsim.runtime.progress import cell
     from zsim_analysis.report.make_report import compare, comparison_path
     from zsim_analysis.sweep.design import is_sweep
@@ -314,7 +314,7 @@ def export(
     from rich.console import Console
     from rich.progress import Progress
 
-    from zsim.record.record_reader import record_at
+    from zsim.output_folder import record_at
     from zsim.schema import plugin
 
     check_range(from_, to)

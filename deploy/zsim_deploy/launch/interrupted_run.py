@@ -8,7 +8,7 @@ import msgspec
 
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError, RunError
-from zsim.record.record_reader import RECORD
+from zsim.output_folder import RECORD
 from zsim.record.record_writer import cut_at_last
 
 JOURNAL = "journal"  # in the folder of a run; what the world hands itself is there too

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from zsim.errors import RecordError, RunError, RunFailedError, SessionError
-from zsim.output_folder import no_locks
+from zsim.output_folder import RECORD, no_locks
 from zsim.record import repair
-from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.consistency import unflown_plans

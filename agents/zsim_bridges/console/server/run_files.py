@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from zsim.record.record_reader import RECORD
+from zsim.output_folder import RECORD
 
 LOOKED_S = 5.0  # wall; a page that has not looked for so long is closed; above GONE_MS + LOOK_MS of head_bar.html
 MTIME_S = 2.0  # by so much a file's time may be too early, at most: that of FAT
