@@ -206,11 +206,13 @@ def completeness(
         take: called with key and payload of each of these, in the order in which they were written.
     """
     info = _info(reader)
-    is_replay, external = info is not None and bool(info.replay_of), _external(info)
-    numbered = {n for n, key in reader.channels().items() if not is_replay and _is_numbered(key, external)}
-    of_clock = {n for n, key in reader.channels().items() if key == keys.CLOCK}
-    beside = {n for n, key in reader.channels().items() if key in keys_beside}
-    sampled, names = {n for n, key in reader.channels().items() if key in keys_sampled}, reader.channels()
+    is_replay = info is not None and bool(info.replay_of)
+    external = {drone.name for drone in (info.drones if info else ()) if drone.body is not msgspec.UNSET}
+    names = reader.channels()
+    numbered = {n for n, key in names.items() if not is_replay and _is_numbered(key, external)}
+    of_clock = {n for n, key in names.items() if key == keys.CLOCK}
+    beside = {n for n, key in names.items() if key in keys_beside}
+    sampled = {n for n, key in names.items() if key in keys_sampled}
     numbers = _Numbers()
     clocks: list[run_messages.Clock] = []
     decode = msgspec.msgpack.Decoder(run_messages.Clock).decode
@@ -266,14 +268,8 @@ def _info(reader: RecordReader) -> messages.Info | None:
         return None
 
 
-def _external(info: messages.Info | None) -> frozenset[str]:
-    """Return the drones of which drivers publish, and not the world."""
-    drones = info.drones if info else ()
-    return frozenset(drone.name for drone in drones if drone.body is not msgspec.UNSET)
-
-
 def _is_numbered(key: str, external: Container[str]) -> bool:
-    """Tell whether only the world publishes on a key, in one run of numbers."""
+    """Tell whether only the world publishes on a key, in one run of numbers: not on those of external drones."""
     group, drone, what = keys.parts(key)
     if group != "drone":
         return key == keys.EVENT

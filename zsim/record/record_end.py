@@ -6,8 +6,7 @@ index in memory, however long the run.
 
 import struct
 import zlib
-from collections import defaultdict
-from collections.abc import Iterator
+from collections import Counter
 from io import FileIO
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -19,7 +18,6 @@ from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistic
 from zsim.errors import RecordError
 from zsim.record.mcap_layout import (
     MAGIC,
-    RecordGroup,
     RecordSpan,
     Source,
     chunk_head,
@@ -39,78 +37,75 @@ _FOOTER_CRC = struct.Struct("<BQQQ")  # the part of the footer that its check su
 _FOOTER_LENGTH = 20
 
 
-class RecordSummary:
-    """The summary at the end of a record, collected one chunk at a time."""
-
-    def __init__(self) -> None:
-        self.schemas = RecordBuilder()
-        self.channels = RecordBuilder()
-        self.chunks = RecordBuilder()
-        self.schema_count = self.channel_count = self.chunk_count = 0
-        self.counts: defaultdict[int, int] = defaultdict(int)
-        self.first_ns, self.last_ns = 2**64 - 1, 0
-
-    def take(self, source: Source) -> None:
-        """Take in the data section of a file."""
-        takers = {Opcode.SCHEMA: self._schema, Opcode.CHANNEL: self._channel, Opcode.CHUNK: self._chunk}
-        for group in groups(source):
-            takers[Opcode(group.place.opcode)](source, group)
-
-    def _schema(self, source: Source, group: RecordGroup) -> None:
-        unpacked(Schema, source, group.place).write(self.schemas)
-        self.schema_count += 1
-
-    def _channel(self, source: Source, group: RecordGroup) -> None:
-        unpacked(Channel, source, group.place).write(self.channels)
-        self.channel_count += 1
-
-    def _chunk(self, source: Source, group: RecordGroup) -> None:
-        place, head = group.place, chunk_head(source, group.place)
-        if head.content > place.end:
-            return  # readers of the summary would be sent to what they cannot read
-        for index in group.indexes:
-            self.counts[index.channel] += index.messages
-        self.chunk_count += 1
-        self.first_ns = min(self.first_ns, head.first_ns)
-        self.last_ns = max(self.last_ns, head.last_ns)
-        ChunkIndex(
-            chunk_length=place.end - place.start,
-            chunk_start_offset=place.start,
-            compression=head.compression,
-            compressed_size=place.end - head.content,
-            message_end_time=head.last_ns,
-            message_index_length=group.end - place.end,
-            message_index_offsets={index.channel: index.start for index in group.indexes},
-            message_start_time=head.first_ns,
-            uncompressed_size=head.size,
-        ).write(self.chunks)
-
-    def statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=0,
-            channel_count=self.channel_count,
-            channel_message_counts=dict(self.counts),
-            chunk_count=self.chunk_count,
-            message_count=sum(self.counts.values()),
-            message_end_time=self.last_ns,
-            message_start_time=min(self.first_ns, self.last_ns),
-            metadata_count=0,
-            schema_count=self.schema_count,
-        )
-
-
 def finish(file: FileIO) -> None:
     """Write summary and footer at the end of a file opened for reading and writing, unbuffered.
 
     Raises:
         OSError: no room.
     """
-    summary = RecordSummary()
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
-        summary.take(source)
+        summary = _summary(source)
         data_end = packed(DataEnd(crc_until(source, len(source))))
     start = file.seek(0, 2) + len(data_end)
-    write_all(file, data_end + b"".join(_ending(summary, start)))
+    at, offsets = start, b""
+    for opcode, records in summary.items():
+        if records:
+            offsets += packed(SummaryOffset(opcode, at, len(records)))
+        at += len(records)
+    body = b"".join(summary.values()) + offsets
+    covered = _FOOTER_CRC.pack(Opcode.FOOTER, _FOOTER_LENGTH, start, at)
+    footer = packed(Footer(start, at, zlib.crc32(covered, zlib.crc32(body))))
+    write_all(file, data_end + body + footer + MAGIC)
+
+
+def _summary(source: Source) -> dict[Opcode, bytes]:
+    """Return the records of the summary of a data section, by their kind, in the order in which they stand there."""
+    schemas, channels, chunks = RecordBuilder(), RecordBuilder(), RecordBuilder()
+    numbers: Counter[Opcode] = Counter()
+    messages: Counter[int] = Counter()
+    first_ns, last_ns = 2**64 - 1, 0
+    for group in groups(source):
+        place, opcode = group.place, Opcode(group.place.opcode)
+        if opcode == Opcode.SCHEMA:
+            unpacked(Schema, source, place).write(schemas)
+        elif opcode == Opcode.CHANNEL:
+            unpacked(Channel, source, place).write(channels)
+        else:
+            head = chunk_head(source, place)
+            if head.content > place.end:
+                continue  # readers of the summary would be sent to what they cannot read
+            for index in group.indexes:
+                messages[index.channel] += index.messages
+            first_ns, last_ns = min(first_ns, head.first_ns), max(last_ns, head.last_ns)
+            ChunkIndex(
+                chunk_length=place.end - place.start,
+                chunk_start_offset=place.start,
+                compression=head.compression,
+                compressed_size=place.end - head.content,
+                message_end_time=head.last_ns,
+                message_index_length=group.end - place.end,
+                message_index_offsets={index.channel: index.start for index in group.indexes},
+                message_start_time=head.first_ns,
+                uncompressed_size=head.size,
+            ).write(chunks)
+        numbers[opcode] += 1
+    statistics = Statistics(
+        attachment_count=0,
+        channel_count=numbers[Opcode.CHANNEL],
+        channel_message_counts=dict(messages),
+        chunk_count=numbers[Opcode.CHUNK],
+        message_count=messages.total(),
+        message_end_time=last_ns,
+        message_start_time=min(first_ns, last_ns),
+        metadata_count=0,
+        schema_count=numbers[Opcode.SCHEMA],
+    )
+    return {
+        Opcode.SCHEMA: schemas.end(),
+        Opcode.CHANNEL: channels.end(),
+        Opcode.STATISTICS: packed(statistics),
+        Opcode.CHUNK_INDEX: chunks.end(),
+    }
 
 
 def finish_bare(file: FileIO) -> None:
@@ -130,26 +125,6 @@ def write_all(file: FileIO, data: bytes) -> None:
         view = view[file.write(view) or 0 :]
 
 
-def _ending(summary: RecordSummary, start: int) -> Iterator[bytes]:
-    """Yield summary, summary offsets, footer and magic; `start` is where the first of it will stand."""
-    groups = {
-        Opcode.SCHEMA: summary.schemas.end(),
-        Opcode.CHANNEL: summary.channels.end(),
-        Opcode.STATISTICS: packed(summary.statistics()),
-        Opcode.CHUNK_INDEX: summary.chunks.end(),
-    }
-    at, offsets = start, b""
-    for opcode, group in groups.items():
-        if group:
-            offsets += packed(SummaryOffset(opcode, at, len(group)))
-        at += len(group)
-    body = b"".join(groups.values()) + offsets
-    covered = _FOOTER_CRC.pack(Opcode.FOOTER, _FOOTER_LENGTH, start, at)
-    yield body
-    yield packed(Footer(start, at, zlib.crc32(covered, zlib.crc32(body))))
-    yield MAGIC
-
-
 def repair(path: str | Path) -> bool:
     """Finish a record whose writer died, in place; return whether there was anything to do.
 
@@ -162,19 +137,15 @@ def repair(path: str | Path) -> bool:
     path = Path(path)
     try:
         with open(path, "r+b", buffering=0) as file:
-            return _repair(file, path)
+            if file.seek(0, 2):
+                with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
+                    if is_complete(source):
+                        return False
+            cut_off(file, path)
+            finish(file)
+            return True
     except OSError as error:
         raise RecordError(f"{path}: cannot be repaired ({error.strerror})") from error
-
-
-def _repair(file: FileIO, path: Path) -> bool:
-    if file.seek(0, 2):
-        with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
-            if is_complete(source):
-                return False
-    cut_off(file, path)
-    finish(file)
-    return True
 
 
 def cut_off(file: FileIO, path: Path) -> None:

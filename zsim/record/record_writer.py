@@ -37,6 +37,12 @@ CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits longer than 0.5 s
 CHANNELS_MAX = 65_535  # MCAP counts channels in 16 bits
 _TIME_MAX = 2**64 - 1
+_MEDIA = {
+    "": "msgpack",
+    "application/msgpack": "msgpack",
+    "application/json": "json",
+    "text/json": "json",
+}  # MCAP's names
 _encode = messages.encode
 
 
@@ -144,8 +150,9 @@ class RecordWriter:
         if channels:
             self._open.add_gate(channels, gate, wall_ns)
             self._end_if_full(wall_ns)
-        else:
-            self._add_each(gate, wall_ns)
+            return
+        for (key, payload), t_ns in zip(gate.pairs, gate.stamps.tolist(), strict=True):
+            self.add(key, payload, messages.encoding(key), t_ns, wall_ns)
 
     def _end_if_full(self, wall_ns: int) -> None:
         """End the open chunk if it is large or old."""
@@ -157,10 +164,6 @@ class RecordWriter:
         names = [gate.table[place] for place in gate.which.tolist()]
         channels = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in names]
         return np.array(channels, dtype=np.int64).tobytes() if all(channels) else b""
-
-    def _add_each(self, gate: GateMessages, wall_ns: int) -> None:
-        for (key, payload), t_ns in zip(gate.pairs, gate.stamps.tolist(), strict=True):
-            self.add(key, payload, messages.encoding(key), t_ns, wall_ns)
 
     def tick(self, wall_ns: int) -> None:
         """Put the open chunk on disk when it is old; call it every 0.1 s, also while nothing arrives.
@@ -210,7 +213,7 @@ class RecordWriter:
             return 0
         self._channels[key] = number = len(self._channels) + 1
         media, _, name = encoding.partition(";")
-        record = Channel(number, key, _message_encoding(media), {}, self._schema(key, name))
+        record = Channel(number, key, _MEDIA.get(media, media), {}, self._schema(key, name))
         self._ahead.append(packed(record))
         return number
 
@@ -282,12 +285,6 @@ def is_being_written(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         return not take_lock(file, shared=True)
-
-
-def _message_encoding(media: str) -> str:
-    """Return MCAP's name for a Zenoh media type."""
-    known = {"": "msgpack", "application/msgpack": "msgpack", "application/json": "json", "text/json": "json"}
-    return known.get(media, media)
 
 
 def _time(value: int) -> int:
