@@ -1,18 +1,20 @@
-"""Compiles plain-float mathematics with numba; without numba the same source runs as Python.
+"""Compiles plain-float mathematics with numba; without numba the same source runs as Python. And columns of rows.
 
 No fast-math and no fused operations, so that the same input gives the same bits, compiled or not.
 
-    inlined, apart   parts of a kernel: they take views of arrays, floats and tuples, and make no array
-    compiled         part of a kernel that may make arrays
-    kernel           called from Python and kept on disk; 1 / 0 is inf, as in numpy
-    portable         called from Python and kept on disk; 1 / 0 raises ZeroDivisionError, as in Python
-    hold             the arrays of a NamedTuple as one argument: numba unpacks each array of a tuple at every call
+    inlined     part of a kernel that takes views of arrays, floats and tuples, and makes no array
+    noinline    the same, rarely run: kept out of its caller's code
+    compiled    part of a kernel that may make arrays
+    kernel      called from Python and kept on disk; 1 / 0 is inf, as in numpy
+    portable    called from Python and kept on disk; 1 / 0 raises ZeroDivisionError, as in Python
+    hold        the arrays of a NamedTuple as one argument: numba unpacks each array of a tuple at every call
+    columns     names of the columns of a row of numbers, which compiled code reads as constants
 
-Numba's own cache on disk looks at the file of a function alone, although all that the function calls is compiled into
-it. So the name of what is kept carries the digest of every file that its module imports, directly or not.
+Numba's own cache on disk looks only at the file of a function, although everything that the function calls is compiled
+into it. So the name of what is kept carries the digest of every file that its module imports, directly or not.
 
-An `inlined` function has no owner of an array to be counted: the atomic counts that numba keeps for every view took a
-fifth of a gate's time, calls of functions that were not inlined another.
+An `inlined` function owns no array whose references are counted: the atomic counts that numba keeps for every view
+took a fifth of a gate's time, calls of functions that were not inlined another.
 """
 
 import hashlib
@@ -42,11 +44,12 @@ _IMPORTS = re.compile(r"^from (zsim[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE
 
 
 def cache_folder() -> str:
-    """Return where compiled code is kept on a machine where numba finds no place; empty where it finds one, or none is.
+    """Return a folder for compiled code where numba finds none of its own; empty where it does, or where there is none.
 
-    It keeps it beside the source, or in the user's cache. Where neither may be written, as in many containers and for
-    users without a home, everything was compiled again in every process; and without HOME the cache of a user whom
-    the system does not know is a folder named `~` in the current one. What is kept is run: the folder is ours alone.
+    Numba keeps compiled code beside the source, or in the user's cache. Where neither can be written, as in many
+    containers and for users without a home, every process would compile everything again; and without HOME the cache
+    of a user whom the system does not know is a folder named `~` in the current one. The code in the folder is run, so
+    nobody else may write there.
     """
     home_cache = Path(os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache")), "numba")
     if _is_writable(Path(__file__).parent / "__pycache__") or (home_cache.is_absolute() and _is_writable(home_cache)):
@@ -85,12 +88,12 @@ def compiled(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Return a part of kernels that becomes part of its caller's code, and makes no array."""
+    """Return a part of kernels that is inlined into its caller, and makes no array."""
     return _compile(function, {**_EXACT, **_UNCOUNTED, "forceinline": True})
 
 
-def apart(function: Function) -> Function:
-    """Return a part of kernels that makes no array and is rarely run: it does not crowd its caller's code."""
+def noinline(function: Function) -> Function:
+    """Return a part of kernels that makes no array and is rarely run: it is not inlined."""
     return _compile(function, {**_EXACT, **_UNCOUNTED})
 
 
@@ -239,6 +242,9 @@ class Columns(Protocol):
 
 def columns(name: str, fields: Iterable[Field]) -> Columns:
     """Return the first column of every field by its name, and the columns in all as `size`.
+
+        STATE = columns("State", (Field("p_WB", "m", 3), Field("q_WB", "1", 4), Field("energy", "J")))
+        row[STATE.p_WB : STATE.p_WB + 3]      row[STATE.energy]      np.zeros((count, STATE.size))
 
     It is a named tuple of integers: compiled code reads its attributes as constants.
 

@@ -9,7 +9,7 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim.math.compiled import Held, apart, inlined, kernel
+from zsim.math.compiled import Held, noinline, inlined, kernel
 from zsim.math.rotation import norm
 from zsim_world.fleet.flight_watch import watch
 from zsim_world.physics import rigid_body as body
@@ -138,7 +138,7 @@ def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, va
     return _read(s, value, config, senses.bias[i, s], noise.table[i], at, height)
 
 
-@apart
+@noinline
 def _read_faulty(
     s: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray, at: int, height: float
 ) -> bool:

@@ -4,7 +4,7 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim.math.compiled import apart, inlined
+from zsim.math.compiled import noinline, inlined
 from zsim.math.rotation import Vector, add, axpy, cross, dot, norm, rotate, scaled, subtract, z_axis
 from zsim_world.physics.air import downwash, jet_reach
 from zsim_world.physics.obstacle_contact import brace
@@ -43,7 +43,7 @@ def _blow(bodies: Bodies, above: int, below: int, aside: float, drop: float) -> 
     bodies.air[below, 2] -= downwash(thrust, row[VEHICLE.air_density], row[VEHICLE.jet_start], drop, aside)
 
 
-@apart
+@noinline
 def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
     """Part the hulls of drones i and j, d = p_j - p_i: along it by spring and damper, across it by dry friction.
 

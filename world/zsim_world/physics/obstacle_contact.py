@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.compiled import apart, inlined
+from zsim.math.compiled import noinline, inlined
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
 from zsim.scenario import obstacle
 from zsim.scenario.scenario import Environment
@@ -73,7 +73,7 @@ def _across(a: Vector, n: Vector) -> Vector:
     return axpy(a, -dot(a, n), n)
 
 
-@apart
+@noinline
 def touched(
     row: Row, touch: Touch, p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector
 ) -> tuple[Vector, Vector]:
@@ -107,7 +107,7 @@ def touched(
     return force, moment
 
 
-@apart
+@noinline
 def meet_obstacles(bodies: Bodies) -> None:
     """Find the solids in reach of every drone, move its anchors along, and note whose hull touches which.
 

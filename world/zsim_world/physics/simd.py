@@ -16,7 +16,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.compiled import Field, apart, columns, inlined
+from zsim.math.compiled import Field, noinline, columns, inlined
 from zsim.math.rotation import Quaternion, Vector
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.ground import drag_anchors
@@ -260,7 +260,7 @@ def _accelerate_alone(bodies: Bodies, i: int, touch: Touch | None) -> None:
     put(bodies.accel[i], 3, alpha)
 
 
-@apart
+@noinline
 def _accelerate_braced(bodies: Bodies, i: int) -> None:
     _accelerate_alone(bodies, i, _touch(bodies, i))
 
@@ -270,7 +270,7 @@ def _touch(bodies: Bodies, i: int) -> Touch:
     return Touch(bodies.obstacle, bodies.solid[i], bodies.held[i], vector(bodies.twist[i], 0))
 
 
-@apart
+@noinline
 def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
     """Let a drone take its step with all that it touches."""
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]

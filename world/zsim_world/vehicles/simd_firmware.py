@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math import rotation as rot
-from zsim.math.compiled import Field, apart, columns, inlined
+from zsim.math.compiled import Field, noinline, columns, inlined
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import charge_percent
 from zsim_world.physics.simd import (
@@ -198,7 +198,7 @@ def _command(bodies: Bodies, boards: Boards, i: int, commands: PerRotor) -> None
         _weaken(bodies.command[i], boards.actuator[i])
 
 
-@apart
+@noinline
 def _weaken(command: NDArray, actuator: NDArray) -> None:
     """Make of a command to the rotors [rad/s] (R,), in place, what faulty ones do of it."""
     count = command.shape[0]
