@@ -9,7 +9,7 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim.math.compiled import Held, noinline, inlined, kernel
+from zsim.math.compiled import Held, inlined, kernel, noinline
 from zsim.math.rotation import norm
 from zsim_world.fleet.flight_watch import watch
 from zsim_world.physics import rigid_body as body

@@ -4,7 +4,7 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim.math.compiled import noinline, inlined
+from zsim.math.compiled import inlined, noinline
 from zsim.math.rotation import Vector, add, axpy, cross, dot, norm, rotate, scaled, subtract, z_axis
 from zsim_world.physics.air import downwash, jet_reach
 from zsim_world.physics.obstacle_contact import brace

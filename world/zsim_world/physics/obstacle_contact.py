@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.compiled import noinline, inlined
+from zsim.math.compiled import inlined, noinline
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
 from zsim.scenario import obstacle
 from zsim.scenario.scenario import Environment

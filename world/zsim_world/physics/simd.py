@@ -16,7 +16,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.compiled import Field, noinline, columns, inlined
+from zsim.math.compiled import Field, columns, inlined, noinline
 from zsim.math.rotation import Quaternion, Vector
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.ground import drag_anchors

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math import rotation as rot
-from zsim.math.compiled import Field, noinline, columns, inlined
+from zsim.math.compiled import Field, columns, inlined, noinline
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import charge_percent
 from zsim_world.physics.simd import (
