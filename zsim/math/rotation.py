@@ -212,6 +212,8 @@ def composed(A: Matrix, B: Matrix) -> Matrix:
     )
 
 
+# Poses between two instants at which position, velocity and attitude are known
+
 COSINE_MAX = 0.9995  # of half the angle between two attitudes; nearer ones are mixed, which errs by 1e-7 rad at most
 
 
