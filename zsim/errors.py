@@ -1,4 +1,4 @@
-"""The errors of zsim, all one line: where, what was found, what is allowed, what to do.
+"""The errors of zsim, each one line: where, what was found, what is allowed, what to do; and texts made of errors.
 
 ZsimError
 ├── DocumentError      a file that a person wrote; carries every fault found, a line each
@@ -25,36 +25,9 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-CONTROL = re.compile(
-    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
-)  # C0, C1, bidirectional
-
-
-def printable(text: str) -> str:
-    """Return a text for a terminal: what comes over the network may hold codes that a terminal acts on."""
-    return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
-
-
-_FIGURE = re.compile(r"(?<![\w.:-])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w:]|\.\d)")  # a number by itself
-REASON_MAX = 300  # characters of a reason
-
-
-def reason_of(error: BaseException) -> str:
-    """Return the message of an exception in one line, with the exception's type where it is none of zsim's."""
-    text = " ".join(str(error).split())[:REASON_MAX]
-    return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
-
 
 class ZsimError(Exception):
     """Base of everything that a user can cause; the command line prints it without a traceback."""
-
-
-def without_figures(text: str) -> str:
-    """Return a reason without its numbers, by which it is known: of a flood each datagram may have another length.
-
-    Names and addresses keep theirs.
-    """
-    return _FIGURE.sub("#", text)
 
 
 class DocumentError(ZsimError):
@@ -142,7 +115,35 @@ class ReportError(ZsimError):
     """A report that cannot be made or written."""
 
 
-# Which extra of pyproject.toml brings a module, by the name that is imported; of several the smallest.
+# Texts of errors
+
+# C0, C1, bidirectional
+CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """Return a text for a terminal: what comes over the network may hold codes that a terminal acts on."""
+    return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+_FIGURE = re.compile(r"(?<![\w.:-])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w:]|\.\d)")  # a number by itself
+REASON_MAX = 300  # characters of a reason
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the message of an exception in one line, with the exception's type where it is none of zsim's."""
+    text = " ".join(str(error).split())[:REASON_MAX]
+    return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
+
+
+def without_figures(text: str) -> str:
+    """Return a reason without its numbers, so that reasons that differ in a length alone are one; names keep theirs."""
+    return _FIGURE.sub("#", text)
+
+
+# Modules that are missing
+
+# Extra of pyproject.toml that brings a module, by the name that is imported; of several the smallest.
 EXTRA_OF = {
     "aiohttp": "gateway",
     "asyncssh": "hosts",
@@ -167,7 +168,7 @@ EXTRA_OF = {
 
 
 def install_command(extras: Iterable[str]) -> str:
-    """Return what to type for some extras of pyproject.toml: no index has zsim, a checkout of it has."""
+    """Return the command that installs some extras of pyproject.toml from the checkout: zsim is on no package index."""
     names = ",".join(sorted(set(extras)))
     checkout = Path(__file__).parents[1]
     if not (checkout / "pyproject.toml").exists():
@@ -176,7 +177,7 @@ def install_command(extras: Iterable[str]) -> str:
 
 
 def missing(error: ModuleNotFoundError) -> str | None:
-    """Return a line on a module that an extra brings, with what to type; None if no extra brings it."""
+    """Return a line on a missing module with the command that installs it; None if no extra brings it."""
     module = (error.name or "").partition(".")[0]
     extra = EXTRA_OF.get(module)
     return f"{module} is not installed; {install_command([extra])}" if extra else None

@@ -1,4 +1,10 @@
-"""A table that leaves out columns where the terminal is narrow, instead of breaking names, units and figures."""
+"""How tables and drones are shown: tables that fit a terminal, and a colour for each drone.
+
+A table leaves out columns where the terminal is narrow, instead of breaking names, units and figures. The colour of a
+drone is the same in reports, the console and exports, distinct with every kind of colour vision. Few drones have the
+colours of Okabe and Ito (2008); more have those of viridis (van der Walt, Smith 2015) from the first drone of the
+scenario to the last, without its yellow, which is hard to see on white paper.
+"""
 
 import os
 from collections.abc import Collection, Sequence
@@ -19,6 +25,7 @@ NAME_WHOLE = 22  # characters of a name for whose sake columns are left out
 WORD_WHOLE = 40  # characters of a word in a text for whose sake columns are left out
 TEXT_LEAST = 18  # characters of a line of text that no column of figures takes away
 UNLIMITED = 10_000  # columns; wider than any table
+NAME_MIN = 12  # columns that a name keeps where the table is too wide: `…ator.drone12`
 
 
 class Column(NamedTuple):
@@ -143,16 +150,16 @@ def print_table(table: FittedTable) -> None:
     console.print(table)
 
 
-NAME_MIN = 12  # columns that a name keeps where the table is too wide: `…ator.drone12`
-
-
 def shortened(name: str, width: int) -> str:
     """Return a name in so many columns, its beginning left out where it is longer."""
     return name if len(name) <= width else f"…{name[len(name) - width + 1 :]}"
 
 
 class NameCell(NamedTuple):
-    """A cell with a name of the contract, or of a host, all characters of which are one column wide."""
+    """A cell with a name that may be wider than it: its end is kept, which tells `estimator.drone2` from its siblings.
+
+    All characters of a name are one column wide.
+    """
 
     name: str
 
@@ -162,6 +169,8 @@ class NameCell(NamedTuple):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield Text(printable(shortened(self.name, options.max_width)), no_wrap=True, overflow="crop")
 
+
+# Colours of drones
 
 FEW = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 MANY = ("#440154", "#482475", "#414487", "#355f8d", "#2a788e", "#21918c", "#22a884", "#44bf70", "#7ad151")  # 0 to 0.8
