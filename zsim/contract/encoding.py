@@ -25,6 +25,16 @@ COUNT_MAX = 0x7F  # largest whole number that is its own mark
 INFINITE = np.uint64(0x7FF0_0000_0000_0000)  # exponent of what is not finite
 
 
+_WHOLE = {
+    kinds_of.IntType: INT,
+    kinds_of.BoolType: BOOL,
+    kinds_of.LiteralType: TEXT,
+    kinds_of.StrType: TEXT,
+    kinds_of.UnionType: TEXT,
+}
+packed = msgspec.msgpack.Encoder().encode
+
+
 class Program(NamedTuple):
     """The layouts of some kinds, as `write` reads them."""
 
@@ -92,17 +102,14 @@ class Layouts:
             self._literal(array_head(length))
             self._take_floats(length)
         elif type(kind) in _WHOLE:
-            self._take_int(_WHOLE[type(kind)])
+            self._ops.append((_WHOLE[type(kind)], self._int, 0))
+            self._int += 1
         else:
             raise TypeError(f"{where} is of a type that has no fixed place in a row")
 
     def _take_floats(self, count: int) -> None:
         self._ops.append((FLOATS, self._float, count))
         self._float += count
-
-    def _take_int(self, op: int) -> None:
-        self._ops.append((op, self._int, 0))
-        self._int += 1
 
     def _literal(self, data: bytes) -> None:
         op, place, size = self._ops[-1]
@@ -111,17 +118,6 @@ class Layouts:
         else:
             self._ops.append((LITERAL, len(self._literals), len(data)))
         self._literals += data
-
-
-_WHOLE = {
-    kinds_of.IntType: INT,
-    kinds_of.BoolType: BOOL,
-    kinds_of.LiteralType: TEXT,
-    kinds_of.StrType: TEXT,
-    kinds_of.UnionType: TEXT,
-}
-
-packed = msgspec.msgpack.Encoder().encode
 
 
 def array_head(size: int) -> bytes:

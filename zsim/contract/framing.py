@@ -1,14 +1,14 @@
-"""How many messages travel in one payload: written, taken apart, and read without decoding each one.
+"""Many messages in one payload: packed, unpacked, and read without decoding each one.
 
     @gate, @gate/{drone}   the world's messages about its drones at one gate           GateMessages
     @batch                 [key, payload] of everything that passed the hub, in order  encode_batch, decode_batch
 
-Sent one by one, the messages of a gate cost each reader and the hub a piece of work and a wake-up each. These keys are
-outside of the contract and begin with `@`, which no wildcard of Zenoh matches: whoever subscribes to `**` gets the
-messages themselves, and not these.
+Sent one by one, each message of a gate would wake every reader and the hub. These keys are outside of the contract and
+begin with `@`, which no wildcard of Zenoh matches: a subscriber to `**` gets the messages themselves, and not these.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from operator import sub
@@ -72,42 +72,23 @@ _decode_gate = msgspec.msgpack.Decoder(_PackedGate).decode
 _decode_batch = msgspec.msgpack.Decoder(Pairs).decode
 
 
+@dataclass(eq=False)
 class GateMessages:
     """The world's messages about its drones at one gate, M of them in order of publication: columns and one buffer.
 
     Message m is on the key table[which[m]], is stamped stamps[m], and its payload is
-    buffer[ends[m - 1] + GAP : ends[m]]. Columns that came over the wire may lead outside of table and buffer:
+    buffer[ends[m - 1] + GAP : ends[m]]. Columns that came over the wire may point outside of table and buffer:
     `check` them before they are followed, or compare as they are read.
-
-    Args:
-        t_ns: gate [ns].
-        seq: number of the gate.
-        table: keys; the same object at every gate.
-        which: the place of each message's key in the table, (M,).
-        stamps: t_ns of each [ns], (M,).
-        ends: where each ends in the buffer, (M,); GAP bytes before each payload are free.
-        buffer: owned by this object.
-        first: where the messages of each drone begin, and their end, (N + 1,); empty where that is not known.
     """
 
-    def __init__(
-        self,
-        t_ns: int,
-        seq: int,
-        table: tuple[str, ...],
-        which: NDArray[np.int64],
-        stamps: NDArray[np.int64],
-        ends: NDArray[np.int64],
-        buffer: bytes | bytearray,
-        first: Sequence[int] = (),
-    ) -> None:
-        self.t_ns, self.seq = t_ns, seq
-        self.table = table
-        self.which = which
-        self.stamps = stamps
-        self.ends = ends
-        self.buffer = buffer
-        self.first = first
+    t_ns: int  # gate [ns]
+    seq: int  # number of the gate
+    table: tuple[str, ...]  # keys; the same object at every gate
+    which: NDArray[np.int64]  # place of each message's key in the table, (M,)
+    stamps: NDArray[np.int64]  # t_ns of each [ns], (M,)
+    ends: NDArray[np.int64]  # where each ends in the buffer, (M,); GAP bytes before each payload are free
+    buffer: bytes | bytearray  # owned by this object
+    first: Sequence[int] = ()  # where the messages of each drone begin, and their end, (N + 1,); empty if not known
 
     @classmethod
     def of(
@@ -160,7 +141,7 @@ class GateMessages:
         return len(self.which)
 
     def check(self) -> None:
-        """Refuse columns that lead outside of table or buffer, and stamps that are no times.
+        """Refuse columns that point outside of table or buffer, and stamps that are no times.
 
         Raises:
             DecodeError: with what is wrong.
@@ -197,10 +178,10 @@ class GateMessages:
 
 
 class PerPattern(Generic[T]):
-    """What a reader looks up of a gate by its keys alone, kept: the same keys come again and again.
+    """A cache of what a reader derives from the keys of a gate, since the same keys come again and again.
 
     Args:
-        learn: looks it up.
+        learn: derives it.
     """
 
     def __init__(self, learn: Callable[[GateMessages], T]) -> None:

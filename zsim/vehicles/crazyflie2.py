@@ -7,10 +7,14 @@ Sources:
     cf2x       gym-pybullet-drones (J. Panerati et al., IROS 2021), assets/cf2x.urdf, after Landry (MIT 2015)
     RotorPy    S. Folk et al. 2023, rotorpy/vehicles/crazyflie_params.py
     Bitcraze   data sheet of the Crazyflie 2.1, and "Measuring propeller RPM: part 3" (2015)
-Its firmware has the structure of the AR.Drone's here; the gains follow from the motors' lag, which is longer.
+Its firmware has the structure of the AR.Drone's here; the gains follow from the motors' lag, which is longer: rate
+16.7 1/s, tilt 5.4 1/s, velocity 1.7 1/s, climb 2.4 1/s. At 5 % of the battery about twenty seconds of hover remain.
 """
 
-from zsim.vehicles.vehicle import Airframe, Battery, Firmware, Limits, Vehicle, cross_layout
+from msgspec.structs import replace
+
+from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
+from zsim.vehicles.vehicle import Airframe, Battery, Limits, Vehicle, cross_layout
 
 ARM_M = 0.0397  # m, centre to rotor (cf2x); 92 mm over all are with the motor mounts (Bitcraze)
 THRUST_N_S2 = 2.8816e-8  # N s^2: 3.16e-10 N per (rev/min)^2 (cf2x)
@@ -51,35 +55,14 @@ VEHICLE = Vehicle(
         efficiency=0.322,  # brushed motors; set so that a full battery hovers for 7 min (Bitcraze)
         electronics_w=0.5,  # W, board and radio; estimated, set with the efficiency
     ),
-    firmware=Firmware(
+    firmware=replace(  # what is not said is chosen as the AR.Drone's
+        ARDRONE2.firmware,
         lag_lead=0.35,  # 25 ms left of the motors' lag; thrust over weight of 2.25 leaves room for it
-        rate_per_lag=0.42,  # damping 0.77 of rate loop and rotors together; 16.7 1/s here
-        lag_min_s=0.015,  # s, three control steps
-        loop_ratio=3.1,  # tilt 5.4 1/s, velocity 1.7 1/s
-        yaw_share=1 / 3.5,  # chosen as the AR.Drone's
-        body_rate_max_rad_s=5.0,  # rad/s, chosen as the AR.Drone's
-        climb_share=1 / 7,  # 2.4 1/s
         hold_1_s=0.5,  # 1/s, below the velocity loop as much as the AR.Drone's
         height_1_s=0.9,  # 1/s, below the climb as much as the AR.Drone's
         brake_s=0.8,  # s, longer as the velocity loop is slower
-        tilt_cut_cosine=0.25,  # chosen as the AR.Drone's
-        lift_share_min=0.15,  # chosen as the AR.Drone's
-        spin_up_s=0.5,  # s, chosen as the AR.Drone's
         takeoff_m_s=0.3,  # m/s, chosen: half of its height in a second
-        takeoff_s_max=20.0,  # s, chosen as the AR.Drone's
-        arrived_m=0.08,  # m, chosen as the AR.Drone's
-        arrived_m_s=0.2,  # m/s, chosen as the AR.Drone's
         descent_m_s=0.3,  # m/s, chosen: softer, for its feet are hard
-        descent_far_1_s=0.3,  # 1/s, chosen as the AR.Drone's
         flare_m=1.0,  # m, chosen
-        touch_share=0.6,  # chosen as the AR.Drone's
-        touch_m_s=0.15,  # m/s, chosen as the AR.Drone's
-        touch_s=0.25,  # s, chosen as the AR.Drone's
-        low_battery_percent=5.0,  # %, about twenty seconds of hover remain
-        disturbance_walk=0.2,  # m/s^2/sqrt(s), as the AR.Drone's: its drag over mass is less, 0.23 1/s
-        lift_walk=0.4,  # m/s^2/sqrt(s), as the AR.Drone's
-        tilt_walk=6e-4,  # rad/sqrt(s), as the AR.Drone's
-        bias_walk=2e-5,  # rad/s/sqrt(s), as the AR.Drone's
-        lift_bias_walk=3e-3,  # m/s^2/sqrt(s), as the AR.Drone's
     ),
 )
