@@ -7,10 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import zsim
 from zsim.math import compiled
+from zsim.math.compiled import Field, columns, portable
 
 ROOT = Path(zsim.__file__).parents[1]
 
@@ -122,3 +124,24 @@ def test_tuples_are_held_after_their_class_was_renamed(tmp_path: Path):
         run = [sys.executable, "-c", "import held_rows; print('held')"]
         made = subprocess.run(run, env={**os.environ, **cache}, capture_output=True, text=True, check=False)
         assert (made.stdout.strip(), made.stderr) == ("held", "")
+
+
+ROW = columns("Row", (Field("p_WB", "m", 3), Field("energy", "J"), Field("q_WB", "1", 4)))
+
+
+def test_fields_stand_one_after_the_other():
+    assert (ROW.p_WB, ROW.energy, ROW.q_WB, ROW.size) == (0, 3, 4, 8)
+
+
+def test_two_fields_of_one_name_are_refused():
+    with pytest.raises(ValueError, match="p_WB"):
+        columns("Row", (Field("p_WB", "m", 3), Field("p_WB", "m", 3)))
+
+
+@portable
+def total(row):
+    return row[ROW.energy] + row[ROW.q_WB]
+
+
+def test_compiled_code_reads_them():
+    assert total(np.arange(8.0)) == 7.0

@@ -372,13 +372,13 @@ def test_values_are_yaml():
 def test_a_drone_named_by_a_number_is_found_by_its_name():
     drones = [drone("2"), drone("1", 2.0), drone("0", 4.0)]
     raw = document(drones=drones)
-    assert scenario_file.override.apply(raw, "drones.0.mass_kg=0.5", yaml.safe_load) is None
+    assert scenario_file.apply_override(raw, "drones.0.mass_kg=0.5", yaml.safe_load) is None
     assert raw["drones"][2]["mass_kg"] == 0.5
 
 
 def test_a_name_with_dots_stands_between_brackets():
     raw = document(drones=[drone("uav.1"), drone("uav.2", 2.0)])
-    assert scenario_file.override.apply(raw, "drones[uav.2].mass_kg=0.5", yaml.safe_load) is None
+    assert scenario_file.apply_override(raw, "drones[uav.2].mass_kg=0.5", yaml.safe_load) is None
     assert raw["drones"][1]["mass_kg"] == 0.5
 
 
@@ -590,36 +590,18 @@ def test_a_fault_that_all_drones_share_is_told_once():
 @pytest.mark.parametrize(
     ("fields", "terms"),
     [
-        (
-            {"drones": [drone("a"), drone("b", 2.0), drone("a", 4.0)]},
-            ("drones[2].name", "'a'", "drones[0]", "unique"),
-        ),
-        (
-            {"drones": [drone("a"), drone("b", 0.5)]},
-            ("drones[1].position_m", "0.50", "'a'", ">=", "0.6", "'b'"),
-        ),
+        ({"drones": [drone("a"), drone("b", 2.0), drone("a", 4.0)]}, ("drones[2].name", "'a'", "drones[0]", "unique")),
+        ({"drones": [drone("a"), drone("b", 0.5)]}, ("drones[1].position_m", "0.50", "'a'", ">=", "0.6", "'b'")),
         ({"drones": [drone("a", position_m=[0, 0, -1])]}, ("drones[0].position_m[2]", "-1", ">=", "0")),
-        (
-            {"drones": [drone("a", mass_kg=2)]},
-            ("drones[0].mass_kg", "2", "<", "0.747"),
-        ),
-        (
-            {"drones": [drone("a", rotor_min_rad_s=600)]},
-            ("drones[0].rotor_min_rad_s", "600", "<", "rotor_max_rad_s", "503"),
-        ),
-        (
-            {"drones": [drone("a", rotor_min_rad_s=400)]},
-            ("drones[0].rotor_min_rad_s", "400", "<", "361.5", "hover"),
-        ),
+        ({"drones": [drone("a", mass_kg=2)]}, ("drones[0].mass_kg", "2", "<", "0.747")),
+        ({"drones": [drone("a", rotor_min_rad_s=600)]}, ("drones[0].rotor_min_rad_s", "600", "<", "rotor_max_rad_s", "503")),
+        ({"drones": [drone("a", rotor_min_rad_s=400)]}, ("drones[0].rotor_min_rad_s", "400", "<", "361.5", "hover")),
         (  # metres of torque per thrust, as RotorS has it
             {"drones": [drone("a", torque_nm_s2=0.016)]},
             ("drones[0].torque_nm_s2", "0.016", "3.36e+06 W", "1.29", "4.29e+03 W", "thrust_n_s2"),
         ),
         ({"drones": [drone("a", torque_nm_s2=1e-15)]}, ("drones[0].torque_nm_s2", "1e-15", "W", "N m s^2")),
-        (
-            {"drones": [drone("a", inertia_kg_m2=[2, 2, 4])]},
-            ("drones[0].inertia_kg_m2", "[2, 2, 4]", "0.137", "kg m^2"),
-        ),
+        ({"drones": [drone("a", inertia_kg_m2=[2, 2, 4])]}, ("drones[0].inertia_kg_m2", "[2, 2, 4]", "0.137", "kg m^2")),
         (  # per (rev/s)^2 instead of (rad/s)^2, and more
             {"drones": [drone("a", thrust_n_s2=0.01)]},
             ("drones[0].thrust_n_s2", "0.01", "0.042 %", "0.5", "90 %", "N s^2"),
@@ -628,18 +610,12 @@ def test_a_fault_that_all_drones_share_is_told_once():
             {"drones": [drone("a", rotor_max_rad_s=4803)]},
             ("drones[0].rotor_max_rad_s", "4803", "480 m/s", "3403", "sound", "rad/s", "rpm"),
         ),
-        (
-            {"drones": [drone("a", model="crazyflie2", rotor_max_rad_s=21706)]},
-            ("drones[0].rotor_max_rad_s", "21706", "501 m/s", "14732"),
-        ),
+        ({"drones": [drone("a", model="crazyflie2", rotor_max_rad_s=21706)]}, ("drones[0].rotor_max_rad_s", "21706", "501 m/s", "14732")),
         (  # a hundred times the AR.Drone's
             {"drones": [drone("a", drag_n_s_m=24.9)]},
             ("drones[0].drag_n_s_m", "24.9", "2 m/s", "49.8 N", "4.21 N", "2.1", "N s/m"),
         ),
-        (
-            {"drones": [drone("a", aerodynamics={"quadratic_drag_n_s2_m2": [0.1, 0.1, 5]})]},
-            ("drones[0].aerodynamics.quadratic_drag_n_s2_m2", "[0.1, 0.1, 5]", "20 N", "1.05", "N s^2/m^2"),
-        ),
+        ({"drones": [drone("a", aerodynamics={"quadratic_drag_n_s2_m2": [0.1, 0.1, 5]})]}, ("drones[0].aerodynamics.quadratic_drag_n_s2_m2", "[0.1, 0.1, 5]", "20 N", "1.05", "N s^2/m^2")),
         (
             {"drones": [drone("a", aerodynamics={"rotor_drag_n_s2_m": 0.0119})]},  # for 1.19e-4
             ("drones[0].aerodynamics.rotor_drag_n_s2_m", "0.0119", "N s^2/m"),
@@ -649,34 +625,16 @@ def test_a_fault_that_all_drones_share_is_told_once():
             ("drones[0].battery_mah", "0.72 s", "10", "86400 s", "mAh"),
         ),
         ({"drones": [drone("a", battery_mah=1e6)]}, ("drones[0].battery_mah", "7.2e+05 s", "86400 s")),
-        (
-            {"drones": [drone("a", limits={"tilt_deg": 58})]},
-            ("drones[0].limits.tilt_deg", "58", "<=", "55.0", "weight"),
-        ),
+        ({"drones": [drone("a", limits={"tilt_deg": 58})]}, ("drones[0].limits.tilt_deg", "58", "<=", "55.0", "weight")),
         (  # its rotors carry it up to 15.4 deg, but 30 deg are allowed to all
             {"drones": [drone("a", mass_kg=0.72, limits={"tilt_deg": 45})]},
             ("drones[0].limits.tilt_deg", "45", "<=", "30.0", "weight"),
         ),
-        (
-            {"sensors": {"imu": {"rate_hz": 500}}, "drones": [drone("a")]},
-            ("drones[0].sensors.imu.rate_hz", "500", "<=", "200"),
-        ),
-        (
-            {"sensors": {"sonar": {"min_m": 7}}, "drones": [drone("a")]},
-            ("drones[0].sensors.sonar.min_m", "7", "<", "max_m", "6"),
-        ),
-        (
-            {"sensors": {"as_printed": True}, "drones": [drone("a")]},
-            ("drones[0].sensors.as_printed", "true", "false"),
-        ),
-        (
-            {"environment": {"height_m": 10_500}, "drones": [drone("a", position_m=[0, 0, 600])]},
-            ("drones[0].position_m[2]", "600", "environment.height_m", "10500", "<=", "11000"),
-        ),
-        (
-            {"environment": {"height_m": 10_500}, "drones": [drone("a", limits={"altitude_m": 501})]},
-            ("drones[0].limits.altitude_m", "501", "environment.height_m", "10500"),
-        ),
+        ({"sensors": {"imu": {"rate_hz": 500}}, "drones": [drone("a")]}, ("drones[0].sensors.imu.rate_hz", "500", "<=", "200")),
+        ({"sensors": {"sonar": {"min_m": 7}}, "drones": [drone("a")]}, ("drones[0].sensors.sonar.min_m", "7", "<", "max_m", "6")),
+        ({"sensors": {"as_printed": True}, "drones": [drone("a")]}, ("drones[0].sensors.as_printed", "true", "false")),
+        ({"environment": {"height_m": 10_500}, "drones": [drone("a", position_m=[0, 0, 600])]}, ("drones[0].position_m[2]", "600", "environment.height_m", "10500", "<=", "11000")),
+        ({"environment": {"height_m": 10_500}, "drones": [drone("a", limits={"altitude_m": 501})]}, ("drones[0].limits.altitude_m", "501", "environment.height_m", "10500")),
         ({"environment": {"height_m": 11_001}}, ("environment.height_m", "11001", ">=", "-100000", "<=", "11000")),
         ({"sensors": {"baro": {"rate_hz": 0.0004}}}, ("sensors.baro.rate_hz", "0.0004", ">=", "0.01", "<=", "1000")),
         ({"time": {"gate_ms": 7}}, ("time.gate_ms", "7", "5")),
@@ -685,57 +643,24 @@ def test_a_fault_that_all_drones_share_is_told_once():
         ({"report": {"window_s": [5, 5]}}, ("report.window_s", "[5, 5]", "[start, end]", "0", "<=", "<")),
         ({"report": {"window_s": [-1, 5]}}, ("report.window_s", "[-1, 5]")),
         ({"processes": {"expect": ["a", "b", "a"]}}, ("processes.expect[2]", "'a'", "expect[0]", "unique")),
-        (
-            {"processes": {"expect": ["my.drone1", "estimator.ghost"]}},
-            ("processes.expect[1]", "'estimator.ghost'", "'ghost'", "estimator.NAME", "drone1"),
-        ),
-        (
-            {"processes": {"expect": ["controller.ghost"]}, "clusters": []},
-            ("processes.expect[0]", "'controller.ghost'", "'ghost'", "controller.NAME"),
-        ),
-        (
-            {"clusters": [{"name": "c", "drones": ["drone1", "drone9"]}]},
-            ("clusters[0].drones[1]", "'drone9'"),
-        ),
-        (
-            {"clusters": [{"name": "c", "drones": ["drone1", "drone1"]}]},
-            ("clusters[0].drones[1]", "'drone1'", "'c'"),
-        ),
+        ({"processes": {"expect": ["my.drone1", "estimator.ghost"]}}, ("processes.expect[1]", "'estimator.ghost'", "'ghost'", "estimator.NAME", "drone1")),
+        ({"processes": {"expect": ["controller.ghost"]}, "clusters": []}, ("processes.expect[0]", "'controller.ghost'", "'ghost'", "controller.NAME")),
+        ({"clusters": [{"name": "c", "drones": ["drone1", "drone9"]}]}, ("clusters[0].drones[1]", "'drone9'")),
+        ({"clusters": [{"name": "c", "drones": ["drone1", "drone1"]}]}, ("clusters[0].drones[1]", "'drone1'", "'c'")),
         ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, ("clusters[0].drones", "1", "2", "64")),
         ({"clusters": [{"name": "c", "drones": [f"d{k}" for k in range(65)]}]}, ("65", "2", "64")),
         (clustered(groups=[{"name": "a", "size": 6}]), ("clusters[0].groups", "1", "none", "2")),
-        (
-            clustered(groups=[{"name": "a", "size": 2}, {"name": "b", "size": 3}]),
-            ("clusters[0].groups", "5", "6"),
-        ),
-        (
-            clustered(groups=[{"name": "a", "size": 3}, {"name": "a", "size": 3}]),
-            ("clusters[0].groups[1].name", "'a'", "groups[0]", "unique"),
-        ),
-        (
-            clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2, "space": "template"}]),
-            ("clusters[0].groups[1].space", "2", "3"),
-        ),
-        (
-            clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2}], template_m=[[0, 0, 0], [1, 0, 0]]),
-            ("clusters[0].template_m", "2", "3"),
-        ),
+        (clustered(groups=[{"name": "a", "size": 2}, {"name": "b", "size": 3}]), ("clusters[0].groups", "5", "6")),
+        (clustered(groups=[{"name": "a", "size": 3}, {"name": "a", "size": 3}]), ("clusters[0].groups[1].name", "'a'", "groups[0]", "unique")),
+        (clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2, "space": "template"}]), ("clusters[0].groups[1].space", "2", "3")),
+        (clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2}], template_m=[[0, 0, 0], [1, 0, 0]]), ("clusters[0].template_m", "2", "3")),
         (clustered(space="triad", template_m=[[0, 0, 0]]), ("clusters[0].template_m", "given")),
         (clustered(template_m=[[0, 0, 0]]), ("clusters[0].template_m", "1", "6")),
-        (
-            clustered(template_m=[[k, k, 0] for k in range(6)]),
-            ("clusters[0].template_m", "0.1"),
-        ),
-        (
-            clustered(zigzag=0.0),
-            ("clusters[0].template_m", "missing", "given"),
-        ),
-        (
-            clustered(space="ring"),
-            ("clusters[0].space", "'ring'", "triad", "template", "package.module:Class", "'c'"),
-        ),
+        (clustered(template_m=[[k, k, 0] for k in range(6)]), ("clusters[0].template_m", "0.1")),
+        (clustered(zigzag=0.0), ("clusters[0].template_m", "missing", "given")),
+        (clustered(space="ring"), ("clusters[0].space", "'ring'", "triad", "template", "package.module:Class", "'c'")),
     ],
-)
+)  # fmt: skip
 def test_fields_that_do_not_agree_are_told(fields: dict[str, Any], terms: tuple[str, ...]):
     assert has_terms(only(faults_of(document(**fields))), *terms)
 
@@ -981,16 +906,12 @@ def test_a_field_of_the_shared_vehicle_is_set_by_its_path():
         ({"takeoff_s": 20, "land_s": 90}, 5, ("5 s", "take-off at 20 s and its landing at 90 s", "nothing")),
         ({"land_s": 90}, 50, ("landing at 90 s", "nothing")),
         ({"takeoff_s": 2, "land_s": 90}, 50, ("before its landing at 90 s: not flown",)),
-        (
-            {"takeoff_s": 2, "trajectory": {"start_s": 60, "expressions": {"x_c": "t"}}},
-            50,
-            ("before its trajectory at 60 s: not flown",),
-        ),
+        ({"takeoff_s": 2, "trajectory": {"start_s": 60, "expressions": {"x_c": "t"}}}, 50, ("before its trajectory at 60 s: not flown",)),
         ({"takeoff_s": 20, "land_s": 90}, 91, ()),
         ({"trajectory": {"start_s": 60, "expressions": {"x_c": "t"}}}, 50, ()),
         ({}, 5, ()),
     ],
-)
+)  # fmt: skip
 def test_what_of_a_plan_begins_after_the_end_of_the_run_is_named(plan: Any, duration_s: float, terms: tuple[str, ...]):
     cluster = {"name": "c", "drones": ["drone1", "drone2"], "plan": plan}
     scenario = scenario_file.resolve(document(clusters=[cluster], duration_s=duration_s), "step.yaml")

@@ -64,10 +64,7 @@ def test_a_sound_document_has_no_faults():
         ({"parts": [{"name": "A"}]}, ("parts[0].name", "'A'", "[a-z]{1,3}")),
         ({"parts": [{"name": "a\n"}]}, ("parts[0].name", "'a\\n'", "[a-z]{1,3}")),
         ({"parts": [{"name": "a", "mass_kg": 0}]}, ("parts[0].mass_kg", "0", ">", "0", "<=", "100")),
-        (
-            {"parts": [{"name": "a", "mass_kg": math.nan}]},
-            ("parts[0].mass_kg", "nan", "finite", ">", "0", "<=", "100"),
-        ),
+        ({"parts": [{"name": "a", "mass_kg": math.nan}]}, ("parts[0].mass_kg", "nan", "finite", ">", "0", "<=", "100")),
         ({"parts": [{"name": "a", "mass_kg": 10**400}]}, ("parts[0].mass_kg", "1" + "0" * 56)),
         ({"parts": [{"name": "a", "place": [1]}]}, ("parts[0].place", "[1]", "list", "2")),
         ({"parts": [{"name": "a", "place": [1, "x"]}]}, ("parts[0].place[1]", "'x'", "finite")),
@@ -85,7 +82,7 @@ def test_a_sound_document_has_no_faults():
         ({"series": [1, 2.5]}, ("series[1]", "2.5", "whole")),
         ({7: 1}, ("7", "known", "count", "free")),
     ],
-)
+)  # fmt: skip
 def test_a_fault_says_where_what_and_what_is_allowed(changes: dict[str, Any], terms: tuple[str, ...]):
     (only,) = [f"{path} {text}" for path, text in faults({**GOOD, **changes}, Whole)]
     assert has_terms(only, *terms)
