@@ -88,19 +88,20 @@ class FittedTable:
     def _shown(self, console: Console, width: int) -> list[int]:
         """Return the places of the columns that a width has room for."""
         shown = list(range(len(self.columns)))
-        while self._least_width(shown, console) > width:
+        wide = console.options.update(width=UNLIMITED)
+        while Measurement.get(console, wide, self._narrowest(shown)).minimum > width:
             spare = [place for place in shown if self.columns[place].worth is not None]
             if not spare:
                 break
             shown.remove(min(spare, key=lambda place: (self.columns[place].worth, -place)))
         return shown
 
-    def _least_width(self, shown: Sequence[int], console: Console) -> int:
-        """Return the width below which one more column is left out."""
+    def _narrowest(self, shown: Sequence[int]) -> Table:
+        """Return a table in whose width one more column would be left out."""
         table = self._empty()
         for place in shown:
             table.add_column(width=self._least(place))
-        return Measurement.get(console, console.options.update(width=UNLIMITED), table).minimum
+        return table
 
     def _table(self, shown: Sequence[int]) -> Table:
         made = self._empty()

@@ -24,7 +24,7 @@ import stat
 import sys
 import tempfile
 from collections import namedtuple
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from functools import cache
 from itertools import accumulate
 from pathlib import Path
@@ -41,6 +41,7 @@ COMPILES = njit is not None  # whether anything is compiled here
 _EXACT: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}  # numba's name for doing without its counts; making an array is refused
 _IMPORTS = re.compile(r"^from (zsim[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
+_NAME = re.compile(r"\w+")
 
 
 def cache_folder() -> str:
@@ -157,14 +158,9 @@ def sources(module: str) -> frozenset[Path]:
 def _imported(module: str) -> tuple[str, ...]:
     """Return the modules of zsim that a loaded module imports."""
     text = Path(str(sys.modules[module].__file__)).read_text(encoding="utf-8")
-    return tuple(name for name in _candidates(text) if getattr(sys.modules.get(name), "__file__", None))
-
-
-def _candidates(text: str) -> Iterator[str]:
-    """Yield what may be a module in the import lines of a text: a package, or what is taken out of it."""
-    for package, names in _IMPORTS.findall(text):
-        yield package
-        yield from (f"{package}.{name}" for name in re.findall(r"\w+", names))
+    lines = _IMPORTS.findall(text)  # of a package, from which modules or names are taken
+    named = [name for package, names in lines for name in (package, *(f"{package}.{n}" for n in _NAME.findall(names)))]
+    return tuple(name for name in named if getattr(sys.modules.get(name), "__file__", None))
 
 
 def digest(files: Iterable[Path]) -> str:

@@ -199,13 +199,9 @@ def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterato
 def _group(source: Source, pending: list[RecordSpan]) -> Iterator[RecordGroup]:
     if pending:
         place, *rest = pending
-        indexes = tuple(_index(source, index) for index in rest)
+        heads = ((INDEX_HEAD.unpack_from(source, index.body), index.start) for index in rest)
+        indexes = tuple(Index(channel, size // INDEX_ENTRY, start) for (channel, size), start in heads)
         yield RecordGroup(place, indexes, pending[-1].end)
-
-
-def _index(source: Source, place: RecordSpan) -> Index:
-    channel, size = INDEX_HEAD.unpack_from(source, place.start + HEAD.size)
-    return Index(channel, size // INDEX_ENTRY, place.start)
 
 
 def is_complete(source: Source) -> bool:

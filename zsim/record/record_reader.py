@@ -174,12 +174,11 @@ class RecordReader:
     @property
     def damaged(self) -> tuple[str, ...]:
         """Return what was met so far that is damaged; everything behind unreadable records is one."""
-        rest = () if self._rest is None else (f"everything from byte {self._rest} on",)
-        return (*(self._named(place) for place in sorted(self._damaged)), *rest)
-
-    def _named(self, place: RecordSpan) -> str:
-        head = chunk_head(self._source, place)
-        return f"the chunk at byte {place.start}, {head.first_ns / 1e9:.2f} to {head.last_ns / 1e9:.2f} s"
+        heads = [(place.start, chunk_head(self._source, place)) for place in sorted(self._damaged)]
+        chunks = [
+            f"the chunk at byte {at}, {head.first_ns / 1e9:.2f} to {head.last_ns / 1e9:.2f} s" for at, head in heads
+        ]
+        return tuple(chunks if self._rest is None else [*chunks, f"everything from byte {self._rest} on"])
 
     def differs(self) -> bool:
         """Tell whether a closed record differs from what its writer closed; all of the file is read for it.

@@ -370,7 +370,12 @@ def _shape_faults(cluster: Any, drones: _Entries) -> Iterator[Fault]:
     placed = {drone.name: drone.position_m for _, drone in drones if _known(drone.name)}
     starts = [placed.get(name) for name in cluster.drones]
     groups = _entries(cluster.groups)
-    yield from _group_faults(cluster, groups)
+    yield from _name_faults("groups", groups)
+    if len(groups) == 1:
+        yield "groups", "has 1 entry; must have none, or 2 or more"
+    sizes = [group.size for _, group in groups]
+    if groups and _known(*sizes) and sum(sizes) != len(cluster.drones):
+        yield "groups", f"has sizes that add up to {sum(sizes)}; must be {len(cluster.drones)}, one for each drone"
     centres: list[Any] = []
     for index, group in groups:
         if group.size is None:
@@ -380,15 +385,6 @@ def _shape_faults(cluster: Any, drones: _Entries) -> Iterator[Fault]:
         centres.append(np.array(own, dtype=float).mean(axis=0) if own and _known(*own) else None)
     robots = len(groups) or len(cluster.drones)
     yield from _template_faults(cluster, centres if groups else starts, robots)
-
-
-def _group_faults(cluster: Any, groups: _Entries) -> Iterator[Fault]:
-    yield from _name_faults("groups", groups)
-    if len(groups) == 1:
-        yield "groups", "has 1 entry; must have none, or 2 or more"
-    sizes = [group.size for _, group in groups]
-    if groups and _known(*sizes) and sum(sizes) != len(cluster.drones):
-        yield "groups", f"has sizes that add up to {sum(sizes)}; must be {len(cluster.drones)}, one for each drone"
 
 
 def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Fault]:

@@ -131,7 +131,10 @@ def _scalar_fault(value: Any, info: types.Type) -> str | None:
     if isinstance(info, types.BytesType):
         return None if isinstance(value, bytes) else f"is {show(value)}; must be bytes"
     if isinstance(info, types.StrType):
-        return _text_fault(value, info)
+        if not isinstance(value, str):
+            return f"is {show(value)}; must be text"
+        if info.pattern and not re.search(info.pattern, value):
+            return f"is {show(value)}; must match {info.pattern.strip('^$').removesuffix(chr(92) + 'Z')}"
     return None
 
 
@@ -149,14 +152,6 @@ def _number_fault(value: Any, info: types.FloatType | types.IntType) -> str | No
     if not is_within:
         wide = whole and not -(2**63) <= value < 2**63
         return f"is {show(value)}; must be {'a whole number of 63 bits and sign' if wide else _limits(info)}"
-    return None
-
-
-def _text_fault(value: Any, info: types.StrType) -> str | None:
-    if not isinstance(value, str):
-        return f"is {show(value)}; must be text"
-    if info.pattern and not re.search(info.pattern, value):
-        return f"is {show(value)}; must match {info.pattern.strip('^$').removesuffix(chr(92) + 'Z')}"
     return None
 
 

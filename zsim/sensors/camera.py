@@ -130,12 +130,8 @@ def frame_of(data: bytes) -> Frame:
             break
         if marker in (SCAN, END):
             break
-        at += _advance(marker, length)
+        if marker == FILL:
+            at += 1
+        else:
+            at += 2 if marker in STANDALONE else 2 + max(2, length)  # at least one byte on, so that reading ends
     raise PictureError(f"data ({len(data)} bytes, {data[:4].hex(' ') or 'none'} …) has no frame of a JPEG; must be one")
-
-
-def _advance(marker: int, length: int) -> int:
-    """Return how many bytes the header goes on after a marker; at least one, so that reading ends."""
-    if marker == FILL:
-        return 1
-    return 2 if marker in STANDALONE else 2 + max(2, length)

@@ -10,7 +10,6 @@ random walk 60 N; a random walk K of the bias has slope +1/2 and K at 3 s (IEEE 
 """
 
 import math
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from zsim.schema.checker import Fault, faults
@@ -107,13 +106,11 @@ def _in_unit(model: dict[str, Any], units: dict[str, Unit], where: str, wrong: l
     read = {key: value for key, value in model.items() if key not in units}
     for key, unit in units.items():
         if key in model:
-            found = [*faults(model[key], NonNegative, f"{where}.{key}"), *_twice(key, unit.field, read, where)]
+            found = [*faults(model[key], NonNegative, f"{where}.{key}")]
+            if unit.field in read:
+                twice = f"says what another of the fields for {unit.field} says; must be the only one"
+                found.append((f"{where}.{key}", twice))
             wrong += found
             if not found:
                 read[unit.field] = unit.factor * model[key]
     return read
-
-
-def _twice(key: str, field: str, read: dict[str, Any], where: str) -> Iterator[Fault]:
-    if field in read:
-        yield f"{where}.{key}", f"says what another of the fields for {field} says; must be the only one"

@@ -6,7 +6,6 @@ The scenario's section, validation, defaults, latency, noise, faults, key, schem
 """
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Annotated, Any, Literal
@@ -248,15 +247,17 @@ def field_types(message: type[Sample]) -> dict[FieldName, FieldType]:
     """
     info: Any = types.type_info(message)
     known = len(Sample.__struct_fields__)
-    return {field.name: _word(field.type, f"{message.__name__}.{field.name}") for field in info.fields[known:]}
-
-
-def _word(info: types.Type, where: str) -> Any:
-    if isinstance(info, types.TupleType) and all(isinstance(item, types.FloatType) for item in info.item_types):
-        return f"number[{len(info.item_types)}]"
-    if type(info) not in _WORDS:
-        raise TypeError(f"{where} is of another type; must be a number, a tuple of numbers, a whole number or a bool")
-    return _WORDS[type(info)]
+    words: dict[str, Any] = {}
+    for field in info.fields[known:]:
+        kind = field.type
+        if isinstance(kind, types.TupleType) and all(isinstance(item, types.FloatType) for item in kind.item_types):
+            words[field.name] = f"number[{len(kind.item_types)}]"
+        elif type(kind) in _WORDS:
+            words[field.name] = _WORDS[type(kind)]
+        else:
+            allowed = "must be a number, a tuple of numbers, a whole number or a bool"
+            raise TypeError(f"{message.__name__}.{field.name} is of another type; {allowed}")
+    return words
 
 
 def message_type(name: str, fields: Mapping[str, str], sensor: str = "") -> type[Sample]:
@@ -271,14 +272,9 @@ def sensor_of(message: type[Struct]) -> str:
 
 @cache
 def _message_type(name: str, fields: tuple[tuple[str, str], ...], sensor: str) -> type[Sample]:
-    own: Any = [(field, _annotation(word)) for field, word in fields]
+    own: Any = [(field, tuple[(Number,) * int(word[7:-1])] if "[" in word else _TYPES[word]) for field, word in fields]
     made: Any = msgspec.defstruct(name, own, bases=(Sample,), namespace={"__sensor__": sensor}, frozen=True, gc=False)
     return made
-
-
-def _annotation(word: str) -> Any:
-    count = re.fullmatch(r"number\[(\d)\]", word)
-    return tuple[(Number,) * int(count[1])] if count else _TYPES[word]  # type: ignore[misc]
 
 
 def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 from functools import cache
-from typing import Any, Literal, NamedTuple, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
@@ -76,14 +76,6 @@ NAME = r"[a-z][a-z0-9_]{0,31}"
 NAME_ALLOWED = f"a letter and up to 31 of a-z 0-9 _, none of {', '.join(RESERVED)}"
 
 
-class OwnSections(NamedTuple):
-    """The user's sensors of a `sensors:` section, apart from the rest of it."""
-
-    rest: dict[str, Any]
-    own: dict[str, dict[str, Any]]
-    faults: list[Fault]
-
-
 @cache
 def sensor_type(module_name: str, where: str = "module") -> SensorType:
     """Return the SENSOR of a user's module.
@@ -109,7 +101,11 @@ def _check(sensor: SensorType) -> None:
         kind = getattr(sensor, part)
         if not (isinstance(kind, type) and issubclass(kind, base)):
             raise TypeError(f"{part} is {show(str(kind))}; must be a subclass of {base.__name__}")
-    _check_settings(sensor.settings)
+    shared, own = (get_type_hints(kind, include_extras=True) for kind in (Sensor, sensor.settings))
+    for name, kind in shared.items():
+        if own[name] != kind:  # the limits of the settings that all sensors share would be lost
+            what = f"settings: {sensor.settings.__name__}.{name} has a type of its own"
+            raise TypeError(f"{what}; must have that of zsim.sensors.sensor.Sensor, e.g. RateHz, LatencyMs")
     fields = Declaration.of(sensor).fields
     if sensor.equation is None:
         raise ValueError("equation is missing; must be a function of truth, settings and environment")
@@ -128,17 +124,10 @@ def _check(sensor: SensorType) -> None:
             raise ValueError(f"message {error}, or `convert` must be given") from error
 
 
-def _check_settings(settings: type[Sensor]) -> None:
-    """Refuse settings that all sensors share under another type: their limits would be lost."""
-    shared, own = (get_type_hints(kind, include_extras=True) for kind in (Sensor, settings))
-    for name, kind in shared.items():
-        if own[name] != kind:
-            what = f"settings: {settings.__name__}.{name} has a type of its own"
-            raise TypeError(f"{what}; must have that of zsim.sensors.sensor.Sensor, e.g. RateHz, LatencyMs")
-
-
-def separate(section: dict[str, Any], imports: bool = True) -> OwnSections:
-    """Take the user's sensors out of a `sensors:` section, each resolved with all its settings.
+def separate(
+    section: dict[str, Any], imports: bool = True
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]], list[Fault]]:
+    """Return a `sensors:` section without the user's sensors, these with all their settings, and their faults.
 
     One that is resolved already is taken as it is: whoever reads `world/info` imports nothing that it names. Without
     `imports` any other is a fault; one that must not be imported (`plugin.names_only`) is left out.
@@ -153,11 +142,14 @@ def separate(section: dict[str, Any], imports: bool = True) -> OwnSections:
             allowed = f"allowed: {', '.join(sorted(FIELDS))}, or a sensor of your own with its module"
             wrong.append((field_path("", name), f"is not known; {suggestion(name, FIELDS)}{allowed}"))
             continue
-        section_faults = [*_name_faults(name)] or [*_section_faults(name, value, imports)]
+        if not isinstance(name, str) or not re.fullmatch(NAME, name) or name in RESERVED:
+            wrong.append((field_path("", name), f"is no name of a sensor; must be {NAME_ALLOWED}"))
+            continue
+        section_faults = [*_section_faults(name, value, imports)]
         wrong += section_faults
         if not section_faults and (DECLARED in value or plugin.may_import()):
             own[name] = _resolved(value)
-    return OwnSections(rest, dict(sorted(own.items())), wrong)
+    return rest, dict(sorted(own.items())), wrong
 
 
 def flattened(sensors: dict[str, Any]) -> dict[str, Any]:
@@ -183,11 +175,6 @@ def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
 def own_rates(drone: Any) -> dict[str, float]:
     """Return the rates of the users' sensors of a drone [Hz], by name."""
     return {name: section["rate_hz"] for name, section in own_sections(drone).items()}
-
-
-def _name_faults(name: Any) -> Iterator[Fault]:
-    if not isinstance(name, str) or not re.fullmatch(NAME, name) or name in RESERVED:
-        yield field_path("", name), f"is no name of a sensor; must be {NAME_ALLOWED}"
 
 
 def _settings_of(section: dict[str, Any]) -> dict[str, Any]:
