@@ -27,8 +27,7 @@ from zsim.schema.message import Count
 
 KINDS = (*keys.SENSORS, "truth", "status")  # of the messages about a drone
 BATCH_MAX = 5_000  # messages of one batch; a flood of somebody's messages goes into several
-Pairs = list[tuple[str, bytes]]
-"""Keys and payloads, in the order in which they were published."""
+Pairs = list[tuple[str, bytes]]  # keys and payloads, in the order in which they were published
 _INT = np.dtype("<i8")
 PATTERNS_MAX = 64  # of keys of a gate, remembered by a reader; sensors of six rates have fewer
 T = TypeVar("T")

@@ -52,8 +52,7 @@ class Topic(NamedTuple):
     is_output: bool
 
 
-TOPICS: dict[str, Topic] = {}
-"""Topics by key, `*` in place of a name."""
+TOPICS: dict[str, Topic] = {}  # topics by key, `*` in place of a name
 
 
 def on(

@@ -13,8 +13,7 @@ VERSION = 1  # of what `pack` writes, the field `version` of the message
 ARRAY = 1  # code of a msgpack extension: (type, shape, numbers) of an array
 TYPES = ("<f8", "<i8", "<i4", "<u8", "|i1", "|b1")  # that an array may have
 
-State = dict[str, Any]
-"""Names and values: numbers, texts, bytes, None, lists and maps of them, and arrays of numbers."""
+State = dict[str, Any]  # names and values: numbers, texts, bytes, None, lists and maps of them, and arrays of numbers
 
 
 class _Array(msgspec.Struct, array_like=True):

@@ -93,8 +93,7 @@ def unflown_plans(scenario: Scenario) -> list[str]:
     return lines
 
 
-_Entries = list[tuple[int, Any]]
-"""Sound entries of a list, with their places in it."""
+_Entries = list[tuple[int, Any]]  # sound entries of a list, with their places in it
 
 
 def _entries(items: list[Any] | None) -> _Entries:

@@ -44,8 +44,7 @@ class Drone(Spec, frozen=True, kw_only=True):
     """One aircraft. What is not given of it is its model's (zsim/vehicles); the defaults here are the AR.Drone's."""
 
     name: Name
-    model: str = "ardrone2"
-    """A stock vehicle, or `package.module` of the user's that defines VEHICLE."""
+    model: str = "ardrone2"  # a stock vehicle, or `package.module` of the user's that defines VEHICLE
     body: Literal["simulated", "external"] | UnsetType = UNSET
     """Unset: simulated, and left out of the resolved text. An external one is published by its driver."""
     position_m: Position
@@ -63,8 +62,7 @@ class Drone(Spec, frozen=True, kw_only=True):
     battery_percent: Annotated[float, Meta(ge=0, le=100)] = 100.0
     takeoff_height_m: TakeoffHeight = ARDRONE2.takeoff_height_m
     limits: Limits = ARDRONE2.limits
-    aerodynamics: Aerodynamics | UnsetType = UNSET
-    """Unset: none but `drag_n_s_m`, and left out of the resolved text."""
+    aerodynamics: Aerodynamics | UnsetType = UNSET  # unset: none but `drag_n_s_m`, and left out of the resolved text
     sensors: Sensors
 
     @property
@@ -109,10 +107,8 @@ class Environment(Spec, frozen=True, kw_only=True):
     air_density_kg_m3: Positive = SEA_LEVEL_KG_M3
     wind: Wind = Wind()
     obstacles: Annotated[list[Obstacle], Meta(max_length=OBSTACLES_MAX)] = []
-    hats: Hats | UnsetType = UNSET
-    """Unset: the defaults, and left out of the resolved text."""
-    light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET
-    """Of a clear day, for the cameras; unset: 1."""
+    hats: Hats | UnsetType = UNSET  # unset: the defaults, and left out of the resolved text
+    light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET  # of a clear day, for the cameras; unset: 1
 
 
 class Silence(Spec, frozen=True, kw_only=True):
@@ -140,14 +136,12 @@ class Gains(Spec, frozen=True, kw_only=True):
     separation_alarm_m: NonNegative = 1.5  # about three hulls
     sigma_max_m: Positive | UnsetType = UNSET
     """Of each drone's position, per axis, for take-off and engagement; unset: 1 m. In flight twice as much."""
-    heading_sigma_max_deg: HeadingSigma | UnsetType = UNSET
-    """Likewise of its heading; unset: 15 deg."""
+    heading_sigma_max_deg: HeadingSigma | UnsetType = UNSET  # likewise of its heading; unset: 15 deg
 
 
 Value = Annotated[Real | str, Meta(description="a finite number or an expression")]
 """Of a variable: in metres or radians, in degrees where the name of an angle ends in `_deg`."""
-Values = Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)]
-"""Values by the names of a formation's variables."""
+Values = Annotated[dict[str, Value], Meta(max_length=VARIABLES_MAX)]  # values by the names of a formation's variables
 
 
 class Waypoint(Spec, frozen=True, kw_only=True):
@@ -199,8 +193,7 @@ class Cluster(Spec, frozen=True, kw_only=True):
     drones: Annotated[list[Name], Meta(min_length=2, max_length=ROBOTS_MAX)]
     groups: Annotated[list[ClusterGroup], Meta(max_length=ROBOTS_MAX // 2)] = []
     """Empty: every drone is a robot of the cluster by itself."""
-    space: SpaceName | None = None
-    """None: see `space_name`."""
+    space: SpaceName | None = None  # None: see `space_name`
     template_m: Template = []
     """Places of the robots, x ahead and y left of the formation; empty: as they stand at the start."""
     law: LawName | UnsetType = UNSET
@@ -222,8 +215,7 @@ AlgorithmName = Annotated[
 class Estimation(Spec, frozen=True, kw_only=True):
     """Settings of the estimators; noise figures come from the drone's own sensors."""
 
-    algorithm: AlgorithmName | UnsetType = UNSET
-    """Unset it stands in no resolved scenario."""
+    algorithm: AlgorithmName | UnsetType = UNSET  # unset: left out of the resolved text
     madgwick_beta: Annotated[float, Meta(ge=0, le=1)] | None = None
     """rad/s; None: chosen from the accelerometer's noise."""
     gate_probability: Annotated[float, Meta(gt=0.5, lt=1)] = 0.9999

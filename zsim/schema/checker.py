@@ -21,8 +21,7 @@ FAULTS_MAX = 100  # lines; further faults are counted
 COUNTED_MAX = 10_000  # of further faults: a document of 1 MB can have many more, each of which takes time
 NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # of the representation only
 
-Fault = tuple[str, str]
-"""(path, "is …; must be …"); the path of the document itself is empty."""
+Fault = tuple[str, str]  # (path, "is …; must be …"); the path of the document itself is empty
 
 
 def faults(value: Any, description: Any, path: str = "") -> Iterator[Fault]:

@@ -28,8 +28,7 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     diagonal_deg: Annotated[float, Meta(ge=10, le=150)]
     """Field of view across the picture's diagonal, without distortion."""
     rate_hz: CameraRateHz
-    latency_ms: LatencyMs = 0.0
-    """From the middle of the exposure to the picture's publication."""
+    latency_ms: LatencyMs = 0.0  # from the middle of the exposure to the picture's publication
     mount: Mount
     distortion: tuple[Real, Real, Real, Real, Real] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 of Brown and Conrady, as OpenCV has them."""
@@ -63,24 +62,19 @@ class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """What a detector of hats makes of pictures, without pictures: held against rendered ones by a test."""
 
     cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
-    latency_ms: LatencyMs = 0.0
-    """Of the detector, after the camera's."""
+    latency_ms: LatencyMs = 0.0  # of the detector, after the camera's
     centre_px: ErrorPx = 0.035  # px, fitted to the detector on rendered pictures, as the next three
     """Error of a large hat's centre, standard deviation per axis."""
-    diameter_px: ErrorPx = 0.11
-    """Error of its apparent diameter, standard deviation."""
+    diameter_px: ErrorPx = 0.11  # error of its apparent diameter, standard deviation
     noise_px2: NonNegative = 0.65
     """Over the apparent diameter, added to both in quadrature; that of a clear day, more in low light."""
     blur_share: NonNegative = 0.018
     """Of the way that a hat moves over the picture during the exposure, added to both in quadrature."""
-    diameter_min_px: Positive = 4.0
-    """What is measured as smaller is not seen."""
+    diameter_min_px: Positive = 4.0  # what is measured as smaller is not seen
     misalignment_deg: Annotated[float, Meta(ge=0, le=30)] = 0.0
     """Constant over a run, of the camera's mount, standard deviation per axis."""
-    miss: Fraction = 0.02
-    """Probability that a hat in view is not seen in a picture."""
-    false_hz: Annotated[float, Meta(ge=0, le=60)] = 0.0
-    """Rate of sightings of nothing, anywhere in the picture."""
+    miss: Fraction = 0.02  # probability that a hat in view is not seen in a picture
+    false_hz: Annotated[float, Meta(ge=0, le=60)] = 0.0  # rate of sightings of nothing, anywhere in the picture
 
 
 class Hats(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -88,8 +82,7 @@ class Hats(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # chosen: a tennis cap's crown, on the AR.Drone's hull
     position_m: tuple[NearM, NearM, NearM] = (-0.03, 0.0, 0.11)  # in B, chosen: on top of the hull, behind the middle
-    covered: Annotated[list[DroneName], Meta(max_length=1000)] = []
-    """Drones whose hat cannot be seen."""
+    covered: Annotated[list[DroneName], Meta(max_length=1000)] = []  # drones whose hat cannot be seen
     false_m: Annotated[list[Vector3], Meta(max_length=100)] = []
     """Centres of balls as large and as magenta as a hat, in W."""
 

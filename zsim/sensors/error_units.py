@@ -25,8 +25,7 @@ class Unit(NamedTuple):
     """A field of the error model in another unit."""
 
     field: str
-    factor: float
-    """The field in the channel's unit, for one of this."""
+    factor: float  # the field in the channel's unit, for one of this
 
 
 EVERY = {"noise_density": Unit("density", 1.0), "random_walk": Unit("bias_walk", 1.0)}  # of channels in SI units, or uT

@@ -34,20 +34,15 @@ MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
 class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Error of one channel, in the channel's unit; units of data sheets and of Kalibr: zsim.sensors.error_units."""
 
-    noise: NonNegative = 0.0
-    """Standard deviation of each sample; white, or with `correlation_s` a Gauss-Markov process."""
-    density: NonNegative = 0.0
-    """White, per sqrt(Hz): density * sqrt(rate) of each sample."""
-    bias: NonNegative = 0.0
-    """Constant over a run, standard deviation over runs, per axis."""
-    bias_walk: NonNegative = 0.0
-    """Random walk of the bias, per sqrt(s)."""
+    noise: NonNegative = 0.0  # standard deviation of each sample; white, or with `correlation_s` a Gauss-Markov process
+    density: NonNegative = 0.0  # white, per sqrt(Hz): density * sqrt(rate) of each sample
+    bias: NonNegative = 0.0  # constant over a run, standard deviation over runs, per axis
+    bias_walk: NonNegative = 0.0  # random walk of the bias, per sqrt(s)
     bias_instability: NonNegative | UnsetType = UNSET
     """Standard deviation of a Gauss-Markov process, in quadrature to a `noise` that is one; unset: none."""
     correlation_s: CorrelationS | UnsetType = UNSET
     """Correlation time of the Gauss-Markov process; unset or 0: `noise` is white."""
-    quantum: NonNegative = 0.0
-    """Step of the converter; 0 = none."""
+    quantum: NonNegative = 0.0  # step of the converter; 0 = none
 
     @property
     def correlation_time_s(self) -> float:
@@ -78,8 +73,7 @@ class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     rate_hz: RateHz
     latency_ms: LatencyMs = 0.0
-    dropout: Fraction = 0.0
-    """Probability that a sample is lost, independent per sample."""
+    dropout: Fraction = 0.0  # probability that a sample is lost, independent per sample
     mount: Mount = Mount()
 
 

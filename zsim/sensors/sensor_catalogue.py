@@ -30,8 +30,7 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The sensors of one drone, after preset and overrides."""
 
     preset: Literal["ardrone2", "paper", "crazyflie2"]
-    as_printed: bool = False
-    """With `paper`: accelerometer 0.35 g as the paper prints it, instead of 0.35 m/s^2."""
+    as_printed: bool = False  # with `paper`: accelerometer 0.35 g as the paper prints it, instead of 0.35 m/s^2
     imu: ImuConfig
     gps: GpsConfig
     mag: MagConfig

@@ -53,14 +53,10 @@ class Aerodynamics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     """
 
     linear_drag_n_s_m: PerAxis = (0.0, 0.0, 0.0)
-    quadratic_drag_n_s2_m2: PerAxis = (0.0, 0.0, 0.0)
-    """c_D of RotorPy: 1/2 rho c A."""
-    rotor_drag_n_s2_m: NonNegative = 0.0
-    """k_d, of each rotor."""
-    rotor_inflow_n_s2_m: NonNegative = 0.0
-    """k_z, of each rotor: thrust that a climb costs and a descent brings."""
-    rotor_lift_n_s2_m2: NonNegative = 0.0
-    """k_h, of each rotor: translational lift."""
+    quadratic_drag_n_s2_m2: PerAxis = (0.0, 0.0, 0.0)  # c_D of RotorPy: 1/2 rho c A
+    rotor_drag_n_s2_m: NonNegative = 0.0  # k_d, of each rotor
+    rotor_inflow_n_s2_m: NonNegative = 0.0  # k_z, of each rotor: thrust that a climb costs and a descent brings
+    rotor_lift_n_s2_m2: NonNegative = 0.0  # k_h, of each rotor: translational lift
 
 
 class Rotor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -76,35 +72,24 @@ class Airframe(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What touches the ground and others: four feet, four points of the hull's rim, and the hull as a sphere."""
 
     hull_radius_m: Positive
-    foot_xy_m: Positive
-    """|x| and |y| of a foot."""
-    foot_depth_m: Positive
-    """Below the centre of mass."""
-    foot_sag_m: Positive
-    """By which the feet give under the weight; sets their stiffness."""
-    foot_damping_ratio: NonNegative
-    """Of critical, of the aircraft bouncing on its four feet."""
+    foot_xy_m: Positive  # |x| and |y| of a foot
+    foot_depth_m: Positive  # below the centre of mass
+    foot_sag_m: Positive  # by which the feet give under the weight; sets their stiffness
+    foot_damping_ratio: NonNegative  # of critical, of the aircraft bouncing on its four feet
     friction: NonNegative
-    rim_xy_m: Positive
-    """|x| and |y| of the upper corners."""
-    rim_height_m: Real
-    """Of the upper corners above the centre of mass."""
-    reach_m: Positive
-    """Farther than any of these points from the centre of mass."""
-    hull_frequency_rad_s: Positive
-    """Of two equal drones pressed together."""
-    hull_damping_ratio: NonNegative
-    """Of critical, of two equal drones pressed together."""
-    clearance_m: Positive
-    """Free space about its centre at the start: hull and room."""
+    rim_xy_m: Positive  # |x| and |y| of the upper corners
+    rim_height_m: Real  # of the upper corners above the centre of mass
+    reach_m: Positive  # farther than any of these points from the centre of mass
+    hull_frequency_rad_s: Positive  # of two equal drones pressed together
+    hull_damping_ratio: NonNegative  # of critical, of two equal drones pressed together
+    clearance_m: Positive  # free space about its centre at the start: hull and room
 
 
 class Battery(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The energy that rotors and electronics draw."""
 
     voltage_v: Positive
-    efficiency: Annotated[float, Meta(gt=0, le=1)]
-    """Electric to shaft power."""
+    efficiency: Annotated[float, Meta(gt=0, le=1)]  # electric to shaft power
     electronics_w: NonNegative
 
 
@@ -115,59 +100,35 @@ class Firmware(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     each outer loop slower than the one in it by `loop_ratio`.
     """
 
-    lag_lead: Annotated[float, Meta(gt=0, le=1)]
-    """The motors are overdriven so that this share of their lag is left."""
-    rate_per_lag: Positive
-    """Rate gain times the overdriven lag."""
-    lag_min_s: Positive
-    """Faster rotors do not make a faster loop."""
+    lag_lead: Annotated[float, Meta(gt=0, le=1)]  # the motors are overdriven so that this share of their lag is left
+    rate_per_lag: Positive  # rate gain times the overdriven lag
+    lag_min_s: Positive  # faster rotors do not make a faster loop
     loop_ratio: Positive
-    yaw_share: Positive
-    """Of the rate gain, about the vertical."""
-    body_rate_max_rad_s: Positive
-    """Wanted of the tilt loop."""
-    climb_share: Positive
-    """Vertical velocity gain over the rate gain."""
-    hold_1_s: Positive
-    """Position gain on the own odometry."""
+    yaw_share: Positive  # of the rate gain, about the vertical
+    body_rate_max_rad_s: Positive  # wanted of the tilt loop
+    climb_share: Positive  # vertical velocity gain over the rate gain
+    hold_1_s: Positive  # position gain on the own odometry
     height_1_s: Positive
-    brake_s: NonNegative
-    """Where a hold begins: about the stopping distance over speed."""
-    tilt_cut_cosine: Annotated[float, Meta(ge=-1, le=1)]
-    """Of the tilt beyond which the motors are cut."""
-    lift_share_min: Fraction
-    """Of the weight: thrust never asked below."""
-    spin_up_s: NonNegative
-    """Rotors at their least before the climb."""
+    brake_s: NonNegative  # where a hold begins: about the stopping distance over speed
+    tilt_cut_cosine: Annotated[float, Meta(ge=-1, le=1)]  # of the tilt beyond which the motors are cut
+    lift_share_min: Fraction  # of the weight: thrust never asked below
+    spin_up_s: NonNegative  # rotors at their least before the climb
     takeoff_m_s: Positive
-    takeoff_s_max: Positive
-    """Then it hovers where it is."""
+    takeoff_s_max: Positive  # then it hovers where it is
     arrived_m: Positive
-    arrived_m_s: Positive
-    """A take-off is over, with the height within arrived_m."""
-    descent_m_s: Positive
-    """Of a landing near the ground."""
-    descent_far_1_s: NonNegative
-    """Faster by this per metre over flare_m."""
+    arrived_m_s: Positive  # a take-off is over, with the height within arrived_m
+    descent_m_s: Positive  # of a landing near the ground
+    descent_far_1_s: NonNegative  # faster by this per metre over flare_m
     flare_m: NonNegative
-    touch_share: Fraction
-    """Of the weight: below, thrust that does not descend stands on the ground."""
-    touch_m_s: Positive
-    """A descent that has stopped."""
-    touch_s: NonNegative
-    """For which both hold before the rotors stop."""
-    low_battery_percent: Annotated[float, Meta(ge=0, le=50)]
-    """It lands; below twice as much it does not take off."""
-    disturbance_walk: Positive
-    """Horizontal disturbance, m/s^2/sqrt(s)."""
-    lift_walk: Positive
-    """Vertical disturbance, m/s^2/sqrt(s)."""
-    tilt_walk: Positive
-    """Of the attitude, least, rad/sqrt(s)."""
-    bias_walk: Positive
-    """Of the gyro, least, rad/s/sqrt(s)."""
-    lift_bias_walk: Positive
-    """Of the vertical accelerometer, least, m/s^2/sqrt(s)."""
+    touch_share: Fraction  # of the weight: below, thrust that does not descend stands on the ground
+    touch_m_s: Positive  # a descent that has stopped
+    touch_s: NonNegative  # for which both hold before the rotors stop
+    low_battery_percent: Annotated[float, Meta(ge=0, le=50)]  # it lands; below twice as much it does not take off
+    disturbance_walk: Positive  # horizontal disturbance, m/s^2/sqrt(s)
+    lift_walk: Positive  # vertical disturbance, m/s^2/sqrt(s)
+    tilt_walk: Positive  # of the attitude, least, rad/sqrt(s)
+    bias_walk: Positive  # of the gyro, least, rad/s/sqrt(s)
+    lift_bias_walk: Positive  # of the vertical accelerometer, least, m/s^2/sqrt(s)
 
 
 class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -179,8 +140,7 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     mass_kg: Mass
     inertia_kg_m2: tuple[Positive, Positive, Positive]
-    arm_m: Arm
-    """Centre to the farthest rotor, the size of the airframe."""
+    arm_m: Arm  # centre to the farthest rotor, the size of the airframe
     thrust_n_s2: Positive
     torque_nm_s2: Positive
     rotor_time_constant_s: RotorLag
