@@ -568,19 +568,32 @@ def _flat(value: dict[str, Any], path: str = "") -> Iterator[tuple[str, float]]:
 # The protocol
 
 
-@pytest.mark.parametrize("shape", sorted(messages.types_by_shape()))
-def test_the_protocol_names_every_message_and_field(shape: str) -> None:
-    """The row of a key holds the message's name and those of all its fields, nested ones too."""
-    kind = messages.types_by_shape()[shape]
+def protocol_row(shape: str) -> str:
+    """Return the row of a key in the table of docs/protocol.md."""
     things = {"drone/*": "drone/{d}", "cluster/*": "cluster/{c}", "process/*": "process/{p}"}
     key = shape.replace("estimates/*", "estimates/{p}")
     things |= {f"camera/{camera}": "camera/{name}" for camera in CAMERAS}
     for stars, names in things.items():
         key = key.replace(stars, names)
     text = (ROOT / "docs/protocol.md").read_text()
-    row = next(line for line in text.splitlines() if line.startswith(f"| `{key}` |"))
+    return next(line for line in text.splitlines() if line.startswith(f"| `{key}` |"))
+
+
+@pytest.mark.parametrize("shape", sorted(messages.types_by_shape()))
+def test_the_protocol_names_every_message_and_field(shape: str) -> None:
+    """The row of a key holds the message's name and those of all its fields, nested ones too."""
+    kind, row = messages.types_by_shape()[shape], protocol_row(shape)
     wanted = [kind.__name__, *(f for f in messages.fields(kind) if f not in ("t_ns", "seq"))]
     assert [word for word in wanted if not re.search(rf"\b{word}\b", row)] == []
+
+
+@pytest.mark.parametrize(
+    "shape", [shape for shape, topic in messages.TOPICS.items() if topic.message and topic.writers]
+)
+def test_the_protocol_names_a_writer_that_the_message_declares(shape: str) -> None:
+    writers = messages.TOPICS[shape].writers
+    words = [word for role in writers for word in (("each", "participant") if role == "each" else (role,))]
+    assert any(word in protocol_row(shape).split("|")[2] for word in words), words
 
 
 def test_the_protocol_names_every_event() -> None:
