@@ -14,7 +14,7 @@ DIGITS = 8  # of a commit in a version: none of two in a repository of this size
 
 
 def commit(package: Path = Path(__file__).parent) -> str:
-    """Return the commit of a package `zsim` in hex digits, as git's files or the build have it; empty if neither does.
+    """Return the commit of a package `zsim` in hex digits, from git's files or from the build; empty if neither has it.
 
     No program is started for it: it is read at every start of every process.
     """

@@ -36,7 +36,7 @@ def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
 
 
 def no_locks(folder: Path) -> str | None:
-    """Return a warning if the file system of a folder has no locks, so that `take_lock` keeps nobody away."""
+    """Return a warning if the file system of a folder has no locks, so that `take_lock` has no effect."""
     if fcntl is None:
         return None
     try:
@@ -48,11 +48,11 @@ def no_locks(folder: Path) -> str | None:
 
 
 def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> None:
-    """Refuse a folder that holds other files than the command's own.
+    """Refuse a folder that contains files other than the command's own.
 
     Args:
         folder: that is there.
-        own: names that are in nobody's way.
+        own: names that the command may overwrite.
         force: take it nevertheless; the files stay as they are.
         use: what the command does with it, for the error: "fly into".
 

@@ -144,7 +144,7 @@ class FittedTable:
 
 
 def print_table(table: FittedTable) -> None:
-    """Print a table on the terminal; into a file or a pipe a row a line, nothing left out."""
+    """Print a table on the terminal; into a file or pipe one row per line, with all columns."""
     console = PipedConsole()
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = UNLIMITED
@@ -152,7 +152,7 @@ def print_table(table: FittedTable) -> None:
 
 
 def shortened(name: str, width: int) -> str:
-    """Return a name in so many columns, its beginning left out where it is longer."""
+    """Return a name shortened to a width; its beginning is left out."""
     return name if len(name) <= width else f"…{name[len(name) - width + 1 :]}"
 
 

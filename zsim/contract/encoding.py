@@ -121,7 +121,7 @@ class Layouts:
 
 
 def array_head(size: int) -> bytes:
-    """Return what stands before the entries of an array."""
+    """Return msgpack's header of an array."""
     return packed([0] * size)[:-size]
 
 
@@ -177,7 +177,7 @@ def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: ND
 
 
 def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints: NDArray, bits: NDArray) -> bool:
-    """Read a message that `write` has written; False for any other, which may be right all the same.
+    """Read a message that `write` has written; return False for any other, which may still be valid.
 
     It reads floats that are finite, truths, and whole numbers from zero on; no texts. To be compiled.
 

@@ -26,7 +26,7 @@ HELD_BYTES = 16_384  # hashed in one go, which takes as long as a few instants
 
 @cache
 def parts() -> dict[str, str]:
-    """Return what the fingerprint is made of, in words."""
+    """Return the parts of the fingerprint by name."""
     versions = {package: _version(package) for package in PACKAGES}
     return {
         "zsim": __version__,
@@ -101,14 +101,14 @@ def _cpu_features() -> str:
 
 
 def _blas() -> str:
-    """Return the kinds of BLAS with which the numeric packages compute, and for which processor each does."""
+    """Return the BLAS libraries of the numeric packages, each with the processor that it computes for."""
     loaded = (each for each in threadpoolctl.threadpool_info() if each["user_api"] == "blas")
     used = (each for each in loaded if _bundled_with(Path(each["filepath"])) in (None, *PACKAGES))
     return " ".join(sorted({f"{each['internal_api']}-{each.get('architecture', '')}" for each in used})) or "none"
 
 
 def _bundled_with(library: Path) -> str | None:
-    """Return the package in whose wheel a library lies; None of one of the system.
+    """Return the package whose wheel contains a library; None for a library of the system.
 
     OpenCV brings a BLAS of its own, with which nothing here computes, and which may choose another processor.
     """
@@ -137,7 +137,7 @@ class TruthHash:
         self._held = 0
 
     def resume(self, hashed: Iterable[bytes], copy: Callable[[memoryview], object]) -> None:
-        """Start again from what `copy` was given, and give it what follows."""
+        """Start again from the bytes that `copy` was given, and give it those that follow."""
         self._hash, self._held = hashlib.sha256(), 0
         for data in hashed:
             self._hash.update(data)
@@ -157,7 +157,7 @@ class TruthHash:
             self.flush()
 
     def flush(self) -> None:
-        """Take in the rows that were added."""
+        """Hash the rows that were added."""
         if not self._held or not self._rows.size:  # of a run whose drones are all external there is nothing
             self._held = 0
             return

@@ -118,7 +118,7 @@ class Mode(Command, frozen=True):
 
 @on("drone/*/link", writers="driver", last="world")
 class LinkState(Message, frozen=True):
-    """The link of a driver to the aircraft that flies as an external drone.
+    """The link between a driver and the aircraft that flies as an external drone.
 
     `state`: `waiting` for the first datagram; `connected`, disarmed: nothing is sent that starts or steers a motor;
     `armed`; `lost` after silence. `peer` is the address that is obeyed. `age_ms` is the wall time since the newest
@@ -232,7 +232,7 @@ class CameraInfo(Message, frozen=True, kw_only=True):
 
 
 class Seen(Struct, frozen=True, gc=False):
-    """A hat that was seen, nobody knows whose.
+    """A hat that was seen, without the identity of its drone.
 
     `direction_B` is the unit vector from the camera to the hat's centre in B. The sigmas are standard deviations,
     that of the direction in each of the two axes across it.
@@ -247,7 +247,7 @@ class Seen(Struct, frozen=True, gc=False):
 @on("drone/*/sightings", writers="detector", is_output=True)
 @on("drone/*/sensor/sightings", writers="world")
 class Sightings(Message, frozen=True, kw_only=True):
-    """All that was seen in one picture; `camera` tells in which camera's."""
+    """The hats seen in one picture of `camera`."""
 
     t_sample_ns: Whole
     source: str = ""
@@ -329,7 +329,7 @@ def cluster_view(state: ClusterState, t_ns: int, seq: int) -> ViewCluster:
 
 
 def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | None:
-    """Return the fault of the first of some fields that has not that many entries."""
+    """Return the fault of the first of some fields that has another number of entries."""
     for name in names:
         entries = len(getattr(message, name))
         if entries != length:
@@ -337,7 +337,7 @@ def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | 
     return None
 
 
-# What a drone and a driver may do
+# Which commands a drone takes, and which truths of a driver are plausible
 
 _ALL: frozenset[DroneState] = frozenset(get_args(DroneState))
 _RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
@@ -368,14 +368,14 @@ UNIT_SLACK = 0.01  # of a quaternion's length; single precision is within 1e-6
 
 
 def moved_on(p_W: Sequence[float], v_W: Sequence[float], age_ns: int) -> tuple[float, float, float]:
-    """Return where a drone is of which nothing has come for so long: at constant velocity, then at rest [m; W]."""
+    """Return the position of a drone from a pose of that age: at constant velocity, then at rest [m; W]."""
     age_s = min(max(0, age_ns), POSE_AGE_MAX_NS) * 1e-9
     x, y, z = (p + v * age_s for p, v in zip(p_W, v_W, strict=True))
     return x, y, z
 
 
 def truth_fault(truth: Truth, rotors: int) -> str | None:
-    """Return what is absurd about a truth whose numbers are finite, None if nothing is."""
+    """Return the first implausible value of a driver's truth whose numbers are finite; None if there is none."""
     limits = (
         ("position_m", DISTANCE_MAX_M, "m"),
         ("velocity_m_s", SPEED_MAX_M_S, "m/s"),

@@ -56,7 +56,7 @@ def _places(table: tuple[str, ...]) -> dict[str, int]:
 
 
 class _PackedGate(Struct, array_like=True, gc=False):
-    """GateMessages on their way; whole numbers as little-endian int64."""
+    """GateMessages on the wire; whole numbers as little-endian int64."""
 
     t_ns: Count
     seq: Count
@@ -117,7 +117,7 @@ class GateMessages:
         """Return what `pack` has packed; not checked yet.
 
         Raises:
-            DecodeError: it is anything else.
+            DecodeError: the payload is anything else.
         """
         try:
             p = _decode_gate(payload)
@@ -212,7 +212,7 @@ def encode_batch(passed: Pairs) -> bytes:
 
 
 def decode_batch(payload: bytes) -> Pairs:
-    """Return what passed.
+    """Return the [key, payload] pairs of a batch.
 
     Raises:
         DecodeError: it is no batch.
@@ -227,7 +227,7 @@ def pairs_of(result: Any) -> Pairs:
     """Return the [key, payload] pairs in the result of an answer.
 
     Raises:
-        DecodeError: it is anything else.
+        DecodeError: the payload is anything else.
     """
     try:
         return msgspec.convert(result, Pairs, builtin_types=(bytes,))  # or texts would pass as base64

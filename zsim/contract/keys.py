@@ -201,7 +201,7 @@ def session_of(token_key: str) -> str:
 
 @lru_cache(maxsize=4096)
 def parts(key: str) -> tuple[str, str, str]:
-    """Return what a key is about, whose it is, and what of it; empty where it is shorter: `drone`, name, `cmd/mode`."""
+    """Return the parts of a key: `drone`, its name, `cmd/mode`; empty where the key is shorter."""
     kind, whose, what, *_ = *key.split("/", 2), "", ""
     return kind, whose, what
 
@@ -222,7 +222,7 @@ def is_command(key: str) -> bool:
 
 
 def is_accepted(key: str) -> bool:
-    """Tell whether a key has commands to an external drone as the world repeats them."""
+    """Tell whether a key carries the commands to an external drone that the world has accepted."""
     kind, _, what = parts(key)
     return kind == "drone" and what.startswith("accepted/")
 
@@ -240,13 +240,13 @@ def is_status(key: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def is_picture(key: str) -> bool:
-    """Tell whether a key has pictures: large, and never needed by the lockstep."""
+    """Tell whether a key carries pictures, which are large and not needed by the lockstep."""
     kind, _, what = parts(key)
     return kind == "drone" and what.startswith("camera/") and what.count("/") == 1
 
 
 def may_drop(key: str) -> bool:
-    """Tell whether a full link may lose messages of a key in realtime, as it may sensors: newer ones come."""
+    """Tell whether a full link may drop messages of a key in realtime, since newer ones follow."""
     return "/sensor/" in key or key.startswith(GATE)
 
 
@@ -254,7 +254,7 @@ def may_drop(key: str) -> bool:
 
 
 def matches(expression: str, key: str) -> bool:
-    """Tell whether a key expression takes a key, as Zenoh does (the in-process bus and the history ask here).
+    """Tell whether a key expression matches a key, as in Zenoh; for the in-process bus and the history.
 
     `*` stands for one chunk, `**` for any number of them, `$*` for a part of one; a chunk that begins
     with `@` is taken only by itself.

@@ -87,9 +87,9 @@ class Info(Message, frozen=True):
     `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
     run_id of the run that is played back; empty for a flight. `user_sensors` is left out where all sensors are the
     contract's, `sightings` where the world computes none. `module_folders` are those in which the world has looked for
-    modules that the scenario names, for who reads the record later; left out where it names none. `changed` has the
-    texts `a.b.c=value` by which the scenario was changed against its file; left out where nobody said. Wherever an Info
-    is made or decoded, the messages of its sensors can be encoded and decoded.
+    modules that the scenario names, for readers of the record; left out where it names none. `changed` has the
+    texts `a.b.c=value` by which the command line changed the scenario's file; left out where that is not known. Making
+    or decoding an Info registers the messages of its sensors.
     """
 
     contract: Count
@@ -137,7 +137,7 @@ _OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest I
 
 
 def _plain(value: Any) -> Any:
-    """Return a number or array of numpy's as numbers of Python's, which msgspec has a form for."""
+    """Return a number or array of numpy as plain numbers, which msgspec can encode."""
     to_plain = getattr(value, "tolist", None)
     if to_plain is None:
         raise TypeError(f"a value is of type {type(value).__name__}; must be a number, text, list or map")
@@ -166,9 +166,9 @@ def type_of(key: str) -> type[Struct] | None:
 
 
 def register_sensors(sensors: Iterable[SensorInfo]) -> None:
-    """Know the messages of a run's own sensors from now on, by the name of the sensor.
+    """Register the messages of the users' sensors of a run, by the name of the sensor.
 
-    A sensor with a name that no sensor, message or field has is left out: its messages are a stranger's.
+    A sensor whose own name, or that of its message or a field, is invalid is left out: its messages stay unknown.
     """
     known = [each for each in sensors if all(map(_NAME.fullmatch, (each.name, each.message.lower(), *each.fields)))]
     types = {sensor.name: message_type(sensor.message, sensor.fields, sensor.name) for sensor in known}
@@ -241,7 +241,7 @@ def decode_as(kind: type[Struct], payload: bytes, where: str) -> Any:
 
 
 def fault_at(key: str, error: Exception) -> str:
-    """Return the text of a refusal without the key with which it opens, for who names that anyway."""
+    """Return the text of a refusal without the key with which it opens."""
     text = str(error)
     return next(
         (text.removeprefix(where) for where in (f"{key}: ", f"{_shown(key)}: ") if text.startswith(where)), text
@@ -263,7 +263,7 @@ def _reader_of(key: str) -> tuple[type[Struct] | None, _Reader]:
 
 @cache
 def _reader(kind: type[Struct]) -> _Reader:
-    """Return what turns a payload into a checked `kind`: the bare decoder where its types say everything."""
+    """Return the decoder of a `kind`: msgspec's own where its types express every check."""
     decode_bare = msgspec.msgpack.Decoder(kind).decode
     fault_of = getattr(kind, "fault", None)
     if fault_of is None:
@@ -284,7 +284,7 @@ def _too_long(payload: bytes) -> NoReturn:
 
 
 def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -> DecodeError:
-    """Return the refusal in the contract's words: key, field, what was found, what is allowed."""
+    """Return a refusal that names key, field, what was found and what is allowed."""
     where = _shown(where)
     if not isinstance(error, msgspec.MsgspecError):
         return DecodeError(f"{where}: {str(error) or type(error).__name__}")
@@ -297,7 +297,7 @@ def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -
 
 
 class NoData(Struct, frozen=True):
-    """Data of which nothing is used."""
+    """Data that is not used."""
 
 
 class RunEnd(Struct, frozen=True):
@@ -307,7 +307,7 @@ class RunEnd(Struct, frozen=True):
 
 
 class ProcessEntry(Struct, frozen=True):
-    """A process has been taken in.
+    """A process has joined.
 
     Attributes:
         from_ns: first gate that it is waited for.
@@ -342,7 +342,7 @@ _EVENT_DATA: dict[str, type[Struct]] = {
 
 
 def read_event(payload: bytes) -> WorldEvent | None:
-    """Return the notice in an event, None for an event of another kind.
+    """Return an event of a kind that processes act on, its data checked; None for an event of another kind.
 
     Raises:
         DecodeError: it is no event, or its data is not what its kind has.

@@ -195,7 +195,7 @@ class ClusterRequest(Message, frozen=True):
 
 
 def _infinite_fault(field: str, value: Any) -> str | None:
-    """Return the fault of a field whose content is free: only its numbers must be finite."""
+    """Return the fault of a field of any content whose numbers must be finite."""
     infinite = next((number for number in _numbers(value) if not math.isfinite(number)), None)
     return None if infinite is None else f"{field} holds {infinite}; must be finite numbers"
 

@@ -1,4 +1,4 @@
-"""The state of an agent as bytes: maps, lists, texts, numbers and plain arrays; to read it runs no code of its own."""
+"""The state of an agent as bytes: maps, lists, texts, numbers and plain arrays; reading it runs no code of its own."""
 
 from typing import Any
 

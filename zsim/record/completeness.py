@@ -32,7 +32,7 @@ class GateGap(Struct, frozen=True):
 
 
 class GateCount:
-    """Counts gates by the clocks of a run in the order in which they passed the world.
+    """Counts the gates of a run by its clocks, in the order in which the world published them.
 
     Args:
         after: the clock behind which it begins; from the start of the run if not given.
@@ -76,7 +76,7 @@ class GateCount:
 
 
 class Completeness(Struct, frozen=True):
-    """What a record has, and what it lacks.
+    """What a record contains, and what is missing.
 
     Attributes:
         gates: on record.

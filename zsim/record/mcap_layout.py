@@ -139,7 +139,7 @@ def unpacked(kind: type[Known], source: Source, place: RecordSpan) -> Known:
 
 
 def places(source: Source) -> Iterator[RecordSpan]:
-    """Yield the whole records of a file up to its footer, its cut, or a length that cannot be right."""
+    """Yield the whole records of a file up to its footer, its cut, or an invalid length."""
     at, size = len(MAGIC), len(source)
     while at + HEAD.size <= size:
         opcode, length = HEAD.unpack_from(source, at)
@@ -153,9 +153,9 @@ def places(source: Source) -> Iterator[RecordSpan]:
 
 
 def is_cut(source: Source, at: int) -> bool:
-    """Tell whether what stands behind the last whole record, at a byte of the file, is the beginning of another one.
+    """Tell whether the bytes behind the last whole record are the beginning of another one.
 
-    Otherwise it is damaged: a length that is wrong hides what follows, however much that is.
+    Otherwise they are damaged: a wrong length hides everything that follows.
     """
     left = len(source) - at - HEAD.size
     if left < 0:
@@ -259,7 +259,7 @@ def crc_until(source: Source, end: int) -> int:
 
 
 def unmap(source: Source) -> None:
-    """Let go of the pages of a file that were read; they are read again when they are needed."""
+    """Release the pages of a mapped file that were read; they are read again when needed."""
     if isinstance(source, mmap) and hasattr(source, "madvise"):  # Windows has none
         from mmap import MADV_DONTNEED
 

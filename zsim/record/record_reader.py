@@ -79,8 +79,8 @@ class RecordReader:
 
     Attributes:
         complete: the record was closed, not cut.
-        damaged: what was met so far and passed over, each with its place: chunks whose check sum differs, and, as one,
-            everything behind a length that cannot be right.
+        damaged: what was skipped so far, each with its place: chunks whose checksum differs, and, as one, everything
+            behind an invalid length.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -173,7 +173,7 @@ class RecordReader:
 
     @property
     def damaged(self) -> tuple[str, ...]:
-        """Return what was met so far that is damaged; everything behind unreadable records is one."""
+        """Return the damage found so far; everything behind unreadable records is one entry."""
         heads = [(place.start, chunk_head(self._source, place)) for place in sorted(self._damaged)]
         chunks = [
             f"the chunk at byte {at}, {head.first_ns / 1e9:.2f} to {head.last_ns / 1e9:.2f} s" for at, head in heads
@@ -213,7 +213,7 @@ class RecordReader:
         return None
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         if isinstance(self._source, mmap):
             self._source.close()
 
@@ -321,7 +321,7 @@ def _recorded(content: bytes, wanted: dict[int, str]) -> Iterator[Recorded]:
 
 
 def _floor_ns(times: list[int]) -> int:
-    """Return a time before most of some times: few that lie far off, on either side, do not move it."""
+    """Return a time before most of some times, robust against a few outliers on either side."""
     if not times:
         return 0
     ordered = sorted(times)
@@ -339,7 +339,7 @@ def _mapped(path: Path) -> Source:
 
 
 def record_notes(reader: RecordReader) -> list[str]:
-    """Return what has to be known of the state of a record that was read, a line each."""
+    """Return warnings about a record that was cut or damaged, one line each."""
     notes = []
     if not reader.complete:
         notes.append("the record was cut: its writer did not close it; everything up to the cut was read")
@@ -349,6 +349,6 @@ def record_notes(reader: RecordReader) -> list[str]:
 
 
 def shown(texts: Sequence[str]) -> str:
-    """Return the first few of many texts, and how many more there are."""
+    """Return the first few of many texts, and the number of the rest."""
     more = len(texts) - SHOWN
     return ", ".join(texts[:SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -80,7 +80,7 @@ def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None)
     Args:
         actions: of the scenario, by process name or role.
         name: of the process.
-        role: that it says it has; else what its name begins with.
+        role: as the process stated it; by default the beginning of its name.
     """
     role = role or name.partition(".")[0]
     default = ROLES[role].on_death if role in ROLES else "drop"
@@ -102,7 +102,7 @@ def on_overdue(
 
 
 def lets_drop(actions: Mapping[str, str], name: str) -> bool:
-    """Tell whether a scenario says itself that a run goes on without a process: that is no failure then.
+    """Tell whether a scenario explicitly lets a run go on without a process, which is then no failure.
 
     Args:
         actions: `on_death` or `on_overdue` of the scenario, by process name or role.
@@ -118,7 +118,7 @@ def is_needed(name: str) -> bool:
 
 
 def check_pace(scenario: Scenario, mode: str) -> None:
-    """Refuse to run external drones, whose time is the wall's, otherwise than in realtime.
+    """Refuse to run external drones, which fly in wall time, in any mode but realtime.
 
     Raises:
         ScenarioError: the scenario has some, and the mode is not "realtime".
@@ -136,7 +136,7 @@ def drivers_of(scenario: Scenario) -> list[str]:
 
 
 def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
-    """Return what to tell whoever starts a run of the drivers that are to be started beside it; a line, or none."""
+    """Return a line on the drivers that have to be started beside a run; none without external drones."""
     drivers, awaited_names = drivers_of(scenario), expected_processes(scenario)
     awaited, others = (listed([d for d in drivers if (d in awaited_names) is wanted]) for wanted in (True, False))
     waits = [f"the run waits for {awaited}"] if awaited else []

@@ -37,11 +37,11 @@ Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class Spec(Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of every section: unknown keys are faults, not surprises."""
+    """Base of every section; unknown keys are faults."""
 
 
 class Drone(Spec, frozen=True, kw_only=True):
-    """One aircraft. What is not given of it is its model's (zsim/vehicles); the defaults here are the AR.Drone's."""
+    """One aircraft. Unset fields default to its model (zsim/vehicles); the defaults here are the AR.Drone's."""
 
     name: Name
     model: str = "ardrone2"  # a stock vehicle, or `package.module` of the user's that defines VEHICLE
@@ -159,7 +159,7 @@ class Trajectory(Spec, frozen=True, kw_only=True):
 
 
 class ClusterPlan(Spec, frozen=True, kw_only=True):
-    """What the controller does by itself."""
+    """What the controller does without being asked."""
 
     takeoff_s: NonNegative | None = None
     target: Values = {}
@@ -180,7 +180,7 @@ LawName = Annotated[
 
 
 class ClusterGroup(Spec, frozen=True, kw_only=True):
-    """So many of a cluster's drones, the next ones in its order, that are one robot of it."""
+    """Drones of a cluster that form one of its robots: the next `size` ones in its order."""
 
     name: Name
     size: Annotated[int, Meta(ge=2)]
@@ -257,7 +257,7 @@ class TimeSteps(Spec, frozen=True, kw_only=True):
 
 
 class Figures(Spec, frozen=True, kw_only=True):
-    """What is judged of a run; the window of the statistics in simulated seconds, None: the last two thirds."""
+    """What is reported of a run; window of the statistics in simulated seconds, None: the last two thirds."""
 
     window_s: tuple[Real, Real] | None = None
     metrics: Annotated[str, Meta(pattern=CLASS_NAME, description="package.module:function")] | UnsetType = UNSET
@@ -291,7 +291,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         return {cluster.name: cluster for cluster in self.clusters}[name]
 
     def own_code(self) -> list[str]:
-        """Return the users' classes, functions, sensors and vehicles that it names, whose modules a rerun needs."""
+        """Return the classes, functions, sensors and vehicles of users that it names, whose modules a rerun needs."""
         spaces = [part.space for cluster in self.clusters for part in (cluster, *cluster.groups)]
         names = [*spaces, *(cluster.law for cluster in self.clusters), self.estimation.chosen(), self.report.metrics]
         classes = [name for name in names if isinstance(name, str) and ":" in name]
@@ -324,7 +324,7 @@ VEHICLE_NUMBERS = tuple(name for name in _SHARED if name in Vehicle.__struct_fie
 
 
 class Document(Scenario, frozen=True, kw_only=True):
-    """What a file may say: a scenario, and what all its drones share."""
+    """The content of a scenario file: a scenario, and what all its drones share."""
 
     sensors: Sensors | None = None
     vehicle: SharedVehicle | None = None

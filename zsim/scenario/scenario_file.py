@@ -80,9 +80,9 @@ def sha256(text: str) -> str:
 def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
     """Return the scenario of a raw document.
 
-    Of a drone later ones win: the numbers of its model, the document's `vehicle:`, its own; of its sensors the preset,
-    the document's `sensors:`, its own. A faulty part of what drones share is not handed on to them, so that its faults
-    are told once.
+    The later of these take precedence. For a drone: the numbers of its model, the document's `vehicle:`, its own fields;
+    for its sensors: the preset, the document's `sensors:`, its own. Faulty parts of the shared sections are not handed
+    on to the drones, so that their faults are reported once.
 
     Args:
         source: opens the lines of the faults.
@@ -96,7 +96,7 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
 
     given = _in_channel_units(document.get("sensors"), "sensors", misread)
     shared_sensors = given or {}
-    sensors = _upon_preset(shared_sensors, ARDRONE2.sensor_preset)
+    sensors = _with_preset(shared_sensors, ARDRONE2.sensor_preset)
     faulty = {path.partition(".")[0] for path, _ in _sensor_faults(sensors)}
     usable = {} if "" in faulty else {name: each for name, each in shared_sensors.items() if name not in faulty}
     shared_vehicle = _sound_vehicle(document.get("vehicle"))
@@ -108,10 +108,10 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
         vehicle = _vehicle_of(drone, f"{where}.model", vehicles, unknown, imports)
         own = _in_channel_units(drone.get("sensors"), f"{where}.sensors", misread)
         own = with_defaults(usable, own) if isinstance(own, dict) else usable if own is None else own
-        own = _own_apart(_upon_preset(own, vehicle.sensor_preset), f"{where}.sensors", unsound, imports)
+        own = _separated(_with_preset(own, vehicle.sensor_preset), f"{where}.sensors", unsound, imports)
         return {**with_defaults(_numbers_of(vehicle), drone), "sensors": own}
 
-    document = {**document, "sensors": _own_apart(sensors, "sensors", unsound, imports)}
+    document = {**document, "sensors": _separated(sensors, "sensors", unsound, imports)}
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
         document["drones"] = [resolved_drone(drone, f"drones[{index}]") for index, drone in enumerate(drones)]
@@ -127,7 +127,7 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
 
 
 def with_defaults(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return a section with the fields of another one that it does not give, those of sections in it one by one."""
+    """Return a section with defaults for the fields that it does not give; nested sections are merged."""
     merged = dict(base)
     for key, value in over.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
@@ -144,8 +144,8 @@ def _in_channel_units(sensors: Any, where: str, misread: list[Fault]) -> Any:
     return read
 
 
-def _upon_preset(sensors: Any, default: str) -> Any:
-    """Return a `sensors:` section with the values of its preset, or of the default, that it does not give."""
+def _with_preset(sensors: Any, default: str) -> Any:
+    """Return a `sensors:` section with its preset, or the default one, as defaults."""
     if not isinstance(sensors, dict):
         return sensors
     name = sensors.get("preset", default)
@@ -156,14 +156,14 @@ def _upon_preset(sensors: Any, default: str) -> Any:
 
 
 def _sensor_faults(section: Any) -> Iterator[Fault]:
-    """Yield the faults of a `sensors:` section upon its preset."""
+    """Yield the faults of a `sensors:` section that has its preset as defaults."""
     if isinstance(section, dict):
         section, _, unsound = separate(section)
         yield from unsound
     yield from faults(section, Sensors)
 
 
-def _own_apart(section: Any, where: str, unsound: list[Fault], imports: bool) -> Any:
+def _separated(section: Any, where: str, unsound: list[Fault], imports: bool) -> Any:
     """Return a `sensors:` section with the users' sensors in `own`."""
     if not isinstance(section, dict):
         return section
@@ -173,7 +173,7 @@ def _own_apart(section: Any, where: str, unsound: list[Fault], imports: bool) ->
 
 
 def _sound_vehicle(section: Any) -> dict[str, Any]:
-    """Return the fields of a document's `vehicle:` that its drones may take; faulty ones are told there alone."""
+    """Return the sound fields of a document's `vehicle:`; the faults of the others are reported there only."""
     if not isinstance(section, dict):
         return {}
     faulty = {path.partition(".")[0].partition("[")[0] for path, _ in faults(section, SharedVehicle)}
@@ -183,7 +183,7 @@ def _sound_vehicle(section: Any) -> dict[str, Any]:
 def _vehicle_of(
     drone: dict[str, Any], where: str, vehicles: dict[str, Vehicle], unknown: list[Fault], imports: bool
 ) -> Vehicle:
-    """Return the vehicle of a drone's model, the AR.Drone where it has none that is known.
+    """Return the vehicle of a drone's model, the AR.Drone for an unknown model.
 
     A drone with all its numbers, as in a resolved scenario, needs no module of a user's: whoever reads `world/info`
     imports nothing that it names. A vehicle that must not be imported is left out.
@@ -313,7 +313,7 @@ def _fields(kind: Any) -> Sequence[Any]:
 
 
 def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
-    """Put a value in its place; a section on the way that is not there, or empty, begins here."""
+    """Set the value at a path; missing or empty sections on the way are created."""
     place: Any = document
     for depth, step in enumerate(steps):
         if not isinstance(place, dict | list):

@@ -1,4 +1,4 @@
-"""Documents that people write: YAML, every fault against a typed description, and the user's classes they name.
+"""Documents that people write: YAML, the check of every field against its type, and the user's classes they name.
 
 Imports errors.
 """

@@ -35,7 +35,7 @@ def first_fault(value: Any, description: Any) -> Fault | None:
 
 
 def first_lines(lines: Iterable[str]) -> list[str]:
-    """Return the lines of the first faults, and one with how many more there are, as far as they are counted."""
+    """Return the lines of the first faults, and one with the number of the rest."""
     rest = iter(lines)
     first = list(islice(rest, FAULTS_MAX))
     more = sum(1 for _ in islice(rest, COUNTED_MAX))
@@ -43,7 +43,7 @@ def first_lines(lines: Iterable[str]) -> list[str]:
 
 
 def sound(value: Any, description: Any) -> Any:
-    """Return what can be relied on of a faulty document.
+    """Return the sound parts of a faulty document.
 
     Structs become namespaces with a field for each of theirs: as given, by default, or None where it is
     missing or faulty. Lists keep their length. What fits is returned as it is.
@@ -208,7 +208,7 @@ def _sound_field(value: dict[str, Any], entry: types.Field) -> Any:
 
 
 def suggestion(name: Any, known: Iterable[str]) -> str:
-    """Return a question for the known name that is most like an unknown one; "" where none is like it."""
+    """Return "did you mean NAME? " with the known name most like an unknown one; "" if none is like it."""
     close = get_close_matches(str(name)[:SHOWN_MAX], known, 1)
     return f"did you mean {close[0]}? " if close else ""
 
@@ -234,7 +234,7 @@ def show(value: Any) -> str:
 
 
 def _as_json(value: Any) -> str:
-    """Return maps and lists as they would stand in a file; NaN and infinities by their names."""
+    """Return maps and lists as in a file; NaN and infinities by name."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_as_json(key)}: {_as_json(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""What messages are made of: numbers that are finite, whole numbers of 64 bits, and what every message starts with."""
+"""Types of messages' fields: finite numbers, whole numbers of 64 bits; and the first fields of every message."""
 
 import sys
 from typing import Annotated
@@ -13,7 +13,7 @@ Vector3 = tuple[Number, Number, Number]
 
 
 class Message(Struct, frozen=True, gc=False):
-    """What every message starts with: simulated time of publication, and a count per key from 0."""
+    """The first fields of every message: simulated time of publication, and a count per key from 0."""
 
     t_ns: Count
     seq: Count

@@ -42,9 +42,9 @@ CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
 def search(*places: Path) -> None:
-    """Let modules be found in the folder of the document that is read now, here and in processes started from here.
+    """Search modules in the folder of the document that is read now, here and in processes started from here.
 
-    It takes the place of the folders before: a program that reads many documents does not fill its environment.
+    It replaces the former folders, so that a program that reads many documents does not fill its environment.
 
     Args:
         places: folders, that of the document first; those that are not there are left out.
@@ -53,13 +53,16 @@ def search(*places: Path) -> None:
 
 
 def folders() -> tuple[Path, ...]:
-    """Return the folders in which modules are looked for beside where Python finds them."""
+    """Return the folders that are searched for modules besides Python's own."""
     return tuple(map(Path, filter(None, os.environ.get(FOLDERS, "").split(os.pathsep))))
 
 
 @contextmanager
 def names_only(wanted: bool = True) -> Iterator[list[str]]:
-    """Import nothing that documents name, if so wanted, here and in processes started from here.
+    """Import nothing that documents name, here and in processes started from here.
+
+    Args:
+        wanted: False to import as usual.
 
     Yields:
         the names of what was found and not imported, as documents have them; empty where all may be imported.
@@ -142,11 +145,11 @@ def full_name(kind: type) -> str:
 
 
 RAISED = (Exception, SystemExit)
-"""What a user's code may raise. An exit ends a run as an exception does: nobody would be told of it otherwise."""
+"""What a user's code may raise. An exit ends a run as an exception does, or it would go unreported."""
 
 
 def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
-    """Return what a user's code raised as an error that names class, method, file and line; None for other errors.
+    """Return an exception of a user's code as an error that names class, method, file and line; None for others.
 
     Args:
         error: caught by code of zsim, so that its traceback begins there.
@@ -213,7 +216,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
 
 
 def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
-    """Return a module, if it may be imported; else find it, and in its text what it is to define."""
+    """Import a module, if that is allowed; else check that it exists and that its text defines the attribute."""
     package = name.partition(".")[0]
     if not may_import() and package not in PACKAGES:
         _find(name, what, attribute)
@@ -269,7 +272,7 @@ def _spec(name: str, where: list[str] | None) -> ModuleSpec | None:
 
 
 def _bound(body: ast.AST) -> set[str]:
-    """Return the names that the text of a module binds, those in branches too; `*` for whatever another one has."""
+    """Return the names that the text of a module binds, also in branches; `*` for a star import."""
     names: set[str] = set()
     for node in ast.iter_child_nodes(body):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
@@ -290,7 +293,7 @@ def _methods(kind: type) -> list[str]:
 
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:
-    """Return what a method of a class takes and is given, if it cannot be called as that of its kind is."""
+    """Return what a method takes and is given, if it cannot be called as that of `kind`; else None."""
     wanted, own = getattr_static(kind, method), getattr_static(loaded, method)
     if not (isfunction(wanted) and isfunction(own)) or wanted is own:
         return None  # of a builtin, or bound in its own way

@@ -87,7 +87,7 @@ _Base: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader  # l
 
 
 class _Reader:
-    """Makes values of YAML's events as they come; so the first thing that is refused ends the work.
+    """Builds values from YAML's events as they come, so that the first refused one ends the work.
 
     Refused are aliases, which can expand without end, tags, directives, keys that are given twice, and a depth or a
     number of values for which C code has no limit of its own. Words mean what YAML 1.2 says (its core schema, section

@@ -59,7 +59,7 @@ class BottomCamera(Camera, frozen=True, kw_only=True):
 
 
 class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a detector of hats makes of pictures, without pictures: held against rendered ones by a test."""
+    """What a detector of hats reports, modelled without pictures; a test compares it with rendered ones."""
 
     cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
     latency_ms: LatencyMs = 0.0  # of the detector, after the camera's
@@ -78,7 +78,7 @@ class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Hats(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The magenta markers by which drones see each other: a ball on every drone, and what only looks like one."""
+    """The magenta markers by which drones see each other: a ball on every drone, and decoys."""
 
     diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # chosen: a tennis cap's crown, on the AR.Drone's hull
     position_m: tuple[NearM, NearM, NearM] = (-0.03, 0.0, 0.11)  # in B, chosen: on top of the hull, behind the middle

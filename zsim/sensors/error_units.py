@@ -60,7 +60,7 @@ KALIBR = {  # keys of Kalibr's imu.yaml, by the path in the section of the IMU
 
 
 def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fault]]:
-    """Return a `sensors:` section, as given, with its error models in the fields of ErrorModel, and what is wrong.
+    """Return a `sensors:` section with its error models converted to the fields of ErrorModel, and the faults.
 
     Args:
         sensors: by name; what is no map, and a user's own sensors, are returned as they are.
@@ -81,7 +81,7 @@ def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fau
 
 
 def _of_kalibr(section: dict[str, Any], where: str, wrong: list[Fault]) -> dict[str, Any]:
-    """Return the section of an IMU with the keys of Kalibr's file where the scenario has them."""
+    """Return the section of an IMU with Kalibr's keys replaced by those of a scenario."""
     read = {key: value for key, value in section.items() if key not in KALIBR}
     for key, place in KALIBR.items():
         if key not in section:

@@ -78,7 +78,7 @@ class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Sample(Message, frozen=True):
-    """What every sensor's message starts with; `t_sample_ns` is the instant of the measurement."""
+    """The first fields of every sensor's message; `t_sample_ns` is the instant of the measurement."""
 
     t_sample_ns: Whole
 
@@ -200,7 +200,7 @@ class SensorType(Struct, frozen=True, kw_only=True):
 
 
 class Declaration(Struct, frozen=True, omit_defaults=True):
-    """What readers of a run need to know of a user's sensor, without its module: it stands in the resolved scenario."""
+    """What readers of a run need to know about a user's sensor without its module; part of the resolved scenario."""
 
     message: MessageName
     fields: dict[FieldName, FieldType]
@@ -209,12 +209,12 @@ class Declaration(Struct, frozen=True, omit_defaults=True):
 
     @classmethod
     def of(cls, kind: SensorType) -> "Declaration":
-        """Return what is to be known of a sensor."""
+        """Return the declaration of a sensor."""
         return cls(kind.message.__name__, field_types(kind.message), kind.channels, kind.label)
 
 
 def scaled(model: ErrorModel, to_si: float) -> ErrorModel:
-    """Return an error model in SI units, given what its unit is in them."""
+    """Return an error model in SI units, given the size of its unit in them."""
     if to_si == 1.0:
         return model
     scales = {field: value for field, value in msgspec.structs.asdict(model).items() if field != "correlation_s"}
@@ -272,7 +272,7 @@ def _message_type(name: str, fields: tuple[tuple[str, str], ...], sensor: str) -
 
 
 def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
-    """Return numbers, one behind the other, as the values of a message's fields.
+    """Return a row of numbers as the values of a message's fields.
 
     Raises:
         ValueError: they are more or fewer than the fields have.

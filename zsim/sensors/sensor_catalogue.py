@@ -95,7 +95,7 @@ def sensor_type(module_name: str, where: str = "module") -> SensorType:
 
 
 def _check(sensor: SensorType) -> None:
-    """Refuse a sensor whose parts do not fit."""
+    """Refuse a sensor whose parts contradict each other."""
     for part, base in (("message", Sample), ("settings", Sensor)):
         kind = getattr(sensor, part)
         if not (isinstance(kind, type) and issubclass(kind, base)):
@@ -158,7 +158,7 @@ def flattened(sensors: dict[str, Any]) -> dict[str, Any]:
 
 
 def declarations(drones: Any) -> dict[str, Declaration]:
-    """Return what is declared of the users' sensors of a scenario's drones, by name, sorted."""
+    """Return the declarations of the users' sensors of a scenario's drones, by name, sorted."""
     sections: dict[str, dict[str, Any]] = {}
     for drone in drones:
         sections = own_sections(drone) | sections
@@ -204,7 +204,7 @@ def _section_faults(name: str, section: dict[str, Any], imports: bool) -> Iterat
 
 
 def _resolved(section: dict[str, Any]) -> dict[str, Any]:
-    """Return a sound section with every setting, and with what readers need to know of the sensor."""
+    """Return a sound section with every setting and the declaration of the sensor."""
     if DECLARED in section:
         return section
     kind = sensor_type(section[MODULE])
