@@ -1,7 +1,7 @@
-"""Whether a record has everything that the world published: every gate, every number of its keys, and the end.
+"""Whether a record is complete: every gate, every sequence number of the world's keys, and the end of the run.
 
-The world numbers what it publishes without gaps, so what is missing shows in the record itself. What others publish
-is not counted: a number that is missing there may never have reached the world, and what did not is not missing here.
+The world numbers its messages without gaps, so the record itself shows which are missing. Messages of others are not
+counted: one that never reached the world is not missing from the record.
 """
 
 from collections.abc import Callable, Container
@@ -19,7 +19,7 @@ from zsim.record.record_reader import MessageSpans, RecordReader, shown
 
 
 class GateGap(Struct, frozen=True):
-    """Gates that are missing one behind the other: how many, and the first and the last of them [ns]."""
+    """Consecutive missing gates: their number, and the first and last of them [ns]."""
 
     gates: int
     from_ns: int
@@ -35,11 +35,11 @@ class GateCount:
     """Counts the gates of a run by its clocks, in the order in which the world published them.
 
     Args:
-        after: the clock behind which it begins; from the start of the run if not given.
+        after: the clock after which counting begins; the start of the run by default.
 
     Attributes:
-        gates: that were counted.
-        gaps: that were met.
+        gates: number of gates so far.
+        gaps: gaps so far.
         ended: whether the clock has stopped.
     """
 
@@ -60,13 +60,13 @@ class GateCount:
         return gap
 
     def misses(self, clock: run_messages.Clock) -> bool:
-        """Tell whether a clock is missing before this one, of a gate or of time that stood still."""
+        """Tell whether a clock is missing before this one, of a gate or of a pause."""
         return clock.seq > self._seq + 1
 
     def gap_before(self, clock: run_messages.Clock) -> GateGap | None:
         """Return the gates that are missing between the clock that was added last and this one.
 
-        A clock that has the next number missed nothing, however far time was moved, as by a replay that seeks.
+        Nothing is missing before a clock with the next number, however far a replay has moved the time.
         """
         missing = clock.step - self._step - 1
         if missing <= 0 or clock.seq == self._seq + 1:
@@ -106,7 +106,7 @@ class Completeness(Struct, frozen=True):
         return sum(gap.gates for gap in self.gaps)
 
     def faults(self) -> list[str]:
-        """Return what is missing, a text each; nothing of a record that is complete."""
+        """Return what is missing, a text each; empty if the record is complete."""
         faults = []
         if self.gaps:
             of = self.gates + self.gates_missing
@@ -162,14 +162,14 @@ def sequence_numbers(spans: MessageSpans) -> NDArray[np.int64]:
 
 
 class _Numbers:
-    """Collects the numbers of the messages of some channels, which may stand in any order."""
+    """Collects the sequence numbers of some channels' messages, in any order."""
 
     def __init__(self) -> None:
         self._channels: list[NDArray[np.int64]] = []
         self._numbers: list[NDArray[np.int64]] = []
 
     def add(self, spans: MessageSpans, rows: NDArray[np.bool_]) -> None:
-        """Take those of the messages of a chunk that are numbered."""
+        """Add the numbers of some messages of a chunk."""
         read = np.where(rows, sequence_numbers(spans), 0)
         for m in np.flatnonzero(read < 0).tolist():  # by another encoder, or garbage, which has no number
             with suppress(*messages.REFUSALS, OverflowError):
@@ -197,7 +197,7 @@ def completeness(
     keys_sampled: Container[str] = (),
     take: Callable[[str, bytes], None] = lambda key, payload: None,
 ) -> Completeness:
-    """Return whether a record has everything: all of it is read, and every check sum compared.
+    """Return what is missing from a record; all of it is read, and every checksum compared.
 
     Args:
         keys_beside: of messages that are wanted as well, which saves reading the record twice.
@@ -250,7 +250,7 @@ def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool
 
 
 def record_completeness(path: Path) -> Completeness:
-    """Return whether the record at a path has everything.
+    """Return what is missing from the record at a path.
 
     Raises:
         RecordError: there is none, or it cannot be read.

@@ -182,7 +182,7 @@ def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterato
     """Yield schemas, channels and chunks of the data section in order.
 
     Args:
-        found: the places of the records, if somebody looks through them already.
+        found: the places of the records, if the caller iterates over them already.
     """
     pending: list[RecordSpan] = []
     for place in found or places(source):
@@ -267,7 +267,7 @@ def unmap(source: Source) -> None:
 
 
 def is_ours(source: Source) -> bool:
-    """Tell whether zsim has written a record, of which the first bytes are given; it gives every chunk a check sum."""
+    """Tell whether zsim has written a record, of which the first bytes are given; zsim gives every chunk a checksum."""
     return source[LIBRARY : LIBRARY + len(OURS)] == OURS
 
 

@@ -1,7 +1,7 @@
-"""Ends a record: data end, summary and footer, all of it read off the file itself.
+"""The end of a record: data end, summary and footer, all derived from the file itself.
 
-The same code closes a record at the end of a run and mends one whose writer died, so the writer keeps no
-index in memory, however long the run.
+The same code closes a record at the end of a run and repairs one whose writer died, so the writer keeps no index in
+memory, however long the run.
 """
 
 import struct
@@ -149,7 +149,7 @@ def repair(path: str | Path) -> bool:
 
 
 def cut_off(file: FileIO, path: Path) -> None:
-    """Take off what stands behind the last whole chunk of a record, so that it can be written on from there.
+    """Cut a record behind its last whole chunk, so that it can be continued from there.
 
     Raises:
         RecordError: no record.

@@ -75,7 +75,7 @@ _Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, messag
 
 
 class RecordReader:
-    """A record as it stands on disk when it is opened; a writer may go on appending to it.
+    """A record as it is on disk when it is opened; a writer may be appending to it.
 
     Attributes:
         complete: the record was closed, not cut.
@@ -113,7 +113,7 @@ class RecordReader:
             keys: exact keys; chunks without any of them are not decompressed.
             by_time: in order of simulated time, messages of one time as they were written; otherwise all as
                 they were written. In memory are the chunks that overlap in time, and stragglers one by one.
-            from_ns: chunks in which everything is older are passed over; a chunk holds a quarter of a wall second.
+            from_ns: chunks with older messages only are skipped; a chunk spans a quarter of a wall second.
 
         Raises:
             RecordError: compressed by another tool in a way that is not ours.
@@ -181,7 +181,7 @@ class RecordReader:
         return tuple(chunks if self._rest is None else [*chunks, f"everything from byte {self._rest} on"])
 
     def differs(self) -> bool:
-        """Tell whether a closed record differs from what its writer closed; all of the file is read for it.
+        """Tell whether a closed record was changed since its writer closed it; the whole file is read.
 
         Names of keys, and indexes, have no check sum of their own.
         """
@@ -202,7 +202,7 @@ class RecordReader:
         """Return where the chunk with the last message of a key begins, and what stands in it before that message.
 
         Args:
-            is_it: returns, by the payload, whether it is the one that is meant.
+            is_it: tells by the payload whether it is the wanted one.
         """
         channels = {number for number, name in self._keys.items() if name == key}
         for chunk in reversed([chunk for chunk in self._chunks if not chunk.channels.isdisjoint(channels)]):

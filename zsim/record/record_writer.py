@@ -49,19 +49,18 @@ _encode = messages.encode
 class RecordWriter:
     """Appends messages to a record; for one thread.
 
-    What is in the file is readable at any moment, whatever happens to this process: a chunk and its indexes
-    are one write. Memory holds the open chunk and the names of the keys, however long the run.
+    The file is readable at any moment, whatever happens to this process: a chunk and its indexes are one write. Memory holds the open chunk and the names of the keys, however long the run.
 
     Attributes:
-        has_former: whether it goes on behind messages of a writer that died.
+        has_former: whether the file had messages of a former writer.
         refused: messages on keys beyond the 65 535 that a record can hold.
     """
 
     def __init__(self, path: str | Path, goes_on: bool = False) -> None:
-        """Start the file, or go on behind the last whole chunk of one whose writer died; none is overwritten.
+        """Create the file, or continue one whose writer died behind its last whole chunk; none is overwritten.
 
         Raises:
-            RecordError: the file exists, or is none that can be gone on with, or cannot be written.
+            RecordError: the file exists, cannot be continued, or cannot be written.
         """
         self.path = Path(path)
         self.has_former = False
@@ -82,7 +81,7 @@ class RecordWriter:
             self._take_up()
         except OSError as error:
             self._file.close()
-            raise RecordError(f"{path}: cannot be gone on with ({error.strerror})") from error
+            raise RecordError(f"{path}: cannot be continued ({error.strerror})") from error
         except RecordError:
             self._file.close()
             raise
@@ -296,10 +295,10 @@ _SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
 
 
 class OpenChunk:
-    """Message records whose heads are still free, and what is to stand in them.
+    """The messages that are not on disk yet: payloads in a buffer, their heads as columns, written all at once.
 
-    Channels are counted from 1. Its memory is kept from chunk to chunk: to be given pages anew would take longer than
-    all that is done here.
+    Channels are counted from 1. The memory is kept from chunk to chunk: allocating new pages would take longer than
+    everything done here.
 
     Args:
         room: bytes that a chunk commonly has, with its last message.
@@ -358,7 +357,7 @@ class OpenChunk:
         self._data = self._data + bytes(max(size - len(self._data), self._room))
 
     def take(self) -> "Content":
-        """Return all that came, and begin anew; what is returned holds until the next message."""
+        """Return the messages so far, and begin a new chunk; the content is valid until the next message."""
         columns = map(_column, (self._channels, self._ends, self._log, self._published))
         content = Content(memoryview(self._data)[: self.size], *columns)
         self._counted = content.write_heads(self._counted)
@@ -412,11 +411,11 @@ def _column(values: array) -> NDArray:
 
 
 def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
-    """Take the last message of a key off a record, and all that was written after it; return whether there was one.
+    """Cut a record before the last message of a key, so that its run can be resumed; return whether there was one.
 
     Args:
         key: of the message.
-        is_it: returns, by the payload, whether it is the one that is meant.
+        is_it: tells by the payload whether it is the wanted one.
 
     Raises:
         RecordError: no record, it cannot be written, or another process writes it.

@@ -217,7 +217,7 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
 
 
 def _tip_fault(drone: Any, vehicle: Vehicle) -> str | None:
-    """Return what is wrong where the tips of the rotors would outrun sound: a speed in rpm."""
+    """Return the fault of a rotor speed whose tips would be supersonic: it is in rpm."""
     scale = (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25  # of a rotor; larger may be a wrong unit of that
     radius_m, high = vehicle.rotor_radius_m * min(1.0, scale), drone.rotor_max_rad_s
     if radius_m * high <= TIP_MAX_M_S:
@@ -228,7 +228,7 @@ def _tip_fault(drone: Any, vehicle: Vehicle) -> str | None:
 
 
 def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
-    """Yield the coefficients by each of which slow air would push as hard as its weight: they are in a wrong unit.
+    """Yield the drag coefficients in a wrong unit: slow air alone would push as hard as the weight.
 
     One that is too small is not to be told from one that is left out.
     """

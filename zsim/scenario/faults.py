@@ -218,7 +218,7 @@ def expected(p: FaultParameter) -> str:
 
 
 def unstated(kind: FaultKind, parameters: Mapping[str, Any]) -> list[FaultParameter]:
-    """Return the magnitudes of a kind that a fault does not state: those too that have a default."""
+    """Return the magnitudes of a kind that a fault does not state, including those with a default."""
     return [
         p
         for p in kind.parameters
@@ -236,7 +236,7 @@ def planned(
     gate_ns: int,
     kinds: Mapping[str, FaultKind] = KINDS,
 ) -> Fault:
-    """Return the fault that a sound map asks for, in whole gates and with every parameter.
+    """Return the fault that a sound description asks for, in whole gates and with every parameter.
 
     It acts in the gates after `from_ns` up to `until_ns`: on what happens between these instants, and on messages that
     belong to those gates.
@@ -368,7 +368,7 @@ def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterat
 
 
 def _allowed_instead(name: str, known: Known) -> str | None:
-    """Return the text of what a process's name must be, None for a good one: most names may be of a user's process."""
+    """Return what a process's name must be, None for an acceptable one: most names may be of a user's process."""
     if not keys.PROCESS_NAME.fullmatch(name):
         return "1 to 48 of a-z 0-9 _ . -"
     if name in known.processes:
@@ -443,7 +443,7 @@ def _within(value: Any, least: float, most: float, above: bool = False) -> bool:
     return number and least <= value <= most and not (above and value == least)
 
 
-# What people type
+# Faults as typed in a terminal or the console
 
 DURATION_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "": 1.0}  # s
 OPTION_OF = {"target": "the argument TARGET", "kind": "the argument KIND", "for_s": "--for", "at_s": "--at"}
@@ -463,7 +463,7 @@ def typed_duration_s(text: str) -> float:
 
 
 def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
-    """Return the map that words NAME=VALUE make; values are YAML.
+    """Return the parameters in words NAME=VALUE; values are YAML.
 
     Raises:
         ValueError: one is no such word, is given twice, or is given by an argument or option instead.
@@ -485,9 +485,9 @@ def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
 
 
 def typed_rest(text: str) -> dict[str, Any]:
-    """Return what stands behind TARGET KIND in `zsim fault add`, as the map of a fault has it.
+    """Return the parameters and times typed after TARGET KIND in `zsim fault add`.
 
-    A list or map needs no quotes here: there is no shell.
+    Lists and maps need no quotes here, since no shell reads them.
 
     Raises:
         ValueError: it is not NAME=VALUE NAME=VALUE … --for DURATION --at DURATION.
@@ -508,7 +508,7 @@ def typed_rest(text: str) -> dict[str, Any]:
 
 
 def _words(text: str) -> list[str]:
-    """Return the words of a text; brackets that are open hold words together."""
+    """Return the words of a text; words inside brackets are kept together."""
     words: list[str] = []
     depth = 0
     try:
