@@ -49,7 +49,8 @@ _encode = messages.encode
 class RecordWriter:
     """Appends messages to a record; for one thread.
 
-    The file is readable at any moment, whatever happens to this process: a chunk and its indexes are one write. Memory holds the open chunk and the names of the keys, however long the run.
+    The file is readable at any moment, whatever happens to this process: a chunk and its indexes are one write. Memory
+    holds the open chunk and the names of the keys, however long the run.
 
     Attributes:
         has_former: whether the file had messages of a former writer.

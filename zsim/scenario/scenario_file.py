@@ -80,9 +80,9 @@ def sha256(text: str) -> str:
 def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
     """Return the scenario of a raw document.
 
-    Later ones take precedence. For a drone: the numbers of its model, the document's `vehicle:`, its own fields; for its
-    sensors: the preset, the document's `sensors:`, its own. Faulty parts of the shared sections are not handed on to the
-    drones, so that their faults are reported once.
+    Later ones take precedence. For a drone: the numbers of its model, the document's `vehicle:`, its own fields; for
+    its sensors: the preset, the document's `sensors:`, its own. Faulty parts of the shared sections are not handed on
+    to the drones, so that their faults are reported once.
 
     Args:
         source: opens the lines of the faults.
