@@ -279,7 +279,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
     estimation: Estimation = Estimation()
     processes: Processes = Processes()
     faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []
-    """Faults to inject, each a map; `fault_check.flaws` judges them."""
+    """Faults to inject, each a map; `zsim.scenario.faults.flaws` checks them."""
     report: Figures = field(default_factory=Figures)
 
     def drone(self, name: str) -> Drone:
