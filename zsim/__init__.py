@@ -1,7 +1,8 @@
-"""What every process of a federation shares: time, frames, keys, messages, scenario, session, agent.
+"""What every process of a federation shares: frames, keys, messages, scenario, record, session, agent.
 
-Rooms from the ground: errors, math and schema, contract, then record, scenario and transport, which do not import each
-other, and runtime; a room imports those below it. Nothing here imports another package of the product.
+Rooms from the ground up: errors; math and schema; sensors; contract; vehicles; record, scenario and transport, which do
+not import each other; runtime; presentation. A room imports those below it. Nothing here imports another package of the
+product.
 """
 
 from contextlib import suppress

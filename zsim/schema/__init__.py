@@ -1,4 +1,9 @@
-"""Documents that people write: YAML, the check of every field against its type, and the user's classes they name.
+"""Documents that people write.
+
+    yaml_file             YAML, read with limits
+    checker               every fault of a document against its type
+    plugin                the user's modules and classes that it names
+    quantities, message   types of its numbers, and of those of messages
 
 Imports errors.
 """
