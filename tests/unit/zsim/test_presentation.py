@@ -1,4 +1,4 @@
-"""Tables in terminals of any width: neither a name, nor a unit, nor a figure is broken."""
+"""Tables in terminals of any width break no name, unit or figure; the colours of drones are distinct for everybody."""
 
 import ast
 import io

@@ -1,4 +1,4 @@
-"""The numeric fingerprint: the same in every process of a machine, another when anything of it changes."""
+"""The numeric fingerprint, the same in every process of a machine; the hash of a flight, written again with `struct`."""
 
 import hashlib
 import os

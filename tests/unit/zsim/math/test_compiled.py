@@ -1,4 +1,4 @@
-"""The compiled mathematics: every file that is compiled counts for the cache, and a change of one renews it."""
+"""Compiled mathematics: every source file of a kernel counts for its cache, and a change of one renews it; columns."""
 
 import importlib
 import os

@@ -1,4 +1,4 @@
-"""Geodesy and attitude conversions."""
+"""Geodesy, against the way back and formulas of others, and conversions of attitudes."""
 
 import math
 import os

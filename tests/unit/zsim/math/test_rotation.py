@@ -1,4 +1,4 @@
-"""Quaternion algebra of the compiled code against scipy."""
+"""Quaternion algebra of the compiled code against scipy; poses between two instants."""
 
 import math
 
