@@ -20,15 +20,16 @@ from inspect import Parameter, getattr_static, isclass, isfunction, signature
 from pathlib import Path
 from traceback import walk_tb
 from types import FrameType, ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zsim import errors
-from zsim.errors import DocumentError, NotTrustedError, UserCodeError
+from zsim.errors import DocumentError, NotTrustedError, UserCodeError, reason_of
 from zsim.schema.checker import show
 
+Object = TypeVar("Object")
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that processes started from here search there too
 IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, for the same reason, and what it then holds
 WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
@@ -134,6 +135,15 @@ def load_module(name: str, where: str) -> ModuleType:
     return _imported(name, f"{where} is {show(name)}")
 
 
+def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Object:
+    """Return the object of a kind that a module `package.module` defines under a fixed name; errors as of `load`."""
+    found = getattr(load_module(name, where), attribute, None)
+    if not isinstance(found, kind):
+        holds = f"whose {attribute} is {show(type(found).__name__)}" if found else f"which defines no {attribute}"
+        raise DocumentError([f"{where} is {show(name)}, {holds}; must be a {kind.__module__}.{kind.__name__}"])
+    return found
+
+
 def is_own(kind: type) -> bool:
     """Tell whether a class is a user's own, and none of zsim's."""
     return kind.__module__.partition(".")[0] not in PACKAGES
@@ -233,8 +243,7 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
     except RAISED as error:
         if isinstance(error, ModuleNotFoundError) and (lacking := errors.missing(error)):
             raise DocumentError([f"{what}, which cannot be imported: {lacking}"]) from error
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"]) from error
+        raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)}); {WHERE}"]) from error
 
 
 def _find(name: str, what: str, attribute: str) -> None:
@@ -258,8 +267,7 @@ def _find(name: str, what: str, attribute: str) -> None:
     try:
         bound = _bound(ast.parse(Path(spec.origin or "").read_bytes()))
     except (OSError, SyntaxError, ValueError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise DocumentError([f"{what}, which cannot be imported ({reason})"]) from error
+        raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)})"]) from error
     if attribute not in bound and "*" not in bound:
         raise DocumentError([f"{what}; must be of {name}: {', '.join(sorted(bound)) or 'it defines nothing'}"])
 

@@ -82,15 +82,11 @@ def sensor_type(module_name: str, where: str = "module") -> SensorType:
     Raises:
         DocumentError: there is none, or it contradicts itself; one line.
     """
-    sensor = getattr(plugin.load_module(module_name, where), "SENSOR", None)
-    what = f"{where} is {show(module_name)}"
-    if not isinstance(sensor, SensorType):
-        holds = f"whose SENSOR is {show(type(sensor).__name__)}" if sensor else "which defines no SENSOR"
-        raise DocumentError([f"{what}, {holds}; must be a zsim.sensors.sensor.SensorType"])
+    sensor = plugin.load_object(module_name, where, "SENSOR", SensorType)
     try:
         _check(sensor)
     except (NameError, TypeError, ValueError) as error:  # a name in an annotation that is nowhere at run time
-        raise DocumentError([f"{what}: SENSOR.{error}"]) from error
+        raise DocumentError([f"{where} is {show(module_name)}: SENSOR.{error}"]) from error
     return sensor
 
 

@@ -5,7 +5,7 @@ from functools import cache
 
 import msgspec
 
-from zsim.errors import DocumentError, NotTrustedError
+from zsim.errors import DocumentError, NotTrustedError, reason_of
 from zsim.schema import plugin
 from zsim.schema.checker import faults, show
 from zsim.vehicles import ardrone2, crazyflie2
@@ -33,17 +33,13 @@ def vehicle_of(model: str, where: str = "model") -> Vehicle:
     if not _MODULE.fullmatch(model):
         raise DocumentError([f"{where} is {show(model)}; must be one of {ALLOWED}"])
     try:
-        module = plugin.load_module(model, where)
+        plugin.load_module(model, where)
     except NotTrustedError:
         raise
     except DocumentError as error:
-        reason = " ".join(f"{type(error.__cause__).__name__}: {error.__cause__}".split())
-        reason = reason if error.__cause__ else "it cannot be found"
+        reason = reason_of(error.__cause__) if error.__cause__ else "it cannot be found"
         raise DocumentError([f"{where} is {show(model)}; must be one of {ALLOWED} ({reason})"]) from error
-    vehicle = getattr(module, "VEHICLE", None)
-    if not isinstance(vehicle, Vehicle):
-        holds = f"whose VEHICLE is {show(type(vehicle).__name__)}" if vehicle else "which defines no VEHICLE"
-        raise DocumentError([f"{where} is {show(model)}, {holds}; must be a zsim.vehicles.vehicle.Vehicle"])
+    vehicle = plugin.load_object(model, where, "VEHICLE", Vehicle)
     flaws = [*faults(msgspec.to_builtins(vehicle), Vehicle)]
     if flaws:
         raise DocumentError([f"{where} is {show(model)}: VEHICLE.{path} {text}" for path, text in flaws])
