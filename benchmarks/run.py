@@ -17,7 +17,7 @@ import psutil
 from benchmarks.child import RefusedError
 from zsim.contract import run_messages
 from zsim.record import RecordReader
-from zsim_deploy.inventory.processes import MODULE
+from zsim_deploy.inventory import MODULE
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 TIMEOUT_S = 600.0
