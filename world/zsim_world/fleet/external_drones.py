@@ -15,7 +15,7 @@ from zsim.contract.snapshot import State
 from zsim.contract.state_rules import state_refusal
 from zsim.scenario.external_bodies import POSE_AGE_MAX_NS, moved_on, truth_fault
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.state.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE
 
 
 class Pose(NamedTuple):

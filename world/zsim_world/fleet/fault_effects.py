@@ -12,9 +12,9 @@ from zsim.contract.snapshot import State
 from zsim.scenario.fault_kinds import sensor_parts
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics.air import WIND
+from zsim_world.physics.fleet_arrays import STATE, Arrays
 from zsim_world.sensors import sensor_set as ss
 from zsim_world.sensors.sensor_set import CONFIG, FAULT, FleetSensors
-from zsim_world.state.fleet_arrays import STATE, Arrays
 from zsim_world.vehicles.simd_firmware import ACTUATOR, sound_actuators
 
 

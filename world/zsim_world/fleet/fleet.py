@@ -30,11 +30,11 @@ from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.flight_watch import FlightWatch, Incident
 from zsim_world.fleet.initial_state import arrays
 from zsim_world.physics.air import WIND
+from zsim_world.physics.fleet_arrays import ROTOR, STATE, VEHICLE, state_arrays
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import WHOSE, Sampled, Sampler, SensorSample, with_more
 from zsim_world.sensors.sensor_set import fleet_sensors
 from zsim_world.sensors.sighting_sampler import PictureSightings, SightingSampler
-from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, state_arrays
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY, SETPOINT
 from zsim_world.vehicles.firmware_settings import SETTING

@@ -13,13 +13,7 @@ from zsim.vehicles.vehicle import Vehicle
 from zsim_world.fleet.flight_watch import SEEN
 from zsim_world.physics import rigid_body
 from zsim_world.physics.air import WIND
-from zsim_world.physics.ground import contact_points
-from zsim_world.physics.obstacle_contact import BALLS, SLOTS_MAX, obstacle_rows
-from zsim_world.physics.simd import body_blocks
-from zsim_world.sensors import sensor_set
-from zsim_world.sensors.noise import NoiseTable
-from zsim_world.sensors.sensor_set import FleetSensors
-from zsim_world.state.fleet_arrays import (
+from zsim_world.physics.fleet_arrays import (
     CLOCK,
     EXPOSED,
     ROTOR,
@@ -38,6 +32,12 @@ from zsim_world.state.fleet_arrays import (
     rotor_slots,
     vehicle_row,
 )
+from zsim_world.physics.ground import contact_points
+from zsim_world.physics.obstacle_contact import BALLS, SLOTS_MAX, obstacle_rows
+from zsim_world.physics.simd import body_blocks
+from zsim_world.sensors import sensor_set
+from zsim_world.sensors.noise import NoiseTable
+from zsim_world.sensors.sensor_set import FleetSensors
 from zsim_world.vehicles import firmware, firmware_settings, observer, observer_gains
 from zsim_world.vehicles.observer import BELIEF, CALIBRATION, DEVICE
 from zsim_world.vehicles.simd_firmware import board_blocks, sound_actuators

@@ -15,6 +15,20 @@ from zsim_world.fleet.flight_watch import watch
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.air import WIND, blow
 from zsim_world.physics.contacts import meet_drones
+from zsim_world.physics.fleet_arrays import (
+    CLOCK,
+    EXPOSED,
+    PLACE,
+    SPAN,
+    STATE,
+    STREAMS,
+    VEHICLE,
+    Arrays,
+    Bodies,
+    NoiseRows,
+    PerRotor,
+    Senses,
+)
 from zsim_world.physics.obstacle_contact import meet_obstacles
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import drained
@@ -35,20 +49,6 @@ from zsim_world.sensors.equations import (
 )
 from zsim_world.sensors.reading import add_errors, displace, hold_reading
 from zsim_world.sensors.sensor_set import CONFIG, NEVER, SCHEDULE
-from zsim_world.state.fleet_arrays import (
-    CLOCK,
-    EXPOSED,
-    PLACE,
-    SPAN,
-    STATE,
-    STREAMS,
-    VEHICLE,
-    Arrays,
-    Bodies,
-    NoiseRows,
-    PerRotor,
-    Senses,
-)
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.observer import DEVICE, STEP_S
 from zsim_world.vehicles.simd_firmware import steer

@@ -21,11 +21,11 @@ from zsim.sensors.sensor import Sample, as_fields, field_types, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
+from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.physics.rotors import charge_percent
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
 from zsim_world.sensors.sighting_sampler import PictureSightings
-from zsim_world.state.fleet_arrays import STATE
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY
 
@@ -64,7 +64,7 @@ class MessageRow(NamedTuple):
 
 
 class PublishedArrays(NamedTuple):
-    """The arrays of a fleet that messages are made of, see `zsim_world.state.fleet_arrays`."""
+    """The arrays of a fleet that messages are made of, see `zsim_world.physics.fleet_arrays`."""
 
     state: NDArray[np.float64]
     accel: NDArray[np.float64]

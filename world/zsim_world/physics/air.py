@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Vector
-from zsim_world.state.fleet_arrays import Row
+from zsim_world.physics.fleet_arrays import Row
 
 WIND = columns(
     "WindColumns",

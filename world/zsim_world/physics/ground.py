@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, add, cross, rotate, rotate_back
-from zsim_world.state.fleet_arrays import VEHICLE, Row
+from zsim_world.physics.fleet_arrays import VEHICLE, Row
 
 Pair = tuple[float, float]
 

@@ -19,8 +19,8 @@ from zsim.math.compiled import apart, inlined
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
 from zsim.scenario import obstacle
 from zsim.scenario.scenario import Environment
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, Row
 from zsim_world.physics.ground import POINTS, contact_point
-from zsim_world.state.fleet_arrays import STATE, VEHICLE, Bodies, Row
 
 HULL_BALLS = 16  # along the hull, chosen: 2 cm are between two of the AR.Drone's, and a thinner post meets the last
 BALLS = POINTS + HULL_BALLS + 1

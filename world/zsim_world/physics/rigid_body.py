@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from zsim.math import rotation as rot
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, add, axpy
+from zsim_world.physics.fleet_arrays import AERO, STATE, VEHICLE, Aero, PerRotor, Row, of, put_of
 from zsim_world.physics.ground import contact
 from zsim_world.physics.obstacle_contact import Touch, touched
 from zsim_world.physics.rotors import in_flow, lagged, wrench
-from zsim_world.state.fleet_arrays import AERO, STATE, VEHICLE, Aero, PerRotor, Row, of, put_of
 
 NOTHING = (0.0, 0.0, 0.0)  # N or N m
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, rotate
-from zsim_world.state.fleet_arrays import AERO, ROTOR, VEHICLE, PerRotor, Row, lift_share, mixed, of, place, put_of
+from zsim_world.physics.fleet_arrays import AERO, ROTOR, VEHICLE, PerRotor, Row, lift_share, mixed, of, place, put_of
 
 LOW_SQUARE_MIN = 1e-12  # (rad/s)^2, of rotors that may stand still
 GROUND_CLEARANCE_MIN = 0.5  # radii, the formula below is not meant for less

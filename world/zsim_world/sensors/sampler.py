@@ -17,10 +17,10 @@ from zsim.math.columns import Field, columns
 from zsim.math.compiled import Held, hold, inlined, kernel
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import SensorType
+from zsim_world.physics.fleet_arrays import Senses
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.sensor_set import SENSORS, FleetSensors
 from zsim_world.sensors.user_sensors import UserSensors
-from zsim_world.state.fleet_arrays import Senses
 
 WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Field("t", "ns"), Field("t_sample", "ns")))
 VALUE_COLUMNS = 9  # of a GPS fix, with its place on the Earth

@@ -20,10 +20,10 @@ from zsim.scenario.obstacle import COLUMNS, row_of
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Camera, Hats, SightingModel
 from zsim.sensors.camera_model import camera_pose
+from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.physics.normal_variates import WORDS, words
 from zsim_world.sensors.hats_in_view import CAMERA, VIEW, camera_row, hats_in_view, mounted, poses_between
 from zsim_world.sensors.sighting_errors import DETECTOR, SEEN, detect
-from zsim_world.state.fleet_arrays import STATE
 
 NOISY_LIGHT = 0.4  # of a clear day, at which a picture's noise is half again of what it is by day; measured
 

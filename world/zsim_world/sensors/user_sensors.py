@@ -11,10 +11,10 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim.sensors.sensor import Sensor, SensorTruth, SensorType
+from zsim_world.physics.fleet_arrays import EXPOSED, STATE, Senses
 from zsim_world.physics.normal_variates import place, words
 from zsim_world.sensors.reading import read
 from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width
-from zsim_world.state.fleet_arrays import EXPOSED, STATE, Senses
 
 
 class UserSensors:

@@ -7,9 +7,9 @@ from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
 from zsim.vehicles.vehicle import Firmware
+from zsim_world.physics.fleet_arrays import ROTOR, VEHICLE, PerRotor, Row, of, put_of
 from zsim_world.physics.rigid_body import vector
 from zsim_world.physics.rotors import mix
-from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor, Row, of, put_of
 from zsim_world.vehicles.observer import STEP_S
 
 DRIVE = columns(  # what the loops of attitude and rate need of the firmware's settings, by which these begin

@@ -21,8 +21,8 @@ from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
 from zsim.vehicles.vehicle import ROTORS_MAX
+from zsim_world.physics.fleet_arrays import ROTOR, VEHICLE, PerRotor, of, put_of
 from zsim_world.physics.rigid_body import four, vector
-from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor, of, put_of
 from zsim_world.vehicles.attitude_control import DRIVE, clipped
 from zsim_world.vehicles.firmware_settings import SETTING
 from zsim_world.vehicles.observer import BELIEF, FLOOR_MIN_M, STEP_S, STILL_STEPS_MIN, lift, standing_height

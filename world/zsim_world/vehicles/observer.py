@@ -13,10 +13,10 @@ from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
 from zsim.sensors.imu import BOARD_RATE_HZ
+from zsim_world.physics.fleet_arrays import VEHICLE, PerRotor, of, put_of
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import free_thrust, lagged
 from zsim_world.sensors.sensor_set import FIELD_MIN_UT
-from zsim_world.state.fleet_arrays import VEHICLE, PerRotor, of, put_of
 from zsim_world.vehicles.observer_gains import GAIN
 
 STEP_S = 1.0 / BOARD_RATE_HZ  # s

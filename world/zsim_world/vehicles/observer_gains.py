@@ -22,8 +22,8 @@ from zsim.scenario.scenario import Drone, Environment
 from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.sensors.sensor import ErrorModel, Sensor, noise_sigma, scaled
 from zsim.vehicles.vehicle import Vehicle
+from zsim_world.physics.fleet_arrays import REFERENCE_DENSITY_KG_M3
 from zsim_world.sensors.sensor_set import heading_sigma
-from zsim_world.state.fleet_arrays import REFERENCE_DENSITY_KG_M3
 
 Array = NDArray[np.float64]
 

@@ -11,6 +11,18 @@ from numpy.typing import NDArray
 from zsim.math import rotation as rot
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import apart, inlined
+from zsim_world.physics.fleet_arrays import (
+    CLOCK,
+    ROTOR,
+    SPAN,
+    VEHICLE,
+    Boards,
+    Bodies,
+    KernelTime,
+    PerRotor,
+    of,
+    put_of,
+)
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import charge_percent
 from zsim_world.physics.simd import (
@@ -23,7 +35,6 @@ from zsim_world.physics.simd import (
     put_lane_four,
     put_lane_vector,
 )
-from zsim_world.state.fleet_arrays import CLOCK, ROTOR, SPAN, VEHICLE, Boards, Bodies, KernelTime, PerRotor, of, put_of
 from zsim_world.vehicles import attitude_control, firmware, observer
 from zsim_world.vehicles.attitude_control import DRIVE
 from zsim_world.vehicles.firmware_settings import SETTING

@@ -8,7 +8,7 @@ from vehicle_rows import one_drone, per_rotor
 
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.physics import rotors
-from zsim_world.state.fleet_arrays import VEHICLE
+from zsim_world.physics.fleet_arrays import VEHICLE
 
 
 @pytest.fixture(scope="module")

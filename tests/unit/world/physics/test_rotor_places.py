@@ -9,7 +9,7 @@ from vehicle_rows import one_drone
 
 from zsim.vehicles.vehicle import Rotor, Vehicle
 from zsim.vehicles.vehicle_catalogue import STOCK, vehicle_of
-from zsim_world.state.fleet_arrays import CROSS_ROTORS, ROTOR, mixed, of, place, rotor_slots
+from zsim_world.physics.fleet_arrays import CROSS_ROTORS, ROTOR, mixed, of, place, rotor_slots
 
 
 def plus() -> Vehicle:

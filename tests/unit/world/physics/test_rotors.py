@@ -12,8 +12,8 @@ from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.physics import rotors
+from zsim_world.physics.fleet_arrays import VEHICLE, PerRotor, rotor_row, rotor_slots, vehicle_row
 from zsim_world.physics.rotors import ground_effect, lagged
-from zsim_world.state.fleet_arrays import VEHICLE, PerRotor, rotor_row, rotor_slots, vehicle_row
 
 LEVEL, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 HIGH = 1000.0  # m, out of ground effect

@@ -7,8 +7,8 @@ import numpy as np
 from zsim.math import rotation
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
+from zsim_world.physics.fleet_arrays import ROTOR, VEHICLE, PerRotor
 from zsim_world.physics.simd import LANES
-from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor
 from zsim_world.vehicles import attitude_control, observer
 from zsim_world.vehicles.attitude_control import DRIVE
 from zsim_world.vehicles.observer import BELIEF
