@@ -16,11 +16,9 @@ from zsim.math.compiled import inlined
 from zsim.math.rotation import add, rotate
 from zsim.schema.quantities import G_M_S2
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Arrays, Bodies, Watched
-from zsim_world.physics.ground import POINTS, contact_point
-from zsim_world.physics.obstacle_contact import FEET, nearest
 from zsim_world.physics.rigid_body import four, vector
-from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, TAKING_OFF
-from zsim_world.vehicles.firmware_settings import SETTING
+from zsim_world.physics.surfaces import FEET, POINTS, contact_point, nearest
+from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, SETTING, TAKING_OFF
 from zsim_world.vehicles.observer import STEP_S
 
 IMPACT_STEPS = 4  # over which a change of velocity is measured: 20 ms, about half of a contact on the feet

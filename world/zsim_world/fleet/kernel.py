@@ -29,25 +29,26 @@ from zsim_world.physics.fleet_arrays import (
     PerRotor,
     Senses,
 )
-from zsim_world.physics.obstacle_contact import meet_obstacles
-from zsim_world.physics.rigid_body import four, put, put_four, vector
-from zsim_world.physics.rotors import drained
+from zsim_world.physics.rigid_body import drained, four, put, put_four, vector
 from zsim_world.physics.simd import accelerate, lead, line_up, move
+from zsim_world.physics.surfaces import meet_obstacles
 from zsim_world.sensors import sensor_set as ss
 from zsim_world.sensors.equations import (
     BodyTruth,
     MountedSensor,
     Site,
     Values,
+    add_errors,
     baro,
+    displace,
     flow,
     gps,
+    hold_reading,
     imu,
     mag,
     pressure,
     sonar,
 )
-from zsim_world.sensors.reading import add_errors, displace, hold_reading
 from zsim_world.sensors.sensor_set import CONFIG, NEVER, SCHEDULE
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.observer import DEVICE, STEP_S

@@ -22,10 +22,10 @@ from zsim.sensors.sensor_catalogue import STOCK
 from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.physics.fleet_arrays import STATE
-from zsim_world.physics.rotors import charge_percent
+from zsim_world.physics.rigid_body import charge_percent
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
-from zsim_world.sensors.sighting_sampler import PictureSightings
+from zsim_world.sensors.sightings import PictureSightings
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY
 

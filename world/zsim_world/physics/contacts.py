@@ -8,9 +8,8 @@ from zsim.math.compiled import apart, inlined
 from zsim.math.rotation import Vector, add, axpy, cross, dot, norm, rotate, scaled, subtract, z_axis
 from zsim_world.physics.air import downwash, jet_reach
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, NearPairs, PerRotor
-from zsim_world.physics.obstacle_contact import brace
-from zsim_world.physics.rigid_body import four, vector
-from zsim_world.physics.rotors import free_thrust
+from zsim_world.physics.rigid_body import four, free_thrust, vector
+from zsim_world.physics.surfaces import brace
 
 DISTANCE_MIN_M = 1e-9  # m, so that two drones in one place have a direction
 CLOSE = 1.0 + 1e-9  # of the square of a distance: more than rounding can make of it

@@ -21,9 +21,8 @@ from zsim.math.compiled import apart, inlined
 from zsim.math.rotation import Quaternion, Vector
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.fleet_arrays import AERO, ROTOR, STATE, VEHICLE, Aero, Bodies, PerRotor, Row
-from zsim_world.physics.ground import drag_anchors
-from zsim_world.physics.obstacle_contact import Touch
 from zsim_world.physics.rigid_body import four, put, vector
+from zsim_world.physics.surfaces import Touch, drag_anchors
 
 LANES = 8  # doubles in a register of 512 bit, or in two of 256
 

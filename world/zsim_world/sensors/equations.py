@@ -7,8 +7,11 @@ is a function of body, mount and site, and returns two vectors; unused places ar
 import math
 from typing import NamedTuple
 
-from zsim.math.compiled import inlined
+from numpy.typing import NDArray
+
+from zsim.math.compiled import inlined, kernel
 from zsim.math.rotation import Quaternion, Vector, add, cross, heading, rotate, rotate_back, z_axis
+from zsim_world.sensors.sensor_set import ARMED, CHANNELS_MAX, CONFIG, FAULT, HOLDING
 
 SEA_LEVEL_PA = 101_325.0  # Pa, ISO 2533
 LAPSE_1_M = 2.25577e-5  # 1/m, 0.0065 K/m over 288.15 K, ISO 2533
@@ -121,3 +124,58 @@ def flow(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
     cos, sin = math.cos(psi), math.sin(psi)
     quality = max(z_axis(x.q_WB)[2], 0.0)
     return (cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]), (quality, 0.0, 0.0)
+
+
+@inlined
+def rounded(value: float, bias: float, white: float, quantum: float) -> float:
+    """Return what the converter gives: value + bias + white, rounded to the quantum (0: none)."""
+    x = value + bias + white
+    return x if quantum == 0.0 else quantum * math.floor(x / quantum + 0.5)
+
+
+@inlined
+def add_errors(n: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int) -> None:
+    """Add the errors of n channels to a value, in place.
+
+    `noise` has standard normal numbers from `at` on (sensor_set.noise_width); `bias` is the bias of each channel, and
+    behind those of all its Gauss-Markov process.
+    """
+    if config[CONFIG.correlated] != 0.0:
+        for k in range(n):
+            state = CHANNELS_MAX + k
+            bias[state] = config[CONFIG.decay + k] * bias[state] + config[CONFIG.kick + k] * noise[at + 2 * n + 1 + k]
+            value[k] += bias[state]
+    for k in range(n):
+        bias[k] += config[CONFIG.walk + k] * noise[at + n + k]
+        white = config[CONFIG.white + k] * noise[at + k]
+        value[k] = rounded(value[k], bias[k], white, config[CONFIG.quantum + k])
+
+
+@inlined
+def displace(n: int, value: NDArray, fault: NDArray) -> None:
+    """Add what a fault adds to the errorless values of a sensor, in place."""
+    for k in range(n):
+        value[k] += fault[FAULT.offset + k]
+
+
+@inlined
+def hold_reading(value: NDArray, fault: NDArray) -> None:
+    """Keep a reading (6,) that is the first of a stuck sensor, or give the one kept, in place."""
+    if fault[FAULT.hold] == ARMED:
+        fault[FAULT.hold] = HOLDING
+        for k in range(CHANNELS_MAX):
+            fault[FAULT.held + k] = value[k]
+    elif fault[FAULT.hold] == HOLDING:
+        for k in range(CHANNELS_MAX):
+            value[k] = fault[FAULT.held + k]
+
+
+@kernel(makes_arrays=False)
+def read(n: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray) -> bool:
+    """Turn the errorless values of a user's sensor into a reading, in place; return False if it is lost."""
+    displace(n, value, fault)
+    add_errors(n, value, config, bias, noise, 0)
+    kept = noise[2 * n] >= config[CONFIG.drop]
+    if kept:
+        hold_reading(value, fault)
+    return kept

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from zsim.math.compiled import kernel
-from zsim_world.physics.normal_variates import WORDS, fill, words
+from zsim_world.sensors.noise import WORDS, fill, words
 
 
 @kernel(makes_arrays=False)

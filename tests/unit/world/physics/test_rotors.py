@@ -11,9 +11,9 @@ from vehicle_rows import one_drone, per_rotor
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle_catalogue import vehicle_of
-from zsim_world.physics import rotors
+from zsim_world.physics import rigid_body
 from zsim_world.physics.fleet_arrays import VEHICLE, PerRotor, rotor_row, rotor_slots, vehicle_row
-from zsim_world.physics.rotors import ground_effect, lagged
+from zsim_world.physics.rigid_body import ground_effect, lagged
 
 LEVEL, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 HIGH = 1000.0  # m, out of ground effect
@@ -28,12 +28,12 @@ def row():
 def wrench(row, q_WB, height_m, w_WB_B, speeds, slew=(0.0, 0.0, 0.0, 0.0)):
     """Return thrust and moment of rotors at these speeds that change by so much [rad/s^2]."""
     commands = np.array(speeds) + row[VEHICLE.rotor_lag] * np.array(slew)
-    return rotors.wrench(row, ROTORS, q_WB, height_m, w_WB_B, per_rotor(speeds), per_rotor(commands), None)
+    return rigid_body.wrench(row, ROTORS, q_WB, height_m, w_WB_B, per_rotor(speeds), per_rotor(commands), None)
 
 
 def mix(row, thrust_n, moment):
     speeds = per_rotor([0.0] * 4)
-    rotors.mix(row, ROTORS, thrust_n, moment, speeds)
+    rigid_body.mix(row, ROTORS, thrust_n, moment, speeds)
     return tuple(speeds.numbers)
 
 
@@ -122,12 +122,12 @@ def test_off_the_centre_the_mixer_keeps_the_limits_and_the_direction_of_the_tilt
     row = vehicle_row(vehicle, drone, scenario.environment)
     known = PerRotor(rotor_row(vehicle, drone, slots), 0, 1, tuple(range(slots)))
     speeds = per_rotor([0.0] * slots)
-    rotors.mix(row, known, thrust, asked, speeds)
+    rigid_body.mix(row, known, thrust, asked, speeds)
     low, high = row[VEHICLE.rotor_min], row[VEHICLE.rotor_max]
     flown = speeds.numbers[:4]
     speeds.numbers[4:] = 0.0  # a slot without a rotor, whose command is clipped to nothing
     assert all(low - 1e-9 <= speed <= high + 1e-9 for speed in flown)
-    total, moment = rotors.wrench(row, known, LEVEL, HIGH, STILL, speeds, speeds, None)
+    total, moment = rigid_body.wrench(row, known, LEVEL, HIGH, STILL, speeds, speeds, None)
     assert abs(moment[0] * asked[1] - moment[1] * asked[0]) < 1e-4  # its direction kept
     if 8.0 < thrust < 16.0 and max(map(abs, asked)) < 0.1:
         assert math.isclose(total, thrust, rel_tol=1e-4)

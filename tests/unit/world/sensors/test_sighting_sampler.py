@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim_world.sensors.sighting_sampler import PictureSightings, SightingSampler
+from zsim_world.sensors.sightings import PictureSightings, SightingSampler
 
 GATE_NS = 20_000_000
 SCENARIO = """

@@ -9,8 +9,8 @@ from scipy.linalg import expm, solve_discrete_are
 
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
-from zsim_world.vehicles import observer_gains
-from zsim_world.vehicles.observer_gains import GAIN
+from zsim_world.vehicles import observer
+from zsim_world.vehicles.observer import GAIN
 
 PRESETS = [{"preset": "paper"}, {"preset": "paper", "as_printed": True}, {"preset": "ardrone2"}]
 NAMES = ["paper", "as_printed", "ardrone2"]
@@ -19,7 +19,7 @@ NAMES = ["paper", "as_printed", "ardrone2"]
 def row_of(sensors, **drone):
     drones = [{"name": "a", "position_m": [0, 0, 0], **drone}]
     scenario = resolve({"name": "t", "duration_s": 1, "sensors": sensors, "drones": drones})
-    return observer_gains.gain_row(ARDRONE2, scenario.drones[0], scenario.environment)
+    return observer.gain_row(ARDRONE2, scenario.drones[0], scenario.environment)
 
 
 @pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
@@ -42,7 +42,7 @@ def test_steady_gain_of_a_scalar_filter_is_the_closed_form():
     """A random walk of q per sqrt(s) seen at 200 Hz with sigma: p = (q' + sqrt(q'^2 + 4 q' r)) / 2."""
     q, r = 0.3**2 / 200, 0.5**2
     p = (q + math.sqrt(q * q + 4 * q * r)) / 2
-    gain = observer_gains.steady_gains(np.zeros((1, 1)), np.array([0.3]), [([1.0], 0.5, 200.0)])
+    gain = observer.steady_gains(np.zeros((1, 1)), np.array([0.3]), [([1.0], 0.5, 200.0)])
     assert gain[0, 0] == pytest.approx(p / (p + r), rel=1e-9)
 
 
@@ -56,7 +56,7 @@ def test_covariance_solves_the_riccati_equation():
     steps = [expm(a * dt * s) @ np.diag(walks**2) @ expm(a * dt * s).T for s in np.linspace(0, 1, 201)]
     noise = dt * np.trapezoid(steps, dx=1 / 200, axis=0)
     expected = solve_discrete_are(expm(a * dt).T, h.T, noise, r)
-    np.testing.assert_allclose(observer_gains.covariance(a, walks, meters), expected, rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(observer.covariance(a, walks, meters), expected, rtol=1e-3, atol=1e-12)
 
 
 @pytest.mark.parametrize(
