@@ -18,7 +18,7 @@ from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 
 class FlightObserver(Protocol):

@@ -22,8 +22,8 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
 from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, decode_or_none
-from zsim_world.flight.coordinator import FLIGHT_REQUESTS
-from zsim_world.flight.world import World
+from zsim_world.run.coordinator import FLIGHT_REQUESTS
+from zsim_world.run.world import World
 
 COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # of truth_sha256
 

@@ -1,6 +1,7 @@
-"""The fleet: all drones of a scenario, one gate at a time. The only thing that the rest of the world uses.
+"""The fleet: all drones of a scenario, one gate at a time, from standing on the ground with their rotors still.
 
-An external drone has a row as every other, so that it is run into and blows on those below; it is led, not integrated.
+An external drone has a row as well, so that others collide with it and it blows on those below; its pose is set, not
+integrated.
 
 Heights: `baro` altitude_m is the height over the origin of W (zeroed at the field, as the aircraft does at power-up),
 and pressure_pa is that of the standard atmosphere at `environment.height_m` + altitude_m.

@@ -133,7 +133,7 @@ class Bodies(NamedTuple):
     obstacle: NDArray  # (M, obstacle.COLUMNS)
     bumping: NDArray  # int8 (N, M), who touches which obstacle with more than its feet
     bumped: NDArray  # int8 (N, M), contacts that began in this gate
-    solid: NDArray  # int32 (N, K), the obstacles in reach of each, see physics/obstacle_contact.py
+    solid: NDArray  # int32 (N, K), the obstacles in reach of each, see physics/surfaces.py
     held: NDArray  # (N, K, BALLS, 3), m, anchors on them
     braced: NDArray  # int8 (N,), 1 where an obstacle is in reach or a hull touches another
     twist: NDArray  # (N, 3), N m in W, of other drones' hulls; of those that are braced

@@ -1,4 +1,9 @@
-"""One drone as a rigid body under rotors, drag, ground and pushes; one step of fourth-order Runge-Kutta."""
+"""One drone as a rigid body under rotors, drag, ground and contact forces; one step of fourth-order Runge-Kutta.
+
+Behind it the rotors: lag, thrust, torque, power; the mixer that finds speeds for a thrust and a torque; the battery.
+Rotor r is at (x, y) rotor_unit in B; seen from above it turns clockwise where its `turn` is 1. `PerRotor` holds groups of
+numbers per rotor, in the order of fleet_arrays.ROTOR.
+"""
 
 import math
 
@@ -82,7 +87,7 @@ def accelerations(
     Args:
         grounded: a constant where it is called. False leaves the ground out, and then the result holds only where
             the ground is out of reach; so there is no branch in it, and several drones go at once (simd.py).
-        row, rotors: parameters; anchor: of its contact points (ground.py).
+        row, rotors: parameters; anchor: of its contact points (surfaces.py).
         p_WB, v_WB, q_WB, w_WB_B: state; speeds, commands, decay: of the rotors, as for `rotors.wrench`.
         air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
         touch: what it touches besides, None: nothing; aero: its aerodynamics, None: none but `drag`.

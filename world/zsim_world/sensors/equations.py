@@ -1,7 +1,8 @@
-"""The equations of the stock sensors: truth to errorless values at a mount X_BS. All pure and compiled.
+"""From the truth to a reading: the equations of the stock sensors at a mount X_BS, then errors and faults. All compiled.
 
-A sensor stands at p_BS in the body and is turned by R_BS (q_BS: sensor components to body components). An equation
-is a function of body, mount and site, and returns two vectors; unused places are zero.
+A sensor is at p_BS in the body, rotated by R_BS (q_BS: sensor components to body components). An equation is a function
+of body, mount and site, and returns two vectors of errorless values; unused places are zero. The error model works on
+rows of `zsim_world.sensors.sensor_set`; `n` numbers of a reading have an error of their own.
 """
 
 import math

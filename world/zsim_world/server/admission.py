@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import Join
 from zsim.transport.session_tokens import Sessions, SessionTokens
-from zsim_world.flight.barrier import Participant
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.journal.journal_entries import Entry, FalselyJoined, Joined, NotShown
-from zsim_world.journal.run_journal import RunJournal
+from zsim_world.run.barrier import Participant
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.server.journal_entries import Entry, FalselyJoined, Joined, NotShown
+from zsim_world.server.run_journal import RunJournal
 
 TOKEN_NS = 3_000_000_000  # wall time by which a token is there; the hub knows one behind routers within 1 s (measured)
 SHOWN_NS = 10_000_000_000  # wall time by which one whose token is not its own publishes a done; first steps take 1 s

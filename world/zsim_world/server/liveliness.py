@@ -3,13 +3,21 @@
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 
+import msgspec
+
 from zsim.contract import keys
-from zsim.contract.run_messages import Join
+from zsim.contract.run_messages import Health, Join
+from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch
 from zsim.transport.session import Session
-from zsim_world.flight.barrier import Barrier
-from zsim_world.server.health_watch import HealthWatch
+from zsim.transport.session_tokens import SessionTokens
+from zsim_world.run.barrier import Barrier
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.message_history import MessageHistory
+from zsim_world.server.journal_entries import ReaderClosed
+from zsim_world.server.run_journal import RunJournal
 
 BYE_NS = 100_000_000  # wall time by which a bye may come after the loss of its process's token
 RETURN_NS = 5_000_000_000  # wall time in which a process is back at a world that was started again; 1 s measured
@@ -126,3 +134,110 @@ class LivelinessMonitor:
             self._checks[name] = _Check(participant.joined_wall_ns + NEW_TOKEN_NS, check.again)
         else:
             self._handle_death(name, time.monotonic_ns())
+
+
+SILENT_NS = 1_800_000_000  # wall time without health, which comes once a second; so a stop is named within 2 s
+STALL_NS = 300_000_000  # wall time between two looks from which on the world itself was held up, or its machine
+
+
+class HealthWatch:
+    """Keeps when each process has last published its health.
+
+    Args:
+        handle_silence: called with name and wall time of its last health when a process falls silent, and with None
+            for that when its health comes again.
+    """
+
+    def __init__(self, handle_silence: Callable[[str, int | None], None]) -> None:
+        self._handle_silence = handle_silence
+        self._last_wall_ns: dict[str, int] = {}
+        self._silent: set[str] = set()
+        self._look_wall_ns = 0
+
+    def received(self, name: str, wall_ns: int) -> None:
+        """Note the health of a process."""
+        self._last_wall_ns[name] = wall_ns
+        if name in self._silent:
+            self._silent.discard(name)
+            self._handle_silence(name, None)
+
+    def forget(self, name: str) -> None:
+        """Expect nothing of a process any more: it has left, or is dead."""
+        self._last_wall_ns.pop(name, None)
+        self._silent.discard(name)
+
+    def look(self, wall_ns: int) -> list[str]:
+        """Report who has fallen silent; return of whom health is expected. To be called all the time."""
+        stall_ns = wall_ns - self._look_wall_ns
+        self._look_wall_ns = wall_ns
+        if stall_ns > STALL_NS:  # what came meanwhile was not read
+            self._last_wall_ns = {name: last_ns + stall_ns for name, last_ns in self._last_wall_ns.items()}
+        for name, last_ns in list(self._last_wall_ns.items()):
+            if name not in self._silent and wall_ns - last_ns >= SILENT_NS:
+                self._silent.add(name)
+                self._handle_silence(name, last_ns)
+        return list(self._last_wall_ns)
+
+
+SHOWN = 5  # expressions of one that subscribes to many
+_decode_health = msgspec.msgpack.Decoder(Health).decode
+
+
+class SlowReaders:
+    """Hands the closed links to a world.
+
+    Args:
+        link: the listening session.
+        tokens: of all processes.
+        world: whose readers they were.
+        history: has the health of those that publish it.
+        journal: of what the world is handed.
+
+    Attributes:
+        watch: closes the links.
+    """
+
+    def __init__(
+        self, link: Session, tokens: SessionTokens, world: Coordinator, history: MessageHistory, journal: RunJournal
+    ) -> None:
+        self._journal = journal
+        self._world = world
+        self._history = history
+        self._own_host = link.host
+        self.watch = LinkWatch(link, tokens, self._awaited)
+
+    def _awaited(self) -> list[Awaited]:
+        awaited = self._world.barrier.awaited()
+        return [Awaited((each.name, *each.join.serves), each.join.pid) for each in awaited]
+
+    def report(self) -> None:
+        """Report the links that were closed since the last time."""
+        while self.watch.closed:
+            closed = self.watch.closed.popleft()
+            far_host = closed.address.rpartition(":")[0].strip("[]")
+            host = self._own_host if closed.process else far_host
+            reads = [expression for name in closed.names for expression in self._reads(name)]
+            text, data = _text(closed, host, reads), {**closed._asdict(), "host": host, "reads": reads}
+            self._world.losses.reader_closed(text, data)
+            self._journal.note(ReaderClosed(text, data))
+
+    def _reads(self, name: str) -> tuple[str, ...]:
+        """Return what a process subscribes to, by its health."""
+        for _, payload in self._history.last(keys.process(name, "health")):
+            with suppress(msgspec.MsgspecError):
+                return _decode_health(payload).reads
+        return ()
+
+    def stuck(self) -> str:
+        """Return which link takes nothing, as text."""
+        named = self.watch.stuck()
+        return f"the link takes nothing of {named[0]}" if named else "no link is known to be full"
+
+
+def _text(closed: ClosedLink, host: str, reads: list[str]) -> str:
+    names = ", ".join(closed.names) or "no process of the run"
+    more = " …" if len(reads) > SHOWN else ""
+    which = f", which reads {', '.join(reads[:SHOWN])}{more}," if reads else ""
+    who = f"{closed.process or 'somebody'} at {closed.address} on {host}"
+    held = f"{closed.held_bytes / 1e6:.1f} MB"
+    return f"{who} ({names}){which} took nothing of {held}; its link is closed ({closed.times} so far)"

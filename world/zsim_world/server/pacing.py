@@ -5,9 +5,9 @@ caught up; then gates follow one another until its done is required again. No ag
 these gates comes while agents still work on the last ones before it.
 """
 
-from zsim_world.flight.barrier import Participant
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.flight.run_clock import RunClock
+from zsim_world.run.barrier import Participant
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.run_clock import RunClock
 
 LAG_GATES = 2  # that the slowest agent may still have before it when a series of gates begins
 GATES_SENT = 3  # at once; more keep agents waiting that could work

@@ -7,10 +7,10 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError
 from zsim.scenario import rights
 from zsim.transport.session import Query, Session
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.journal.journal_entries import Controlled
-from zsim_world.journal.run_journal import RunJournal
-from zsim_world.server.message_history import MessageHistory
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.message_history import MessageHistory
+from zsim_world.server.journal_entries import Controlled
+from zsim_world.server.run_journal import RunJournal
 
 
 @dataclass(eq=False)

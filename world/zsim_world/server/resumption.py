@@ -7,9 +7,10 @@ from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlRequest, Join
 from zsim.errors import RunError
 from zsim.transport.session import ReceivedSample
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.flight.world import World
-from zsim_world.journal.journal_entries import (
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.message_history import MessageHistory
+from zsim_world.run.world import World
+from zsim_world.server.journal_entries import (
     Advanced,
     Controlled,
     Died,
@@ -25,8 +26,7 @@ from zsim_world.journal.journal_entries import (
     Resumed,
     Taken,
 )
-from zsim_world.journal.run_journal import RunJournal
-from zsim_world.server.message_history import MessageHistory
+from zsim_world.server.run_journal import RunJournal
 from zsim_world.server.world_inputs import MessageIntake
 from zsim_world.server.world_outputs import WorldOutputs
 

@@ -16,13 +16,13 @@ from zsim.errors import DecodeError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
 from zsim.transport.session import ReceivedSample, Session, Subscription
-from zsim_world.flight.barrier import Participant
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.journal.journal_entries import GivenUp, Taken
-from zsim_world.journal.run_journal import RunJournal
+from zsim_world.run.barrier import Participant
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.message_history import MessageHistory
 from zsim_world.server.admission import Admission
+from zsim_world.server.journal_entries import GivenUp, Taken
 from zsim_world.server.liveliness import LivelinessMonitor
-from zsim_world.server.message_history import MessageHistory
+from zsim_world.server.run_journal import RunJournal
 from zsim_world.server.world_outputs import WorldOutputs
 
 TICK_S = 0.1  # how often a standing world looks at the wall clock

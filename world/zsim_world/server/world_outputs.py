@@ -8,10 +8,10 @@ from zsim.contract import keys, messages
 from zsim.contract.framing import BATCH_MAX, GateMessages, Pairs, encode_batch
 from zsim.runtime.agent import Output
 from zsim.transport.session import ReceivedSample, Session
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.journal.journal_entries import Kept
-from zsim_world.journal.run_journal import RunJournal
-from zsim_world.server.message_history import MessageHistory
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.message_history import MessageHistory
+from zsim_world.server.journal_entries import Kept
+from zsim_world.server.run_journal import RunJournal
 
 
 class WorldOutputs:

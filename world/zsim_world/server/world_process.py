@@ -19,17 +19,16 @@ from zsim.transport.session import Query, Session
 from zsim.transport.session_tokens import SessionTokens
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.flight.world import World
-from zsim_world.journal.journal_entries import Advanced, Died, Expired, FellSilent, Resumed
-from zsim_world.journal.run_journal import RunJournal
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.message_history import MessageHistory
+from zsim_world.run.world import World
 from zsim_world.server.admission import Admission
-from zsim_world.server.liveliness import LivelinessMonitor
-from zsim_world.server.message_history import MessageHistory
+from zsim_world.server.journal_entries import Advanced, Died, Expired, FellSilent, Resumed
+from zsim_world.server.liveliness import LivelinessMonitor, SlowReaders
 from zsim_world.server.pacing import STOOD_STILL_NS, Pacer, Pipelining
 from zsim_world.server.query_service import QueryService
 from zsim_world.server.resumption import Resumption
-from zsim_world.server.slow_readers import SlowReaders
+from zsim_world.server.run_journal import RunJournal
 from zsim_world.server.turn_watch import TurnWatch
 from zsim_world.server.world_inputs import TICK_S, MessageIntake, ProgressCallback, open_inputs
 from zsim_world.server.world_outputs import WorldOutputs

@@ -1,7 +1,16 @@
-"""What the firmware believes: attitude, velocity, height, disturbance, from its own noisy sensors with fixed gains.
+"""The firmware's estimate of attitude, velocity, height and disturbance, from its own noisy sensors with fixed gains.
 
 The velocity is in the heading frame (x forward, y left, z up). Tilt is corrected by the velocity, not by taking the
 accelerometer for gravity: in flight a multirotor's specific force lies along its thrust whatever its tilt.
+
+The gains are steady Kalman gains for the noises of the drone's sensors, computed once. The design model of one horizontal
+axis (heading frame), driven by white noise:
+    dv/dt = -c v + g tilt + u      c: drag over mass; u: disturbance (wind, collisions, model error)
+    dtilt/dt = rate + noise        rate: error of the gyro's bias
+    drate/dt = noise, du/dt = noise
+measured by the accelerometer (u - c v: a multirotor's specific force across its thrust is its drag and disturbance)
+and by the optical flow (v). Vertical: dz/dt = v, dv/dt = -c v + u, with a height and the accelerometer's bias besides
+(u - c v + bias; across, a bias is one with a tilt). Heading: psi and rate.
 """
 
 import math
@@ -134,7 +143,7 @@ def observe(
     Args:
         belief: (BELIEF.size + R,) in place.
         own: the heading frame in W; turned: by how much it has turned in this step [rad].
-        row: the vehicle's nominal parameters; gain: (GAIN.size,), observer_gains.py.
+        row: the vehicle's nominal parameters; gain: (GAIN.size,), see `gain_row`.
         device: (DEVICE.size,) newest samples; the marks of new ones are cleared.
         board: (CALIBRATION.size,).
         on_ground: standing: velocity zero, gravity is all that the accelerometer feels.

@@ -8,8 +8,8 @@ from zsim.contract import flight_messages, keys
 from zsim.contract.run_messages import Event
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.flight.world import World
 from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.run.world import World
 
 
 def scenario(count: int = 2, drone: Any = None, **top: Any):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsim.contract.run_messages import Done, Join, Waiting
-from zsim_world.flight.barrier import Barrier, Participant
+from zsim_world.run.barrier import Barrier, Participant
 
 RUN = "run1"
 GATE_NS = 20_000_000

@@ -9,7 +9,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Mode, Velocity
 from zsim.contract.run_messages import ControlRequest, Event
 from zsim.scenario import scenario_file
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_MS = 20
 AGE_MAX_MS = 400

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from refused import has_terms
 
 from zsim.contract.flight_messages import Mode, Velocity
-from zsim_world.flight.command_queue import PROGRAM, RECENT_PER_DRONE, CommandQueue, QueuedCommand
-from zsim_world.flight.run_outbox import Refusal
+from zsim_world.run.commands import PROGRAM, RECENT_PER_DRONE, CommandQueue, QueuedCommand
+from zsim_world.run.outbox import Refusal
 
 D1, D2 = 0, 1
 OPERATOR = 10  # priority that docs/protocol.md gives to operators

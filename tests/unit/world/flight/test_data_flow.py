@@ -3,8 +3,8 @@
 from zsim.contract import keys
 from zsim.contract.run_messages import Done, Join
 from zsim.scenario import scenario_file
-from zsim_world.flight.data_flow import DataFlow
-from zsim_world.flight.world import World
+from zsim_world.run.coordinator import DataFlow
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 SCENARIO = scenario_file.from_text("""

@@ -12,7 +12,7 @@ from zsim.contract.run_messages import ControlRequest, Done, Event, Join
 from zsim.contract.snapshot import pack, unpack
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 SCENARIO = """

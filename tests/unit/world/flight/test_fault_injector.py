@@ -9,7 +9,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Faults, Join
 from zsim.scenario import scenario_file
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 SCENARIO = """

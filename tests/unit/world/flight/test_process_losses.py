@@ -10,7 +10,7 @@ from zsim.contract import keys
 from zsim.contract.run_messages import Bye, Done, Event, Join
 from zsim.errors import RunFailedError, ScenarioError
 from zsim.scenario import scenario_file
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 ME = "estimator.d1"
@@ -113,7 +113,7 @@ def test_what_is_refused(processes: str, path: str) -> None:
 
 
 def test_the_journal_has_it() -> None:
-    from zsim_world.journal import journal_entries as entries
+    from zsim_world.server import journal_entries as entries
 
     made: Any = entries.decode(entries.encode([entries.Expired(ME)]))
     assert made == [entries.Expired(ME)]

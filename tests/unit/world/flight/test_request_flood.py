@@ -11,9 +11,8 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Mode, Velocity
 from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest, Done, Event, Join
 from zsim.scenario import scenario_file
-from zsim_world.flight.budgets import CHANGES_MAX, STRANGERS_MAX, UNJOINED
-from zsim_world.flight.run_outbox import EVENTS_MAX, REFUSED_MAX
-from zsim_world.flight.world import World
+from zsim_world.run.outbox import CHANGES_MAX, EVENTS_MAX, REFUSED_MAX, STRANGERS_MAX, UNJOINED
+from zsim_world.run.world import World
 
 FLOOD = 5000  # requests, several times what is published
 GATE_NS = 20_000_000

@@ -8,8 +8,8 @@ from refused import has_terms
 
 from zsim.contract.run_messages import ControlRequest
 from zsim.scenario.scenario import TimeSteps
-from zsim_world.flight.run_clock import RunClock
-from zsim_world.flight.run_outbox import Refusal
+from zsim_world.run.outbox import Refusal
+from zsim_world.run.run_clock import RunClock
 
 GATE_NS = 20_000_000
 

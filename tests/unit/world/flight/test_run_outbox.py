@@ -2,7 +2,7 @@
 
 from refused import has_terms
 
-from zsim_world.flight.run_outbox import EVENTS_MAX, REASONS_MAX, RefusalLog
+from zsim_world.run.outbox import EVENTS_MAX, REASONS_MAX, RefusalLog
 
 MODE = "drone/d1/cmd/mode"
 

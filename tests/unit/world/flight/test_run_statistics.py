@@ -2,7 +2,7 @@
 
 import pytest
 
-from zsim_world.flight.run_statistics import GATES_KEPT, CommandAges, RealTimeFactor, RunStatistics
+from zsim_world.run.run_statistics import GATES_KEPT, CommandAges, RealTimeFactor, RunStatistics
 
 MS = 1_000_000
 GATE_NS = 20 * MS
@@ -47,7 +47,7 @@ def test_old_gates_are_forgotten():
 
 
 def test_old_ages_are_forgotten(monkeypatch):
-    monkeypatch.setattr("zsim_world.flight.run_statistics.AGES_KEPT", 2)
+    monkeypatch.setattr("zsim_world.run.run_statistics.AGES_KEPT", 2)
     ages = CommandAges()
     ages.gate(0, 0)
     for age_ms in (9, 8, 3, 2, 1):

@@ -10,7 +10,7 @@ from zsim.contract.framing import GateMessages
 from zsim.contract.run_messages import ControlRequest, Done, Join
 from zsim.contract.snapshot import pack, unpack
 from zsim.scenario import scenario_file
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 GATES = 340

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from zsim.errors import RunError
-from zsim_world.journal import run_journal
-from zsim_world.journal.journal_entries import Advanced, Died, Entry, Taken
-from zsim_world.journal.run_journal import RunJournal, journaled_run
+from zsim_world.server import run_journal
+from zsim_world.server.journal_entries import Advanced, Died, Entry, Taken
+from zsim_world.server.run_journal import RunJournal, journaled_run
 
 NEXT_NS = run_journal.CHECKPOINT_NS
 RUN = ("run1", "a" * 64)

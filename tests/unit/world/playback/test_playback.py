@@ -19,10 +19,9 @@ from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
 from zsim.sensors.camera import FrontCamera
-from zsim_world.flight.world import World
-from zsim_world.playback.playback import NOT_FLYABLE, RECORD_OVER, Playback, PlaybackRange
-from zsim_world.playback.record_timeline import MARKS_MAX, timeline_marks
-from zsim_world.playback.recorded_gates import RecordedGates
+from zsim_world.run.playback import MARKS_MAX, NOT_FLYABLE, RECORD_OVER, Playback, PlaybackRange, timeline_marks
+from zsim_world.run.recorded_gates import RecordedGates
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 ZEROS = (0.0, 0.0, 0.0)

@@ -7,8 +7,8 @@ from zsim.contract import keys
 from zsim.contract.run_messages import ControlRequest, Done, Event, Join
 from zsim.scenario import scenario_file
 from zsim.transport.session_tokens import SessionTokens
-from zsim_world.flight.budgets import STRANGERS_MAX
-from zsim_world.flight.world import World
+from zsim_world.run.outbox import STRANGERS_MAX
+from zsim_world.run.world import World
 from zsim_world.server.admission import DONE_NS, HELD_NS, LOOK_NS, SHOWN_NS, TOKEN_NS, WITHHELD_MAX, Admission
 
 GATE_NS = 20_000_000

@@ -1,6 +1,6 @@
 """Who has fallen silent."""
 
-from zsim_world.server.health_watch import SILENT_NS, HealthWatch
+from zsim_world.server.liveliness import SILENT_NS, HealthWatch
 
 S = 1_000_000_000
 LOOK_NS = S // 10

@@ -9,7 +9,7 @@ from fake_link import FakeLink
 from zsim.contract import keys
 from zsim.contract.run_messages import Join
 from zsim.scenario import scenario_file
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 from zsim_world.server.liveliness import SILENT_S, LivelinessMonitor
 
 GATE_NS = 20_000_000

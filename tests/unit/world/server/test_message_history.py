@@ -7,8 +7,8 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Done
 from zsim.transport.session import ReceivedSample
-from zsim_world.server import message_history
-from zsim_world.server.message_history import KEEP_NS, MessageHistory
+from zsim_world.run import message_history
+from zsim_world.run.message_history import KEEP_NS, MessageHistory
 
 SECOND_NS = 1_000_000_000
 IMU = keys.sensor("d1", "imu")

@@ -13,9 +13,9 @@ from zsim.contract.flight_messages import Mode
 from zsim.contract.run_messages import Event
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
-from zsim_world.flight.world import World
-from zsim_world.journal import run_journal
-from zsim_world.journal.run_journal import RunJournal
+from zsim_world.run.world import World
+from zsim_world.server import run_journal
+from zsim_world.server.run_journal import RunJournal
 from zsim_world.server.world_process import WorldProcess
 
 GATE_NS = 20_000_000

@@ -8,11 +8,11 @@ from zsim.contract.run_messages import Health
 from zsim.scenario import scenario_file
 from zsim.transport.link_watch import ClosedLink
 from zsim.transport.session_tokens import SessionTokens
-from zsim_world.flight.budgets import STRANGERS_MAX
-from zsim_world.flight.world import World
-from zsim_world.journal.run_journal import RunJournal
-from zsim_world.server.message_history import MessageHistory
-from zsim_world.server.slow_readers import SlowReaders
+from zsim_world.run.message_history import MessageHistory
+from zsim_world.run.outbox import STRANGERS_MAX
+from zsim_world.run.world import World
+from zsim_world.server.liveliness import SlowReaders
+from zsim_world.server.run_journal import RunJournal
 
 SCENARIO = "{name: one, duration_s: 1, drones: [{name: d1, position_m: [0, 0, 0]}]}"
 CONSOLE = ClosedLink("192.0.2.7:4000", "", ("console.1",), 400_000, 1)

@@ -18,7 +18,7 @@ from zsim.runtime.health import HealthMeter
 from zsim.scenario import rights, scenario_file
 from zsim.schema.message import Message
 from zsim_world.fleet.fleet import DivergedError
-from zsim_world.flight.world import DURATION_OVER, World
+from zsim_world.run.world import DURATION_OVER, World
 from zsim_world.server.world_process import WorldProcess
 
 GATE_NS = 20_000_000

@@ -1,6 +1,6 @@
 """The world of a run: integrates all drones, owns simulated time, applies commands and faults. No session, no clock.
 
-What it shares with a replay, first of all who takes part and who is waited for, is in `zsim_world.flight.coordinator`.
+What it shares with a replay, first of all who takes part and who is waited for, is in `zsim_world.run.coordinator`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -26,11 +26,10 @@ from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import GatePublication
-from zsim_world.flight.barrier import Participant
-from zsim_world.flight.command_intake import CommandIntake
-from zsim_world.flight.command_queue import CommandQueue
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.flight.fault_injector import FaultInjector
+from zsim_world.run.barrier import Participant
+from zsim_world.run.commands import CommandIntake, CommandQueue
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.faults import FaultInjector
 
 DURATION_OVER = "the scenario's duration is over"  # why a run of full length ended
 

@@ -24,8 +24,8 @@ from zsim.contract.messages import REFUSALS
 from zsim.contract.snapshot import State, pack, unpack
 from zsim.errors import DecodeError, RunError
 from zsim.output_folder import take_lock
-from zsim_world.journal import journal_entries
-from zsim_world.journal.journal_entries import Entry
+from zsim_world.server import journal_entries
+from zsim_world.server.journal_entries import Entry
 
 VERSION = 2  # of the files, and of the states in them
 CHECKPOINT_NS = 5_000_000_000  # simulated time between two; the history that a replay refills reaches back as far

@@ -4,7 +4,9 @@ It does everything else that a world does: it keeps time, waits for who takes pa
 and is paused, stepped and stopped. No drone can be flown.
 """
 
-from collections.abc import Callable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -12,21 +14,19 @@ import msgspec
 import numpy as np
 
 from zsim.contract import flight_messages, keys, messages, run_messages
-from zsim.contract.camera_messages import CameraInfo
+from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
 from zsim.contract.framing import KINDS, GateMessages, run_key_table
-from zsim.contract.run_messages import ControlAnswer, ControlRequest
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Event
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Output
 from zsim.scenario.role_table import OnDeath
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.barrier import Participant
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.flight.run_clock import number, refused_argument
-from zsim_world.flight.run_outbox import Refusal
-from zsim_world.playback.live_processes import LiveProcesses
-from zsim_world.playback.record_timeline import timeline_marks
-from zsim_world.playback.recorded_gates import Gate, PlaybackViews, RecordedGates, is_played, without_kills
+from zsim_world.run.barrier import Participant
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.outbox import Refusal
+from zsim_world.run.recorded_gates import Gate, PlaybackViews, RecordedGates, author, is_played, without_kills
+from zsim_world.run.run_clock import number, refused_argument
 
 RECORD_OVER = "the record is over"  # why a replay of the whole record ended
 
@@ -327,3 +327,72 @@ def _recount(payloads: list[bytes], kinds: list[int], first: list[int]) -> None:
                 message = messages.decode_as(flight_messages.Status, payloads[m], "status")
                 count = sum(kind != truth for kind in kinds[begin:end])
                 payloads[m] = messages.encode(msgspec.structs.replace(message, count=count))
+
+
+OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish these
+
+
+class LiveProcesses:
+    """The processes that take part at a gate.
+
+    A camera or detector counts by the drones that it declares, whatever its name is; one that declares none, as a
+    program of the user's own may, by its name.
+
+    Args:
+        scenario: of the record.
+        participants: alive.
+
+    Attributes:
+        names: of the processes whose work they do.
+    """
+
+    def __init__(self, scenario: Scenario, participants: Iterable[Participant]) -> None:
+        served = [each.served_names for each in participants]
+        self._cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
+        self._by_name = {name for names in served if not any(map(self._is_of_cameras, names)) for name in names}
+        self.names = {name for names in served for name in names}
+
+    def _is_of_cameras(self, name: str) -> bool:
+        role, _, drone = name.partition(".")
+        return role in OF_CAMERAS.values() and drone in self._cameras
+
+    def replace(self, recorded: Recorded) -> bool:
+        """Tell whether one of them publishes a message of its own in place of one on record."""
+        role = OF_CAMERAS.get(messages.type_of(recorded.key))
+        if role is None:
+            return bool(self.names) and author(recorded) in self.names
+        if f"{role}.{keys.thing(recorded.key)}" in self.names and self._is_drawn(recorded.key):
+            return True
+        return bool(self._by_name) and author(recorded) in self._by_name
+
+    def _is_drawn(self, key: str) -> bool:
+        """Tell whether a camera is one that the scenario gives its drone, if it gives it any."""
+        _, drone, what = keys.parts(key)
+        cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
+        return not cameras or camera == what or camera in cameras
+
+
+MARKS_MAX = 400  # on a timeline; more would be narrower than a pixel
+LEFT_OUT = frozenset({"command", "end"})  # kinds of events: what was commanded is too much to be marked
+TEXT_MAX = 120  # characters
+
+
+def timeline_marks(reader: RecordReader) -> list[dict[str, Any]]:
+    """Return the events on record, but for commands: t_s, kind and text of each; of many, evenly thinned out."""
+    marks = [_mark(event) for event in _events(reader) if event.kind not in LEFT_OUT]
+    return marks[:: -(-len(marks) // MARKS_MAX) or 1]
+
+
+def _events(reader: RecordReader) -> list[Event]:
+    events = []
+    for recorded in reader.messages([keys.EVENT]):
+        try:
+            events.append(messages.decode(keys.EVENT, recorded.payload))
+        except DecodeError:
+            continue
+    return events
+
+
+def _mark(event: Event) -> dict[str, Any]:
+    text = f"{event.subject}: {event.text}" if event.subject else event.text
+    return {"t_s": event.t_ns / 1e9, "kind": event.kind, "text": text[:TEXT_MAX]}

@@ -18,9 +18,9 @@ from zsim.scenario.scenario import FAULTS_MAX, Scenario
 from zsim.schema.checker import show
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.fault_effects import Impairment
-from zsim_world.flight.barrier import Barrier
-from zsim_world.flight.run_clock import Operation, RunClock
-from zsim_world.flight.run_outbox import Refusal, RunOutbox
+from zsim_world.run.barrier import Barrier
+from zsim_world.run.outbox import Refusal, RunOutbox
+from zsim_world.run.run_clock import Operation, RunClock
 
 NEVER_NS = 2**63 - 1  # a gate that does not come
 SELECTORS = ("id", "target", "kind")

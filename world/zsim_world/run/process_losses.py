@@ -9,10 +9,9 @@ from msgspec import UNSET
 from zsim.contract.run_messages import Bye, Join
 from zsim.scenario.role_table import ROLES, OnDeath, OnOverdue, agent_names, lets_drop, on_overdue
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.barrier import Barrier, Participant
-from zsim_world.flight.budgets import Budgets
-from zsim_world.flight.run_clock import RunClock
-from zsim_world.flight.run_outbox import RunOutbox
+from zsim_world.run.barrier import Barrier, Participant
+from zsim_world.run.outbox import Budgets, RunOutbox
+from zsim_world.run.run_clock import RunClock
 
 START_TIMEOUT_S = 60.0  # wall; chosen, for processes that a launched run expects and does not start itself
 START_TIMEOUT_OWN_S = 600.0  # wall; chosen, for those that its launcher starts: the first start may compile for minutes

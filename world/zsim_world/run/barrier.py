@@ -15,7 +15,7 @@ from zsim.contract import keys
 from zsim.contract.run_messages import Bye, Done, Join, Waiting
 from zsim.contract.snapshot import State
 from zsim.scenario.rights import WORLD
-from zsim_world.flight.run_outbox import Refusal
+from zsim_world.run.outbox import Refusal
 
 
 @dataclass

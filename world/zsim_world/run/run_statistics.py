@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from zsim.contract.snapshot import State
-from zsim_world.flight.barrier import Participant
+from zsim_world.run.barrier import Participant
 
 GATES_KEPT = 256  # gates whose publication time is remembered for the age of commands; 5 s, older ones are refused
 AGES_KEPT = 1_000_000  # for the percentiles; 8 MB

@@ -6,7 +6,7 @@ from typing import Any
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX, ControlAnswer, ControlRequest
 from zsim.contract.snapshot import State
 from zsim.scenario.scenario import TimeSteps
-from zsim_world.flight.run_outbox import Refusal
+from zsim_world.run.outbox import Refusal
 
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
 """Does what a request asks for; returns why it is refused, an answer with a result, or None when done."""

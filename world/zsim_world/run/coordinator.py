@@ -17,16 +17,15 @@ from zsim.contract.fingerprint import fingerprint
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError, RunFailedError
 from zsim.runtime.agent import Output
+from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
 from zsim.scenario.role_table import OnDeath, agent_names, lets_drop, on_death
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.barrier import Barrier, Participant
-from zsim_world.flight.budgets import STRANGERS_MAX, Budgets
-from zsim_world.flight.data_flow import DataFlow
-from zsim_world.flight.process_losses import ProcessLosses
-from zsim_world.flight.run_clock import Operation, RunClock, number
-from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox, too_many
-from zsim_world.flight.run_statistics import RunStatistics
+from zsim_world.run.barrier import Barrier, Participant
+from zsim_world.run.outbox import STRANGERS_MAX, Budgets, KeyedMessage, Refusal, RunOutbox, too_many
+from zsim_world.run.process_losses import ProcessLosses
+from zsim_world.run.run_clock import Operation, RunClock, number
+from zsim_world.run.run_statistics import RunStatistics
 
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # that change a flight
 RECORDER = "recorder"  # name and role
@@ -411,3 +410,33 @@ def _shortened(args: dict[str, Any]) -> dict[str, Any]:
         return args
     pairs = list(args.items())[:8]
     return {str(name)[:40]: value if number(value) is not None else str(value)[:80] for name, value in pairs}
+
+
+class DataFlow:
+    """The flow between the processes of a scenario; of a role that is unknown nothing is known.
+
+    Args:
+        scenario: with the drones and clusters that processes are about.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._rights: dict[str, rights.Rights] = {}
+        self._known: dict[tuple[str, str], bool] = {}
+
+    def feeds(self, writer: str, reader: str) -> bool:
+        """Tell whether one process publishes what another one reads, and not the other way round as well."""
+        return self._writes_for(writer, reader) and not self._writes_for(reader, writer)
+
+    def _writes_for(self, writer: str, reader: str) -> bool:
+        pair = writer, reader
+        if pair not in self._known:
+            read = {*self._of(reader).reads} - {*self._of(reader).writes}  # but for its own last value
+            written = [key for key in self._of(writer).writes if "*" not in key]
+            self._known[pair] = any(rights.permits(read, key) for key in written)
+        return self._known[pair]
+
+    def _of(self, name: str) -> rights.Rights:
+        if name not in self._rights:
+            self._rights[name] = rights.of(name, self._scenario)
+        return self._rights[name]
