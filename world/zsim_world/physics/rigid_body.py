@@ -1,8 +1,8 @@
 """One drone as a rigid body under rotors, drag, ground and contact forces; one step of fourth-order Runge-Kutta.
 
-Behind it the rotors: lag, thrust, torque, power; the mixer that finds speeds for a thrust and a torque; the battery.
-Rotor r is at (x, y) rotor_unit in B; seen from above it turns clockwise where its `turn` is 1. `PerRotor` holds groups of
-numbers per rotor, in the order of fleet_arrays.ROTOR.
+After it the rotors: lag, thrust, torque, power; the mixer that finds speeds for a thrust and a torque; the battery.
+Rotor r is at (x, y) rotor_unit in B; seen from above it turns clockwise where its `turn` is 1. `PerRotor` holds groups
+of numbers per rotor, in the order of fleet_arrays.ROTOR.
 """
 
 import math

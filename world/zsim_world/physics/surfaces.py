@@ -3,11 +3,11 @@
 Friction is a spring to an anchor on the surface; where it would exceed the friction cone, the anchor is dragged along.
 The anchor is fixed within a step and moves after it, so that a step is a smooth function of the state.
 
-At obstacles a drone is a rigid set of balls: the contact points of the ground, with no radius, then balls along its hull
-and one in its middle, so that neither a post nor an edge fits between the points. A ball is pushed along the surface
-normal by the same law. The distance to a convex solid is the depth of a potential, so springs and anchors return no more
-energy than they were given. A drone has slots for the solids within its reach, each with an anchor for every ball; they
-are updated after every step and do not change within one.
+At obstacles a drone is a rigid set of balls: the contact points of the ground, with no radius, then balls along its
+hull and one in its middle, so that neither a post nor an edge fits between the points. A ball is pushed along the
+surface normal by the same law. The distance to a convex solid is the depth of a potential, so springs and anchors
+return no more energy than they were given. A drone has slots for the solids within its reach, each with an anchor for
+every ball; they are updated after every step and do not change within one.
 """
 
 import math

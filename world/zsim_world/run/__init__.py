@@ -1,4 +1,4 @@
-"""The rules of a run, without session and wall clock: participants, simulated time, commands, faults, requests, refusals.
+"""The rules of a run, without session and wall clock: participants, time, commands, faults, requests, refusals.
 
 Each file uses those below it only; what an object needs of another one is passed to its constructor.
 

@@ -1,4 +1,4 @@
-"""From the truth to a reading: the equations of the stock sensors at a mount X_BS, then errors and faults. All compiled.
+"""From the truth to a reading: the equations of the stock sensors, then errors and faults. All compiled.
 
 A sensor is at p_BS in the body, rotated by R_BS (q_BS: sensor components to body components). An equation is a function
 of body, mount and site, and returns two vectors of errorless values; unused places are zero. The error model works on

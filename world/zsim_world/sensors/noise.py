@@ -1,13 +1,13 @@
 """The random numbers of a fleet: one stream per drone and sensor, one of wind per drone, one of wind for all.
 
-The kernel takes rows of standard normal numbers from one table; `refill` moves the unused rows to the front and draws the
-rest. A stream does not depend on the size of the table, nor on the other drones.
+The kernel takes rows of standard normal numbers from one table; `refill` moves the unused rows to the front and draws
+the rest. A stream does not depend on the size of the table, nor on the other drones.
 
 The numbers are those of numpy's default generator, compiled: PCG64 and the ziggurat, to the same bits (a test compares
-them). In one loop a number takes 2.7 ns; from numpy's generator, called by compiled code, 4 ns (docs/decisions/0017). The
-generator: M. O'Neill, HMC-CS-2014-0905 (2014), PCG XSL-RR 128/64. The ziggurat: G. Marsaglia and W. W. Tsang, J. Stat.
-Softw. 5 (2000), with numpy's use of the bits. Its tables follow from a recurrence whose rounding is numpy's own, so they
-are read from numpy's generator by setting its state to produce the word that asks for an entry.
+them). In one loop a number takes 2.7 ns; from numpy's generator, called by compiled code, 4 ns (docs/decisions/0017).
+The generator: M. O'Neill, HMC-CS-2014-0905 (2014), PCG XSL-RR 128/64. The ziggurat: G. Marsaglia and W. W. Tsang, J.
+Stat. Softw. 5 (2000), with numpy's use of the bits. Its tables follow from a recurrence whose rounding is numpy's own,
+so they are read from numpy's generator by setting its state to produce the word that asks for an entry.
 """
 
 import math

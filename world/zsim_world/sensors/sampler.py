@@ -2,8 +2,8 @@
 
 Values in the contract's order of fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude [deg],
 altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m]; sonar: range [m],
-valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading, computed in Python after
-the gate from the truth that the kernel logged.
+valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading, computed in Python
+after the gate from the truth that the kernel logged.
 """
 
 from typing import NamedTuple

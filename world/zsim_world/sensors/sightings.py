@@ -1,9 +1,9 @@
 """Sightings of hats without pictures: exposures between two gates, and a detector's errors.
 
-Each camera has a random stream; everything that falls due in a gate is computed in one compiled call. The errors are those
-of the detector on rendered pictures (tests compare them): of a hat's centre and apparent diameter in pixels, larger for
-small hats, for motion during the exposure and in low light; misses and false alarms. The same number of random numbers is
-drawn for every picture of a camera.
+Each camera has a random stream; everything that falls due in a gate is computed in one compiled call. The errors are
+those of the detector on rendered pictures (tests compare them): of a hat's centre and apparent diameter in pixels,
+larger for small hats, for motion during the exposure and in low light; misses and false alarms. The same number of
+random numbers is drawn for every picture of a camera.
 """
 
 import math

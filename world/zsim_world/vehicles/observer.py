@@ -3,14 +3,14 @@
 The velocity is in the heading frame (x forward, y left, z up). Tilt is corrected by the velocity, not by taking the
 accelerometer for gravity: in flight a multirotor's specific force lies along its thrust whatever its tilt.
 
-The gains are steady Kalman gains for the noises of the drone's sensors, computed once. The design model of one horizontal
-axis (heading frame), driven by white noise:
+The gains are steady Kalman gains for the noises of the drone's sensors, computed once. The design model of one
+horizontal axis (heading frame), driven by white noise:
     dv/dt = -c v + g tilt + u      c: drag over mass; u: disturbance (wind, collisions, model error)
     dtilt/dt = rate + noise        rate: error of the gyro's bias
     drate/dt = noise, du/dt = noise
-measured by the accelerometer (u - c v: a multirotor's specific force across its thrust is its drag and disturbance)
-and by the optical flow (v). Vertical: dz/dt = v, dv/dt = -c v + u, with a height and the accelerometer's bias besides
-(u - c v + bias; across, a bias is one with a tilt). Heading: psi and rate.
+measured by the accelerometer (u - c v: a multirotor's specific force across its thrust is its drag and disturbance) and
+by the optical flow (v). Vertical: dz/dt = v, dv/dt = -c v + u, with a height and the accelerometer's bias besides (u -
+c v + bias; across, a bias is one with a tilt). Heading: psi and rate.
 """
 
 import math
