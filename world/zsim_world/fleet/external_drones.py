@@ -5,17 +5,17 @@ as a pose may be trusted; then it stands where that led to.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState, Status, Truth
-from zsim.contract.snapshot import State
 from zsim.contract.state_rules import state_refusal
 from zsim.scenario.external_bodies import POSE_AGE_MAX_NS, moved_on, truth_fault
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.fleet_arrays import STATE, VEHICLE
+from zsim_world.run_state import Saved
 
 
 class Pose(NamedTuple):
@@ -32,6 +32,8 @@ class ExternalDrones:
         fleet: is led by their poses.
     """
 
+    SAVED: ClassVar[Saved] = {"_poses": dict[int, Pose], "_statuses": dict[int, Status]}
+
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._index = {fleet.names[i]: i for i in fleet.external}
@@ -44,16 +46,6 @@ class ExternalDrones:
     @property
     def names(self) -> frozenset[str]:
         return frozenset(self._index)
-
-    def snapshot(self) -> State:
-        """Return what the drivers have published last."""
-        poses = {i: [pose.t_ns, pose.row] for i, pose in self._poses.items()}
-        return {"poses": poses, "statuses": {i: [*_fields(status)] for i, status in self._statuses.items()}}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._poses = {i: Pose(t_ns, row.copy()) for i, (t_ns, row) in state["poses"].items()}
-        self._statuses = {i: Status(*fields) for i, fields in state["statuses"].items()}
 
     # What a driver publishes
 
@@ -138,7 +130,3 @@ def ahead(pose: Pose, t_ns: int) -> NDArray[np.float64]:
     if age_ns >= POSE_AGE_MAX_NS:
         row[v] = row[STATE.w_WB_B : STATE.w_WB_B + 3] = 0.0
     return row
-
-
-def _fields(status: Status) -> tuple[Any, ...]:
-    return tuple(getattr(status, name) for name in Status.__struct_fields__)

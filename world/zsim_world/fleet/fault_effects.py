@@ -1,18 +1,19 @@
 """What faults do to the arrays of a fleet: sensors, rotors and the air. Without any, the arrays are as at the start."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from zsim.contract.run_messages import Fault
-from zsim.contract.snapshot import State
 from zsim.scenario.fault_kinds import sensor_parts
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics.air import WIND
 from zsim_world.physics.fleet_arrays import STATE, Arrays
+from zsim_world.run_state import Saved
 from zsim_world.sensors import sensor_set as ss
 from zsim_world.sensors.sensor_set import CONFIG, FAULT, FleetSensors
 from zsim_world.vehicles.simd_firmware import ACTUATOR, sound_actuators
@@ -30,6 +31,8 @@ class Impairment:
         rotors: names of the rotors of each drone.
     """
 
+    SAVED: ClassVar[Saved] = {"_held": dict[int, tuple[float, ...]], "_gusts": tuple[Fault, ...], "_calm": bool}
+
     def __init__(
         self, arrays: Arrays, drones: Sequence[str], vehicles: Sequence[Vehicle], sensors: FleetSensors
     ) -> None:
@@ -44,16 +47,6 @@ class Impairment:
         self._held: dict[int, tuple[float, ...]] = {}  # by fault: at which speed the rotors of its drone turned
         self._gusts: tuple[Fault, ...] = ()
         self._calm = True
-
-    def snapshot(self) -> State:
-        """Return what acts beside the arrays of the fleet."""
-        return {"held": self._held, "gusts": [fault.id for fault in self._gusts], "calm": self._calm}
-
-    def restore(self, state: State, faults: Mapping[int, Fault]) -> None:
-        """Take over what `snapshot` returned; `faults` are those of the run, by id."""
-        self._held = {number: tuple(speeds) for number, speeds in state["held"].items()}
-        self._gusts = tuple(faults[number] for number in state["gusts"])
-        self._calm = state["calm"]
 
     def strike(self, acting: Sequence[Fault]) -> None:
         """Let these faults act from now on, and no others; those that have acted before go on."""

@@ -9,7 +9,7 @@ and pressure_pa is that of the standard atmosphere at `environment.height_m` + a
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 from msgspec import UNSET
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import RotorInfo
-from zsim.contract.snapshot import State
 from zsim.contract.state_rules import state_refusal
 from zsim.errors import RunError
 from zsim.math.compiled import hold
@@ -55,6 +54,7 @@ from zsim_world.physics.fleet_arrays import (
 )
 from zsim_world.physics.simd import body_blocks
 from zsim_world.physics.surfaces import BALLS, SLOTS_MAX, contact_points, obstacle_rows
+from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import WHOSE, Sampled, Sampler, SensorSample, with_more
@@ -114,6 +114,16 @@ class Fleet:
         touching: whether a drone's hull touched another's in the last gate, (N,).
     """
 
+    SAVED: ClassVar[Saved] = {
+        "_tick": int,
+        "_gates": int,
+        "_least": float,
+        "touching": IN_PLACE,
+        "arrays": IN_PLACE,
+        "_streams": IN_PLACE,
+        "_sampler": PART,
+        "_sightings": PART,
+    }
     sampled: Sampled
 
     def __init__(self, scenario: Scenario) -> None:
@@ -135,7 +145,8 @@ class Fleet:
         self.sensors = fleet_sensors(scenario)
         self.environment = scenario.environment
         self._noise = NoiseTable(scenario, NOISE_GATES)
-        self._w = arrays(scenario, vehicles, self.sensors, self._noise)
+        self._streams = self._noise.streams
+        self._w = initial_arrays(scenario, vehicles, self.sensors, self._noise)
         self._sampler = Sampler(scenario, self.sensors, self._w.senses)
         self._sightings = _sighting_sampler(scenario, self._w.bodies.vehicle[:, VEHICLE.hull_radius])
         self.sightings: dict[int, PictureSightings] = {}
@@ -187,34 +198,13 @@ class Fleet:
         self._gates += 1
         self._integrate(self._ticks)
 
-    def snapshot(self) -> State:
-        """Return all from which the flight goes on to the same bits."""
-        return {
-            "tick": self._tick,
-            "gates": self._gates,
-            "least_m": self._least,
-            "touching": self.touching,
-            "arrays": list(state_arrays(self._w)),
-            "streams": self._noise.streams,
-            "sampler": self._sampler.snapshot(),
-            **({"sightings": self._sightings.snapshot()} if self._sightings else {}),
-        }
+    @property
+    def arrays(self) -> list[NDArray]:
+        """All arrays of the kernel but the near pairs of drones."""
+        return list(state_arrays(self._w))
 
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` of a fleet of the same scenario returned.
-
-        Raises:
-            ValueError: it is of another scenario.
-        """
-        self._tick, self._gates, self._least = state["tick"], state["gates"], state["least_m"]
-        self.touching[:] = state["touching"]
-        for array, saved in zip(state_arrays(self._w), state["arrays"], strict=True):
-            array[...] = saved
+    def restored(self) -> None:
         self.bodies.near.origin.fill(math.inf)  # the near pairs are found anew
-        self._noise.streams[:] = state["streams"]
-        self._sampler.restore(state["sampler"])
-        if self._sightings:
-            self._sightings.restore(state["sightings"])
 
     def samples(self) -> list[SensorSample]:
         """Return what fell due for publication in the last gate but sightings, by (t_ns, drone, sensor)."""
@@ -408,7 +398,7 @@ def _vehicle(index: int, drone: Drone) -> Vehicle:
 ON_ROOF_M = 0.01  # m, chosen: so near to an obstacle a drone starts upon it
 
 
-def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable) -> Arrays:
+def initial_arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable) -> Arrays:
     """Return the arrays of the kernel for a scenario whose drones are these vehicles with these sensors."""
     dt, drones, place = scenario.time.physics_dt_ms / 1000.0, scenario.drones, scenario.environment
     each = rotor_slots(vehicles)

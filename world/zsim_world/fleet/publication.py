@@ -4,7 +4,7 @@ Per drone: its samples in time order, truth, and status last, which counts them.
 """
 
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from zsim.contract import encoding, flight_messages, keys, messages
 from zsim.contract.camera_messages import Sightings
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError, reason_of
 from zsim.math.compiled import Held, compiled, hold, inlined, kernel
 from zsim.schema import plugin
@@ -23,6 +22,7 @@ from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.physics.fleet_arrays import STATE
 from zsim_world.physics.rigid_body import charge_percent
+from zsim_world.run_state import IN_PLACE, Saved
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
 from zsim_world.sensors.sightings import PictureSightings
@@ -106,6 +106,8 @@ class PublicationState(NamedTuple):
 class GatePublication:
     """Writes the messages of each gate and counts them per key."""
 
+    SAVED: ClassVar[Saved] = {"counts": IN_PLACE}
+
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         own = [*fleet.sensors.names[STOCK_SENSORS:], *([keys.SIGHTINGS] if fleet.has_sightings else [])]
@@ -115,13 +117,13 @@ class GatePublication:
         self._seen = PublishedArrays(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
         self._commanders: list[str | None] = []  # of the last gate
         commanders = np.zeros(fleet.count, dtype=np.int64)
-        counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
+        self.counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
         rotors = np.array(fleet.rotors, dtype=np.int64)
         own_messages = np.array([0 if i in fleet.external else OWN_MESSAGES for i in range(fleet.count)])
         self._first = int(np.argmax(own_messages))  # a drone with a status, which numbers the gates
         self._own_count = int(own_messages.sum())
         sigmas_m = np.array(fleet.gps_sigma_m)
-        self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, counts, rotors, own_messages)
+        self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, self.counts, rotors, own_messages)
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = encoding.words((*firmware.MODES, None))
         self._room_beside = 0  # bytes of users' messages
@@ -133,14 +135,6 @@ class GatePublication:
         uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
         state = PublicationState(self._words, self._seen, uncounted, self._written)
         publish(hold(state), *self._fleet.sampled, *self._payloads(), 0)
-
-    def snapshot(self) -> State:
-        """Return how many messages each key has had."""
-        return {"counts": self._fleetwide.counts}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._fleetwide.counts[:] = state["counts"]
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the present gate; `commanders` are those of the drones, None for none."""

@@ -6,16 +6,15 @@ every gating participant's done for t minus the command delay. That is the only 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
-import msgspec
 from msgspec import UNSET
 
 from zsim.contract import keys
 from zsim.contract.run_messages import Bye, Done, Join, Waiting
-from zsim.contract.snapshot import State
 from zsim.scenario.rights import WORLD
 from zsim_world.run.outbox import Refusal
+from zsim_world.run_state import Saved
 
 
 @dataclass
@@ -167,29 +166,18 @@ class Barrier:
         expected: names without which the run does not start.
     """
 
+    SAVED: ClassVar[Saved] = {"_expected": list[str], "participants": dict[str, Participant]}
+
     def __init__(self, run_id: str, gate_ns: int, expected: list[str]) -> None:
         self._run_id = run_id
         self._gate_ns = gate_ns
-        self._expected = dict.fromkeys(expected, 0)
+        self._expected = [*dict.fromkeys(expected)]
         self.participants: dict[str, Participant] = {}
-
-    def snapshot(self) -> State:
-        """Return who takes part, and who is expected."""
-        return {
-            "expected": list(self._expected),
-            "participants": [msgspec.to_builtins(participant) for participant in self.participants.values()],
-        }
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._expected = dict.fromkeys(state["expected"], 0)
-        each = msgspec.convert(state["participants"], list[Participant])
-        self.participants.clear()
-        self.participants.update({participant.name: participant for participant in each})
 
     def expect(self, name: str) -> None:
         """Do not start without this one either."""
-        self._expected[name] = 0
+        if name not in self._expected:
+            self._expected.append(name)
 
     def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> Refusal | None:
         """Take a participant in; return why it is refused.
@@ -349,8 +337,8 @@ class Barrier:
     def remove(self, name: str) -> Participant | None:
         """Take a participant out: it published bye or is dropped."""
         removed = self.participants.pop(name, None)
-        for expected in (name, *(removed.join.serves if removed else ())):
-            self._expected.pop(expected, None)
+        gone = (name, *(removed.join.serves if removed else ()))
+        self._expected = [expected for expected in self._expected if expected not in gone]
         return removed
 
     def absent(self) -> list[str]:

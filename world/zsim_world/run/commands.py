@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Ardrone
 from zsim.contract.run_messages import PRIORITY_MAX, ControlRequest, Fault
-from zsim.contract.snapshot import State
 from zsim.runtime.link_faults import NEVER, RADIO, WORLD, distance_between, joins, place_of, total_delay_ns
 from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.external_drones import ExternalDrones
@@ -20,6 +19,7 @@ from zsim_world.fleet.fleet import Fleet
 from zsim_world.run.barrier import Barrier
 from zsim_world.run.outbox import Budgets, Refusal, RunOutbox, too_many
 from zsim_world.run.run_clock import Operation, RunClock, number, refused_argument
+from zsim_world.run_state import Saved
 
 MISSION_STATES = ("active", "finished", "aborted")
 MISSION_ITEMS_MAX, MISSION_REASON_MAX = 1_000_000, 80  # chosen: far more than autopilots keep; a line
@@ -304,6 +304,13 @@ class CommandQueue:
         drones: names in scenario order.
     """
 
+    SAVED: ClassVar[Saved] = {
+        "_commanders": list[Commander | None],
+        "_priorities": dict[tuple[int, str], int],
+        "_queued": dict[int, list[QueuedCommand]],
+        "_recent": dict[tuple[int, str, int, str, int], Any],
+    }
+
     def __init__(self, drones: list[str]) -> None:
         self._names = drones
         self._commanders: list[Commander | None] = [None] * len(drones)
@@ -315,31 +322,14 @@ class CommandQueue:
         """Return the name of each drone's commander."""
         return [commander.source if commander else None for commander in self._commanders]
 
-    def snapshot(self) -> State:
-        """Return what is queued, and who flies what."""
-        queued = [command for each in self._queued.values() for command in each]
-        recent = [[*mark, messages.encode(message)] for mark, message in self._recent.items()]
-        return {
-            "commanders": [commander and list(commander) for commander in self._commanders],
-            "priorities": [[*about, priority] for about, priority in self._priorities.items()],
-            "queued": [[*command[:-1], messages.encode(command.message)] for command in queued],
-            "recent": recent,
-        }
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._commanders = [commander and Commander(*commander) for commander in state["commanders"]]
-        self._priorities = {(drone, source): priority for drone, source, priority in state["priorities"]}
-        self._queued = {}
-        for *fields, payload in state["queued"]:
-            command = QueuedCommand(*fields, message=None)
-            message = self._decoded(command.drone, command.kind, payload)
-            self._queued.setdefault(command.apply_ns, []).append(command._replace(message=message))
-        recent = ((tuple(mark), self._decoded(mark[0], mark[1], payload)) for *mark, payload in state["recent"])
-        self._recent = dict(recent)
-
     def _decoded(self, drone: int, kind: str, payload: bytes) -> Any:
         return messages.decode(keys.command(self._names[drone], kind), payload)
+
+    def restored(self) -> None:
+        """Give the messages, of which the state has the fields, their types."""
+        for t_ns, queued in self._queued.items():
+            self._queued[t_ns] = [each._replace(message=_command(each.kind, each.message)) for each in queued]
+        self._recent = {mark: _command(mark[1], message) for mark, message in self._recent.items()}
 
     def push(self, drone: int, kind: str, message: Any, apply_ns: int) -> bool:
         """Queue a command for its instant; return False for a duplicate."""
@@ -425,6 +415,10 @@ class CommandQueue:
         """Remove queued setpoints; a mode that was requested is still entered."""
         for instant, queued in self._queued.items():
             self._queued[instant] = [each for each in queued if each.kind == "mode" or not unwanted(each)]
+
+
+def _command(kind: str, fields: Any) -> Any:
+    return msgspec.convert(fields, messages.type_of(keys.command("any", kind)))
 
 
 _order = itemgetter(slice(6))  # all of a QueuedCommand but the message

@@ -339,8 +339,8 @@ class Coordinator(ABC):
         """Return the participants whose dones are missing for the next gate, or for one so much later."""
         return self.barrier.blocking(self.clock.required_ns + ahead_ns)
 
-    def standing_for(self) -> list[Participant]:
-        """Return for whom time stands in lockstep, which else would go on."""
+    def blocking_clock(self) -> list[Participant]:
+        """Return the participants blocking the clock in lockstep, which would run otherwise."""
         clock = self.clock
         waits = clock.mode == "lockstep" and clock.state == "running" and not clock.is_halted
         return self.blocking() if waits else []
@@ -364,12 +364,8 @@ class Coordinator(ABC):
         all_of_them = self.barrier.participants.values()
         return tuple(p.missed(wall_ns) for p in all_of_them if p.is_missed)
 
-    def is_waiting_to_leave(self) -> bool:
-        """Tell, after the end, whether a participant has yet to leave, or a dead recorder to come back for the rest."""
-        return bool(self.waiting_to_leave())
-
     def waiting_to_leave(self, since_end_ns: int = 0) -> tuple[run_messages.Waiting, ...]:
-        """Return who has yet to leave, or to come back for the rest, so long after the end."""
+        """Return the participants that have yet to leave, and a dead recorder that is to write the rest."""
         participants = self.barrier.participants.values()
         waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self.losses.may_return(p))]
         return tuple(run_messages.Waiting(p.name, p.join.host, since_end_ns / 1e9) for p in waited)

@@ -2,13 +2,12 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 
 from zsim.contract import keys
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Fault, Faults
-from zsim.contract.snapshot import State
 from zsim.runtime.link_faults import KINDS as LINK_KINDS
 from zsim.scenario import fault_kinds
 from zsim.scenario.fault_check import Known, flaws
@@ -21,6 +20,7 @@ from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.run.barrier import Barrier
 from zsim_world.run.outbox import Refusal, RunOutbox
 from zsim_world.run.run_clock import Operation, RunClock
+from zsim_world.run_state import PART, Saved
 
 NEVER_NS = 2**63 - 1  # a gate that does not come
 SELECTORS = ("id", "target", "kind")
@@ -35,6 +35,16 @@ class FaultInjector:
     Args:
         effects: of faults on the fleet.
     """
+
+    SAVED: ClassVar[Saved] = {
+        "_faults": dict[int, Fault],
+        "_begun": set[int],
+        "_over": set[int],
+        "_count": int,
+        "_seq": int,
+        "_next_ns": int,
+        "_effects": PART,
+    }
 
     def __init__(
         self, scenario: Scenario, clock: RunClock, barrier: Barrier, outbox: RunOutbox, effects: Impairment
@@ -71,26 +81,6 @@ class FaultInjector:
             acting = tuple(fault for fault in self._of_links if fault_kinds.acts(fault, gate_ns))
             self._of_links_at[gate_ns] = acting
         return acting
-
-    def snapshot(self) -> State:
-        """Return what is planned and acts, and what acts on the fleet beside its arrays."""
-        return {
-            "faults": [msgspec.to_builtins(fault) for fault in self._faults.values()],
-            "begun": sorted(self._begun),
-            "over": sorted(self._over),
-            "count": self._count,
-            "seq": self._seq,
-            "next_ns": self._next_ns,
-            "effects": self._effects.snapshot(),
-        }
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._faults = {fault.id: fault for fault in msgspec.convert(state["faults"], list[Fault])}
-        self._begun, self._over = set(state["begun"]), set(state["over"])
-        self._count, self._seq, self._next_ns = state["count"], state["seq"], state["next_ns"]
-        self._sort_links()
-        self._effects.restore(state["effects"], self._faults)
 
     # Time
 
@@ -243,6 +233,9 @@ class FaultInjector:
         self._sort_links()
         self._outbox.put(keys.FAULTS, Faults(self._clock.now_ns, self._seq, self.all))
         self._seq += 1
+
+    def restored(self) -> None:
+        self._sort_links()
 
     def _sort_links(self) -> None:
         """Note which faults are of links."""

@@ -17,7 +17,6 @@ from zsim.contract.run_messages import ClusterRequest, ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights
 from zsim.schema.message import Count
-from zsim.transport.session import ReceivedSample
 
 KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back
 KEEP_BYTES = 500_000_000  # payloads kept at most: those of 1000 drones are about 300 MB in KEEP_NS
@@ -49,6 +48,7 @@ class MessageHistory:
     """
 
     def __init__(self, keep_bytes: int = KEEP_BYTES, page_bytes: int = PAGE_BYTES) -> None:
+        self.passed: list[tuple[str, bytes]] = []  # what recorders have not been sent yet, in order
         self._last: dict[str, bytes] = {}
         self._recent: deque[_Entry] = deque()
         self._now_ns = 0
@@ -157,10 +157,10 @@ class MessageHistory:
         )
         return ControlAnswer(True, result=passed, more=more)
 
-    def lost_outputs(self, kept: Any, done_ns: int) -> list[ReceivedSample]:
-        """Return those of the outputs that a participant kept that have not come, each once, as after a cut link.
+    def lost_outputs(self, kept: Any, done_ns: int) -> Pairs:
+        """Return the outputs kept by a participant that have not arrived, each once, as after a cut link.
 
-        What it kept of gates later than its newest done is left out: that is on its way, or its done will count it.
+        Those of gates later than its newest done are left out: they are on their way, or its done will count them.
 
         Args:
             kept: the result of its answer.
@@ -169,11 +169,11 @@ class MessageHistory:
         Raises:
             DecodeError: the result is no list of [key, payload].
         """
-        outputs: dict[Any, ReceivedSample] = {}
+        outputs: dict[Any, tuple[str, bytes]] = {}
         for key, payload in pairs_of(kept):
             identity = _identity(key, payload)
             if identity is not None and identity[1] <= done_ns:
-                outputs[identity] = ReceivedSample(key, payload)
+                outputs[identity] = (key, payload)
         stamps = {(key, t_ns) for key, t_ns, _, _ in outputs}
         for t_ns, key, payload in self._each():
             if (key, t_ns) in stamps:

@@ -6,111 +6,98 @@ the same.
 
 import re
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from zsim.contract import keys, run_messages
-from zsim.contract.snapshot import State
 from zsim.scenario.rights import WORLD
-
-CHANGES_MAX = 1000  # of a source at once, as many as there may be faults; then 50 a simulated second at gates of 20 ms
-UNJOINED = 10  # sources that have not joined may together do what so many may that have: names cost nothing
-STRANGERS_MAX = 100  # newcomers of all names, and other news of strangers, at once; then one a simulated second
-SUBJECTS_MAX = 10_000  # sources and subjects
-SECOND_NS = 1_000_000_000
-
-
-class ChangeBudget:
-    """Bounds what each source may change: so much at once, and one more with every period.
-
-    Args:
-        now_ns: returns the newest gate [ns].
-        period_ns: in which one more is allowed [ns].
-        most: at once.
-    """
-
-    def __init__(self, now_ns: Callable[[], int], period_ns: float, most: int = CHANGES_MAX) -> None:
-        self._now_ns = now_ns
-        self._period_ns = period_ns
-        self._most = most
-        self._spent: dict[str, tuple[float, int]] = {}  # changes that count still, and at which gate they did [ns]
-
-    def snapshot(self) -> State:
-        """Return what each source has spent."""
-        return {"spent": [[source, *spent] for source, spent in self._spent.items()]}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._spent = {source: (count, at_ns) for source, count, at_ns in state["spent"]}
-
-    def knows(self, source: str) -> bool:
-        """Return whether a source has made a change."""
-        return source in self._spent
-
-    def allows(self, source: str) -> bool:
-        """Return whether a source may make one more change."""
-        return self._counted(source) <= self._most - 1
-
-    def spend(self, source: str) -> bool:
-        """Count a change; return False where there was none left."""
-        if not self.allows(source):
-            return False
-        if len(self._spent) > SUBJECTS_MAX:
-            self._spent.clear()
-        self._spent[source] = self._counted(source) + 1, self._now_ns()
-        return True
-
-    def _counted(self, source: str) -> float:
-        spent, at_ns = self._spent.get(source, (0.0, 0))
-        return max(0.0, spent - (self._now_ns() - at_ns) / self._period_ns)
-
-
-class Budgets:
-    """All of a run.
-
-    Args:
-        now_ns: returns the newest gate [ns].
-        gate_ns: between two gates [ns].
-
-    Attributes:
-        changes: of each source.
-        unjoined: the same of all sources together that have not joined, by what they do.
-        strangers: news of processes that nobody expects, by kind.
-    """
-
-    def __init__(self, now_ns: Callable[[], int], gate_ns: int) -> None:
-        self.changes = ChangeBudget(now_ns, gate_ns)
-        self.unjoined = ChangeBudget(now_ns, gate_ns / UNJOINED, UNJOINED * CHANGES_MAX)
-        self.strangers = ChangeBudget(now_ns, SECOND_NS, STRANGERS_MAX)
-
-    def snapshot(self) -> State:
-        """Return what was spent."""
-        return {name: part.snapshot() for name, part in self._parts().items()}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        for name, part in self._parts().items():
-            part.restore(state[name])
-
-    def _parts(self) -> dict[str, ChangeBudget]:
-        return {"changes": self.changes, "unjoined": self.unjoined, "strangers": self.strangers}
-
-    def allows(self, source: str, what: str, has_joined: bool) -> bool:
-        """Return whether a source may do something once more."""
-        return self.changes.allows(f"{what}{source}") and (has_joined or self.unjoined.allows(what))
-
-    def spend(self, source: str, what: str, has_joined: bool) -> bool:
-        """Count what a source does; return False where there was nothing left."""
-        if not self.allows(source, what, has_joined):
-            return False
-        return self.changes.spend(f"{what}{source}") and (has_joined or self.unjoined.spend(what))
-
+from zsim_world.run_state import PART, Saved
 
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
+CHANGES_MAX = 1000  # of a source at once, as many as there may be faults; then 50 a simulated second at gates of 20 ms
+UNJOINED = 10  # sources that have not joined may together do as much as so many that have: anybody can invent names
+STRANGERS_MAX = 100  # newcomers of all names, and other reports about strangers, at once; then one a simulated second
+SUBJECTS_MAX = 10_000  # sources and subjects
+SECOND_NS = 1_000_000_000
 EVENTS_MAX = 20  # events per source, subject and reason; further refusals are counted only
 REASONS_MAX = 10  # of a source and subject that are kept apart; all further ones count as one
-REFUSED_MAX = 1000  # events of all sources at once, whose names cost nothing; then one a simulated second
+REFUSED_MAX = 1000  # events of all sources at once, whose names can be invented; then one a simulated second
 
 _FIGURE = re.compile(r"\d[\d.e+-]*")
+
+
+class RunOutbox:
+    """Messages of the world that are to be published.
+
+    Args:
+        now_ns: returns the newest gate, with which events are stamped [ns].
+
+    Attributes:
+        pending: keys and messages in order.
+        refusals: all refusals, including those beyond the limit of events.
+        refused_requests: the same of `world/control`.
+        left_out: number of events that were not published because there had been enough like them.
+    """
+
+    SAVED: ClassVar[Saved] = {
+        "_next_seq": dict[str, int],
+        "refusals": PART,
+        "refused_requests": PART,
+        "_notices": PART,
+        "left_out": int,
+    }
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
+        self._next_seq: dict[str, int] = {}
+        self.pending: list[KeyedMessage] = []
+        self.refusals = RefusalLog(now_ns)
+        self.refused_requests = RefusalLog(now_ns)
+        self.left_out = 0
+        self._notices = ChangeBudget(now_ns, SECOND_NS)
+
+    def restored(self) -> None:
+        self.pending = []  # the former world has published it
+
+    def put(self, key: str, message: Any) -> None:
+        """Add a message."""
+        self.pending.append((key, message))
+
+    def take(self) -> list[KeyedMessage]:
+        """Remove and return all messages."""
+        pending, self.pending = self.pending, []
+        return pending
+
+    def next_seq(self, key: str) -> int:
+        """Return the number of the next message on a key."""
+        seq = self._next_seq.get(key, 0)
+        self._next_seq[key] = seq + 1
+        return seq
+
+    def number_from(self, key: str, seq: int) -> None:
+        """Let the next message on a key have this number."""
+        self._next_seq[key] = seq
+
+    def event(
+        self, kind: str, subject: str, text: str, data: Mapping[str, Any] | None = None, source: str = WORLD
+    ) -> None:
+        """Add an event."""
+        seq = self.next_seq(keys.EVENT)
+        self.put(keys.EVENT, run_messages.Event(self._now_ns(), seq, kind, source, subject, text, dict(data or {})))
+
+    def notice(
+        self, kind: str, subject: str, text: str, data: Mapping[str, Any] | None = None, source: str = WORLD
+    ) -> None:
+        """Add an event on which nobody acts, unless there have been too many of this kind, subject and source."""
+        if self._notices.spend(f"{kind} {subject} {source}"):
+            self.event(kind, subject, text, data, source)
+        else:
+            self.left_out += 1
+
+    def refuse(self, source: str, subject: str, reason: "Refusal | str") -> None:
+        """Count a refusal, and add an event of it unless there have been too many like it."""
+        text = self.refusals.add(source, subject, str(reason))
+        if text is not None:
+            self.event("refused", subject, text, {"reason": str(reason)}, source)
 
 
 class Refusal(NamedTuple):
@@ -138,12 +125,11 @@ def too_many(source: str) -> Refusal:
 class RefusalLog:
     """Counts refusals, and limits how many of them become events: of each source, and of all together.
 
-    Args:
-        now_ns: returns the newest gate [ns].
-
     Attributes:
         count: of all of them.
     """
+
+    SAVED: ClassVar[Saved] = {"count": int, "_counts": dict[tuple[str, str], dict[str, int]], "_total": PART}
 
     def __init__(self, now_ns: Callable[[], int] = lambda: 0) -> None:
         self.count = 0
@@ -169,91 +155,68 @@ class RefusalLog:
         last = " (further ones are counted only)" if former == EVENTS_MAX - 1 else ""
         return f"{subject}: {reason}{last}"
 
-    def snapshot(self) -> State:
-        """Return what was counted."""
-        counts = [[*about, counts] for about, counts in self._counts.items()]
-        return {"count": self.count, "counts": counts, "total": self._total.snapshot()}
 
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self.count = state["count"]
-        self._counts = {(source, subject): counts for source, subject, counts in state["counts"]}
-        self._total.restore(state["total"])
-
-
-class RunOutbox:
-    """Messages of the world that are to be published.
+class ChangeBudget:
+    """Limits what each source may change: so much at once, and one more with every period.
 
     Args:
-        now_ns: returns the newest gate, with which events are stamped [ns].
-
-    Attributes:
-        pending: keys and messages in order.
-        refusals: counted, also those that are no events any more.
-        refused_requests: the same of `world/control`.
-        left_out: events that were not published since there had been enough like them.
+        now_ns: returns the newest gate [ns].
+        period_ns: in which one more is allowed [ns].
+        most: at once.
     """
 
-    def __init__(self, now_ns: Callable[[], int]) -> None:
+    SAVED: ClassVar[Saved] = {"_spent": dict[str, tuple[float, int]]}
+
+    def __init__(self, now_ns: Callable[[], int], period_ns: float, most: int = CHANGES_MAX) -> None:
         self._now_ns = now_ns
-        self._next_seq: dict[str, int] = {}
-        self.pending: list[KeyedMessage] = []
-        self.refusals = RefusalLog(now_ns)
-        self.refused_requests = RefusalLog(now_ns)
-        self.left_out = 0
-        self._notices = ChangeBudget(now_ns, SECOND_NS)
+        self._period_ns = period_ns
+        self._most = most
+        self._spent: dict[str, tuple[float, int]] = {}  # changes that still count, and the gate of the newest [ns]
 
-    def snapshot(self) -> State:
-        """Return the numbers of the keys, and what was refused."""
-        return {
-            "next_seq": self._next_seq,
-            "refusals": self.refusals.snapshot(),
-            "refused_requests": self.refused_requests.snapshot(),
-            "notices": self._notices.snapshot(),
-            "left_out": self.left_out,
-        }
+    def knows(self, source: str) -> bool:
+        """Return whether a source has made a change."""
+        return source in self._spent
 
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned; what is pending is forgotten."""
-        self._next_seq, self.pending = state["next_seq"], []
-        self.refusals.restore(state["refusals"])
-        self.refused_requests.restore(state["refused_requests"])
-        self._notices.restore(state["notices"])
-        self.left_out = state["left_out"]
+    def allows(self, source: str) -> bool:
+        """Return whether a source may make one more change."""
+        return self._counted(source) <= self._most - 1
 
-    def put(self, key: str, message: Any) -> None:
-        """Add a message."""
-        self.pending.append((key, message))
+    def spend(self, source: str) -> bool:
+        """Count a change; return False where there was none left."""
+        if not self.allows(source):
+            return False
+        if len(self._spent) > SUBJECTS_MAX:
+            self._spent.clear()
+        self._spent[source] = self._counted(source) + 1, self._now_ns()
+        return True
 
-    def take(self) -> list[KeyedMessage]:
-        """Remove and return all messages."""
-        pending, self.pending = self.pending, []
-        return pending
+    def _counted(self, source: str) -> float:
+        spent, at_ns = self._spent.get(source, (0.0, 0))
+        return max(0.0, spent - (self._now_ns() - at_ns) / self._period_ns)
 
-    def next_seq(self, key: str) -> int:
-        """Return the number of the next message on a key."""
-        seq = self._next_seq.get(key, 0)
-        self._next_seq[key] = seq + 1
-        return seq
 
-    def event(
-        self, kind: str, subject: str, text: str, data: Mapping[str, Any] | None = None, source: str = WORLD
-    ) -> None:
-        """Add an event."""
-        seq = self.next_seq(keys.EVENT)
-        self.put(keys.EVENT, run_messages.Event(self._now_ns(), seq, kind, source, subject, text, dict(data or {})))
+class Budgets:
+    """All change budgets of a run.
 
-    def notice(
-        self, kind: str, subject: str, text: str, data: Mapping[str, Any] | None = None, source: str = WORLD
-    ) -> None:
-        """Add an event on which nobody acts, and which may repeat without end, unless there have been enough of it."""
-        if self._notices.spend(f"{kind} {subject} {source}"):
-            self.event(kind, subject, text, data, source)
-        else:
-            self.left_out += 1
+    Attributes:
+        changes: of each source.
+        unjoined: of all sources together that have not joined, by what they do.
+        strangers: of reports about processes that nobody expects, by kind.
+    """
 
-    def refuse(self, source: str, subject: str, reason: Refusal | str) -> None:
-        """Count a refusal, and add an event of it unless there have been too many like it."""
-        text = self.refusals.add(source, subject, str(reason))
-        if text is not None:
-            self.event("refused", subject, text, {"reason": str(reason)}, source)
+    SAVED: ClassVar[Saved] = {"changes": PART, "unjoined": PART, "strangers": PART}
+
+    def __init__(self, now_ns: Callable[[], int], gate_ns: int) -> None:
+        self.changes = ChangeBudget(now_ns, gate_ns)
+        self.unjoined = ChangeBudget(now_ns, gate_ns / UNJOINED, UNJOINED * CHANGES_MAX)
+        self.strangers = ChangeBudget(now_ns, SECOND_NS, STRANGERS_MAX)
+
+    def allows(self, source: str, what: str, has_joined: bool) -> bool:
+        """Return whether a source may do something once more."""
+        return self.changes.allows(f"{what}{source}") and (has_joined or self.unjoined.allows(what))
+
+    def spend(self, source: str, what: str, has_joined: bool) -> bool:
+        """Count what a source does; return False where there was nothing left."""
+        if not self.allows(source, what, has_joined):
+            return False
+        return self.changes.spend(f"{what}{source}") and (has_joined or self.unjoined.spend(what))

@@ -1,12 +1,12 @@
 """Simulated time of a run: its gates, whether and how fast it passes, and the requests that change this."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX, ControlAnswer, ControlRequest
-from zsim.contract.snapshot import State
 from zsim.scenario.scenario import TimeSteps
 from zsim_world.run.outbox import Refusal
+from zsim_world.run_state import Saved
 
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
 """Does what a request asks for; returns why it is refused, an answer with a result, or None when done."""
@@ -31,6 +31,15 @@ class RunClock:
         ended: why the run is over, None while it goes on.
         is_complete: whether it is over by itself, so that nothing of it can be gone on with.
     """
+
+    SAVED: ClassVar[Saved] = {  # of a run that has not ended
+        "rate": float,
+        "now_ns": int,
+        "next_ns": int,
+        "state": str,
+        "steps_allowed": int,
+        "jumps": int,
+    }
 
     def __init__(self, time: TimeSteps, mode: str, rate: float) -> None:
         self.mode = mode
@@ -66,16 +75,6 @@ class RunClock:
     def _set(self, t_ns: int) -> None:
         """Set the newest gate, and the one after it an interval later."""
         self.now_ns, self.next_ns = t_ns, t_ns + self.gate_ns
-
-    def snapshot(self) -> State:
-        """Return the state of a run that has not ended."""
-        names = ("rate", "now_ns", "next_ns", "state", "steps_allowed", "jumps")
-        return {name: getattr(self, name) for name in names}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        for name, value in state.items():
-            setattr(self, name, value)
 
     def complete(self, reason: str) -> None:
         """End the run, which comes to its end by itself."""

@@ -2,14 +2,13 @@
 
 import math
 from array import array
-from collections import deque
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from zsim.contract.snapshot import State
 from zsim_world.run.barrier import Participant
+from zsim_world.run_state import PART, Saved
 
 GATES_KEPT = 256  # gates whose publication time is remembered for the age of commands; 5 s, older ones are refused
 AGES_KEPT = 1_000_000  # for the percentiles; 8 MB
@@ -19,19 +18,20 @@ MARK_NS = 10_000_000  # wall time between two marks of the rate, which looks bac
 class CommandAges:
     """Wall time from a gate's publication to the arrival of a command that answers it."""
 
+    SAVED: ClassVar[Saved] = {"_published": dict[int, int], "ages": bytes, "_oldest": int}
+
     def __init__(self) -> None:
         self._published: dict[int, int] = {}
         self._ages_ns = array("q")
         self._oldest = 0  # index of the oldest age once so many are kept
 
-    def snapshot(self) -> State:
-        """Return what was noted."""
-        return {"published": self._published, "ages": self._ages_ns.tobytes(), "oldest": self._oldest}
+    @property
+    def ages(self) -> bytes:
+        return self._ages_ns.tobytes()
 
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._published, self._oldest = state["published"], state["oldest"]
-        self._ages_ns = array("q", state["ages"])
+    @ages.setter
+    def ages(self, ages: bytes) -> None:
+        self._ages_ns = array("q", ages)
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""
@@ -63,29 +63,25 @@ class CommandAges:
 class RealTimeFactor:
     """Simulated per wall seconds, over the last wall second and over the run."""
 
+    SAVED: ClassVar[Saved] = {
+        "_marks": list[tuple[int, int]],
+        "_start_wall_ns": int | None,
+        "_last": tuple[int, int],
+        "_sim_ns": int,
+    }
+
     def __init__(self) -> None:
-        self._marks: deque[tuple[int, int]] = deque()
+        self._marks: list[tuple[int, int]] = []  # simulated and wall time; at most a second's
         self._start_wall_ns: int | None = None
         self._last = (0, 0)
         self._sim_ns = 0
-
-    def snapshot(self) -> State:
-        """Return what was noted."""
-        marks = [list(mark) for mark in self._marks]
-        return {"marks": marks, "start_wall_ns": self._start_wall_ns, "last": list(self._last), "sim_ns": self._sim_ns}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._marks = deque(map(tuple, state["marks"]))
-        self._start_wall_ns, self._sim_ns = state["start_wall_ns"], state["sim_ns"]
-        self._last = tuple(state["last"])
 
     def stand_still(self, wall_ns: int) -> None:
         """Leave out of the wall time of the run what has passed since the last gate, until wall_ns."""
         if self._start_wall_ns is not None:
             self._start_wall_ns += wall_ns - self._last[1]
             self._last = (self._last[0], wall_ns)
-            self._marks = deque([self._last])
+            self._marks = [self._last]
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""
@@ -95,7 +91,7 @@ class RealTimeFactor:
             self._sim_ns += t_ns - self._last[0]
         self._last, marks = (t_ns, wall_ns), self._marks
         while len(marks) > 1 and wall_ns - marks[0][1] > 1_000_000_000:
-            marks.popleft()
+            del marks[0]
         if not marks or wall_ns - marks[-1][1] >= MARK_NS:
             marks.append(self._last)
 
@@ -127,29 +123,20 @@ class RunStatistics:
         closest_m: least distance between two drones so far, standing ones too [m]; inf for a single one.
     """
 
+    SAVED: ClassVar[Saved] = {
+        "ages": PART,
+        "rate": PART,
+        "world_misses": int,
+        "closest_m": float,
+        "_deadline_count": int,
+    }
+
     def __init__(self) -> None:
         self.ages = CommandAges()
         self.rate = RealTimeFactor()
         self.world_misses = 0
         self.closest_m = math.inf
         self._deadline_count = 0
-
-    def snapshot(self) -> State:
-        """Return what was noted."""
-        return {
-            "ages": self.ages.snapshot(),
-            "rate": self.rate.snapshot(),
-            "world_misses": self.world_misses,
-            "closest_m": self.closest_m,
-            "deadline_count": self._deadline_count,
-        }
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self.ages.restore(state["ages"])
-        self.rate.restore(state["rate"])
-        self.world_misses, self.closest_m = state["world_misses"], state["closest_m"]
-        self._deadline_count = state["deadline_count"]
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""

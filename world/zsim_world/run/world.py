@@ -4,7 +4,7 @@ What it shares with a replay, first of all who takes part and who is waited for,
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from msgspec import UNSET
 
@@ -30,6 +30,7 @@ from zsim_world.run.barrier import Participant
 from zsim_world.run.commands import CommandIntake, CommandQueue
 from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.faults import FaultInjector
+from zsim_world.run_state import PART, Saved, saved_state
 
 DURATION_OVER = "the scenario's duration is over"  # why a run of full length ended
 
@@ -55,6 +56,21 @@ class World(Coordinator):
         faults: that are injected.
         failure: what is to be raised once the end is published, None for a run that ended well.
     """
+
+    SAVED: ClassVar[Saved] = {
+        "requests": int,
+        "left_early": list[str],
+        "clock": PART,
+        "outbox": PART,
+        "budgets": PART,
+        "barrier": PART,
+        "statistics": PART,
+        "fleet": PART,
+        "queue": PART,
+        "faults": PART,
+        "_publication": PART,
+        "drivers": PART,
+    }
 
     def __init__(
         self,
@@ -127,35 +143,13 @@ class World(Coordinator):
 
     # To go on elsewhere
 
-    def snapshot(self) -> State:
-        """Return all from which the run goes on to the same bits; nothing is pending in the outbox."""
-        self._hash.flush()
-        own = {"count": self.requests, "left_early": self.left_early}
-        return {"requests": own, **{name: part.snapshot() for name, part in self._parts().items()}}
+    def checkpoint(self) -> State:
+        """Return all from which the run continues to the same bits, but the hash of its truth.
 
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` of a world of the same scenario returned, but the hash of its truth.
-
-        Raises:
-            ValueError: it is of another scenario.
+        Nothing may be pending in the outbox.
         """
-        self.requests, self.left_early = state["requests"]["count"], list(state["requests"]["left_early"])
-        for name, part in self._parts().items():
-            part.restore(state[name])
-
-    def _parts(self) -> dict[str, Any]:
-        return {
-            "clock": self.clock,
-            "outbox": self.outbox,
-            "budgets": self.budgets,
-            "barrier": self.barrier,
-            "statistics": self.statistics,
-            "fleet": self.fleet,
-            "queue": self.queue,
-            "faults": self.faults,
-            "publication": self._publication,
-            "drivers": self.drivers,
-        }
+        self._hash.flush()
+        return saved_state(self)
 
     def keep_truth(self, copy: Callable[[memoryview], object], hashed: Iterable[bytes] = ()) -> None:
         """Let `copy` take the bytes of the truth hash from now on; those before were `hashed`."""

@@ -6,13 +6,12 @@ valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbe
 after the gate from the truth that the kernel logged.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError, reason_of
 from zsim.math import geodetic
 from zsim.math.columns import Field, columns
@@ -24,6 +23,7 @@ from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim.sensors.sensor import Sensor, SensorTruth, SensorType
 from zsim_world.physics.fleet_arrays import EXPOSED, STATE, Senses
+from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.equations import read
 from zsim_world.sensors.noise import place, words
@@ -82,6 +82,8 @@ class Sampler:
         senses: of the kernel.
     """
 
+    SAVED: ClassVar[Saved] = {"_later": Sampled, "_user_sensors": PART}
+
     def __init__(self, scenario: Scenario, sensors: FleetSensors, senses: Senses) -> None:
         place = scenario.environment
         latency_ns = sensor_set.latencies(sensors)
@@ -93,17 +95,6 @@ class Sampler:
         self._user_sensors = UserSensors(scenario, sensors, senses) if own else None
         self._in_order = not (own or latency_ns.any())
         self._later = NONE
-
-    def snapshot(self) -> State:
-        """Return what is on its way, and what the users' sensors have come to."""
-        own = self._user_sensors.snapshot() if self._user_sensors else []
-        return {"whose": self._later.whose, "values": self._later.values, "user_sensors": own}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._later = Sampled(state["whose"], state["values"])
-        if self._user_sensors:
-            self._user_sensors.restore(state["user_sensors"])
 
     def due(self, logged: int, now_ns: int) -> Sampled:
         """Return what falls due up to now of what was logged and of what waits.
@@ -191,6 +182,8 @@ class UserSensors:
         senses: of the kernel.
     """
 
+    SAVED: ClassVar[Saved] = {"sensors": PART}
+
     def __init__(self, scenario: Scenario, sensors: FleetSensors, senses: Senses) -> None:
         self._senses = senses
         self._environment = scenario.environment
@@ -204,14 +197,10 @@ class UserSensors:
                     what = f"{drone.name}: sensors.{name}"
                     self._sensors[s, i] = _UserSensor(what, sensors.types[s], settings, rng, senses.config[i, s])
 
-    def snapshot(self) -> list[State]:
-        """Return bias and random stream of each."""
-        return [sensor.snapshot() for sensor in self._sensors.values()]
-
-    def restore(self, states: list[State]) -> None:
-        """Take over what `snapshot` returned."""
-        for sensor, state in zip(self._sensors.values(), states, strict=True):
-            sensor.restore(state)
+    @property
+    def sensors(self) -> list["_UserSensor"]:
+        """All of them, drone by drone."""
+        return [*self._sensors.values()]
 
     def readings(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return whose (M, 3) and values (M, 6) of what the kernel logged in a gate, without what is lost.
@@ -235,6 +224,8 @@ class UserSensors:
 class _UserSensor:
     """One sensor of one drone: settings, present bias and random stream."""
 
+    SAVED: ClassVar[Saved] = {"bias": IN_PLACE, "stream": list[int]}
+
     def __init__(
         self, what: str, kind: SensorType, settings: Sensor, rng: np.random.Generator, config: NDArray[np.float64]
     ) -> None:
@@ -250,12 +241,13 @@ class _UserSensor:
         self._p_BS = config[CONFIG.p_BS : CONFIG.p_BS + 3].copy()
         self._R_BS = rotation_matrix(config[CONFIG.q_BS : CONFIG.q_BS + 4])
 
-    def snapshot(self) -> State:
-        return {"bias": self.bias, "stream": words(self._rng)}
+    @property
+    def stream(self) -> list[int]:
+        return words(self._rng)
 
-    def restore(self, state: State) -> None:
-        self.bias[:] = state["bias"]
-        place(self._rng, state["stream"])
+    @stream.setter
+    def stream(self, stream: list[int]) -> None:
+        place(self._rng, stream)
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
         """Return what it is exposed to, by a row of EXPOSED."""

@@ -8,14 +8,13 @@ random numbers is drawn for every picture of a camera.
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
 from zsim.contract.camera_messages import Seen
-from zsim.contract.snapshot import State
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import Held, compiled, hold, inlined, kernel
 from zsim.math.random_streams import stream
@@ -25,6 +24,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Camera, Hats, SightingModel
 from zsim.sensors.camera_model import Lens, camera_pose, undistorted
 from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.run_state import IN_PLACE, Saved
 from zsim_world.sensors.hats_in_view import CAMERA, VIEW, camera_row, hats_in_view, mounted, poses_between
 from zsim_world.sensors.noise import WORDS, fill, words
 
@@ -90,6 +90,16 @@ class SightingSampler:
         hulls: radius of each drone's [m], (N,).
     """
 
+    SAVED: ClassVar[Saved] = {
+        "_streams": IN_PLACE,
+        "_counts": list[int],
+        "_due_ns": list[int],
+        "_next_ns": int,
+        "_later": list[PictureSightings],
+        "_former": np.ndarray,
+        "_former_ns": int,
+    }
+
     def __init__(self, scenario: Scenario, hulls: Array) -> None:
         env = scenario.environment
         hats = Hats() if env.hats is UNSET else env.hats
@@ -125,24 +135,6 @@ class SightingSampler:
         self._gate_ns = round(scenario.time.gate_ms * 1e6)
         self._former = np.empty((0, STATE.size))  # states of the last gate before a picture
         self._former_ns = 0
-
-    def snapshot(self) -> State:
-        """Return what is on its way, the poses of the last gate, and the random streams."""
-        later = [[*each[:4], [_plain(seen) for seen in each.seen]] for each in self._later]
-        watch = {"counts": [*self._counts], "streams": self._streams}
-        return {"later": later, "former": self._former, "former_ns": self._former_ns, **watch}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._later = [
-            PictureSightings(t_ns, i, at_ns, name, tuple(map(_sighting, seen)))
-            for t_ns, i, at_ns, name, seen in state["later"]
-        ]
-        self._former, self._former_ns = state["former"].copy(), state["former_ns"]
-        self._counts = [*state["counts"]]
-        self._due_ns = [each.at_ns(count) for each, count in zip(self._exposures, self._counts, strict=True)]
-        self._next_ns = min(self._due_ns)
-        self._streams[:] = state["streams"]
 
     def due(self, state: Array, now_ns: int) -> list[PictureSightings]:
         """Return what falls due by a gate, given the state of all drones there, (N, STATE.size or more)."""
@@ -207,11 +199,6 @@ def _sighting(row: list[float]) -> Seen:
     """Return what a row of SEEN says."""
     _, x, y, z, range_m, sigma, sigma_m = row
     return Seen((x, y, z), range_m, sigma, sigma_m)
-
-
-def _plain(seen: Seen) -> list[float]:
-    """Return a sighting as a row of SEEN."""
-    return [0.0, *seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m]
 
 
 def _turned(r: Array) -> Array:

@@ -24,10 +24,10 @@ from zsim.contract.messages import REFUSALS
 from zsim.contract.snapshot import State, pack, unpack
 from zsim.errors import DecodeError, RunError
 from zsim.output_folder import take_lock
-from zsim_world.server import journal_entries
-from zsim_world.server.journal_entries import Entry
+from zsim_world.run import inputs
+from zsim_world.run.inputs import Entry
 
-VERSION = 2  # of the files, and of the states in them
+VERSION = 3  # of the files, and of the states in them
 CHECKPOINT_NS = 5_000_000_000  # simulated time between two; the history that a replay refills reaches back as far
 CHECKPOINT_WALL_NS = 1_000_000_000  # wall time between two at least: a checkpoint of 1000 drones has 20 MB
 CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the one before it is younger than the history
@@ -98,7 +98,7 @@ class RunJournal:
         """Put what was noted into the file; to be called before anything is published that follows from it."""
         if self._entries:
             entries, self._entries = self._entries, []
-            self._guarded(lambda: _write(self._file, _framed(journal_entries.encode(entries))))
+            self._guarded(lambda: _write(self._file, _framed(inputs.encode(entries))))
 
     def keep_truth(self, data: memoryview) -> None:
         """Append bytes of the truth hash."""
@@ -233,7 +233,7 @@ class RunJournal:
         assert self._folder is not None
         for number in range(self._first, self._number + 1):
             for frame in self._frames(self._folder / f"{number}.entries"):
-                yield from journal_entries.decode(frame)
+                yield from inputs.decode(frame)
 
     def truth(self, size: int) -> Iterator[bytes]:
         """Yield the first bytes of the truth hash, and forget the others, which the world appends again."""

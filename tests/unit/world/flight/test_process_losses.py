@@ -263,7 +263,7 @@ def test_or_when_the_run_is_over() -> None:
     say_bye(made)
     made.publish_end()
     assert events(made) == [("leave", ME), ("end", "world")]
-    assert not made.is_waiting_to_leave()
+    assert not made.waiting_to_leave()
     assert made.left_early == []
 
 

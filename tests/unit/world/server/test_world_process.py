@@ -320,13 +320,13 @@ def test_the_end_waits_for_a_recorder_that_died_where_it_comes_back(action: str,
     made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "tester", "here", 2, GATE_NS), 0)
     made.publish_end()
     made.handle(keys.process(ME, "bye"), run_messages.Bye(0, 0, "over"), 0)
-    assert made.is_waiting_to_leave()
+    assert made.waiting_to_leave()
     made.losses.died("recorder", 0)
-    assert made.is_waiting_to_leave() is waits
+    assert bool(made.waiting_to_leave()) is waits
     made.handle(keys.process("recorder", "join"), Join(0, 1, "run1", 2, "recorder", "here", 3, 0, slack_ns=GATE_NS), 0)
-    assert made.is_waiting_to_leave()
+    assert made.waiting_to_leave()
     made.handle(keys.process("recorder", "bye"), run_messages.Bye(0, 0, "over"), 0)
-    assert not made.is_waiting_to_leave()
+    assert not made.waiting_to_leave()
 
 
 def test_the_end_names_whom_it_waits_for():
