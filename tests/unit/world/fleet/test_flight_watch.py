@@ -3,6 +3,7 @@
 from typing import Any, Literal
 
 import pytest
+from continued import continue_from
 
 from zsim.contract import flight_messages, keys
 from zsim.contract.run_messages import Event
@@ -144,7 +145,7 @@ def test_a_drone_whose_commander_falls_silent_lands_and_says_why():
 def test_the_watch_goes_on_from_its_snapshot():
     fleet, other = airborne(), Fleet(scenario())
     fleet.emergency(0)
-    other.restore(fleet.snapshot())
+    continue_from(fleet, other)
     assert incidents_of(other, 1.0) == incidents_of(fleet, 1.0) != []
 
 

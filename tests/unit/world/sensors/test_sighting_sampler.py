@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from continued import continue_from
 from numpy.typing import NDArray
 
 from zsim.scenario import scenario_file
@@ -115,6 +116,6 @@ def test_it_goes_on_from_a_snapshot():
     whole = sampled(made(*fields), range(200))
     first, second = made(*fields), made(*fields)
     before = sampled(first, range(101))
-    second.restore(first.snapshot())
+    continue_from(first, second)
     after: list[Any] = sampled(second, range(101, 200))
     assert before + after == whole

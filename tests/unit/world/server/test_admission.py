@@ -5,8 +5,11 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.contract.run_messages import ControlRequest, Done, Event, Join
+from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
+from zsim.scenario.rights import WORLD
 from zsim.transport.session_tokens import SessionTokens
+from zsim_world.run.inputs import Run
 from zsim_world.run.outbox import STRANGERS_MAX
 from zsim_world.run.world import World
 from zsim_world.server.admission import DONE_NS, HELD_NS, LOOK_NS, SHOWN_NS, TOKEN_NS, WITHHELD_MAX, Admission
@@ -31,7 +34,8 @@ class Case:
         self.world = World(scenario_file.from_text(SCENARIO), mode, run_id="run1")
         tokens = SessionTokens(self.link)  # type: ignore[arg-type]
         tokens.watch()
-        self.admission = Admission(tokens, self.world, trusts)
+        run = Run(self.world, HealthMeter(WORLD))
+        self.admission = Admission(tokens, run, trusts)
         self.wall_ns = TOKEN_NS
         self._dones = 0
 

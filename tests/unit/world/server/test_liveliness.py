@@ -8,7 +8,10 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.contract.run_messages import Join
+from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
+from zsim.scenario.rights import WORLD
+from zsim_world.run.inputs import Run
 from zsim_world.run.world import World
 from zsim_world.server.liveliness import SILENT_S, LivelinessMonitor
 
@@ -28,13 +31,8 @@ class Case:
         self.name = name
         self.take_in: Callable[[], None] = lambda: None
         self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
-        self.liveliness = LivelinessMonitor(
-            FakeLink(),  # type: ignore[arg-type]
-            self.world.barrier,
-            self.world.losses.died,
-            lambda: self.take_in(),
-            self.world.losses.silence_changed,
-        )
+        run, link = Run(self.world, HealthMeter(WORLD)), FakeLink()
+        self.liveliness = LivelinessMonitor(link, run, lambda: self.take_in())  # type: ignore[arg-type]
         self.period_ns = period_ns
         self.join(incarnation=1, pid=7)
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from zsim_world.server.pacing import DELAY_MAX_NS, GATES_SENT, LAG_GATES, Pipelining
+from zsim_world.server.world_process import DELAY_MAX_NS, GATES_SENT, LAG_GATES, Pipelining
 
 GATE_NS = 20_000_000
 

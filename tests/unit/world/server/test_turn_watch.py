@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from zsim_world.server.turn_watch import TurnWatch
+from zsim_world.server.world_process import TurnWatch
 
 TICK_MS = 100
 

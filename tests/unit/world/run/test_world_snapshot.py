@@ -11,6 +11,7 @@ from zsim.contract.run_messages import ControlRequest, Done, Join
 from zsim.contract.snapshot import pack, unpack
 from zsim.scenario import scenario_file
 from zsim_world.run.world import World
+from zsim_world.run_state import restore
 
 GATE_NS = 20_000_000
 GATES = 340
@@ -99,7 +100,7 @@ def whole() -> tuple[Flown, dict[int, bytes], dict[int, int]]:
     for k in range(1, GATES):
         flown.go_on(k)
         if k in RESTORED:
-            states[k], sizes[k] = pack(flown.world.snapshot()), len(flown.published)
+            states[k], sizes[k] = pack(flown.world.checkpoint()), len(flown.published)
     return flown, states, sizes
 
 
@@ -116,8 +117,8 @@ def test_a_world_goes_on_from_its_state(whole: tuple[Flown, dict[int, bytes], di
     again = Flown()
     again.world.take_outbox()
     state = unpack(states[k])
-    again.world.restore(state)
-    assert all(pack({"part": part}) == pack({"part": state[name]}) for name, part in again.world.snapshot().items())
+    restore(again.world, state)
+    assert all(pack({"part": part}) == pack({"part": state[name]}) for name, part in again.world.checkpoint().items())
     for gate in range(k + 1, GATES):
         again.go_on(gate)
     assert again.published == flown.published[sizes[k] :]
@@ -129,8 +130,8 @@ def test_the_hash_of_truth_goes_on(whole: tuple[Flown, dict[int, bytes], dict[in
     first.start()
     for k in range(1, 40):
         first.go_on(k)
-    state, hashed = unpack(pack(first.world.snapshot())), bytes(truth)
-    second.world.restore(state)
+    state, hashed = unpack(pack(first.world.checkpoint())), bytes(truth)
+    restore(second.world, state)
     second.world.keep_truth(lambda data: None, [hashed[:1000], hashed[1000:]])
     for k in range(40, 60):
         first.go_on(k)
@@ -142,4 +143,4 @@ def test_the_hash_of_truth_goes_on(whole: tuple[Flown, dict[int, bytes], dict[in
 def test_a_state_of_another_fleet_is_refused(whole: tuple[Flown, dict[int, bytes], dict[int, int]]):
     alone = {**SCENARIO, "drones": SCENARIO["drones"][:1], "faults": []}
     with pytest.raises(ValueError, match="shape"):
-        World(scenario_file.resolve(alone)).restore(unpack(whole[1][77]))
+        restore(World(scenario_file.resolve(alone)), unpack(whole[1][77]))

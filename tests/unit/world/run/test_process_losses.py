@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+from continued import continue_from
 from msgspec import UNSET
 from refused import has_terms
 
@@ -10,6 +11,8 @@ from zsim.contract import keys
 from zsim.contract.run_messages import Bye, Done, Event, Join
 from zsim.errors import RunFailedError, ScenarioError
 from zsim.scenario import scenario_file
+from zsim_world.run import inputs
+from zsim_world.run.inputs import Expired
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
@@ -113,10 +116,7 @@ def test_what_is_refused(processes: str, path: str) -> None:
 
 
 def test_the_journal_has_it() -> None:
-    from zsim_world.server import journal_entries as entries
-
-    made: Any = entries.decode(entries.encode([entries.Expired(ME)]))
-    assert made == [entries.Expired(ME)]
+    assert inputs.decode(inputs.encode([Expired(ME)])) == [Expired(ME)]
 
 
 # One that never comes
@@ -301,7 +301,7 @@ def test_who_leaves_early_is_named_and_fails_the_run_unless_that_is_allowed(
     assert [has_terms(line, ME, "0.02 s", "enough") for line in made.left_early] == [True] * fails
     assert made.ended is None
     restored = world(processes)
-    restored.restore(made.snapshot())
+    continue_from(made, restored)
     assert restored.left_early == made.left_early
 
 

@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+from continued import continue_from
 from msgspec import UNSET
 from msgspec.structs import replace
 from refused import has_terms
@@ -203,6 +204,6 @@ def test_what_was_spent_is_in_a_snapshot(world: World) -> None:
         join(world, f"console.{number}")
     events(world)
     again = World(world.scenario, run_id="run1")
-    again.restore(world.snapshot())
+    continue_from(world, again)
     join(again, "late.1")
     assert kinds(again) == {}

@@ -3,13 +3,13 @@
 from typing import Any
 
 import pytest
+from continued import continue_from
 from refused import has_terms, refused
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Ardrone, Mode, Status, Truth, Velocity
 from zsim.contract.framing import GateMessages
 from zsim.contract.run_messages import ControlRequest, Done, Event, Join
-from zsim.contract.snapshot import pack, unpack
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim_world.run.world import World
@@ -197,7 +197,7 @@ def test_estimators_of_it_have_no_deadlines(world: World):
 def test_a_world_that_goes_on_elsewhere_has_what_drivers_published(world: World):
     command(world, velocity(world))
     other = world_of()
-    other.restore(unpack(pack(world.snapshot())))
+    continue_from(world, other)
     for each in (world, other):
         each.advance(0)
     published = dict(command(other, velocity(other, seq=1)))
