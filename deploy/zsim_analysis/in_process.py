@@ -61,7 +61,7 @@ class InProcessFlight:
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)
         for name in set(scenario.expected()) - set(agent_names(scenario)):
             if lets_drop(scenario.processes.on_overdue or {}, name):
-                self.world.losses.expired(name)  # nobody else can come here
+                self.world.expired(name)  # nobody else can come here
         self._agents = agents(self.world)
 
     def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:

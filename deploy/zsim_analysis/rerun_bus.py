@@ -293,9 +293,9 @@ class RerunBus(Bus):
             self._admit(_joined(event))
         left = event.kind == "leave" and self._world.barrier.has_farewell(event.subject)
         if (event.kind == "death" or left) and event.subject not in self._rerun:
-            self._world.losses.died(event.subject, 0)
+            self._world.died(event.subject, 0)
         elif event.kind == "overdue" and event.subject not in self._rerun:
-            self._world.losses.expired(event.subject)
+            self._world.expired(event.subject)
         elif event.kind == "control" and event.subject in FLIGHT_REQUESTS and event.data.get("ok"):
             args = event.data.get("args")
             request = ControlRequest(event.subject, args if isinstance(args, dict) else {}, event.source)

@@ -6,7 +6,7 @@ Each file uses those below it only; what an object needs of another one is passe
       ├─ commands                         commands: checked, queued, applied; commanders
       ├─ faults                           injected faults
       └─ coordinator                      what a flight and a replay have in common
-           ├─ process_losses              consequences of a process's death, silence or absence
+           ├─ participants                how processes join, leave and get lost, and what each means
            ├─ run_statistics              figures of the run
            ├─ barrier                     participants, and whom the world waits for
            ├─ run_clock                   simulated time and its requests

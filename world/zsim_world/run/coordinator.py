@@ -1,97 +1,38 @@
-"""What a flight (World) and a replay (Playback) have in common: who takes part, who is waited for, what is published.
+"""What a flight (World) and a replay (Playback) have in common: what arrives, what is asked for, what time waits for.
 
-No session, no clock: a runner hands it what arrives (`handle`, `losses`, `control`), asks whether it may go on
-(`may_advance`), lets it go on (`advance`), and publishes its outbox. Wall times are passed in.
+No session, no clock: a runner passes on what arrives, asks whether it may go on (`may_advance`), lets it go on
+(`advance`), and publishes its outbox. Wall times are passed in.
 """
 
-import uuid
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
-from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
-from zsim.contract.fingerprint import fingerprint
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
-from zsim.errors import RunError, RunFailedError
 from zsim.runtime.agent import Output
-from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
-from zsim.scenario.role_table import OnDeath, agent_names, lets_drop, on_death
-from zsim.scenario.scenario import Scenario
-from zsim_world.run.barrier import Barrier, Participant
-from zsim_world.run.outbox import STRANGERS_MAX, Budgets, KeyedMessage, Refusal, RunOutbox, too_many
-from zsim_world.run.process_losses import ProcessLosses
-from zsim_world.run.run_clock import Operation, RunClock, number
-from zsim_world.run.run_statistics import RunStatistics
+from zsim_world.run.barrier import Participant
+from zsim_world.run.outbox import KeyedMessage, Refusal, too_many
+from zsim_world.run.participants import Participants
+from zsim_world.run.run_clock import number
 
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # that change a flight
-RECORDER = "recorder"  # name and role
-_JOIN = "process/"  # before a name: what is counted of its joins
 ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
 
 
-class Coordinator(ABC):
+class Coordinator(Participants):
     """One run, as its participants see it.
 
-    Args:
-        scenario: resolved.
-        mode: "lockstep" or "realtime".
-        rate: simulated per wall seconds to pace at; 0 = as fast as possible.
-        wall_ns: monotonic wall time.
-        run_id: given by a launcher, and by tests that compare records.
-        expected: names of the processes without which the run does not start.
-
     Attributes:
-        names: of the drones, in scenario order.
-        clock: simulated time.
-        barrier: who takes part.
-        outbox: what is to be published.
-        budgets: of what sources may still do.
-        losses: what the loss of a process means.
-        requests: on `world/control`, all of them counted.
-        statistics: of the run so far.
         refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
-        is_launched: whether a launcher has started it and its processes, and not people one after the other.
         external: names of the drones of which drivers publish sensors, truth and status.
-        unpaced: names of the processes that step when a driver publishes, and not at every gate.
-        failure: what is to be raised once the end is published, None for a run that ended well.
-        left_early: a line for each process that the run needed and that left it before the end.
     """
 
     refused_queries: tuple[str, ...] = ()
-    is_launched: bool = False
     external: frozenset[str] = frozenset()
-    unpaced: frozenset[str] = frozenset()
-
-    def __init__(
-        self,
-        scenario: Scenario,
-        mode: str,
-        rate: float,
-        wall_ns: Callable[[], int],
-        run_id: str | None,
-        expected: list[str],
-    ) -> None:
-        self.scenario = scenario
-        self.run_id = run_id or uuid.uuid4().hex[:12]
-        self.names = [drone.name for drone in scenario.drones]
-        self.clock = RunClock(scenario.time, mode, rate)
-        self.outbox = RunOutbox(lambda: self.clock.now_ns)
-        self.budgets = Budgets(lambda: self.clock.now_ns, self.clock.gate_ns)
-        self.requests = 0
-        self.barrier = Barrier(self.run_id, self.clock.gate_ns, expected)
-        self.statistics = RunStatistics()
-        self.failure: RunError | None = None
-        self.left_early: list[str] = []
-        self._expected = expected
-        self._own_names = {RECORDER, *expected, *agent_names(scenario)}
-        self._data_flow = DataFlow(scenario)
-        self.start_wall_ns = wall_ns()
-        self._operations: dict[str, Operation] = self.clock.operations()
-        self.losses = ProcessLosses(self)
 
     @abstractmethod
     def info(self) -> messages.Info:
@@ -113,26 +54,13 @@ class Coordinator(ABC):
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
         """Take a command to a drone; return False for a duplicate."""
 
-    def take_of_driver(self, drone: str, message: Any) -> str | None:  # noqa: B027 - a replay has no drivers
-        """Take what the driver of an external drone has published; return why it is refused."""
-
-    def release_drones(self, name: str) -> None:  # noqa: B027 - a replay has no commanders
-        """Take the drones from a process that flew them and is gone."""
-
-    def on_death(self, participant: Participant) -> OnDeath:
-        """Return what the death of a participant means."""
-        return on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
+    def take_of_driver(self, drone: str, message: Any) -> str | None:
+        """Take what the driver of an external drone has published; return why it is refused. A replay has no drivers."""
 
     @property
     def now_ns(self) -> int:
         """Return the newest gate; 0 before the start too."""
         return self.clock.now_ns
-
-    def fail(self, reason: str) -> None:
-        """End the run before its time."""
-        if self.ended is None:
-            self.failure = RunFailedError(reason)
-        self.clock.stop(reason)
 
     @property
     def ended(self) -> str | None:
@@ -149,132 +77,15 @@ class Coordinator(ABC):
             if self._handle_command(name, what[4:], message):
                 self.statistics.ages.command(message.t_ns, wall_ns)
         elif kind == "process" and what == "done":
-            self._handle_done(name, message, wall_ns)
+            self.handle_done(name, message, wall_ns)
         elif kind == "process" and what == "join":
-            self._handle_join(name, message, wall_ns)
+            self.handle_join(name, message, wall_ns)
         elif kind == "process" and what == "bye":
-            self._handle_bye(name, message, wall_ns)
+            self.handle_bye(name, message, wall_ns)
 
     def count_output(self, source: str) -> None:
         """Count an output (estimate, cluster state) of a participant."""
         self.barrier.count_output(source)
-
-    def give_up_outputs(self, name: str) -> None:
-        """Wait no longer for the outputs of a participant that are lost."""
-        missing = self.barrier.participants[name].reset_counts()
-        if missing:
-            text = f"{name}: {missing} of its outputs did not come"
-            self.outbox.notice("outputs_missing", name, text, {"missing": missing})
-
-    def _handle_done(self, name: str, message: run_messages.Done, wall_ns: int) -> None:
-        refusal = self.barrier.done(name, message, self.now_ns, wall_ns)
-        if refusal:
-            self.outbox.refuse(name, f"process/{name}/done", refusal)
-        elif refusal := self.barrier.take_back_bye(name):
-            self.outbox.refuse(name, f"process/{name}/bye", refusal)
-
-    def _handle_join(self, name: str, message: run_messages.Join, wall_ns: int) -> None:
-        former, replaced = self.barrier.participants.get(name), self.barrier.replaced(name, message)
-        is_new = self._is_new(name)
-        refusal = self._join_refusal(name, message, is_new)
-        refusal = refusal or self.barrier.join(name, message, self.clock.next_ns, wall_ns)
-        if refusal:
-            self.outbox.refuse(name, f"process/{name}/join", refusal)
-            return
-        self.budgets.changes.spend(_JOIN + name)
-        if is_new:
-            self.budgets.strangers.spend("join")
-        joined = self.barrier.participants[name]
-        kind, data = "join", joined.entry()
-        if former is not None and former.join.incarnation != message.incarnation:
-            kind, data["former_pid"] = "superseded" if former.alive else "restart", former.join.pid
-        self.outbox.event(kind, name, f"{name} on {message.host} (pid {message.pid})", data, name)
-        for dead in replaced:
-            self.release_drones(dead.name)
-        self._warn_of(joined)
-
-    def _is_new(self, name: str) -> bool:
-        """Tell whether the scenario has no process of a name, which never took part either."""
-        is_known = name in self._own_names or name in self.barrier.participants
-        return not is_known and not self.budgets.changes.knows(_JOIN + name)
-
-    def _join_refusal(self, name: str, message: run_messages.Join, is_new: bool) -> Refusal | None:
-        """Return why there have been too many joins; for whom time stands may always come."""
-        if is_new and not self.budgets.strangers.allows("join"):
-            return Refusal("newcomers", f"beyond {STRANGERS_MAX} at once", "must wait: one may join each second")
-        may_join = self._stands_for(name) or self.budgets.changes.allows(_JOIN + name)
-        return None if may_join else too_many(name)
-
-    def _stands_for(self, name: str) -> bool:
-        """Tell whether time stands until a process comes, or may do so soon."""
-        former = self.barrier.participants.get(name)
-        if former is None:
-            return self.clock.state == "waiting" and name in self._expected
-        return former.is_waited_for and former.is_missed
-
-    def _warn_of(self, joined: Participant) -> None:
-        """Publish that a newcomer computes with other bits, or does the work of others too."""
-        name, join, own = joined.name, joined.join, fingerprint()
-        if join.fingerprint and join.fingerprint != own:
-            text = f"{name} on {join.host} computes with another numeric fingerprint; the same bits are not promised"
-            self.outbox.event("fingerprint", name, text, {"found": join.fingerprint, "expected": own})
-        for other, both in self.barrier.duplicates(name).items():
-            text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
-            self.outbox.event("doubled", name, text, {"other": other})
-
-    def _handle_bye(self, name: str, message: run_messages.Bye, wall_ns: int) -> None:
-        participant = self.barrier.participants.get(name)
-        if participant is None:
-            return
-        if refusal := self.barrier.bye_refusal(participant, message):
-            self.outbox.refuse(name, f"process/{name}/bye", refusal)
-            return
-        is_named = UNSET not in (message.run_id, message.incarnation)
-        if is_named or not participant.alive or self.ended is not None:
-            self.leave(participant, message, wall_ns)
-        else:  # of contract 1.0, or somebody else's: the loss of the token decides
-            participant.farewell = message
-
-    def leave(self, participant: Participant, bye: run_messages.Bye, wall_ns: int) -> None:
-        """Take a participant out that has said bye."""
-        name = participant.name
-        if bye.failed is True and self.ended is None:
-            self.losses.failed(name, bye.reason, wall_ns)
-            return
-        fails = self._is_missed_from_now(participant)
-        text = f"{name} left: {bye.reason}"
-        data = {"reason": bye.reason, "run_id": self.run_id, "incarnation": participant.join.incarnation}
-        if fails:
-            text += "; a run that goes on without it fails, unless processes.on_death has drop for it"
-            self.left_early.append(f"{name} left at {self.now_ns / 1e9:.2f} s, before the end: {bye.reason}")
-        self.outbox.event("leave", name, text, {**data, "fails": True} if fails else data, name)
-        self.barrier.remove(name)
-        self.release_drones(name)
-        self.expect_again(participant)
-        self._after_bye(participant, bye.reason)
-
-    def _is_missed_from_now(self, participant: Participant) -> bool:
-        """Tell whether the leave of a process fails the run: it flew by the scenario, and nobody else does its work.
-
-        A program of somebody's own leaves when it is through; the leave of a recorder ends the run.
-        """
-        if self.ended is not None or self.clock.state == "waiting" or participant.join.role == RECORDER:
-            return False
-        is_allowed = lets_drop(self.scenario.processes.on_death, participant.name)
-        is_needed = not participant.served_names.isdisjoint(agent_names(self.scenario))
-        return is_needed and not is_allowed and self.barrier.substitute(participant.name) is None
-
-    def expect_again(self, participant: Participant) -> None:
-        """Wait at the start for whom a process that is gone has stood for."""
-        if self.clock.state == "waiting":
-            for each in self._expected:
-                if each in participant.served_names:
-                    self.barrier.expect(each)
-
-    def _after_bye(self, participant: Participant, reason: str) -> None:
-        """Do what the leave of a process means for the run."""
-        if participant.join.role == RECORDER:
-            self.clock.stop(f"the recorder left: {reason}")
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
         """Let time stand, in a world that was started again, until those who took part are back or dead.
@@ -367,7 +178,7 @@ class Coordinator(ABC):
     def waiting_to_leave(self, since_end_ns: int = 0) -> tuple[run_messages.Waiting, ...]:
         """Return the participants that have yet to leave, and a dead recorder that is to write the rest."""
         participants = self.barrier.participants.values()
-        waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self.losses.may_return(p))]
+        waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self.may_return(p))]
         return tuple(run_messages.Waiting(p.name, p.join.host, since_end_ns / 1e9) for p in waited)
 
     # Publication
@@ -406,33 +217,3 @@ def _shortened(args: dict[str, Any]) -> dict[str, Any]:
         return args
     pairs = list(args.items())[:8]
     return {str(name)[:40]: value if number(value) is not None else str(value)[:80] for name, value in pairs}
-
-
-class DataFlow:
-    """The flow between the processes of a scenario; of a role that is unknown nothing is known.
-
-    Args:
-        scenario: with the drones and clusters that processes are about.
-    """
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        self._rights: dict[str, rights.Rights] = {}
-        self._known: dict[tuple[str, str], bool] = {}
-
-    def feeds(self, writer: str, reader: str) -> bool:
-        """Tell whether one process publishes what another one reads, and not the other way round as well."""
-        return self._writes_for(writer, reader) and not self._writes_for(reader, writer)
-
-    def _writes_for(self, writer: str, reader: str) -> bool:
-        pair = writer, reader
-        if pair not in self._known:
-            read = {*self._of(reader).reads} - {*self._of(reader).writes}  # but for its own last value
-            written = [key for key in self._of(writer).writes if "*" not in key]
-            self._known[pair] = any(rights.permits(read, key) for key in written)
-        return self._known[pair]
-
-    def _of(self, name: str) -> rights.Rights:
-        if name not in self._rights:
-            self._rights[name] = rights.of(name, self._scenario)
-        return self._rights[name]

@@ -244,7 +244,7 @@ class Died(Entry, tag=2):
     name: str
 
     def apply(self, run: Run) -> None:
-        run.world.losses.died(self.name, self.wall_ns)
+        run.world.died(self.name, self.wall_ns)
 
 
 class Controlled(Entry, tag=3):
@@ -307,7 +307,7 @@ class FalselyJoined(Entry, tag=8):
     reason: str
 
     def apply(self, run: Run) -> None:
-        run.world.losses.falsely_joined(self.name, self.join, self.reason)
+        run.world.falsely_joined(self.name, self.join, self.reason)
 
 
 class NotShown(Entry, tag=9):
@@ -318,7 +318,7 @@ class NotShown(Entry, tag=9):
     reason: str
 
     def apply(self, run: Run) -> None:
-        run.world.losses.not_shown(self.name, self.reason, self.wall_ns)
+        run.world.not_shown(self.name, self.reason, self.wall_ns)
 
 
 class FellSilent(Entry, tag=10):
@@ -328,7 +328,7 @@ class FellSilent(Entry, tag=10):
     since_wall_ns: int | None
 
     def apply(self, run: Run) -> None:
-        run.world.losses.silence_changed(self.name, self.since_wall_ns)
+        run.world.silence_changed(self.name, self.since_wall_ns)
 
 
 class ReaderClosed(Entry, tag=11):
@@ -338,7 +338,7 @@ class ReaderClosed(Entry, tag=11):
     data: dict[str, Any]
 
     def apply(self, run: Run) -> None:
-        run.world.losses.reader_closed(self.text, self.data)
+        run.world.reader_closed(self.text, self.data)
 
 
 class Expired(Entry, tag=12):
@@ -347,7 +347,7 @@ class Expired(Entry, tag=12):
     name: str
 
     def apply(self, run: Run) -> None:
-        run.world.losses.expired(self.name)
+        run.world.expired(self.name)
 
 
 _OfWorld = Advanced | Published | Resumed

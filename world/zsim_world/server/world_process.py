@@ -320,7 +320,7 @@ class WorldProcess:
             self._serve(self._queries.popleft())
             self._outputs.flush()
         self._liveliness.check_due()
-        if self._world.ended is None and (name := self._world.losses.overdue(time.monotonic_ns())):
+        if self._world.ended is None and (name := self._world.overdue(time.monotonic_ns())):
             self._run.enter(Expired(name))
         self._readers.report()
         self._admission.check_due(time.monotonic_ns())

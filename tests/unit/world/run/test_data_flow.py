@@ -3,7 +3,7 @@
 from zsim.contract import keys
 from zsim.contract.run_messages import Done, Join
 from zsim.scenario import scenario_file
-from zsim_world.run.coordinator import DataFlow
+from zsim_world.run.participants import DataFlow
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000

@@ -296,7 +296,7 @@ def test_who_dies_or_leaves_does_not_end_it(flight: RecordReader):
     made = playback(flight)
     join(made, "recorder", 0)
     join(made, "estimator.d1")
-    made.losses.died("estimator.d1", 0)
+    made.died("estimator.d1", 0)
     made.handle(keys.process("recorder", "bye"), Bye(0, 0, "enough"), 0)
     assert len(on(keys.CLOCK, played(made))) == 10
     assert made.ended == RECORD_OVER

@@ -44,22 +44,22 @@ def events(made: World) -> list[tuple[str, str]]:
 
 def test_one_that_died_is_overdue_after_its_time_and_not_before() -> None:
     made = world("return_s: 2")
-    assert made.losses.overdue(10 * RETURN_NS) is None
-    made.losses.died(ME, 1)
-    assert made.losses.overdue(RETURN_NS + 1) is None
-    assert made.losses.overdue(RETURN_NS + 2) == ME
+    assert made.overdue(10 * RETURN_NS) is None
+    made.died(ME, 1)
+    assert made.overdue(RETURN_NS + 1) is None
+    assert made.overdue(RETURN_NS + 2) == ME
 
 
 def test_without_a_time_nobody_is_overdue() -> None:
     made = world("on_death: {}")
-    made.losses.died(ME, 1)
-    assert made.losses.overdue(10**18) is None
+    made.died(ME, 1)
+    assert made.overdue(10**18) is None
 
 
 def test_then_the_run_ends() -> None:
     made = world("return_s: 2")
-    made.losses.died(ME, 1)
-    made.losses.expired(ME)
+    made.died(ME, 1)
+    made.expired(ME)
     assert events(made) == [("death", ME), ("overdue", ME)]
     assert made.ended is not None
     assert has_terms(made.ended, ME, "2")
@@ -68,9 +68,9 @@ def test_then_the_run_ends() -> None:
 @pytest.mark.parametrize("whose", ["estimator", ME])
 def test_or_goes_on_without_it(whose: str) -> None:
     made = world(f"return_s: 2, on_overdue: {{{whose}: drop}}")
-    made.losses.died(ME, 1)
+    made.died(ME, 1)
     assert not made.may_advance()
-    made.losses.expired(ME)
+    made.expired(ME)
     assert events(made) == [("death", ME), ("overdue", ME), ("drop", ME)]
     assert made.ended is None
     assert made.may_advance()
@@ -80,8 +80,8 @@ def test_or_goes_on_without_it(whose: str) -> None:
 def test_one_for_which_no_gate_waits_ends_nothing_by_staying_away(name: str) -> None:
     made = world("return_s: 2")
     made.handle(keys.process(name, "join"), Join(0, 0, "run1", 2, name.split(".")[0], "h", 8, 0), 0)
-    made.losses.died(name, 1)
-    made.losses.expired(name)
+    made.died(name, 1)
+    made.expired(name)
     assert events(made)[-3:] == [("death", name), ("overdue", name), ("drop", name)]
     assert made.ended is None
 
@@ -89,18 +89,18 @@ def test_one_for_which_no_gate_waits_ends_nothing_by_staying_away(name: str) -> 
 @pytest.mark.parametrize(("on_death", "ends"), [("wait", True), ("restart", True), ("end", True), ("drop", False)])
 def test_one_that_is_stopped_is_overdue_too_and_on_death_says_what_it_means(on_death: str, ends: bool) -> None:
     made = world(f"return_s: 2, on_death: {{estimator: {on_death}}}")
-    made.losses.silence_changed(ME, 5)
-    assert made.losses.overdue(RETURN_NS + 5) is None
-    assert made.losses.overdue(RETURN_NS + 6) == ME
-    made.losses.expired(ME)
+    made.silence_changed(ME, 5)
+    assert made.overdue(RETURN_NS + 5) is None
+    assert made.overdue(RETURN_NS + 6) == ME
+    made.expired(ME)
     assert (made.ended is not None) is ends
 
 
 def test_unless_it_goes_on_before() -> None:
     made = world("return_s: 2")
-    made.losses.silence_changed(ME, 5)
-    made.losses.silence_changed(ME, None)
-    assert made.losses.overdue(10 * RETURN_NS) is None
+    made.silence_changed(ME, 5)
+    made.silence_changed(ME, None)
+    assert made.overdue(10 * RETURN_NS) is None
 
 
 @pytest.mark.parametrize(
@@ -146,19 +146,19 @@ def waiting(processes: str, is_launched: bool = True) -> World:
 def test_one_that_never_joins_is_overdue_after_its_time(
     processes: str, is_launched: bool, after_s: float, name: str | None
 ) -> None:
-    assert waiting(processes, is_launched).losses.overdue(round(after_s * 1e9)) == name
+    assert waiting(processes, is_launched).overdue(round(after_s * 1e9)) == name
 
 
 def test_one_that_the_launcher_starts_may_compile_first() -> None:
     made = waiting("on_death: {}")
     made.handle(keys.process(OWN, "join"), Join(0, 0, "run1", 1, "fence", "h", 7, GATE_NS), 0)
-    assert made.losses.overdue(WAITED_NS) is None
-    assert made.losses.overdue(601_000_000_000) == ME
+    assert made.overdue(WAITED_NS) is None
+    assert made.overdue(601_000_000_000) == ME
 
 
 def test_then_the_run_fails_and_names_it() -> None:
     made = waiting("start_timeout_s: 5")
-    made.losses.expired(OWN)
+    made.expired(OWN)
     assert events(made) == [("overdue", OWN)]
     assert isinstance(made.failure, RunFailedError)
     assert has_terms(str(made.failure), OWN, "5", "processes.start_timeout_s")
@@ -169,7 +169,7 @@ def test_or_begins_without_it_where_the_scenario_says_so() -> None:
     made = waiting("start_timeout_s: 5, on_overdue: {fence: drop}")
     made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "estimator", "h", 7, GATE_NS), 0)
     assert not made.may_advance()
-    made.losses.expired(OWN)
+    made.expired(OWN)
     assert [kind for kind, name in events(made) if name == OWN] == ["overdue", "drop"]
     assert made.may_advance()
     assert made.failure is None
@@ -234,7 +234,7 @@ def test_a_bye_of_another_incarnation_or_run_is_refused(
 
 def test_a_late_bye_of_a_former_incarnation_ends_nothing() -> None:
     made = world("on_death: {}")
-    made.losses.died(ME, 1)
+    made.died(ME, 1)
     made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 2, "estimator", "h", 8, GATE_NS), 2)
     say_bye(made, run_id="run1", incarnation=1)
     assert [kind for kind, _ in events(made)] == ["death", "restart", "refused"]
@@ -246,7 +246,7 @@ def test_a_bye_without_an_incarnation_counts_when_the_token_is_gone_as_well(fail
     made = world("on_death: {estimator: drop}")
     say_bye(made, failed=failed)
     assert events(made) == []
-    made.losses.died(ME, 6)
+    made.died(ME, 6)
     assert [kind for kind, _ in events(made)] == (["failure", "drop"] if failed is True else ["leave"])
     assert ME not in made.barrier.participants
 
@@ -254,7 +254,7 @@ def test_a_bye_without_an_incarnation_counts_when_the_token_is_gone_as_well(fail
 def test_or_when_nobody_ever_showed_a_token() -> None:
     made = world("on_death: {}")
     say_bye(made)
-    made.losses.not_shown(ME, "has no liveliness token", 6)
+    made.not_shown(ME, "has no liveliness token", 6)
     assert events(made) == [("leave", ME)]
 
 
@@ -275,7 +275,7 @@ def test_who_says_done_after_such_a_bye_has_not_said_it() -> None:
     ((kind, text),) = texts(made)
     assert kind == "refused"
     assert has_terms(text, "process/estimator.d1/bye", "incarnation", "missing", "1")
-    made.losses.died(ME, 7)
+    made.died(ME, 7)
     assert events(made) == [("death", ME)]
 
 

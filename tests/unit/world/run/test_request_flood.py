@@ -93,7 +93,7 @@ def test_a_process_takes_its_own_place_so_often_only_unless_time_stands_for_it(w
     for number in range(FLOOD):
         world.handle(keys.process("estimator.d1", "join"), replace(first, incarnation=1 + number), 0)
     assert kinds(world) == {"join": 1, "superseded": CHANGES_MAX - 1, "refused": EVENTS_MAX}
-    world.losses.died("estimator.d1", 0)
+    world.died("estimator.d1", 0)
     world.handle(keys.process("estimator.d1", "join"), replace(first, incarnation=2 * FLOOD), 0)
     assert kinds(world) == {"death": 1, "restart": 1}
 
@@ -194,7 +194,7 @@ def test_refusals_of_all_sources_together_are_so_many_events(world: World) -> No
 def test_news_of_joins_that_nobody_is_behind_is_bounded(world: World) -> None:
     for number in range(FLOOD):
         message = Join(0, 0, "run1", 1, "x", "here", 1, 20_000_000)
-        world.losses.falsely_joined(f"x.{number}", message, "no token")
+        world.falsely_joined(f"x.{number}", message, "no token")
     assert kinds(world) == {"no_show": STRANGERS_MAX}
     assert world.result()["refused"] == FLOOD - STRANGERS_MAX
 

@@ -154,7 +154,7 @@ def test_a_program_without_such_a_token_takes_over_with_its_first_done(case: Cas
 def test_or_as_soon_as_the_one_that_lives_is_not_there(case: Case, how: str) -> None:
     case.join(ME, pid=8, incarnation=2)
     if how == "silent":
-        case.world.losses.silence_changed(ME, case.wall_ns)
+        case.world.silence_changed(ME, case.wall_ns)
         case.passes(LOOK_NS)
     else:
         case.advance()
@@ -169,7 +169,7 @@ def test_the_same_process_rejoins_without_another_token(case: Case) -> None:
 
 @pytest.mark.parametrize("session", ["b", ""])
 def test_nobody_restarts_the_dead_without_a_token(case: Case, session: str) -> None:
-    case.world.losses.died(ME, case.wall_ns)
+    case.world.died(ME, case.wall_ns)
     case.show(ME, "a", alive=False)
     case.join(ME, pid=8, incarnation=2)
     case.passes(TOKEN_NS)

@@ -321,7 +321,7 @@ def test_the_end_waits_for_a_recorder_that_died_where_it_comes_back(action: str,
     made.publish_end()
     made.handle(keys.process(ME, "bye"), run_messages.Bye(0, 0, "over"), 0)
     assert made.waiting_to_leave()
-    made.losses.died("recorder", 0)
+    made.died("recorder", 0)
     assert bool(made.waiting_to_leave()) is waits
     made.handle(keys.process("recorder", "join"), Join(0, 1, "run1", 2, "recorder", "here", 3, 0, slack_ns=GATE_NS), 0)
     assert made.waiting_to_leave()
