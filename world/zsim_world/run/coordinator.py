@@ -4,7 +4,7 @@ No session, no clock: a runner passes on what arrives, asks whether it may go on
 (`advance`), and publishes its outbox. Wall times are passed in.
 """
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,7 +23,7 @@ FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"}) 
 ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
 
 
-class Coordinator(Participants):
+class Coordinator(Participants, ABC):
     """One run, as its participants see it.
 
     Attributes:
@@ -55,7 +55,7 @@ class Coordinator(Participants):
         """Take a command to a drone; return False for a duplicate."""
 
     def take_of_driver(self, drone: str, message: Any) -> str | None:
-        """Take what the driver of an external drone has published; return why it is refused. A replay has no drivers."""
+        """Take a message of an external drone's driver; return why it is refused. A replay has no drivers."""
 
     @property
     def now_ns(self) -> int:

@@ -13,13 +13,13 @@ from zsim.scenario import fault_kinds
 from zsim.scenario.fault_check import Known, flaws
 from zsim.scenario.fault_kinds import PROCESS_KILL
 from zsim.scenario.rights import WORLD
-from zsim.scenario.scenario import FAULTS_MAX, Scenario
+from zsim.scenario.scenario import FAULTS_MAX
 from zsim.schema.checker import show
 from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.fault_effects import Impairment
-from zsim_world.run.barrier import Barrier
-from zsim_world.run.outbox import Refusal, RunOutbox
-from zsim_world.run.run_clock import Operation, RunClock
+from zsim_world.run.outbox import Refusal
+from zsim_world.run.participants import Participants
+from zsim_world.run.run_clock import Operation
 from zsim_world.run_state import PART, Saved
 
 NEVER_NS = 2**63 - 1  # a gate that does not come
@@ -27,12 +27,13 @@ SELECTORS = ("id", "target", "kind")
 
 
 class FaultInjector:
-    """Keeps the faults, and lets them act on the fleet.
+    """The faults of a run, applied to its fleet.
 
-    One that is requested begins with the gate that is integrated next: nobody can have worked on that yet, so a run
+    A fault that is requested begins with the gate that is integrated next: nobody can have worked on that yet, so a run
     with the same faults at the same instants gives the same bits.
 
     Args:
+        run: in which they act.
         effects: of faults on the fleet.
     """
 
@@ -46,19 +47,17 @@ class FaultInjector:
         "_effects": PART,
     }
 
-    def __init__(
-        self, scenario: Scenario, clock: RunClock, barrier: Barrier, outbox: RunOutbox, effects: Impairment
-    ) -> None:
-        self._scenario, self._clock, self._barrier, self._outbox = scenario, clock, barrier, outbox
+    def __init__(self, run: Participants, effects: Impairment) -> None:
+        self._scenario, self._clock, self._barrier, self._outbox = run.scenario, run.clock, run.barrier, run.outbox
         self._effects = effects
-        self._kinds = fault_kinds.kinds_of(declarations(scenario.drones))
+        self._kinds = fault_kinds.kinds_of(declarations(run.scenario.drones))
         self._faults: dict[int, Fault] = {}
         self._begun: set[int] = set()
         self._over: set[int] = set()  # ended or cleared, kept for those who still work on gates in which it acted
         self._count = self._seq = 0
         self._of_links: tuple[Fault, ...] = ()
         self._of_links_at: dict[int, tuple[Fault, ...]] = {}  # by gate, since the last change or integrated gate
-        for planned in scenario.faults:
+        for planned in run.scenario.faults:
             self._plan(planned, "scenario")
         self._next_ns = self._next_change_ns()
         self._publish()
@@ -67,10 +66,6 @@ class FaultInjector:
     def all(self) -> tuple[Fault, ...]:
         """Return the faults that are planned, act, or have just ended, in order of their ids."""
         return tuple(self._faults[number] for number in sorted(self._faults))
-
-    def acting(self, gate_ns: int) -> list[Fault]:
-        """Return the faults that act in a gate."""
-        return [fault for fault in self.all if fault_kinds.acts(fault, gate_ns)]
 
     def of_links(self, gate_ns: int) -> tuple[Fault, ...]:
         """Return the faults of links and radios that act in a gate; used for every command."""
@@ -90,27 +85,24 @@ class FaultInjector:
         self._of_links_at.clear()
         if now_ns >= self._next_ns:
             self._begin_and_end(now_ns)
-            self._effects.strike(self.acting(next_ns))
+            self._effects.strike([fault for fault in self.all if fault_kinds.acts(fault, next_ns)])
         self._effects.blow(now_ns, next_ns)
 
     def _begin_and_end(self, now_ns: int) -> None:
         for fault in self.all:
             if fault.id not in self._begun and fault.from_ns <= now_ns:
                 self._begun.add(fault.id)
-                self._event("fault", fault, self._beginning(fault))
+                text = "begins"
+                if _is_instant(fault):
+                    immune = self._immunity(fault.target)
+                    text = f"has no effect: the process {immune}" if immune else ""
+                self._event("fault", fault, text)
             if fault.id not in self._over and _end_ns(fault) <= now_ns:
                 self._over.add(fault.id)
                 if not _is_instant(fault):
                     self._event("fault_end", fault, "is over")
         self._remove_past(now_ns)
         self._next_ns = self._next_change_ns()
-
-    def _beginning(self, fault: Fault) -> str:
-        """Return the text of a fault's state for the event of its beginning."""
-        if not _is_instant(fault):
-            return "begins"
-        immune = self._immunity(fault.target)
-        return f"has no effect: the process {immune}" if immune else ""
 
     def _immunity(self, process: str) -> str | None:
         """Return why a process that takes part cannot be killed by a fault; None if it can."""
@@ -152,7 +144,7 @@ class FaultInjector:
         return {"fault_add": self._add, "fault_clear": self._clear}
 
     def _add(self, request: ControlRequest) -> ControlAnswer:
-        args = _arguments(request)
+        args = {name: value for name, value in request.args.items() if value is not None}
         refusal = self._refusal(args)
         if refusal:
             return ControlAnswer(False, str(refusal))
@@ -163,7 +155,7 @@ class FaultInjector:
 
     def _clear(self, request: ControlRequest) -> ControlAnswer | Refusal:
         """End the faults of an id, a target or a kind, or all."""
-        args = _arguments(request)
+        args = {name: value for name, value in request.args.items() if value is not None}
         unknown = [name for name in args if name not in SELECTORS]
         if unknown:
             return Refusal(unknown[0][:40], "not known", f"allowed: {', '.join(SELECTORS)}, or nothing")
@@ -256,10 +248,6 @@ class FaultInjector:
     def _event(self, kind: str, fault: Fault, state: str, source: str = WORLD) -> None:
         text = f"{fault.kind} of {fault.target} {state}".rstrip()
         self._outbox.event(kind, fault.target, text, msgspec.structs.asdict(fault), source)
-
-
-def _arguments(request: ControlRequest) -> dict[str, Any]:
-    return {name: value for name, value in request.args.items() if value is not None}
 
 
 def _is_instant(fault: Fault) -> bool:

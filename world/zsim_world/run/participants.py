@@ -5,7 +5,6 @@ No session, no clock: wall times are passed in. `zsim_world.run.barrier` has the
 
 import math
 import uuid
-from abc import ABC
 from collections.abc import Callable
 from typing import Any
 
@@ -28,7 +27,7 @@ START_TIMEOUT_OWN_S = 600.0  # wall; chosen, for those that its launcher starts:
 _JOIN = "process/"  # before a name: what is counted of its joins
 
 
-class Participants(ABC):
+class Participants:
     """The participants of a run, and what they share: its time, its outbox, its limits.
 
     Args:
@@ -83,7 +82,7 @@ class Participants(ABC):
         self._agent_names = agent_names(scenario)
         self._own_names = {RECORDER, *expected, *self._agent_names}
 
-    def release_drones(self, name: str) -> None:  # noqa: B027 - a replay has no commanders
+    def release_drones(self, name: str) -> None:
         """Release the drones commanded by a process that is gone."""
 
     def on_death(self, participant: Participant) -> OnDeath:

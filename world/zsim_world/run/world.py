@@ -1,6 +1,6 @@
-"""The world of a run: integrates all drones, owns simulated time, applies commands and faults. No session, no clock.
+"""The world of a flight: integrates all drones, owns simulated time, applies commands and faults. No session, no clock.
 
-What it shares with a replay, first of all who takes part and who is waited for, is in `zsim_world.run.coordinator`.
+Participants and requests, which a replay has as well, are in `zsim_world.run.participants` and `.coordinator`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -12,7 +12,6 @@ from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import TruthHash, fingerprint
 from zsim.contract.flight_messages import Status
-from zsim.contract.framing import GateMessages
 from zsim.contract.snapshot import State
 from zsim.contract.views import DroneView, ViewDrones
 from zsim.errors import UserCodeError
@@ -26,8 +25,7 @@ from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.external_drones import ExternalDrones
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import GatePublication
-from zsim_world.run.barrier import Participant
-from zsim_world.run.commands import CommandIntake, CommandQueue
+from zsim_world.run.commands import CommandIntake
 from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.faults import FaultInjector
 from zsim_world.run_state import PART, Saved, saved_state
@@ -36,7 +34,7 @@ DURATION_OVER = "the scenario's duration is over"  # why a run of full length en
 
 
 class World(Coordinator):
-    """One run.
+    """One flight.
 
     Args:
         scenario: resolved.
@@ -83,36 +81,26 @@ class World(Coordinator):
     ) -> None:
         check_pace(scenario, mode)
         super().__init__(scenario, mode, rate, wall_ns, run_id, scenario.expected())
-        clock, barrier, outbox = self.clock, self.barrier, self.outbox
         self._changed = UNSET if changed is None else tuple(changed)
         self.fleet = Fleet(scenario)
         self.drivers = ExternalDrones(self.fleet)
         self.external = self.drivers.names
         self.unpaced = frozenset(f"estimator.{drone}" for drone in self.external)
         self._simulated = [i for i in range(self.fleet.count) if i not in self.drivers]
-        self.queue = CommandQueue(self.names)
-        self.faults = FaultInjector(scenario, clock, barrier, outbox, self.fleet.impairment)
-        self._intake = CommandIntake(
-            scenario,
-            clock,
-            barrier,
-            outbox,
-            self.queue,
-            self.fleet,
-            self.drivers,
-            self.faults.of_links,
-            self.budgets,
-        )
+        self.faults = FaultInjector(self, self.fleet.impairment)
+        self._intake = CommandIntake(self, self.fleet, self.drivers, self.faults.of_links)
+        self.queue = self._intake.queue
         self._operations |= {**self._intake.operations(), **self.faults.operations()}
         self._publication = GatePublication(self.fleet)
         self._hash = TruthHash(len(self._simulated))
-        self._last_ns = round(scenario.duration_s * 1e9) // clock.gate_ns * clock.gate_ns
+        self._last_ns = round(scenario.duration_s * 1e9) // self.clock.gate_ns * self.clock.gate_ns
         self.statistics.separation(self.fleet.closest_m())
 
     def info(self) -> messages.Info:
         """Return the message of `world/info`."""
         s, env = self.scenario, self.scenario.environment
-        text = scenario_file.to_text(s)
+        text, declared = scenario_file.to_text(s), declarations(s.drones)
+        user_sensors = tuple(messages.SensorInfo(name, each.message, each.fields) for name, each in declared.items())
         return messages.Info(
             t_ns=0,
             seq=0,
@@ -135,13 +123,13 @@ class World(Coordinator):
             scenario_sha256=scenario_file.sha256(text),
             version=__version__,
             fingerprint=fingerprint(),
-            user_sensors=_own_sensors(s) or UNSET,
+            user_sensors=user_sensors or UNSET,
             sightings=self.fleet.has_sightings or UNSET,
             module_folders=tuple(map(str, plugin.folders())) if s.own_code() else UNSET,
             changed=self._changed,
         )
 
-    # To go on elsewhere
+    # State
 
     def checkpoint(self) -> State:
         """Return all from which the run continues to the same bits, but the hash of its truth.
@@ -152,7 +140,7 @@ class World(Coordinator):
         return saved_state(self)
 
     def keep_truth(self, copy: Callable[[memoryview], object], hashed: Iterable[bytes] = ()) -> None:
-        """Let `copy` take the bytes of the truth hash from now on; those before were `hashed`."""
+        """Copy the bytes of the truth hash to `copy` from now on; those before were `hashed`."""
         self._hash.resume(hashed, copy)
 
     # What arrives
@@ -195,16 +183,21 @@ class World(Coordinator):
         if not is_first:
             self.clock.advance(self.fleet.t_ns)
             self.statistics.separation(self.fleet.closest_m())
-            self._publish_collisions()
             self._publish_incidents()
-        self._publish_gate(gate, wall_ns)
+        state = self.fleet.bodies.state
+        self._hash.add(self.now_ns, state[self._simulated] if self.external else state)
+        if gate is not None:
+            self.outbox.put(keys.GATE, gate)
+        self.statistics.gate(self.now_ns, wall_ns)
+        self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
         if self.now_ns >= self._last_ns:
             self.clock.complete(DURATION_OVER)
 
     def _begin_gate(self) -> None:
-        """Take what has arrived before the fleet is integrated to the next gate."""
+        """Apply what has arrived before the fleet is integrated to the next gate."""
         if self.clock.mode == "realtime":
-            self.statistics.deadlines(self._paced(), self.clock.required_ns)
+            paced = [p for p in self.barrier.participants.values() if not p.served_names <= self.unpaced]
+            self.statistics.deadlines(paced, self.clock.required_ns)
             self.barrier.give_up_late()
         self._intake.apply(self.now_ns)
         self.faults.apply(self.now_ns)
@@ -216,30 +209,16 @@ class World(Coordinator):
         self.outbox.event(kind, subject, str(error), data)
         self.clock.complete(str(error))
 
-    def _paced(self) -> list[Participant]:
-        """Return who has a deadline at every gate."""
-        return [p for p in self.barrier.participants.values() if not p.served_names <= self.unpaced]
-
-    def _publish_collisions(self) -> None:
+    def _publish_incidents(self) -> None:
         for i, j in self.fleet.collisions():
             name, other = self.names[i], self.names[j]
             self.outbox.notice("collision", name, f"{name} and {other} collide", {"other": other})
         for i, m in self.fleet.bumps():
             name, other = self.names[i], self.scenario.environment.obstacles[m].name
             self.outbox.notice("collision", name, f"{name} runs into {other}", {"other": other})
-
-    def _publish_incidents(self) -> None:
         for each in self.fleet.incidents():
             data = {**each.data, "commander": self.queue.commanders()[each.drone]}
             self.outbox.notice(each.kind, self.names[each.drone], each.text, data)
-
-    def _publish_gate(self, gate: GateMessages | None, wall_ns: int) -> None:
-        state = self.fleet.bodies.state
-        self._hash.add(self.now_ns, state[self._simulated] if self.external else state)
-        if gate is not None:
-            self.outbox.put(keys.GATE, gate)
-        self.statistics.gate(self.now_ns, wall_ns)
-        self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
 
     def result(self) -> dict[str, Any]:
         """Return the figures of the run so far."""
@@ -270,9 +249,3 @@ class World(Coordinator):
             drones.append(DroneView(name, *pose, rotors, state, battery_percent, commanders[i]))
         wind = tuple(tuple(row) for row in self.fleet.wind_m_s.tolist())
         return ViewDrones(self.now_ns, seq, tuple(drones), wind)
-
-
-def _own_sensors(scenario: Scenario) -> tuple[messages.SensorInfo, ...]:
-    """Return what `world/info` says of the users' sensors."""
-    declared = declarations(scenario.drones)
-    return tuple(messages.SensorInfo(name, each.message, each.fields) for name, each in declared.items())

@@ -8,7 +8,7 @@ from refused import has_terms, parts
 from zsim.contract import keys
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Faults, Join
-from zsim.scenario import scenario_file
+from zsim.scenario import fault_kinds, scenario_file
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
@@ -199,7 +199,8 @@ def test_what_links_carry_is_what_acts():
     add(made, "gps_dropout")
     for _ in range(8):
         for gate in range(12):
-            acting = [fault for fault in made.faults.acting(gate * GATE_NS) if fault.kind != "gps_dropout"]
+            t_ns = gate * GATE_NS
+            acting = [each for each in made.faults.all if fault_kinds.acts(each, t_ns) and each.kind != "gps_dropout"]
             assert list(made.faults.of_links(gate * GATE_NS)) == acting
         go(made, 1)
 
