@@ -1,12 +1,13 @@
 """A replay: plays the record of a run onto its keys in place of a world.
 
-It does everything else that a world does: it keeps time, waits for who takes part, answers for the last values,
-and is paused, stepped and stopped. No drone can be flown.
+It does everything else that a world does: it keeps time, waits for its participants, answers for the last values,
+and can be paused, stepped and stopped. No drone can be flown.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -16,14 +17,14 @@ import numpy as np
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
 from zsim.contract.framing import KINDS, GateMessages, run_key_table
-from zsim.contract.run_messages import ControlAnswer, ControlRequest, Event
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Output
 from zsim.scenario.role_table import OnDeath
 from zsim.scenario.scenario import Scenario
 from zsim_world.run.barrier import Participant
-from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.coordinator import FLIGHT_REQUESTS, Coordinator
 from zsim_world.run.outbox import Refusal
 from zsim_world.run.recorded_gates import Gate, PlaybackViews, RecordedGates, author, is_played, without_kills
 from zsim_world.run.run_clock import number, refused_argument
@@ -35,7 +36,10 @@ SEEK_MAX_S = 1e9  # beyond it, nanoseconds are no int64
 VIEWED_MAX = 10_000  # drones times instants in one answer to `views`: 2 MB
 VIEWED_MAX_S = 60.0  # simulated, in one answer to `views`; chosen: the replay stands while it reads them
 BEFORE_NS = 1_000_000_000  # in which each key that views are made of is published once
-FLIGHT_OPS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that only a flight takes
+OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish these
+MARKS_MAX = 400  # on a timeline; more would be narrower than a pixel
+LEFT_OUT = frozenset({"command", "end"})  # kinds of events: too many commands to be marked
+TEXT_MAX = 120  # characters
 
 
 class PlaybackRange(NamedTuple):
@@ -45,7 +49,7 @@ class PlaybackRange(NamedTuple):
         from_ns, to_ns: first and last gate [ns]; None for the end.
         keys: expressions; what matches none is not played.
         paused: whether it stands still after its first gate.
-        holds: whether it stands still after its last one, for who wants to go back, rather than end.
+        holds: whether it stands still after its last one, so that one can go back, rather than end.
     """
 
     from_ns: int = 0
@@ -58,8 +62,8 @@ class PlaybackRange(NamedTuple):
 class Playback(Coordinator):
     """Plays a record.
 
-    What a process that takes part publishes in place of one on record (by its name: `estimator.drone1`; pictures and
-    what is seen in them: by their drone) is not played.
+    Outputs that a participant publishes itself (recognised by its name, `estimator.drone1`; pictures and detections by
+    their drone) are not played.
 
     Args:
         reader: of the record; it stays open.
@@ -181,7 +185,7 @@ class Playback(Coordinator):
         return self._answer(request) if request.op == "views" else super().control(request)
 
     def _seek(self, request: ControlRequest) -> Refusal | None:
-        """Go on from another gate. Whoever is waited for would miss what lies between."""
+        """Continue from another gate. Refused while anybody is waited for, who would miss what lies between."""
         t_s = number(request.args.get("t_s"))
         if t_s is None or not 0 <= t_s < SEEK_MAX_S:
             return refused_argument(request, "t_s", "a time on record [s]")
@@ -198,7 +202,7 @@ class Playback(Coordinator):
         return None
 
     def _forget(self, t_ns: int) -> None:
-        """Forget what was played before a jump to the gate t_ns: there it may never have been."""
+        """Forget what was played before a jump to the gate t_ns."""
         self._last.clear()
         self.statistics.rate.jump()
         if self._plays_faults and self._pending_faults is None:
@@ -222,7 +226,7 @@ class Playback(Coordinator):
         return max((m for m in lists if m.t_ns < t_ns), key=lambda m: m.t_ns, default=None)
 
     def _camera_infos_before(self, t_ns: int) -> list[Recorded]:
-        """Return the last info of each camera before a time: a camera may say once only how it sees."""
+        """Return the last info of each camera before a time: a camera may publish it only once."""
         before = (m for m in self._reader.messages(self._camera_infos, by_time=False) if m.t_ns < t_ns)
         return list({m.key: m for m in sorted(before, key=lambda m: m.t_ns)}.values())
 
@@ -249,22 +253,17 @@ class Playback(Coordinator):
                 self._publish(recorded)
 
     def _publish(self, recorded: Recorded) -> None:
-        """Publish a message again, byte by byte, but for events, since ours are among them, and kills of processes."""
+        """Publish a message again, byte by byte, except events, which are numbered anew, and kills of processes."""
         key, payload = recorded.key, recorded.payload
         if key == keys.EVENT:
-            self._publish_event(payload)
+            with suppress(DecodeError):
+                event: run_messages.Event = messages.decode(keys.EVENT, payload)
+                if event.kind != "end":  # the replay has an end of its own
+                    self.outbox.put(key, msgspec.structs.replace(event, seq=self.outbox.next_seq(key)))
         elif key == keys.FAULTS:
             self.outbox.put(key, msgspec.Raw(without_kills(payload)))
         elif key != keys.VIEW_DRONES:
             self.outbox.put(key, msgspec.Raw(payload))
-
-    def _publish_event(self, payload: bytes) -> None:
-        try:
-            event: run_messages.Event = messages.decode(keys.EVENT, payload)
-        except DecodeError:
-            return
-        if event.kind != "end":  # the replay has an end of its own
-            self.outbox.put(keys.EVENT, msgspec.structs.replace(event, seq=self.outbox.next_seq(keys.EVENT)))
 
     def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
         """Return what the world published of its drones, as it did: drone by drone, the status last."""
@@ -297,13 +296,13 @@ class Playback(Coordinator):
         return True
 
     def _perform(self, request: ControlRequest) -> Refusal | ControlAnswer | None:
-        return ControlAnswer(False, NOT_FLYABLE) if request.op in FLIGHT_OPS else super()._perform(request)
+        return ControlAnswer(False, NOT_FLYABLE) if request.op in FLIGHT_REQUESTS else super()._perform(request)
 
     def refusal_at(self, key: str) -> str | None:
         return None if f"controller.{keys.thing(key)}" in self._live().names else NOT_FLYABLE
 
     def _after_bye(self, participant: Participant, reason: str) -> None:
-        """Go on: the record is there already."""
+        """Go on also without a recorder."""
 
     def _is_missed_from_now(self, participant: Participant) -> bool:
         return False
@@ -329,14 +328,11 @@ def _recount(payloads: list[bytes], kinds: list[int], first: list[int]) -> None:
                 payloads[m] = messages.encode(msgspec.structs.replace(message, count=count))
 
 
-OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish these
-
-
 class LiveProcesses:
-    """The processes that take part at a gate.
+    """The processes that take part at a gate, whose outputs are not played.
 
-    A camera or detector counts by the drones that it declares, whatever its name is; one that declares none, as a
-    program of the user's own may, by its name.
+    A camera or detector is recognised by the drones that it declares, whatever its name is; one that declares none, as
+    a program of the user's own may, by its name.
 
     Args:
         scenario: of the record.
@@ -357,7 +353,7 @@ class LiveProcesses:
         return role in OF_CAMERAS.values() and drone in self._cameras
 
     def replace(self, recorded: Recorded) -> bool:
-        """Tell whether one of them publishes a message of its own in place of one on record."""
+        """Tell whether one of them publishes a message in place of one on record."""
         role = OF_CAMERAS.get(messages.type_of(recorded.key))
         if role is None:
             return bool(self.names) and author(recorded) in self.names
@@ -366,33 +362,19 @@ class LiveProcesses:
         return bool(self._by_name) and author(recorded) in self._by_name
 
     def _is_drawn(self, key: str) -> bool:
-        """Tell whether a camera is one that the scenario gives its drone, if it gives it any."""
+        """Tell whether the scenario has a camera; where a drone has none there, any counts."""
         _, drone, what = keys.parts(key)
         cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
         return not cameras or camera == what or camera in cameras
 
 
-MARKS_MAX = 400  # on a timeline; more would be narrower than a pixel
-LEFT_OUT = frozenset({"command", "end"})  # kinds of events: what was commanded is too much to be marked
-TEXT_MAX = 120  # characters
-
-
 def timeline_marks(reader: RecordReader) -> list[dict[str, Any]]:
     """Return the events on record, but for commands: t_s, kind and text of each; of many, evenly thinned out."""
-    marks = [_mark(event) for event in _events(reader) if event.kind not in LEFT_OUT]
-    return marks[:: -(-len(marks) // MARKS_MAX) or 1]
-
-
-def _events(reader: RecordReader) -> list[Event]:
-    events = []
+    marks = []
     for recorded in reader.messages([keys.EVENT]):
-        try:
-            events.append(messages.decode(keys.EVENT, recorded.payload))
-        except DecodeError:
-            continue
-    return events
-
-
-def _mark(event: Event) -> dict[str, Any]:
-    text = f"{event.subject}: {event.text}" if event.subject else event.text
-    return {"t_s": event.t_ns / 1e9, "kind": event.kind, "text": text[:TEXT_MAX]}
+        with suppress(DecodeError):
+            event: run_messages.Event = messages.decode(keys.EVENT, recorded.payload)
+            if event.kind not in LEFT_OUT:
+                text = f"{event.subject}: {event.text}" if event.subject else event.text
+                marks.append({"t_s": event.t_ns / 1e9, "kind": event.kind, "text": text[:TEXT_MAX]})
+    return marks[:: -(-len(marks) // MARKS_MAX) or 1]

@@ -1,4 +1,4 @@
-"""A record read as the gates of a run, a few of them in memory at a time; what of it is played, and its views."""
+"""A record as the gates of a run, a few of them in memory at a time; which messages a replay plays, and its views."""
 
 from bisect import bisect_left
 from collections import defaultdict, deque
@@ -27,7 +27,7 @@ from zsim.scenario import rights
 from zsim.scenario.fault_kinds import PROCESS_KILL
 
 SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # say who published them
-VIEWS = (ViewDrones, ViewCluster, ViewEstimates)  # made anew, as often as they are shown
+VIEWS = (ViewDrones, ViewCluster, ViewEstimates)  # a replay makes its own
 
 
 class Gate(NamedTuple):
@@ -52,12 +52,11 @@ _decode_sourced = msgspec.msgpack.Decoder(_Sourced).decode
 class RecordedGates:
     """Reads a record from any gate on.
 
-    An answer to a gate is written a few gates later, since the world runs ahead of those who answer; it is played with
-    the gate that it is stamped with. What comes later than that by its stamp (of a program that stamps nothing, or in
-    realtime) is played where it was written.
+    An answer to a gate is written a few gates later, since the world runs ahead of the agents; it is played with the
+    gate of its stamp. A message whose stamp is further from where it was written (of a program that stamps nothing, or
+    in realtime) is played where it was written.
 
-    Args:
-        reader: of the record.
+    Args: reader: of the record.
         gate_ns: of the run.
         delay_ns: of its commands, by which the world may be ahead.
         wanted: keys.
@@ -123,7 +122,7 @@ class RecordedGates:
         return due_ns if newest - self._slack_ns < due_ns <= writing_ns else writing_ns
 
     def _take(self, t_ns: int, held: dict[int, list[Recorded]]) -> Gate:
-        """Return a gate; what has waited longer, for a gate that the record lacks, comes with it."""
+        """Return a gate, with the messages of gates before it that the record lacks."""
         due = sorted(gate_ns for gate_ns in held if gate_ns <= t_ns)
         return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
 
@@ -137,7 +136,9 @@ def _is_gate(payload: bytes) -> bool:
 
 
 def is_played(key: str, expressions: Sequence[str]) -> bool:
-    """Return whether the messages of a key are played: none that are made anew, or are about absent processes.
+    """Return whether the messages of a key are played.
+
+    A replay publishes its own info, clock and views; what is about the processes on record is left out.
 
     Args:
         expressions: that the user wants to be played.
@@ -147,7 +148,7 @@ def is_played(key: str, expressions: Sequence[str]) -> bool:
 
 
 def author(recorded: Recorded) -> str:
-    """Return the process that published a message beside the world, empty where it was none of a known role."""
+    """Return the process that published a message, empty for the world and for unknown roles."""
     kind = messages.type_of(recorded.key)
     if kind is flight_messages.Estimate:
         return f"estimator.{keys.thing(recorded.key)}"
