@@ -1,7 +1,7 @@
-"""External drones, as their drivers publish them: where each is, in which state, and what it can be asked. No clock.
+"""External drones, as their drivers publish them: pose, state, and which commands they accept. No clock.
 
-A driver publishes a pose for a gate now and then. Between two of them the drone is moved on with its velocity, as long
-as a pose may be trusted; then it stands where that led to.
+A driver publishes a pose for a gate now and then. Between two poses the drone moves on with its velocity, for as long
+as a pose is trusted; then it stands still.
 """
 
 import math
@@ -19,7 +19,7 @@ from zsim_world.run_state import Saved
 
 
 class Pose(NamedTuple):
-    """A row of a fleet's states, and the gate that it is of [ns]."""
+    """A row of a fleet's states, and its gate [ns]."""
 
     t_ns: int
     row: NDArray[np.float64]  # (STATE.size + rotors of the drone,)
@@ -29,7 +29,7 @@ class ExternalDrones:
     """The external drones of a fleet; `i` counts them among all its drones.
 
     Args:
-        fleet: is led by their poses.
+        fleet: follows their poses.
     """
 
     SAVED: ClassVar[Saved] = {"_poses": dict[int, Pose], "_statuses": dict[int, Status]}
@@ -46,8 +46,6 @@ class ExternalDrones:
     @property
     def names(self) -> frozenset[str]:
         return frozenset(self._index)
-
-    # What a driver publishes
 
     def take(self, drone: str, message: Any, now_ns: int) -> str | None:
         """Take a message of a driver; return why it is refused.
@@ -80,7 +78,7 @@ class ExternalDrones:
         return fault
 
     def _row(self, i: int, truth: Truth) -> NDArray[np.float64]:
-        """Return a truth as a state: a unit quaternion, and rotors within what the drone's have."""
+        """Return a truth as a row of state: a unit quaternion, and rotor speeds within the drone's limits."""
         row = np.empty(STATE.size + len(truth.rotor_rad_s))
         row[STATE.p_WB : STATE.p_WB + 3], row[STATE.v_WB : STATE.v_WB + 3] = truth.position_m, truth.velocity_m_s
         row[STATE.q_WB : STATE.q_WB + 4] = np.divide(truth.orientation_wxyz, math.hypot(*truth.orientation_wxyz))
@@ -89,24 +87,20 @@ class ExternalDrones:
         row[STATE.size :] = np.clip(truth.rotor_rad_s, 0.0, most)
         return row
 
-    # Time
-
     def lead(self) -> None:
-        """Put every drone whose driver has published a pose where it is now, before the fleet goes on."""
+        """Move every drone whose driver has published a pose to the present, before the fleet advances."""
         now_ns = self._fleet.t_ns
         for i, pose in self._poses.items():
             self._fleet.lead(i, ahead(pose, now_ns))
-
-    # What it can be asked
 
     def status(self, i: int) -> Status | None:
         """Return the newest status, None before the first."""
         return self._statuses.get(i)
 
     def command_refusal(self, i: int, kind: str, message: Any) -> str | None:
-        """Return why a command is not handed on to the driver, None if it is.
+        """Return why a command is not passed on to the driver, None if it is.
 
-        A stop of the rotors is always handed on; all else is judged by the state that the driver has published last.
+        A stop of the rotors always is; everything else depends on the state that the driver has published last.
         """
         name, asked = self._fleet.names[i], message.mode if kind == "mode" else "setpoint"
         if asked == "emergency":
@@ -114,16 +108,16 @@ class ExternalDrones:
         if i not in self._statuses:
             return f"{name} has no state: its driver has published none; start driver.{name}"
         state: DroneState = self._statuses[i].state
-        return state_refusal(name, state, asked) or self._setpoint_fault(i, kind, message)
-
-    def _setpoint_fault(self, i: int, kind: str, message: Any) -> str | None:
-        if kind == "rotors":
-            return self._fleet.rotors_fault(i, message.speed_rad_s)
-        return self._fleet.orientation_fault(i, message.orientation_wxyz) if kind == "attitude" else None
+        refusal = state_refusal(name, state, asked)
+        if refusal is None and kind == "rotors":
+            refusal = self._fleet.rotors_fault(i, message.speed_rad_s)
+        if refusal is None and kind == "attitude":
+            refusal = self._fleet.orientation_fault(i, message.orientation_wxyz)
+        return refusal
 
 
 def ahead(pose: Pose, t_ns: int) -> NDArray[np.float64]:
-    """Return the state at t_ns of what was at a pose: at constant velocity, at rest once the pose is too old."""
+    """Return the state at t_ns extrapolated from a pose: at constant velocity, at rest once the pose is too old."""
     row, age_ns = pose.row.copy(), t_ns - pose.t_ns
     p, v = slice(STATE.p_WB, STATE.p_WB + 3), slice(STATE.v_WB, STATE.v_WB + 3)
     row[p] = moved_on(row[p].tolist(), row[v].tolist(), age_ns)

@@ -23,7 +23,6 @@ from zsim.math.compiled import hold
 from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario import obstacle
 from zsim.scenario.scenario import Drone, Scenario
-from zsim.sensors.gps import GpsConfig
 from zsim.sensors.sensor import noise_sigma
 from zsim.vehicles.vehicle import Vehicle
 from zsim.vehicles.vehicle_catalogue import vehicle_of
@@ -70,6 +69,7 @@ GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
 TAKEOFF_CHARGE = 2.0  # of the charge at which it lands: below, it does not take off
 UPRIGHT_COSINE = 0.87  # 30 deg, beyond which it does not take off
 QUATERNION_SQUARE_MIN = 1e-6  # shorter, a quaternion has no direction
+ON_ROOF_M = 0.01  # m, chosen: so near to an obstacle a drone starts upon it
 NOISE_GATES = 8  # gates between two refills of the noise: that of 100 drones then fits a cache of 1 MB
 
 
@@ -131,13 +131,15 @@ class Fleet:
 
         Raises:
             DivergedError: the scenario's numbers cannot be integrated.
+            DocumentError: the model of a drone is a module that is not installed here.
         """
         self.names = [drone.name for drone in scenario.drones]
-        vehicles = [_vehicle(index, drone) for index, drone in enumerate(scenario.drones)]
+        vehicles = [vehicle_of(drone.model, f"drones[{i}].model") for i, drone in enumerate(scenario.drones)]
         self.rotors = [len(vehicle.rotors) for vehicle in vehicles]
         self.count = len(self.names)
         self.external = {i: e for e, i in enumerate(i for i, d in enumerate(scenario.drones) if d.is_external)}
-        self.gps_sigma_m = [_gps_sigma(drone.sensors.gps) for drone in scenario.drones]
+        fixes = [drone.sensors.gps for drone in scenario.drones]
+        self.gps_sigma_m = [noise_sigma(gps.position_m, gps.rate_hz) for gps in fixes]
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
         self._ticks = round(scenario.time.gate_ms / scenario.time.physics_dt_ms)
         self._tick = 0
@@ -148,7 +150,9 @@ class Fleet:
         self._streams = self._noise.streams
         self._w = initial_arrays(scenario, vehicles, self.sensors, self._noise)
         self._sampler = Sampler(scenario, self.sensors, self._w.senses)
-        self._sightings = _sighting_sampler(scenario, self._w.bodies.vehicle[:, VEHICLE.hull_radius])
+        has_some = any(drone.sensors.sightings is not UNSET and not drone.is_external for drone in scenario.drones)
+        hulls = self._w.bodies.vehicle[:, VEHICLE.hull_radius]
+        self._sightings = SightingSampler(scenario, hulls.copy()) if has_some else None
         self.sightings: dict[int, PictureSightings] = {}
         self._held = hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
@@ -157,10 +161,7 @@ class Fleet:
         self._hull_m = float(self.bodies.vehicle[:, VEHICLE.hull_radius].max())
         self._integrate(0)
         self._watch = FlightWatch(self._w, self.names, [each.name for each in scenario.environment.obstacles])
-        self._rehearse()
-
-    def _rehearse(self) -> None:
-        """Load or compile what the first command needs: in realtime no gate may wait for it."""
+        # loads or compiles what the first command needs: in realtime no gate may wait for it
         kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
 
     @property
@@ -376,28 +377,6 @@ class Fleet:
             self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
 
 
-def _sighting_sampler(scenario: Scenario, hulls: NDArray[np.float64]) -> SightingSampler | None:
-    """Return what makes the sightings of a scenario, None where no drone has any."""
-    has_some = any(drone.sensors.sightings is not UNSET and not drone.is_external for drone in scenario.drones)
-    return SightingSampler(scenario, hulls.copy()) if has_some else None
-
-
-def _gps_sigma(gps: GpsConfig) -> float:
-    return noise_sigma(gps.position_m, gps.rate_hz)
-
-
-def _vehicle(index: int, drone: Drone) -> Vehicle:
-    """Return what a drone of a scenario is.
-
-    Raises:
-        DocumentError: its model is a module that is not installed here.
-    """
-    return vehicle_of(drone.model, f"drones[{index}].model")
-
-
-ON_ROOF_M = 0.01  # m, chosen: so near to an obstacle a drone starts upon it
-
-
 def initial_arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable) -> Arrays:
     """Return the arrays of the kernel for a scenario whose drones are these vehicles with these sensors."""
     dt, drones, place = scenario.time.physics_dt_ms / 1000.0, scenario.drones, scenario.environment
@@ -452,7 +431,7 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
 
 
 def near(n: int) -> NearPairs:
-    """Return near pairs that are yet to be found: no drone is where it was."""
+    """Return near pairs that are yet to be found, since no drone is at its origin."""
     pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)
     return NearPairs(pair=pairs, number=np.zeros(1, dtype=np.int64), origin=np.full((n, 3), np.inf))
 
@@ -503,7 +482,7 @@ def _senses(scenario: Scenario, sensors: FleetSensors, noise: NoiseTable) -> Sen
 
 
 def _standing(drone: Drone, row: np.ndarray, rotors: int) -> np.ndarray:
-    """Return the state of a drone whose feet carry its weight; a place above the ground is one that it falls from."""
+    """Return the state of a drone whose feet carry its weight; from a position above the ground it falls."""
     state = np.zeros(STATE.size + rotors)
     state[STATE.p_WB : STATE.p_WB + 3] = drone.position_m
     state[STATE.p_WB + 2] += row[VEHICLE.stand_height]
@@ -522,8 +501,8 @@ def _first_belief(
 ) -> np.ndarray:
     """Return the belief at power-up: level, heading unknown until the first magnetometer sample.
 
-    Where that tells none, the heading is the one that the drone was set down with. One that starts on a roof knows of
-    its height, as one that has landed there.
+    Where the field gives none, the heading is the true one at the start. A drone that starts on a roof knows its
+    height, like one that has landed there.
     """
     belief = np.zeros(BELIEF.size + rotors)
     belief[BELIEF.q_WB] = 1.0
@@ -540,19 +519,15 @@ def _first_belief(
 
 
 def _calibration(drone: Drone, scenario: Scenario) -> np.ndarray:
-    """Return what the board knows of its mounts, and the bearing of the magnetic field where it gives a heading."""
-    board = np.zeros(CALIBRATION.size)
-    field = scenario.environment.magnetic_field_ut
-    board[CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4] = _turn(drone.sensors.imu.mount.rpy_deg)
-    board[CALIBRATION.mag_turn : CALIBRATION.mag_turn + 4] = _turn(drone.sensors.mag.mount.rpy_deg)
+    """Return the board's calibration: its mounts, and the bearing of the magnetic field where that gives a heading."""
+    board, field = np.zeros(CALIBRATION.size), scenario.environment.magnetic_field_ut
+    imu, mag = drone.sensors.imu.mount, drone.sensors.mag.mount
+    board[CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4] = quaternion_from_rpy(np.radians(imu.rpy_deg))
+    board[CALIBRATION.mag_turn : CALIBRATION.mag_turn + 4] = quaternion_from_rpy(np.radians(mag.rpy_deg))
     compass = sensor_set.has_compass(drone.sensors.mag, field)
     board[CALIBRATION.mag_bearing] = math.atan2(field[1], field[0]) if compass else math.nan
     board[CALIBRATION.sonar_min] = drone.sensors.sonar.min_m
     return board
-
-
-def _turn(rpy_deg: tuple[float, float, float]) -> np.ndarray:
-    return quaternion_from_rpy(np.radians(rpy_deg))
 
 
 def _wind(scenario: Scenario) -> np.ndarray:

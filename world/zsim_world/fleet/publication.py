@@ -202,7 +202,9 @@ class UserMessages:
         seq: dict[tuple[int, int], int] = {}
         for m in places:
             sighting = sightings.get(m)
-            s, i, t_ns, t_sample_ns = whose[m].tolist() if sighting is None else _whose(self._seen, sighting)
+            s, i, t_ns, t_sample_ns = whose[m].tolist()
+            if sighting is not None:
+                s, i, t_ns, t_sample_ns = self._seen, sighting.drone, sighting.t_ns, sighting.t_sample_ns
             number = seq.get((i, s), counts.item(i, s + 2))
             seq[i, s] = number + 1
             stamps = (t_ns, number, t_sample_ns)
@@ -233,10 +235,6 @@ class UserMessages:
             text = f"its reading makes no {kind.message.__name__} ({reason_of(error)})"
             raise UserCodeError(text, what) from error
         return self._messages[s - STOCK_SENSORS](*stamps, *fields)
-
-
-def _whose(sensor: int, sighting: PictureSightings) -> tuple[int, int, int, int]:
-    return sensor, sighting.drone, sighting.t_ns, sighting.t_sample_ns
 
 
 def _sightings(stamps: tuple[int, int, int], sighting: PictureSightings) -> Sightings:

@@ -56,7 +56,8 @@ class RecordedGates:
     gate of its stamp. A message whose stamp is further from where it was written (of a program that stamps nothing, or
     in realtime) is played where it was written.
 
-    Args: reader: of the record.
+    Args:
+        reader: of the record.
         gate_ns: of the run.
         delay_ns: of its commands, by which the world may be ahead.
         wanted: keys.
