@@ -1,12 +1,12 @@
-"""The journal of a run on disk: all that its world was handed, in order, and checkpoints of its whole state.
+"""The journal of a run on disk: all inputs of its world, in order, and checkpoints of its whole state.
 
-A world is a function of its scenario and of what it is handed. So one that died goes on, to the same bits, from a
-checkpoint and what it was handed since. An entry is in the file, though not on the disk, before anything that follows
-from it is published; a kill takes nothing of it.
+A world is a function of its scenario and its inputs. So one that is started again continues to the same bits, from a
+checkpoint and the inputs since. An entry is in the file, though not on the disk, before anything that follows from it
+is published; killing the process loses none.
 
 A folder has, with n counting from 0: `n.entries`, frames of entries; `n.checkpoint`, the state at their beginning, none
-for 0; `truth`, the bytes of the truth hash. A frame: length and CRC-32 of what follows (little-endian, 32 bit each),
-then msgpack.
+for 0; `truth`, the bytes of the truth hash. A frame: length and CRC-32 of the content (little-endian, 32 bit each),
+then the content in msgpack.
 """
 
 import os
@@ -54,13 +54,13 @@ class Checkpoint(NamedTuple):
 
 
 class RunJournal:
-    """Writes the journal of one run, or nothing without a folder.
+    """Reads and writes the journal of one run, or nothing without a folder.
 
     Args:
         folder: of this run alone; it is made.
         run_id, scenario_sha256: of the run.
-        say: takes a line where the journal cannot be written any more.
-        all_died: whether all who took part in a run that goes on have to be started again.
+        say: shows a line if the journal cannot be written any more.
+        all_died: whether all participants of a run that is continued have to be started again.
     """
 
     def __init__(
@@ -72,7 +72,8 @@ class RunJournal:
         all_died: bool = False,
     ) -> None:
         self.all_died = all_died
-        self._folder = folder
+        self._folder = folder or Path()
+        self._is_kept = folder is not None
         self._head = _Head(VERSION, run_id, scenario_sha256)
         self._say = say
         self._entries: list[Entry] = []
@@ -82,32 +83,27 @@ class RunJournal:
         self._writer = ThreadPoolExecutor(1, "checkpoint")
         self._written: Future[None] | None = None
 
-    @property
-    def enabled(self) -> bool:
-        """Tell whether what is noted is kept."""
-        return self._folder is not None
-
     # Writing
 
     def note(self, entry: Entry) -> None:
         """Add an entry, for `commit`."""
-        if self._folder is not None:
+        if self._is_kept:
             self._entries.append(entry)
 
     def commit(self) -> None:
-        """Put what was noted into the file; to be called before anything is published that follows from it."""
+        """Write the entries to the file; to be called before anything is published that follows from them."""
         if self._entries:
             entries, self._entries = self._entries, []
             self._guarded(lambda: _write(self._file, _framed(inputs.encode(entries))))
 
     def keep_truth(self, data: memoryview) -> None:
         """Append bytes of the truth hash."""
-        if self._folder is not None:
+        if self._is_kept:
             self._guarded(lambda: _write(self._truth, data))
 
     def is_due(self, now_ns: int, wall_ns: int) -> bool:
         """Tell whether it is time for a checkpoint, by simulated time and a monotonic clock."""
-        due = now_ns >= self._due_ns and wall_ns >= self._due_wall_ns and self._folder is not None
+        due = now_ns >= self._due_ns and wall_ns >= self._due_wall_ns and self._is_kept
         return due and (self._written is None or self._written.done())
 
     def add_checkpoint(self, state: State, now_ns: int, wall_ns: int) -> None:
@@ -124,8 +120,7 @@ class RunJournal:
         self._written = self._writer.submit(self._write_checkpoint, number, pack(content), former)
 
     def _write_checkpoint(self, number: int, content: bytes, former: int) -> None:
-        """Put a checkpoint on disk, after what it needs, and remove what is not needed any more."""
-        assert self._folder is not None
+        """Put a checkpoint on disk after the files that it needs, and remove those that are no longer needed."""
         place = self._folder / f"{number}.checkpoint"
         os.fsync(former)
         os.close(former)
@@ -137,28 +132,23 @@ class RunJournal:
         finally:
             os.close(file)
         place.with_suffix(".new").replace(place)
-        self._remove_before(number - CHECKPOINTS_KEPT + 1)
-
-    def _remove_before(self, number: int) -> None:
-        assert self._folder is not None
-        for place in self._folder.iterdir():
-            if place.stem.isdecimal() and int(place.stem) < number:
-                place.unlink()
+        for former_place in self._folder.iterdir():
+            if former_place.stem.isdecimal() and int(former_place.stem) <= number - CHECKPOINTS_KEPT:
+                former_place.unlink()
 
     def _open_entries(self, number: int) -> int:
-        assert self._folder is not None
         file = os.open(self._folder / f"{number}.entries", os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         if not os.fstat(file).st_size:
             _write(file, _framed(msgspec.msgpack.encode(self._head)))
         return file
 
     def _guarded(self, write: Callable[[], None]) -> None:
-        """Do without a journal from now on if it cannot be written: the run goes on."""
+        """Continue the run without a journal if it cannot be written."""
         try:
             write()
         except OSError as error:
-            folder, self._folder = self._folder, None
-            why = f"{folder}: the journal cannot be written ({error.strerror})"
+            self._is_kept = False
+            why = f"{self._folder}: the journal cannot be written ({error.strerror})"
             self._say(f"{why}; if the world dies now, the run ends")
             self._entries.clear()
             self.close()
@@ -174,8 +164,8 @@ class RunJournal:
         self._file = self._truth = -1
 
     def remove(self) -> None:
-        """Remove a journal that is closed: its run is over, and nothing goes on from it."""
-        if self._folder is None:
+        """Remove a journal that is closed and whose run is over."""
+        if not self._is_kept:
             return
         with suppress(OSError):
             for place in self._folder.iterdir():
@@ -185,14 +175,14 @@ class RunJournal:
     # Reading
 
     def open(self) -> Checkpoint | None:
-        """Begin the journal, or go on with the one that is there; return where a world goes on from, None for a start.
+        """Begin a journal, or open the one that is there; return the checkpoint to continue from, None for a start.
 
-        `entries` are what it was handed since.
+        `entries` are the inputs since then.
 
         Raises:
             RunError: the journal there is of another run, or cannot be read.
         """
-        if self._folder is None:
+        if not self._is_kept:
             return None
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -207,7 +197,6 @@ class RunJournal:
 
     def _newest(self) -> Checkpoint | None:
         """Return the newest checkpoint but one: the history is refilled from there."""
-        assert self._folder is not None
         numbers = sorted(int(place.stem) for place in self._folder.glob("*.entries"))
         if not numbers:
             return None
@@ -220,7 +209,6 @@ class RunJournal:
 
     def _checkpoint(self, number: int) -> Checkpoint | None:
         """Return a checkpoint, None if it is not whole."""
-        assert self._folder is not None
         with suppress(OSError, DecodeError):
             frames = list(self._frames(self._folder / f"{number}.checkpoint"))
             if frames:
@@ -229,14 +217,13 @@ class RunJournal:
         return None
 
     def entries(self) -> Iterator[Entry]:
-        """Yield what the world was handed since the checkpoint; what is broken at the end was never published."""
-        assert self._folder is not None
+        """Yield the inputs since the checkpoint; nothing that follows from a broken end was ever published."""
         for number in range(self._first, self._number + 1):
             for frame in self._frames(self._folder / f"{number}.entries"):
                 yield from inputs.decode(frame)
 
     def truth(self, size: int) -> Iterator[bytes]:
-        """Yield the first bytes of the truth hash, and forget the others, which the world appends again."""
+        """Yield the first bytes of the truth hash, and drop the others, which the world appends again."""
         os.ftruncate(self._truth, size)
         os.lseek(self._truth, 0, os.SEEK_SET)
         while data := os.read(self._truth, HASHED_BYTES):
