@@ -1,7 +1,7 @@
-"""Who takes part in the lockstep, how far each has come, and whom the world waits for.
+"""The participants of the lockstep, how far each has come, and whom the world waits for.
 
-Pure bookkeeping: no session, no clock; wall times are passed in. To integrate from t on, the world needs
-every gating participant's done for t minus the command delay. That is the only wait there is.
+Pure bookkeeping: no session, no clock; wall times are passed in. To integrate from t on, the world needs every gating
+participant's done for t minus the command delay. That is the only wait there is.
 """
 
 from collections.abc import Callable
@@ -22,24 +22,24 @@ class Participant:
     """One process that has joined, by its newest incarnation.
 
     Attributes:
-        join: as it has published it.
+        join: as published.
         from_ns: first gate that it is waited for.
-        done_ns: newest gate that it is through with.
-        surplus: outputs that came in since its last done.
-        missing: outputs that it counted in its dones and that have not come in.
+        done_ns: newest gate that it has completed.
+        surplus: outputs that have arrived since its last done.
+        missing: outputs counted in its dones that have not arrived.
         done_seq: number of its newest done, None before the first of its process.
         lost_done: whether a done was lost, and with it the count of the outputs before it.
-        was_incomplete: whether it was at the last gate, in realtime.
+        was_incomplete: whether outputs were missing at the last gate, in realtime.
         rejoined: whether another incarnation of its name was there before.
-        repeats: whether it may publish once more what was counted before.
-        successor: whether that one lived, and has ended for it.
+        repeats: whether it may publish again what was counted before.
+        successor: whether it has replaced another process that was alive.
         since_wall_ns: when it last joined, sent a done or died.
         joined_wall_ns: when this incarnation joined.
         deadline_misses: dones that were late in realtime.
         away: whether it has yet to come back to a world that was started again.
         silent_wall_ns: when its last health came, if it has fallen silent since.
-        farewell: its bye, if that names no incarnation and so may be somebody else's, until its token goes or a done
-            shows that it goes on.
+        farewell: its bye, if that names no incarnation and so may be somebody else's; it counts when the token is lost,
+            and is taken back by the next done.
     """
 
     name: str
@@ -76,21 +76,22 @@ class Participant:
         return self.gating or self.join.slack_ns > 0
 
     def is_process_of(self, join: Join) -> bool:
-        """Tell whether another join comes from the same process, which takes part as before."""
-        return _identity(self.join) == _identity(join)
+        """Tell whether another join comes from the same process, taking part in the same way."""
+        fields = ("host", "pid", "role", "period_ns", "slack_ns", "serves")
+        return all(getattr(self.join, name) == getattr(join, name) for name in fields)
 
     @property
     def served_names(self) -> set[str]:
-        """Return the names of the processes whose work it does, its own among them."""
+        """Return the names of the processes whose work it does, including its own."""
         return {self.name, *self.join.serves}
 
     @property
     def incomplete(self) -> bool:
-        """Tell whether it counted more outputs in its dones than have come in, or a done of it was lost."""
+        """Tell whether outputs counted in its dones have not arrived, or a done was lost."""
         return self.missing > 0 or self.lost_done
 
     def required_ns(self, need_ns: int) -> int | None:
-        """Return the newest done required of it for `need_ns`, None if none is yet."""
+        """Return the newest done required of it for `need_ns`, None if none is required yet."""
         join = self.join
         if join.period_ns > 0:
             required = need_ns - need_ns % join.period_ns
@@ -101,14 +102,14 @@ class Participant:
         return required if required >= self.from_ns else None
 
     def blocks(self, need_ns: int) -> bool:
-        """Tell whether its done for `need_ns`, or an output that it counted, is not in yet."""
+        """Tell whether its done for `need_ns`, or an output that it counted, has not arrived."""
         required = self.required_ns(need_ns)
         return required is not None and (self.done_ns < required or self.missing > 0 or self.lost_done)
 
     def note_done(self, message: Done) -> None:
-        """Take the number of a done, of which a gap shows that one was lost, and its count of outputs.
+        """Compare the number of a done and its count of outputs with what has arrived.
 
-        More outputs than it counts belong to the next done.
+        A gap in the numbers shows that a done was lost. More outputs than it counts belong to the next done.
         """
         if self.gating and self.done_seq is not None and message.seq > self.done_seq + 1:
             self.lost_done = True
@@ -117,15 +118,15 @@ class Participant:
         self.surplus, self.missing = max(0, balance), max(0, -balance)
 
     def note_refused_done(self, seq: int) -> None:
-        """Take the number of a done that is refused, if it is the next of the same process: it was not lost."""
+        """Note the number of a refused done, if it is the next of the same process: it was not lost."""
         if self.done_seq is not None and seq == self.done_seq + 1:
             self.done_seq = seq
 
     def reset_counts(self) -> int:
-        """Start counting outputs anew, once they were requested again; return how many are missing for good.
+        """Restart the counts once outputs were requested again; return how many are missing for good.
 
         A surplus would hide the next loss: outputs that belong to the next done do not come while some are missing. Of
-        what is repeated after a rejoin, some was counted before it: that is not missing.
+        the outputs repeated after a rejoin some were counted before: these are not missing.
         """
         missing = 0 if self.repeats else self.missing
         self.missing, self.surplus, self.lost_done, self.repeats = 0, 0, False, False
@@ -136,7 +137,7 @@ class Participant:
         return Waiting(self.name, self.join.host, (wall_ns - self.since_wall_ns) / 1e9, held_by)
 
     def missed(self, wall_ns: int) -> Waiting:
-        """Return the entry of `clock` that names it as dead or silent, where nobody is waited for."""
+        """Return the entry of `clock` that names it as dead or silent, in realtime, where nobody is waited for."""
         since_ns = self.since_wall_ns if not self.alive or self.silent_wall_ns is None else self.silent_wall_ns
         return Waiting(self.name, self.join.host, (wall_ns - since_ns) / 1e9)
 
@@ -150,11 +151,6 @@ class Participant:
             "done_ns": self.done_ns,
         }
         return {**entry, "serves": self.join.serves} if self.join.serves else entry
-
-
-def _identity(join: Join) -> tuple[Any, ...]:
-    """Return what a process has in common with itself whenever it joins."""
-    return join.host, join.pid, join.role, join.period_ns, join.slack_ns, join.serves
 
 
 class Barrier:
@@ -175,15 +171,15 @@ class Barrier:
         self.participants: dict[str, Participant] = {}
 
     def expect(self, name: str) -> None:
-        """Do not start without this one either."""
+        """Wait for another process at the start."""
         if name not in self._expected:
             self._expected.append(name)
 
     def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> Refusal | None:
-        """Take a participant in; return why it is refused.
+        """Admit a participant; return why it is refused.
 
-        A known name keeps its progress: the new incarnation goes on from there. So does a participant that does all
-        the work of others that are dead: it replaces them. The same join again changes nothing.
+        The new incarnation of a known name continues from its progress; so does a participant that does all the work of
+        others that are dead, and replaces them. The same join again changes nothing.
         """
         refusal = self._join_refusal(name, message)
         if refusal:
@@ -212,7 +208,7 @@ class Barrier:
         return None
 
     def takes_place(self, name: str, message: Join) -> bool:
-        """Tell whether a join would put a process into the place of another one."""
+        """Tell whether a join would replace another process."""
         if not self.accepts(name, message):
             return False
         former = self.participants.get(name)
@@ -240,7 +236,7 @@ class Barrier:
         return Refusal("run_id", repr(run_id[:40]), f"must be {self._run_id!r} (read world/info)")
 
     def done(self, name: str, message: Done, now_ns: int, wall_ns: int) -> Refusal | None:
-        """Note that a participant is through with `done_ns`; return why the done is refused."""
+        """Note that a participant has completed the gate `done_ns`; return why the done is refused."""
         participant = self.participants.get(name)
         if participant is None:
             return Refusal("join", "missing", f"must publish process/{name}/join first")
@@ -259,7 +255,7 @@ class Barrier:
         return None
 
     def bye_refusal(self, participant: Participant, message: Bye) -> Refusal | None:
-        """Return why a bye is none of this participation: it names another run or incarnation."""
+        """Return the refusal of a bye that names another run or incarnation."""
         if message.run_id not in (UNSET, self._run_id):
             return self._run_id_refusal(str(message.run_id))
         if message.incarnation not in (UNSET, participant.join.incarnation):
@@ -267,12 +263,12 @@ class Barrier:
         return None
 
     def has_farewell(self, name: str) -> bool:
-        """Tell whether a participant leaves as soon as its token goes."""
+        """Tell whether a participant leaves as soon as its token is lost."""
         participant = self.participants.get(name)
         return participant is not None and participant.farewell is not None
 
     def take_back_bye(self, name: str) -> Refusal | None:
-        """Take it that a participant goes on: who said bye in its name, without its incarnation, was somebody else."""
+        """Drop the bye of a participant that goes on: it was somebody else's; return its refusal."""
         participant = self.participants.get(name)
         if participant is None or participant.farewell is None:
             return None
@@ -280,7 +276,7 @@ class Barrier:
         return _incarnation_refusal(participant, "missing")
 
     def count_output(self, name: str) -> None:
-        """Count one output of a participant that has come in."""
+        """Count one output of a participant that has arrived."""
         participant = self.participants.get(name)
         if participant is None:
             return
@@ -290,16 +286,16 @@ class Barrier:
             participant.surplus += 1
 
     def is_gating(self, name: str) -> bool:
-        """Tell whether a process is waited for, also one that seems dead: its outputs may come before its return."""
+        """Tell whether a process gates, even one that seems dead: its outputs may arrive before it rejoins."""
         participant = self.participants.get(name)
         return participant is not None and participant.gating
 
     def awaited(self) -> list[Participant]:
-        """Return who takes part in a way that it must not lose anything; callable from any thread."""
+        """Return the participants that must not lose any message; callable from any thread."""
         return [p for p in list(self.participants.values()) if p.is_waited_for]
 
     def mark_dead(self, name: str, wall_ns: int) -> Participant | None:
-        """Mark a participant as dead; it stays in the barrier until it is removed or rejoins."""
+        """Mark a participant as dead; it stays until it is removed or rejoins."""
         participant = self.participants.get(name)
         if participant is None or not participant.alive:
             return None
@@ -308,34 +304,34 @@ class Barrier:
         return participant
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
-        """Wait for everybody who is waited for to come back to a world that was started again."""
+        """Wait for all to come back to a world that was started again."""
         for participant in self.participants.values():
             participant.since_wall_ns = participant.joined_wall_ns = wall_ns
             participant.alive = participant.alive and not all_died
             participant.away = participant.is_waited_for and (participant.alive or all_died)
 
     def away(self) -> list[Participant]:
-        """Return who has not come back yet."""
+        """Return the participants that have not come back yet."""
         return [p for p in self.participants.values() if p.away]
 
     def waiting_for_return(self, wall_ns: int) -> tuple[Waiting, ...]:
-        """Return who has not come back yet, as `clock` names them."""
+        """Return the same as entries of `clock`."""
         return tuple(participant.waiting(wall_ns) for participant in self.away())
 
     def substitute(self, name: str) -> Participant | None:
-        """Return who lives and does all the work of a participant beside its own."""
+        """Return a living participant that does all the work of another as well, None if there is none."""
         served = self.participants[name].served_names
         others = (p for p in self.participants.values() if p.name != name and p.alive)
         return next((p for p in others if served <= p.served_names), None)
 
     def duplicates(self, name: str) -> dict[str, set[str]]:
-        """Return the names that a participant serves and others who live serve as well, by their names."""
+        """Return the names that living participants serve in common with one, by participant."""
         served = self.participants[name].served_names
         others = (p for p in self.participants.values() if p.name != name and p.alive)
         return {p.name: both for p in others if (both := served & p.served_names)}
 
     def remove(self, name: str) -> Participant | None:
-        """Take a participant out: it published bye or is dropped."""
+        """Remove a participant that has said bye or is dropped."""
         removed = self.participants.pop(name, None)
         gone = (name, *(removed.join.serves if removed else ()))
         self._expected = [expected for expected in self._expected if expected not in gone]
@@ -347,17 +343,17 @@ class Barrier:
         return [name for name in self._expected if name not in present]
 
     def blocking(self, need_ns: int) -> list[Participant]:
-        """Return whose done for `need_ns` is not in yet."""
+        """Return the participants whose done for `need_ns` has not arrived."""
         return [p for p in self.participants.values() if p.blocks(need_ns)]
 
     def incomplete(self) -> list[Participant]:
-        """Return of whom outputs or a done were lost, or are still on their way."""
+        """Return the participants whose outputs or done were lost, or are still on their way."""
         return [p for p in self.participants.values() if p.incomplete]
 
     def give_up_late(self) -> None:
-        """At a gate in realtime, wait no longer for outputs that were missing at the one before: they are lost.
+        """At a gate in realtime, give up outputs that were missing at the gate before: they are lost.
 
-        Nobody asks for them again there, and every later gate would count as a deadline miss of their sender.
+        They are not requested again, and every later gate would count as a deadline miss of their sender.
         """
         for participant in self.participants.values():
             if participant.incomplete and participant.was_incomplete:
@@ -367,9 +363,9 @@ class Barrier:
     def waiting_for(
         self, need_ns: int, wall_ns: int, start_wall_ns: int, feeds: Callable[[str, str], bool] = lambda *_: False
     ) -> tuple[Waiting, ...]:
-        """Return whom the world waits for, as `clock` names them: first the dead, then who is silent for longest.
+        """Return whom the world waits for, as entries of `clock`: first the dead, then by time without a done.
 
-        Who only waits for another's outputs published after that one, and is expected after it; `feeds` tells who does.
+        `feeds` tells whether one process reads another's outputs, and so may only be waiting itself.
         """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
         rank = {name: place for place, name in enumerate(self._expected)}
@@ -383,7 +379,7 @@ def _incarnation_refusal(participant: Participant, found: str) -> Refusal:
 
 
 def _holders_up(victim: Participant, late: list[Participant], feeds: Callable[[str, str], bool]) -> tuple[str, ...]:
-    """Return for whose outputs one of several that are late may only wait itself."""
+    """Return the late participants whose outputs one of them may be waiting for."""
     read_by = victim.served_names if victim.gating and victim.alive and not victim.away else ()
     others = (p for p in late if p is not victim and p.gating)
     return tuple(p.name for p in others if any(feeds(w, r) for w in p.served_names for r in read_by))
