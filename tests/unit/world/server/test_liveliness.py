@@ -6,14 +6,17 @@ from typing import Any
 import pytest
 from fake_link import FakeLink
 
-from zsim.contract import keys
-from zsim.contract.run_messages import Join
+from zsim.contract import keys, messages
+from zsim.contract.run_messages import Health, Join
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import WORLD
+from zsim.transport.link_watch import ClosedLink
+from zsim.transport.session_tokens import SessionTokens
 from zsim_world.run.inputs import Run
+from zsim_world.run.outbox import STRANGERS_MAX
 from zsim_world.run.world import World
-from zsim_world.server.liveliness import SILENT_S, LivelinessMonitor
+from zsim_world.server.liveliness import SILENT_NS, SILENT_S, HealthWatch, LivelinessMonitor, SlowReaders
 
 GATE_NS = 20_000_000
 SCENARIO = """
@@ -121,3 +124,92 @@ def test_who_joins_in_place_of_one_that_lives_takes_over() -> None:
     case = Case("estimator.d1", GATE_NS)
     case.join(incarnation=2, pid=8)
     assert case.events()[1:] == ["superseded"]
+
+
+S = 1_000_000_000
+LOOK_NS = S // 10
+ME = "estimator.d1"
+
+
+class Watched:
+    """A watch, and what it reports."""
+
+    def __init__(self) -> None:
+        self.reports: list[tuple[str, int | None]] = []
+        self.watch = HealthWatch(lambda name, since_ns: self.reports.append((name, since_ns)))
+
+    def looks(self, from_ns: int, to_ns: int) -> None:
+        for wall_ns in range(from_ns, to_ns + 1, LOOK_NS):
+            self.watch.look(wall_ns)
+
+
+def test_a_stopped_process_is_reported_once_within_two_seconds_and_when_it_is_back():
+    case = Watched()
+    case.watch.look(10 * S)
+    case.watch.received(ME, 10 * S)
+    case.looks(10 * S, 10 * S + SILENT_NS - LOOK_NS)
+    assert case.reports == []
+    case.looks(10 * S + SILENT_NS, 15 * S)
+    assert case.reports == [(ME, 10 * S)]
+    assert SILENT_NS + LOOK_NS < 2 * S
+    case.watch.received(ME, 15 * S)
+    assert case.reports[1:] == [(ME, None)]
+
+
+def test_what_the_world_did_not_read_while_it_was_held_up_is_nobody_s_silence():
+    case = Watched()
+    case.watch.look(10 * S)
+    case.watch.received(ME, 10 * S)
+    case.watch.look(15 * S)
+    assert case.reports == []
+
+
+def test_nothing_is_expected_of_one_that_has_left():
+    case = Watched()
+    case.watch.look(10 * S)
+    case.watch.received(ME, 10 * S)
+    case.watch.forget(ME)
+    case.looks(10 * S, 15 * S)
+    assert case.reports == []
+
+
+ONE = "{name: one, duration_s: 1, drones: [{name: d1, position_m: [0, 0, 0]}]}"
+CONSOLE = ClosedLink("192.0.2.7:4000", "", ("console.1",), 400_000, 1)
+STRANGER = ClosedLink("127.0.0.1:4000", "pid 7 (python reader.py)", (), 70_000, 2)
+
+
+@pytest.fixture
+def readers() -> SlowReaders:
+    """Those of a run in which console.1 has published its health."""
+    link = FakeLink()
+    health = Health(0, 0, "console", "desk", 9, {}, 0, 0, 0, 0, reads=("view/**", "world/event"))
+    run = Run(World(scenario_file.from_text(ONE), run_id="run1"), HealthMeter(WORLD))
+    run.history.add(keys.process("console.1", "health"), messages.encode(health), 0)
+    return SlowReaders(link, SessionTokens(link), run)  # type: ignore[arg-type]
+
+
+def reported(readers: SlowReaders, closed: ClosedLink) -> dict[str, object]:
+    """Return the data of the event of a closed link."""
+    readers.watch.closed.append(closed)
+    readers.report()
+    events = [message for key, message in readers._run.world.take_outbox() if key == keys.EVENT]
+    (event,) = [event for event in events if event.kind == "slow_reader"]
+    assert all(str(name) in event.text for name in (closed.address, *closed.names))
+    return event.data
+
+
+def test_a_process_of_the_run_is_named_with_what_it_reads(readers: SlowReaders) -> None:
+    data = reported(readers, CONSOLE)
+    assert (data["host"], data["names"], data["reads"]) == ("192.0.2.7", ("console.1",), ["view/**", "world/event"])
+
+
+def test_a_stranger_on_this_machine_is_named_by_its_command(readers: SlowReaders) -> None:
+    data = reported(readers, STRANGER)
+    assert (data["host"], data["process"], data["reads"], data["times"]) == ("laptop", STRANGER.process, [], 2)
+
+
+def test_ever_new_sessions_are_so_many_events_only(readers: SlowReaders) -> None:
+    readers.watch.closed.extend(STRANGER._replace(address=f"127.0.0.1:{port}") for port in range(3 * STRANGERS_MAX))
+    readers.report()
+    events = [message for key, message in readers._run.world.take_outbox() if key == keys.EVENT]
+    assert [event.kind for event in events] == ["slow_reader"] * STRANGERS_MAX

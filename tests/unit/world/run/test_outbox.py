@@ -12,7 +12,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Mode, Velocity
 from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest, Done, Event, Join
 from zsim.scenario import scenario_file
-from zsim_world.run.outbox import CHANGES_MAX, EVENTS_MAX, REFUSED_MAX, STRANGERS_MAX, UNJOINED
+from zsim_world.run.outbox import CHANGES_MAX, EVENTS_MAX, REASONS_MAX, REFUSED_MAX, STRANGERS_MAX, UNJOINED, RefusalLog
 from zsim_world.run.world import World
 
 FLOOD = 5000  # requests, several times what is published
@@ -207,3 +207,32 @@ def test_what_was_spent_is_in_a_snapshot(world: World) -> None:
     continue_from(world, again)
     join(again, "late.1")
     assert kinds(again) == {}
+
+
+MODE = "drone/d1/cmd/mode"
+
+
+def test_the_first_of_each_are_events_and_all_are_counted():
+    refusals = RefusalLog()
+    texts = [refusals.add("a.one", MODE, "too late") for _ in range(EVENTS_MAX + 5)]
+    assert texts[0] == f"{MODE}: too late"
+    last = texts[EVENTS_MAX - 1] or ""
+    assert last.startswith(f"{MODE}: too late")
+    assert has_terms(last, "counted")
+    assert texts[EVENTS_MAX:] == [None] * 5
+    assert refusals.add("b.two", MODE, "too late") == texts[0]
+    assert refusals.count == EVENTS_MAX + 6
+
+
+def test_a_new_reason_is_an_event_after_many_of_another():
+    refusals = RefusalLog()
+    ages = [refusals.add("a.one", MODE, f"age is {500.5 + age} ms; must be <= 500 ms") for age in range(2 * EVENTS_MAX)]
+    assert len([text for text in ages if text]) == EVENTS_MAX
+    assert refusals.add("a.one", MODE, "landed") == f"{MODE}: landed"
+
+
+def test_ever_new_reasons_do_not_make_events_for_ever():
+    refusals = RefusalLog()
+    texts = [refusals.add("a.one", MODE, "x" * length) for length in range(1, 1 + 100 * EVENTS_MAX)]
+    assert len([text for text in texts if text]) == REASONS_MAX + EVENTS_MAX
+    assert refusals.count == 100 * EVENTS_MAX
