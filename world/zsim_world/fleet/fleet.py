@@ -208,7 +208,7 @@ class Fleet:
         self.bodies.near.origin.fill(math.inf)  # the near pairs are found anew
 
     def samples(self) -> list[SensorSample]:
-        """Return what fell due for publication in the last gate but sightings, by (t_ns, drone, sensor)."""
+        """Return the samples published in the last gate, without sightings, by (t_ns, drone, sensor)."""
         numbers = self.sampled.whose[:, WHOSE.sensor] < len(self.sensors.names)
         return Sampled(self.sampled.whose[numbers], self.sampled.values[numbers]).each(self.sensors)
 
@@ -218,7 +218,7 @@ class Fleet:
         return TrueState(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], accel, s[:, STATE.size :])
 
     def lead(self, i: int, pose: NDArray[np.float64]) -> None:
-        """Let an external drone be where a pose says, (STATE.size + its rotors,), and move on with its velocity."""
+        """Move an external drone to a pose, (STATE.size + its rotors,), from which it continues with its velocity."""
         self.bodies.pose[self.external[i], : len(pose)] = pose
         self.bodies.state[i, : len(pose)] = pose
 
@@ -232,11 +232,11 @@ class Fleet:
         return self._least
 
     def collisions(self) -> list[tuple[int, int]]:
-        """Return the pairs whose hulls began to touch in the last gate."""
+        """Return the pairs of drones whose hulls began to touch in the last gate."""
         return self._began
 
     def bumps(self) -> list[tuple[int, int]]:
-        """Return who began to touch which obstacle in the last gate."""
+        """Return the pairs of drone and obstacle that began to touch in the last gate."""
         if not self.bodies.obstacle.size:
             return []
         return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
@@ -246,7 +246,7 @@ class Fleet:
         return self._watch.incidents() if self._has_incidents else []
 
     def takeoff(self, i: int) -> str | None:
-        """Start a take-off; return None, or why not."""
+        """Start a take-off; return None, or why it is refused."""
         charge = self.status(i)[1]
         if refusal := self._state_refusal(i, "takeoff"):
             return refusal
@@ -260,7 +260,7 @@ class Fleet:
         return None
 
     def land(self, i: int) -> str | None:
-        """Start a landing; return None, or why not."""
+        """Start a landing; return None, or why it is refused."""
         if refusal := self._state_refusal(i, "land"):
             return refusal
         if self._mode(i) != firmware.LANDING:
@@ -273,7 +273,7 @@ class Fleet:
         return None
 
     def reset(self, i: int) -> str | None:
-        """Leave the emergency; return None, or why not."""
+        """Leave the emergency; return None, or why that is refused."""
         if refusal := self._state_refusal(i, "reset"):
             return refusal
         self._enter(i, firmware.LANDED)
@@ -286,42 +286,42 @@ class Fleet:
         yaw_rate_rad_s: float = 0.0,
         frame: Literal["heading", "world"] = "heading",
     ) -> str | None:
-        """Fly a velocity in the heading frame, or in W by the firmware's own heading; return None, or why not."""
+        """Fly a velocity in the heading frame, or in W by the firmware's own heading; return why it is refused."""
         kind = firmware.VELOCITY if frame == "heading" else firmware.VELOCITY_WORLD
         return self._set(i, kind, (*velocity_m_s, yaw_rate_rad_s))
 
     def set_ardrone(
         self, i: int, forward: float, left: float, up: float, yaw_left: float, hover: bool = False
     ) -> str | None:
-        """Fly by tilt, climb and yaw rate, each in [-1, 1] of its limit, or hover; return None, or why not."""
+        """Fly by tilt, climb and yaw rate, each in [-1, 1] of its limit, or hover; return why it is refused."""
         return self._set(i, firmware.HOVER if hover else firmware.ARDRONE, (forward, left, up, yaw_left))
 
     def set_attitude(self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0) -> str | None:
-        """Fly a tilt (of q_WB, w first; its heading is not used), thrust [N] and yaw rate; return None, or why not."""
+        """Fly a tilt (q_WB, w first, without its heading), thrust [N] and yaw rate; return why it is refused."""
         if fault := self.orientation_fault(i, q_WB):
             return fault
         return self._set(i, firmware.ATTITUDE, (*q_WB, thrust_n, yaw_rate_rad_s))
 
     def set_rotors(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
-        """Command the speeds of all rotors within their limits; return None, or why not."""
+        """Command the speeds of all rotors within their limits; return why it is refused."""
         if fault := self.rotors_fault(i, speed_rad_s):
             return fault
         return self._set(i, firmware.ROTORS, tuple(speed_rad_s))
 
     def orientation_fault(self, i: int, q_WB: Sequence[float]) -> str | None:
-        """Return why an orientation sent to a drone is none, None if it is one."""
+        """Return why an orientation is invalid, None if it is valid."""
         if sum(x * x for x in q_WB) < QUATERNION_SQUARE_MIN:
             return f"{self.names[i]} was sent the orientation {list(q_WB)}; must be a quaternion of length 1"
         return None
 
     def rotors_fault(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
-        """Return why rotor speeds sent to a drone are not for it, None if they are."""
+        """Return why rotor speeds do not fit a drone, None if they do."""
         if len(speed_rad_s) != self.rotors[i]:
             return f"{self.names[i]} was sent {len(speed_rad_s)} rotor speeds; it has {self.rotors[i]} rotors"
         return None
 
     def release(self, i: int) -> None:
-        """Let nobody fly the drone any more: it hovers."""
+        """Let a drone hover that has no commander any more."""
         self.boards.setpoint[i, SETPOINT.kind] = firmware.NONE
 
     def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
@@ -355,7 +355,7 @@ class Fleet:
             self._add_sightings(self._sightings.due(self.bodies.state, self.t_ns))
 
     def _add_sightings(self, sightings: list[PictureSightings]) -> None:
-        """Put sightings among the samples of the gate, behind those of the same drone and time."""
+        """Insert sightings into the samples of the gate, after those of the same drone and time."""
         self.sightings = {}
         if not sightings:
             return

@@ -56,7 +56,7 @@ class PublicationBuffers(NamedTuple):
 
 
 class MessageRow(NamedTuple):
-    """What one message is made of."""
+    """The numbers that one message is made of."""
 
     ints: NDArray[np.int64]
     floats: NDArray[np.float64]
@@ -74,7 +74,7 @@ class PublishedArrays(NamedTuple):
 
 
 class PublishedState(NamedTuple):
-    """What messages are made of beside these arrays, of N drones."""
+    """What messages of N drones are made of beside these arrays."""
 
     touching: NDArray[np.bool_]  # (N,), whether a hull touched another in this gate
     sigma_m: NDArray[np.float64]  # (N,), of each one's GPS
@@ -85,7 +85,7 @@ class PublishedState(NamedTuple):
 
 
 class UserPayloads(NamedTuple):
-    """Messages of users' sensors among the M samples of a gate, one behind the other."""
+    """Messages of users' sensors among the M samples of a gate, one after the other."""
 
     data: NDArray[np.uint8]
     ends: NDArray[np.int64]  # (M,), where that of each sample ends, those of stock sensors being empty
@@ -137,7 +137,7 @@ class GatePublication:
         publish(hold(state), *self._fleet.sampled, *self._payloads(), 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
-        """Return the messages of the present gate; `commanders` are those of the drones, None for none."""
+        """Return the messages of the present gate; `commanders` has the commander of each drone, None for none."""
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + self._own_count
         payloads = self._payloads()
@@ -157,11 +157,11 @@ class GatePublication:
         return GateMessages(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
 
     def _payloads(self) -> "UserPayloads":
-        """Return what is written already of this gate: the messages of the users' sensors."""
+        """Return the encoded messages of the users' sensors of this gate."""
         return self._encoder.encoded(self._fleetwide.counts) if self._encoder else NO_PAYLOADS
 
     def _number(self, commander: str | None) -> int:
-        """Return the number of a word; a new one is learnt."""
+        """Return the number of a word; a new one is added."""
         if commander not in self._known:
             self._known[commander] = COMMANDER + len(self._known)
             self._words = encoding.words((*firmware.MODES, *self._known))
@@ -176,7 +176,7 @@ class GatePublication:
 
 
 class UserMessages:
-    """Encodes what users' sensors have sampled, and sightings."""
+    """Encodes the samples of users' sensors, and sightings."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -218,7 +218,7 @@ class UserMessages:
         """Return the message of a reading.
 
         Raises:
-            UserCodeError: the sensor's conversion fails, or returns what the message has no place for.
+            UserCodeError: the sensor's conversion fails, or returns values that the message cannot hold.
         """
         kind, settings = self._fleet.sensors.types[s], self._fleet.sensors.settings[i][s]
         numbers = values[: kind.values].tolist()
@@ -277,7 +277,7 @@ def _by_drone(whose: NDArray, own: NDArray, first: NDArray) -> None:
 
 @compiled
 def _in_order(whose: NDArray, own: NDArray, first: NDArray) -> NDArray:
-    """Return which sample, or -1 for truth and -2 for status, stands at each place."""
+    """Return the sample, -1 for truth or -2 for status, at each place."""
     drones = len(first) - 1
     order, free = np.empty(first[drones], np.int64), first.copy()
     for m in range(whose.shape[0]):
@@ -292,13 +292,13 @@ def _in_order(whose: NDArray, own: NDArray, first: NDArray) -> NDArray:
 
 @inlined
 def _kind(sensor: int) -> int:
-    """Return the number of a sensor's messages among the kinds: a user's sensors stand behind the status."""
+    """Return the number of a sensor's kind of message: those of users' sensors follow the status."""
     return sensor if sensor < STOCK_SENSORS else sensor + 2
 
 
 @inlined
 def _copy(user: UserPayloads, m: int, out: NDArray, start: int) -> int:
-    """Write the message of sample m of a user's sensor, which is encoded already; return where it ends."""
+    """Copy the encoded message of sample m of a user's sensor; return where it ends."""
     begin = user.ends[m - 1] if m > 0 else 0
     for k in range(user.ends[m] - begin):
         out[start + k] = user.data[begin + k]
@@ -333,7 +333,7 @@ def _fill(
 
 @kernel()
 def publish(held: Held, whose: NDArray, values: NDArray, data: NDArray, ends: NDArray, now_ns: int) -> int:
-    """Write the messages of a gate, drone by drone, and count them; return how many bytes that were.
+    """Write the messages of a gate, drone by drone, and count them; return the number of bytes.
 
     Args:
         held: a PublicationState, by `hold`.

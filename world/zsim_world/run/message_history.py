@@ -27,7 +27,7 @@ EXPRESSIONS_MAX = 1000  # of one replay; a controller of hundreds of drones read
 
 
 class _ReplayArgs(msgspec.Struct):
-    """The arguments of a replay; `page` is `more` of the answer before."""
+    """The arguments of a replay; `page` is the field `more` of the answer before."""
 
     from_ns: int
     keys: Annotated[list[str], msgspec.Meta(max_length=EXPRESSIONS_MAX)]
@@ -43,8 +43,11 @@ class MessageHistory:
     """Payloads as on the wire, by key.
 
     Args:
-        keep_bytes: of the payloads that a replay may bring again.
-        page_bytes: of the payloads that one page brings.
+        keep_bytes: limit of the payloads kept for replays.
+        page_bytes: limit of the payloads on one page.
+
+    Attributes:
+        passed: messages that recorders have not been sent yet, in order.
     """
 
     def __init__(self, keep_bytes: int = KEEP_BYTES, page_bytes: int = PAGE_BYTES) -> None:
@@ -68,7 +71,7 @@ class MessageHistory:
     def add(self, key: str, payload: bytes, t_ns: int) -> None:
         """Keep a message; t_ns is its stamp.
 
-        How old it is follows from the world's clock at its arrival: a sender's stamp may be anything.
+        Its age is judged by the world's clock at its arrival: a sender's stamp may be anything.
         """
         if key == keys.CLOCK:
             self._now_ns = t_ns
@@ -77,9 +80,9 @@ class MessageHistory:
         self._keep(t_ns, [(key, payload)], len(payload))
 
     def add_foreign(self, key: str, payload: bytes) -> None:
-        """Keep, for recorders, a message that is none of the contract or was refused; it is nobody's last value.
+        """Keep, for recorders, a message outside of the contract or a refused one; it is not a last value.
 
-        What is beyond FOREIGN_BYTES is not kept: strangers push nothing out that a participant may lack.
+        Beyond FOREIGN_BYTES nothing is kept, so that strangers push out nothing that a participant may lack.
         """
         if self._foreign_bytes + len(payload) <= FOREIGN_BYTES:
             self._foreign_bytes += len(payload)
@@ -102,13 +105,13 @@ class MessageHistory:
             self._forgotten += len(oldest)
 
     def last(self, expression: str) -> list[tuple[str, bytes]]:
-        """Return the last value of every key that an expression takes."""
+        """Return the last value of every key that matches an expression."""
         if expression in self._last:
             return [(expression, self._last[expression])]
         return [(key, payload) for key, payload in list(self._last.items()) if keys.matches(expression, key)]
 
     def page(self, from_ns: int, wanted: Callable[[str], bool], start: int = 0) -> tuple[Pairs, int | None]:
-        """Return what is stamped after from_ns and on a key that is wanted, as far as a page holds it.
+        """Return a page of the messages stamped after from_ns on keys that are wanted.
 
         Args:
             from_ns: simulated time [ns].
@@ -164,7 +167,7 @@ class MessageHistory:
 
         Args:
             kept: the result of its answer.
-            done_ns: newest gate that it is through with.
+            done_ns: newest gate that it has completed.
 
         Raises:
             DecodeError: the result is no list of [key, payload].
@@ -182,7 +185,7 @@ class MessageHistory:
 
 
 def _identity(key: str, payload: bytes) -> tuple[str, int, int, str] | None:
-    """Return (key, t_ns, seq, source), by which an output is recognised; None for what no done counts."""
+    """Return (key, t_ns, seq, source), which identify an output; None for messages that no done counts."""
     kind = messages.type_of(key)
     if kind is None or not issubclass(kind, Command | Estimate | ClusterState | ClusterRequest):
         return None

@@ -63,7 +63,7 @@ class NoiseTable:
     def _draw_start(
         self, scenario: Scenario, streams: list[list[np.random.Generator]], shared: np.random.Generator
     ) -> None:
-        """Draw the biases and gusts at the start, first of each stream."""
+        """Draw the biases and gusts at the start, the first numbers of each stream."""
         common = shared.standard_normal(3)
         share = scenario.environment.wind.gust_correlation
         for i, drone in enumerate(scenario.drones):
@@ -133,7 +133,7 @@ class Ziggurat(NamedTuple):
 
 
 def _read_tables() -> Ziggurat:
-    """Read the tables of numpy's ziggurat from what it draws."""
+    """Read the tables of numpy's ziggurat from the numbers that it draws."""
     rng = np.random.Generator(np.random.PCG64(0))
     width = np.array([_drawn(rng, layer, 1)[0] for layer in range(_LAYERS)])
     inside = np.zeros(_LAYERS, dtype=np.uint64)  # of layer 1: none, it is the cap
@@ -146,7 +146,7 @@ def _read_tables() -> Ziggurat:
 
 
 def _drawn(rng: np.random.Generator, layer: int, size: int) -> tuple[float, bool]:
-    """Return the number that numpy makes of a word, and whether it needed no other."""
+    """Return the number that numpy draws for a word, and whether it needed no other word."""
     bits, state = rng.bit_generator, layer | size << int(_SIZE_SHIFT)  # without high bits, the word is the low ones
     held = bits.state
     step = held["state"]["inc"]
@@ -160,7 +160,7 @@ _WIDTH, _INSIDE, _HEIGHT = _read_tables()
 
 
 def words(rng: np.random.Generator) -> list[int]:
-    """Return the words of a stream, (WORDS.size,), from where numpy's generator stands.
+    """Return the words of a stream, (WORDS.size,), at the present state of numpy's generator.
 
     Raises:
         ValueError: it is not a PCG64.
@@ -173,7 +173,7 @@ def words(rng: np.random.Generator) -> list[int]:
 
 
 def place(rng: np.random.Generator, stream: Sequence[int]) -> None:
-    """Let numpy's generator stand where the words of a stream do, (WORDS.size,)."""
+    """Set the state of numpy's generator to the words of a stream, (WORDS.size,)."""
     state = stream[WORDS.state] << 64 | stream[WORDS.state + 1]
     step = stream[WORDS.step] << 64 | stream[WORDS.step + 1]
     rng.bit_generator.state = {**rng.bit_generator.state, "state": {"state": state, "inc": step}}
@@ -181,7 +181,7 @@ def place(rng: np.random.Generator, stream: Sequence[int]) -> None:
 
 @inlined
 def fill(out: NDArray, stream: NDArray) -> None:
-    """Draw standard normal numbers into out (n,), and move the stream's words (WORDS.size,) on."""
+    """Draw standard normal numbers into out (n,), and advance the stream's words (WORDS.size,)."""
     state = (stream[WORDS.state], stream[WORDS.state + 1])
     step = (stream[WORDS.step], stream[WORDS.step + 1])
     drawn = 0

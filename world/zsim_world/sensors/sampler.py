@@ -64,7 +64,7 @@ NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COL
 
 
 class SampledLog(NamedTuple):
-    """What the kernel logged, and what turns it into samples."""
+    """The log of the kernel, and what turns it into samples."""
 
     whose: NDArray[np.int64]  # (M, 3): sensor, drone, tick
     value: NDArray[np.float64]  # (M, CHANNELS_MAX)
@@ -74,7 +74,7 @@ class SampledLog(NamedTuple):
 
 
 class Sampler:
-    """Makes samples of what the kernel logged, and keeps back those that are delayed.
+    """Makes samples of the kernel's log, and holds back those that are delayed.
 
     Args:
         scenario: resolved.
@@ -97,7 +97,7 @@ class Sampler:
         self._later = NONE
 
     def due(self, logged: int, now_ns: int) -> Sampled:
-        """Return what falls due up to now of what was logged and of what waits.
+        """Return the samples that are due up to now, of the log and of those held back.
 
         Raises:
             UserCodeError: the equation of a user's sensor fails.
@@ -122,7 +122,7 @@ class Sampler:
 
 @kernel()
 def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
-    """Return index and values of Sampled of the first rows of a log.
+    """Return index and values of Sampled for the first rows of a log.
 
     Args:
         held: a SampledLog, by `hold`.
@@ -145,7 +145,7 @@ def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
 
 @inlined
 def _is_before(a: NDArray, b: NDArray) -> bool:
-    """Tell whether a measurement stands before or with another in the order of (t_ns, drone, sensor)."""
+    """Tell whether a measurement comes before or with another in the order of (t_ns, drone, sensor)."""
     if a[WHOSE.t] != b[WHOSE.t]:
         return a[WHOSE.t] < b[WHOSE.t]
     if a[WHOSE.drone] != b[WHOSE.drone]:
@@ -155,7 +155,7 @@ def _is_before(a: NDArray, b: NDArray) -> bool:
 
 @kernel()
 def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return measurements with others among them that have no numbers, and the rows in which these stand.
+    """Return measurements with others inserted that have no numbers, and the rows of these.
 
     Args:
         whose, values: of Sampled, in its order.
@@ -174,7 +174,7 @@ def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, 
 
 
 class UserSensors:
-    """Makes readings. Each drone and sensor has a random stream, as the stock sensors have.
+    """The users' sensors of a fleet. Each drone and sensor has a random stream, as the stock sensors have.
 
     Args:
         scenario: resolved.
@@ -203,10 +203,10 @@ class UserSensors:
         return [*self._sensors.values()]
 
     def readings(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return whose (M, 3) and values (M, 6) of what the kernel logged in a gate, without what is lost.
+        """Return whose (M, 3) and values (M, 6) of the exposures logged in a gate, without those that are lost.
 
         Raises:
-            UserCodeError: an equation fails, or returns what is no reading.
+            UserCodeError: an equation fails, or returns what is not a reading.
         """
         senses, kept = self._senses, []
         count = int(senses.exposed_count[0])
@@ -250,7 +250,7 @@ class _UserSensor:
         place(self._rng, stream)
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
-        """Return what it is exposed to, by a row of EXPOSED."""
+        """Return the truth that it is exposed to, from a row of EXPOSED."""
         state, accel = row[EXPOSED.state : EXPOSED.accel].copy(), row[EXPOSED.accel : EXPOSED.air].copy()
         return SensorTruth(
             t_s=t_s,

@@ -34,14 +34,14 @@ Array = NDArray[np.float64]
 
 
 class PictureSightings(NamedTuple):
-    """What was seen in one picture.
+    """The sightings in one picture.
 
     Attributes:
-        t_ns: when it is published.
+        t_ns: when they are published.
         drone: whose camera.
         t_sample_ns: the middle of the exposure.
         camera: its name.
-        seen: in no order that tells whose hats they are.
+        seen: in an order that does not tell whose hats they are.
     """
 
     t_ns: int
@@ -52,7 +52,7 @@ class PictureSightings(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """What W cameras look at and with what, as compiled code takes it; N drones."""
+    """The W cameras and what they look at, for compiled code; N drones."""
 
     drones: NDArray[np.int64]  # (W,), whose each camera is
     cameras: Array  # (W, CAMERA.size)
@@ -66,7 +66,7 @@ class Surroundings(NamedTuple):
 
 
 class _Exposures(NamedTuple):
-    """When a camera takes pictures, and how late what is seen in them is published."""
+    """When a camera takes pictures, and the delay until its sightings are published."""
 
     drone: int
     name: str
@@ -78,7 +78,7 @@ class _Exposures(NamedTuple):
         return round(count * 1e9 / self.rate_hz)
 
     def publish(self, at_ns: int, seen: tuple[Seen, ...]) -> PictureSightings:
-        """Return what was seen in a picture of an instant."""
+        """Return the sightings in a picture of an instant."""
         return PictureSightings(at_ns + self.latency_ns, self.drone, at_ns, self.name, seen)
 
 
@@ -137,7 +137,7 @@ class SightingSampler:
         self._former_ns = 0
 
     def due(self, state: Array, now_ns: int) -> list[PictureSightings]:
-        """Return what falls due by a gate, given the state of all drones there, (N, STATE.size or more)."""
+        """Return what is due by a gate, given the state of all drones there, (N, STATE.size or more)."""
         if self._next_ns <= now_ns:
             self._later += self._looked(state[:, : STATE.size].copy(), now_ns)
         if self._next_ns <= now_ns + self._gate_ns:  # a picture before the next gate needs this state
@@ -149,7 +149,7 @@ class SightingSampler:
         return due
 
     def _looked(self, now: Array, now_ns: int) -> list[PictureSightings]:
-        """Return what is seen in all pictures up to a gate."""
+        """Return the sightings in all pictures up to a gate."""
         pictures = sorted(self._taken(now_ns))
         self._next_ns = min(self._due_ns)
         first = not len(self._former)
@@ -171,7 +171,7 @@ class SightingSampler:
 
 
 def _watching(scenario: Scenario) -> Iterator[tuple[int, str, Camera, SightingModel]]:
-    """Yield every camera of a simulated drone in whose pictures a detector looks: drone, name, camera, detector."""
+    """Yield every camera of a simulated drone with a detector: drone, name, camera, detector."""
     for i, drone in enumerate(scenario.drones):
         model = drone.sensors.sightings
         if model is not UNSET and not drone.is_external:
@@ -181,7 +181,7 @@ def _watching(scenario: Scenario) -> Iterator[tuple[int, str, Camera, SightingMo
 
 
 def _detector(camera: Camera, model: SightingModel, hats: Hats, light: float, rng: np.random.Generator) -> Array:
-    """Return the row of a detector; its camera's misalignment is the first that its stream gives."""
+    """Return the row of a detector; its camera's misalignment is drawn first from its stream."""
     row = np.zeros(DETECTOR.size)
     misaligned_rad = math.radians(model.misalignment_deg)
     R_BK = camera_pose(camera).R_BK @ _turned(misaligned_rad * rng.standard_normal(3))
@@ -196,13 +196,13 @@ def _detector(camera: Camera, model: SightingModel, hats: Hats, light: float, rn
 
 
 def _sighting(row: list[float]) -> Seen:
-    """Return what a row of SEEN says."""
+    """Return the sighting of a row of SEEN."""
     _, x, y, z, range_m, sigma, sigma_m = row
     return Seen((x, y, z), range_m, sigma, sigma_m)
 
 
 def _turned(r: Array) -> Array:
-    """Return the matrix of a small turn [rad], to second order."""
+    """Return the rotation matrix of a small rotation vector [rad], to second order."""
     x, y, z = r.tolist()
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     U, _, Vt = np.linalg.svd(np.eye(3) + K)
@@ -219,7 +219,7 @@ def look(
     held: Held,
     streams: NDArray,
 ) -> NDArray:
-    """Return what is seen in some pictures, (M, SEEN.size).
+    """Return the sightings in some pictures, (M, SEEN.size).
 
     Args:
         pictures: instant [ns] and camera of each, by instant, (P, 2).
@@ -278,7 +278,7 @@ SMALLEST = 0.1  # of a hat's apparent diameter, the least that is measured
 
 @inlined
 def _unit(normal: float) -> float:
-    """Return a number between 0 and 1, all alike, of a standard normal one."""
+    """Return a uniform number between 0 and 1 from a standard normal one."""
     return 0.5 * math.erfc(normal / math.sqrt(2.0))
 
 
@@ -296,7 +296,7 @@ def _sigmas_px(model: NDArray, row: NDArray) -> tuple[float, float]:
 
 @inlined
 def _put(model: NDArray, to_K: Vector, range_m: float, sigma: float, sigma_m: float, out: NDArray) -> None:
-    """Write a sighting along a direction of K, of any length."""
+    """Write a sighting in a direction of K, of any length."""
     length = math.sqrt(to_K[0] * to_K[0] + to_K[1] * to_K[1] + to_K[2] * to_K[2])
     for k in range(3):
         at = DETECTOR.R_BK + 3 * k
@@ -307,13 +307,13 @@ def _put(model: NDArray, to_K: Vector, range_m: float, sigma: float, sigma_m: fl
 
 @inlined
 def _range_m(model: NDArray, angle: float) -> float:
-    """Return how far a hat of an apparent diameter [rad] is."""
+    """Return the distance of a hat of an apparent diameter [rad]."""
     return model[DETECTOR.radius] / math.sin(0.5 * min(angle, ANGLE_MAX))
 
 
 @inlined
 def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
-    """Write what is seen of a hat in view; False if it is missed by chance, or measured as too small."""
+    """Write the sighting of a hat in view; False if it is missed by chance, or measured as too small."""
     centre_px, diameter_px = _sigmas_px(model, row)
     scale, angle = row[VIEW.scale], row[VIEW.angle]
     measured = angle + diameter_px / scale * noise[2]
@@ -360,7 +360,7 @@ def _sort(out: NDArray, first: int, end: int) -> None:
 
 @compiled
 def detect(model: NDArray, lens: Lens, view: NDArray, stream: NDArray, out: NDArray, first: int) -> int:
-    """Write what a detector sees in a picture into rows of `out` from `first` on; return where they end.
+    """Write a detector's sightings in a picture into rows of `out` from `first` on; return where they end.
 
     Args:
         model: (DETECTOR.size,).
