@@ -107,7 +107,7 @@ class KernelTime(NamedTuple):
 
 
 class NearPairs(NamedTuple):
-    """Pairs of drones that can matter to each other, and for which places that was found (contacts.py)."""
+    """Pairs of drones that can affect each other, and the positions for which they were found (contacts.py)."""
 
     pair: NDArray  # int32 (N (N - 1) / 2, 2), i < j, ascending
     number: NDArray  # int64 (1,), how many pairs
@@ -115,7 +115,7 @@ class NearPairs(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """N aircraft, as physics has them."""
+    """The bodies of N aircraft."""
 
     each: tuple[int, ...]  # R numbers
     vehicle: NDArray  # (N, VEHICLE.size)
@@ -185,14 +185,14 @@ class Senses(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """What is kept of N drones to find their incidents, see fleet/flight_watch.py."""
+    """What is kept of N drones to detect their incidents, see fleet/flight_watch.py."""
 
     seen: NDArray  # (N, flight_watch.SEEN.size)
     found: NDArray  # int64 (N,), bits of the incidents of each in the last gate
 
 
 class Arrays(NamedTuple):
-    """All that a fleet is."""
+    """All arrays of a fleet."""
 
     time: KernelTime
     bodies: Bodies
@@ -205,7 +205,7 @@ class Arrays(NamedTuple):
 
 
 def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
-    """Yield all arrays of a fleet but those that are found again: a flight goes on from their numbers alone."""
+    """Yield the arrays that make up the state of a fleet: all but the near pairs, which are found anew."""
     for member in group:
         if isinstance(member, np.ndarray):
             yield member
@@ -214,7 +214,7 @@ def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
 
 
 class PerRotor(NamedTuple):
-    """Groups of numbers per rotor of one drone, in a row or in a block of drones: `of` reads them."""
+    """Groups of numbers per rotor of one drone, in a row or in a block of drones, read by `of`."""
 
     numbers: NDArray
     first: int
@@ -223,7 +223,7 @@ class PerRotor(NamedTuple):
 
 
 class Aero(NamedTuple):
-    """Aerodynamics of one drone; compiled code knows how many `parts` (Bodies.aero_parts), and leaves out the rest."""
+    """Aerodynamics of one drone; compiled code knows the number of `parts` (Bodies.aero_parts) and omits the rest."""
 
     parts: tuple[int, ...]
     numbers: Row  # (AERO.size,)
@@ -276,7 +276,7 @@ def rotor_slots(vehicles: Iterable[Vehicle]) -> int:
 
 
 def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDArray[np.float64]:
-    """Return the parameters of one drone, (VEHICLE.size,): its vehicle's, with what the scenario says of it."""
+    """Return the parameters of one drone, (VEHICLE.size,): its vehicle's, with the scenario's changes."""
     row, frame = np.empty(VEHICLE.size), vehicle.airframe
     density = environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3
     size = drone.arm_m / vehicle.arm_m
@@ -320,7 +320,7 @@ def aero_row(drone: Drone, environment: Environment) -> NDArray[np.float64]:
 
 
 def rotor_row(vehicle: Vehicle, drone: Drone, rotors: int) -> NDArray[np.float64]:
-    """Return what is known of each rotor of one drone, (ROTOR.size * rotors,)."""
+    """Return the parameters of each rotor of one drone, (ROTOR.size * rotors,)."""
     groups, count = np.zeros((ROTOR.size, rotors)), len(vehicle.rotors)
     roll, minus_pitch, turn = allocation(vehicle)
     groups[ROTOR.x, :count], groups[ROTOR.y, :count], groups[ROTOR.turn, :count] = -minus_pitch, roll, turn

@@ -173,7 +173,7 @@ def step(
 ) -> None:
     """Advance one drone's state (STATE.size + R,) by dt [s] in place, under a command (R,) [rad/s] to its rotors.
 
-    The rotors' lag is integrated exactly, also inside the step; air and pushes of others are held over it.
+    The rotors' lag is integrated exactly, also within the step; air and forces of others are held over it.
     """
     decay = half_decay(row[VEHICLE.rotor_lag], dt)
     speeds, commands = PerRotor(state, STATE.size, 1, rotors.each), PerRotor(command, 0, 1, rotors.each)
@@ -197,7 +197,7 @@ def lag(speeds: PerRotor, commands: PerRotor, decay: float) -> None:
 
 @inlined
 def half_decay(lag_s: float, dt: float) -> float:
-    """Return what is left of a rotor's distance to its commanded speed after half a step."""
+    """Return the fraction of a rotor's distance to its commanded speed that is left after half a step."""
     return math.exp(-0.5 * dt / lag_s)
 
 
@@ -370,7 +370,7 @@ def free_thrust(row: Row, speeds: PerRotor) -> float:
 def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: PerRotor) -> None:
     """Set rotor speeds [rad/s] that give a thrust [N] and a moment in B [N m] within the rotors' limits.
 
-    What cannot be had is given up in this order: yaw first, then thrust, tilt last.
+    What exceeds the limits is given up in this order: yaw first, then thrust, tilt last.
     """
     thrust = row[VEHICLE.thrust]
     low = thrust * row[VEHICLE.rotor_min] * row[VEHICLE.rotor_min]

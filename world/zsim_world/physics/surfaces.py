@@ -144,7 +144,7 @@ def _vector(row: NDArray) -> Vector:
 
 @inlined
 def _across(a: Vector, n: Vector) -> Vector:
-    """Return what of a vector is perpendicular to the unit vector n."""
+    """Return the component of a vector perpendicular to the unit vector n."""
     return axpy(a, -dot(a, n), n)
 
 
@@ -184,7 +184,7 @@ def touched(
 
 @apart
 def meet_obstacles(bodies: Bodies) -> None:
-    """Find the solids in reach of every drone, move its anchors along, and note whose hull touches which.
+    """Find the obstacles within reach of every drone, move its anchors, and note which hulls touch which.
 
     `braced[i]` is 1 where there are any; `bumping[i, m]` where more than its feet is in contact now; `bumped` is set to
     1 where such contact begins.
@@ -215,7 +215,7 @@ def meet_obstacles(bodies: Bodies) -> None:
 
 @inlined
 def brace(bodies: Bodies, i: int) -> None:
-    """Note that drone i is not in free air: it is stepped with all that it touches."""
+    """Note that drone i is not in free air: it is stepped with everything that it touches."""
     if bodies.braced[i] == 0:
         bodies.braced[i] = 1
         for k in range(3):
@@ -224,7 +224,7 @@ def brace(bodies: Bodies, i: int) -> None:
 
 @inlined
 def _slot(bodies: Bodies, i: int, m: int, distance: float) -> int:
-    """Return the slot for obstacle m among those of drone i: its own, or that of the farthest; -1: all hold nearer."""
+    """Return the slot for obstacle m of drone i: its own, or that of the farthest; -1 if all hold nearer ones."""
     solid, p = bodies.solid[i], STATE.p_WB
     x, y, z = bodies.state[i, p], bodies.state[i, p + 1], bodies.state[i, p + 2]
     chosen, farthest = -1, distance
@@ -239,9 +239,10 @@ def _slot(bodies: Bodies, i: int, m: int, distance: float) -> int:
 
 @inlined
 def _drag_anchors(row: NDArray, solid: NDArray, anchor: NDArray, state: NDArray, is_new: bool) -> bool:
-    """Move the anchors of one drone on one solid after a step; return whether more than its feet touches it.
+    """Move the anchors of one drone on one obstacle after a step; return whether more than its feet touches it.
 
-    An anchor is at its ball's centre where there is no contact or `is_new`, and else follows within the friction cone.
+    An anchor is at its ball's centre where there is no contact or `is_new`, and otherwise follows within the friction
+    cone.
     """
     p_WB, q = _vector(state[STATE.p_WB : STATE.p_WB + 3]), state[STATE.q_WB : STATE.q_WB + 4]
     q_WB = (q[0], q[1], q[2], q[3])

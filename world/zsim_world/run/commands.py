@@ -30,7 +30,7 @@ RECENT_PER_DRONE = 32  # commands remembered to recognise duplicates; a rejoin r
 
 
 class CommandIntake:
-    """Takes commands as they arrive, and hands them to the fleet at their instants.
+    """Takes commands as they arrive, and passes them to the fleet at their instants.
 
     Args:
         run: whose participants send commands.
@@ -146,7 +146,7 @@ class CommandIntake:
         return self._fleet.bodies.state[i, :3].tolist() if i is not None else None
 
     def apply(self, t_ns: int) -> None:
-        """Hand the commands that take effect at t_ns to the firmware."""
+        """Pass the commands that take effect at t_ns to the firmware."""
         for command in self.queue.pop(t_ns):
             self._carry_out(command, t_ns + self._clock.gate_ns)
 
@@ -275,14 +275,14 @@ class QueuedCommand(NamedTuple):
 
 
 class Commander(NamedTuple):
-    """Who flies a drone."""
+    """The source that flies a drone."""
 
     source: str
     priority: int
 
 
 class CommandQueue:
-    """Commands that are to take effect, and the commander of each drone.
+    """Commands that are yet to take effect, and the commander of each drone.
 
     Args:
         drones: names in scenario order.
@@ -310,7 +310,7 @@ class CommandQueue:
         return messages.decode(keys.command(self._names[drone], kind), payload)
 
     def restored(self) -> None:
-        """Give the messages, of which the state has the fields, their types."""
+        """Convert the messages, which the state holds as maps, to their types."""
         for t_ns, queued in self._queued.items():
             self._queued[t_ns] = [each._replace(message=_command(each.kind, each.message)) for each in queued]
         self._recent = {mark: _command(mark[1], message) for mark, message in self._recent.items()}
@@ -386,7 +386,7 @@ class CommandQueue:
         return None
 
     def remove_source(self, source: str) -> list[int]:
-        """Take all drones and priorities from a source that left; return the drones of which it was the commander."""
+        """Remove a source that has left as commander and its priorities; return the drones that it commanded."""
         drones = [i for i, commander in enumerate(self._commanders) if commander and commander.source == source]
         for drone in drones:
             self._commanders[drone] = None

@@ -88,7 +88,7 @@ class Coordinator(Participants, ABC):
         self.barrier.count_output(source)
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
-        """Let time stand, in a world that was started again, until those who took part are back or dead.
+        """Let time stand, in a world that was started again, until the participants are back or dead.
 
         Args:
             all_died: whether they have to be started again, too.
@@ -99,9 +99,9 @@ class Coordinator(Participants, ABC):
     # Requests
 
     def control(self, request: ControlRequest) -> ControlAnswer:
-        """Answer a request on `world/control`; it is an event, unless its source has had many of its kind.
+        """Answer a request on `world/control`; it is an event, unless its source has made too many of its kind.
 
-        One that changes the flight is an event always, as a rerun repeats it: beyond the budget it is refused.
+        A request that changes the flight is always an event, since a rerun repeats it: beyond the budget it is refused.
         """
         self.requests += 1
         op, source = request.op[:40], request.source if keys.PROCESS_NAME.fullmatch(request.source) else ""
@@ -138,7 +138,7 @@ class Coordinator(Participants, ABC):
     # Time
 
     def may_advance(self) -> bool:
-        """Tell whether nothing but pacing keeps the world from the next gate."""
+        """Tell whether the next gate may come, but for pacing."""
         clock = self.clock
         if clock.is_halted or self.barrier.away():
             return False
@@ -157,7 +157,7 @@ class Coordinator(Participants, ABC):
         return self.blocking() if waits else []
 
     def must_wait_for(self, participant: Participant) -> bool:
-        """Tell whether the scenario has a process that is waited for however long its first step takes."""
+        """Tell whether the scenario needs a participant, so that it is waited for however long its first step takes."""
         if participant.served_names <= self.unpaced:
             return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)
@@ -169,7 +169,7 @@ class Coordinator(Participants, ABC):
         return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self.start_wall_ns, self._data_flow.feeds)
 
     def missed(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
-        """Return who is dead, silent or not back yet in realtime, where nobody else is waited for."""
+        """Return the participants that are dead, silent or not back yet in realtime, where nobody is waited for."""
         if self.clock.mode != "realtime":
             return ()
         all_of_them = self.barrier.participants.values()

@@ -142,7 +142,7 @@ class Playback(Coordinator):
             self._end(over)
 
     def _over(self) -> str:
-        """Return why nothing more is to be played; empty while there is something."""
+        """Return why there is nothing more to play; empty while there is something."""
         to_ns = self._played.to_ns
         if self._coming is None:
             return RECORD_OVER
@@ -162,7 +162,7 @@ class Playback(Coordinator):
         return ControlAnswer(True, result={**span, "marks": timeline_marks(self._reader)})
 
     def _views_of_past(self, request: ControlRequest) -> Refusal | ControlAnswer:
-        """Answer the views of instants on record, `every_s` apart, wherever the replay is: for curves and trails."""
+        """Answer the views of instants on record, `every_s` apart, for curves and trails."""
         from_s, to_s, every_s = (number(request.args.get(name)) for name in ("from_s", "to_s", "every_s"))
         if from_s is None or not 0.0 <= from_s < SEEK_MAX_S:
             return refused_argument(request, "from_s", "a time on record [s]")
@@ -266,7 +266,7 @@ class Playback(Coordinator):
             self.outbox.put(key, msgspec.Raw(payload))
 
     def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
-        """Return what the world published of its drones, as it did: drone by drone, the status last."""
+        """Return the world's messages about its drones as the world published them: drone by drone, status last."""
         of_drones.sort(key=lambda m: self._place[m.key] // self._kinds)
         which = np.array([self._place[m.key] for m in of_drones])
         first = np.searchsorted(which // self._kinds, np.arange(len(self.names) + 1)).tolist()
@@ -318,7 +318,7 @@ def _is_of(view: str, live: set[str]) -> bool:
 
 
 def _recount(payloads: list[bytes], kinds: list[int], first: list[int]) -> None:
-    """Let each status count the sensor messages that are played; agents would wait for those that are left out."""
+    """Let each status count the sensor messages that are played; agents would wait for the others."""
     truth, status = KINDS.index("truth"), KINDS.index("status")
     for begin, end in pairwise(first):
         for m in range(begin, end):

@@ -59,7 +59,7 @@ class RunClock:
 
     @property
     def is_halted(self) -> bool:
-        """Tell whether time stands whatever dones there are: the run has ended or is paused."""
+        """Tell whether time stands whatever dones arrive: the run has ended or is paused."""
         return self.ended is not None or (self.state == "paused" and self.steps_allowed == 0)
 
     def start(self, t_ns: int, paused: bool = False) -> None:
@@ -68,7 +68,7 @@ class RunClock:
         self._set(t_ns)
 
     def advance(self, t_ns: int) -> None:
-        """Go on to a gate: one less may come while the run is paused."""
+        """Advance to a gate; while the run is paused, this uses up one step."""
         self.steps_allowed = max(0, self.steps_allowed - 1)
         self._set(t_ns)
 
@@ -77,7 +77,7 @@ class RunClock:
         self.now_ns, self.next_ns = t_ns, t_ns + self.gate_ns
 
     def complete(self, reason: str) -> None:
-        """End the run, which comes to its end by itself."""
+        """End the run at its regular end."""
         self.is_complete = self.ended is None
         self.stop(reason)
 

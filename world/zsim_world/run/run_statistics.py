@@ -77,7 +77,7 @@ class RealTimeFactor:
         self._sim_ns = 0
 
     def stand_still(self, wall_ns: int) -> None:
-        """Leave out of the wall time of the run what has passed since the last gate, until wall_ns."""
+        """Exclude from the run's wall time what has passed since the last gate, until wall_ns."""
         if self._start_wall_ns is not None:
             self._start_wall_ns += wall_ns - self._last[1]
             self._last = (self._last[0], wall_ns)
@@ -96,7 +96,7 @@ class RealTimeFactor:
             marks.append(self._last)
 
     def jump(self) -> None:
-        """Note that simulated time jumps to the next gate: it does not pass."""
+        """Note that simulated time jumps to the next gate rather than passing."""
         self._marks.clear()
 
     def now(self) -> float:
@@ -148,7 +148,7 @@ class RunStatistics:
         self.closest_m = min(self.closest_m, closest_m)
 
     def deadlines(self, participants: Iterable[Participant], need_ns: int) -> None:
-        """Count whose done for need_ns was due, and whose is missing."""
+        """Count the participants whose done for need_ns was due, and those whose done is missing."""
         for participant in participants:
             if participant.gating and participant.required_ns(need_ns) is not None:
                 self._deadline_count += 1

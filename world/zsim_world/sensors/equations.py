@@ -35,7 +35,7 @@ class BodyTruth(NamedTuple):
 
 
 class MountedSensor(NamedTuple):
-    """Pose of a sensor in the body, and the largest range of one that has such."""
+    """Pose of a sensor in the body, and the largest range of a range sensor."""
 
     p_BS: Vector  # m
     q_BS: Quaternion
@@ -43,7 +43,7 @@ class MountedSensor(NamedTuple):
 
 
 class Site(NamedTuple):
-    """Where the flight is."""
+    """The place of the flight."""
 
     gravity: float  # m/s^2
     field_W: Vector  # uT, of the Earth
@@ -94,8 +94,8 @@ def baro(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
 def pressure(altitude_m: float) -> float:
     """Return the static pressure [Pa] of the standard atmosphere at an altitude above sea level (ISO 2533).
 
-    It holds to 11 km, which no scenario allows to exceed; a drone that a wind carries beyond finds the same law, and
-    where that ends, at 44 km, a vacuum.
+    The law holds to 11 km, the limit of scenarios; a drone carried beyond by the wind gets the same law, and a vacuum
+    where that ends, at 44 km.
     """
     return SEA_LEVEL_PA * math.pow(max(1.0 - LAPSE_1_M * altitude_m, 0.0), PRESSURE_EXPONENT)
 
@@ -129,7 +129,7 @@ def flow(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
 
 @inlined
 def rounded(value: float, bias: float, white: float, quantum: float) -> float:
-    """Return what the converter gives: value + bias + white, rounded to the quantum (0: none)."""
+    """Return the converter's output: value + bias + white, rounded to the quantum (0: none)."""
     x = value + bias + white
     return x if quantum == 0.0 else quantum * math.floor(x / quantum + 0.5)
 
@@ -154,14 +154,14 @@ def add_errors(n: int, value: NDArray, config: NDArray, bias: NDArray, noise: ND
 
 @inlined
 def displace(n: int, value: NDArray, fault: NDArray) -> None:
-    """Add what a fault adds to the errorless values of a sensor, in place."""
+    """Add the offset of a fault to the errorless values of a sensor, in place."""
     for k in range(n):
         value[k] += fault[FAULT.offset + k]
 
 
 @inlined
 def hold_reading(value: NDArray, fault: NDArray) -> None:
-    """Keep a reading (6,) that is the first of a stuck sensor, or give the one kept, in place."""
+    """Store the first reading (6,) of a stuck sensor, or replace a reading by the stored one, in place."""
     if fault[FAULT.hold] == ARMED:
         fault[FAULT.hold] = HOLDING
         for k in range(CHANNELS_MAX):

@@ -48,7 +48,7 @@ def loop_gains(design: Firmware, rotor_lag_s: float) -> tuple[float, float, floa
 
 
 def lag_shares(design: Firmware, rotor_lag_s: float) -> tuple[float, float]:
-    """Return what is left of a rotor's lag after a step, and by how much to overdrive it to shorten that lag."""
+    """Return the fraction of a rotor's lag left after a step, and the overdrive that shortens that lag."""
     decay = math.exp(-STEP_S / rotor_lag_s)
     return decay, (1.0 - math.exp(-STEP_S / (design.lag_lead * rotor_lag_s))) / (1.0 - decay)
 
@@ -192,7 +192,7 @@ RISING, HOLDING = 1.0, 2.0
 
 
 class Decision(NamedTuple):
-    """What the firmware has decided on for the next 5 ms."""
+    """The firmware's decision for the next 5 ms."""
 
     driven: bool  # True: the drive is to find the command from the last three; False: it is set
     z_H: Vector  # along the body's z wanted, in the heading frame
@@ -218,7 +218,7 @@ def decide(
     land_s: float,
     charge_percent: float,
 ) -> Decision:
-    """Decide what the rotors are to do in the next 5 ms: set commands [rad/s], or return what they are to give.
+    """Decide on the rotors of the next 5 ms: set commands [rad/s], or return the thrust and attitude wanted.
 
     Args:
         commands: of the rotors, set where the drive need not find them.
@@ -292,7 +292,7 @@ def _change_mode(
 
 @inlined
 def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
-    """Return the mode in the air that a setpoint of this kind and the commander's silence ask for."""
+    """Return the mode in the air for this kind of setpoint and the commander's silence."""
     if kind == NONE:
         return HOVERING
     if silence_s >= hover_s + land_s:
@@ -321,7 +321,7 @@ def _fly(
     setting: NDArray,
     setpoint: NDArray,
 ) -> Decision:
-    """Decide what the rotors are to do in the air, or on the way there."""
+    """Decide on the rotors in the air, or on the way there."""
     kind = int(setpoint[SETPOINT.kind])
     if mode == FLYING and kind == ROTORS:
         for r in range(len(rotors.each)):
@@ -397,7 +397,7 @@ def _asked_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: NDAr
 
 @inlined
 def _held(memory: NDArray, belief: NDArray, own: Quaternion, setting: NDArray, v_des: Vector) -> Vector:
-    """Return the v_des with the horizontal velocity that holds the place of the own odometry."""
+    """Return v_des with the horizontal velocity that holds the position of the odometry."""
     v_W = rot.rotate(own, vector(belief, BELIEF.v_H))
     for k in range(2):
         if memory[MEMORY.holds_xy] == 0.0:
@@ -436,7 +436,7 @@ def _climb(
 
 @inlined
 def _ascent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
-    """Return the vertical velocity of a take-off [m/s]: along a height that rises evenly."""
+    """Return the vertical velocity of a take-off [m/s], following a height that rises evenly."""
     height, standing = belief[BELIEF.height], standing_height(belief, row)
     final = min(setting[SETTING.takeoff_height] + (standing - row[VEHICLE.stand_height]), setting[SETTING.altitude])
     if memory[MEMORY.holds_z] == 0.0:

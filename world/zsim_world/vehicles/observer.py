@@ -92,7 +92,7 @@ SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barome
 
 @inlined
 def _face(belief: NDArray, q: Quaternion) -> Quaternion:
-    """Believe an attitude; return its heading frame in W, which all that follows is given."""
+    """Set the believed attitude; return its heading frame in W."""
     put_four(belief, BELIEF.q_WB, q)
     belief[BELIEF.heading] = rot.heading(q)
     return rot.about_z(belief[BELIEF.heading])
@@ -107,7 +107,7 @@ def _turn_by(belief: NDArray, own: Quaternion, r_H: Vector) -> Quaternion:
 
 @inlined
 def _take_bias(belief: NDArray, own: Quaternion, r_H: Vector) -> None:
-    """Take a rate error [rad/s], given in the heading frame, out of the gyro's bias."""
+    """Correct the gyro's bias by a rate error [rad/s] given in the heading frame."""
     q_HB = rot.level(own, four(belief, BELIEF.q_WB))
     put(belief, BELIEF.gyro_bias, axpy(vector(belief, BELIEF.gyro_bias), -1.0, rot.rotate_back(q_HB, r_H)))
 
@@ -244,7 +244,7 @@ def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
 
 @inlined
 def _correct_tilt(belief: NDArray, gain: NDArray, own: Quaternion, e: Vector) -> Quaternion:
-    """Correct tilt and gyro bias by an innovation of the flow (the accelerometer's share of it is nothing)."""
+    """Correct tilt and gyro bias by an innovation of the flow; that of the accelerometer has no share in it."""
     tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]
     own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther so
     _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
@@ -284,7 +284,7 @@ def _measure_height(belief: NDArray, gain: NDArray, device: NDArray, sonar_min: 
 
 @inlined
 def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) -> None:
-    """Learn what the barometer shows at height zero: on the ground, and in the air while the sonar gives the height."""
+    """Learn the barometer's reading at height zero: on the ground, and in the air while the sonar works."""
     if on_ground or belief[BELIEF.sonar_age] <= SONAR_AGE_MAX:
         n = belief[BELIEF.baro_samples] + 1.0
         belief[BELIEF.baro_samples] = n
@@ -356,7 +356,7 @@ Meter = tuple[float, float]  # standard deviation of a sample, samples per secon
 
 
 class ObserverDesign(NamedTuple):
-    """What the gains of one drone follow from."""
+    """The parameters that the gains of one drone follow from."""
 
     drag_1_s: float
     gravity_m_s2: float
@@ -395,7 +395,7 @@ def gain_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> Array:
 
 
 def sample_rate(sensor: Sensor) -> float:
-    """Return the rate [Hz] at which samples really come."""
+    """Return the rate [Hz] of samples without those that drop out."""
     return max(sensor.rate_hz * (1.0 - sensor.dropout), SAMPLE_RATE_MIN_HZ)
 
 
@@ -429,7 +429,7 @@ def _across(d: ObserverDesign) -> Array:
 
 
 def _upwards(d: ObserverDesign, height: Meter) -> Array:
-    """Return the gains of accelerometer, flow and a meter of the height."""
+    """Return the gains of accelerometer, flow and height sensor."""
     c = d.drag_1_s
     a = np.array([[0, 1, 0, 0], [0, -c, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
     walks = np.array([0.0, 0.0, d.lift_walk, d.accel_walk])
