@@ -100,12 +100,9 @@ def test_whose_work_is_done_twice():
     assert made.substitute("estimator.d2") is None
 
 
-def test_before_the_first_gate_nobody_owes_anything():
-    assert blocked(barrier("a", "b"), -1) == []
-
-
 def test_everybody_owes_a_done_for_the_instant_that_commands_come_from():
     made = barrier("a", "b")
+    assert blocked(made, -1) == []  # before the first gate
     assert blocked(made, 0) == ["a", "b"]
     assert made.done("a", done(0), 0, WALL_NS) is None
     assert blocked(made, 0) == ["b"]
@@ -155,19 +152,11 @@ def test_a_longer_period_owes_only_its_own_instants(period: int, need: int, owed
     assert blocked(made, need) == []
 
 
-def test_a_late_joiner_is_waited_for_from_the_next_gate_on():
-    made = barrier("a")
-    made.join("late", join(), 10 * GATE_NS, 0)
-    made.done("a", done(9), 9 * GATE_NS, 0)
-    assert blocked(made, 9) == []
-    made.done("a", done(10), 10 * GATE_NS, 0)
-    assert blocked(made, 10) == ["late"]
-
-
-def test_a_late_joiner_of_a_longer_period_is_waited_for_from_its_own_first_instant():
+@pytest.mark.parametrize(("period", "first"), [(1, 7), (5, 10)])
+def test_a_late_joiner_is_waited_for_from_its_own_first_instant_on(period: int, first: int):
     made = barrier(expected=[])
-    made.join("late", join(period_ns=5 * GATE_NS), 7 * GATE_NS, 0)
-    assert [gate for gate in range(13) if blocked(made, gate)] == [10, 11, 12]
+    made.join("late", join(period_ns=period * GATE_NS), 7 * GATE_NS, 0)
+    assert [gate for gate in range(13) if blocked(made, gate)] == [*range(first, 13)]
 
 
 @pytest.mark.parametrize(
@@ -224,13 +213,6 @@ def test_the_same_join_again_changes_nothing():
     made.done("a", done(0, sent=1), 0, 0)
     assert blocked(made, 0) == []
     assert made.participants["a"].from_ns == 0
-
-
-def test_a_dead_process_lives_again_with_the_same_incarnation():
-    made = barrier("a")
-    made.mark_dead("a", WALL_NS)
-    made.join("a", join(1), GATE_NS, WALL_NS)
-    assert made.is_gating("a")
 
 
 def test_a_watcher_that_begins_to_gate_is_waited_for_from_then_on():
@@ -380,12 +362,6 @@ def test_a_done_that_was_refused_was_not_lost():
     assert made.incomplete() == []
 
 
-def test_outputs_of_strangers_are_nobody_s():
-    made = barrier("a")
-    made.count_output("stranger")
-    assert list(made.participants) == ["a"]
-
-
 @settings(max_examples=200, deadline=None)
 @given(
     sents=st.lists(st.integers(0, 4), min_size=1, max_size=8),
@@ -423,11 +399,14 @@ def test_the_dead_are_waited_for_until_they_are_dropped():
     assert made.absent() == []
 
 
-def test_a_death_is_reported_once():
+def test_a_death_is_reported_once_and_the_same_incarnation_may_come_back():
     made = barrier("a")
-    assert made.mark_dead("a", 0) is not None
-    assert made.mark_dead("a", 0) is None
-    assert made.mark_dead("nobody", 0) is None
+    made.count_output("nobody")
+    reported = [made.mark_dead(name, 0) is not None for name in ("a", "a", "nobody")]
+    assert reported == [True, False, False]
+    made.join("a", join(1), GATE_NS, WALL_NS)
+    assert list(made.participants) == ["a"]
+    assert made.participants["a"].alive
 
 
 def test_who_is_gone_can_come_back_as_a_newcomer():
@@ -451,8 +430,5 @@ def test_waiting_for_names_who_where_and_since_when():
     made.done("controller.main", done(0), 0, 4 * WALL_NS)
     assert [waiting.name for waiting in made.waiting_for(0, 4 * WALL_NS, 0)] == ["estimator.d1"]
 
-
-def test_waiting_for_counts_from_the_death_of_the_dead():
-    made = barrier("a")
-    made.mark_dead("a", WALL_NS)
-    assert made.waiting_for(0, 3 * WALL_NS, 0) == (Waiting("a", "laptop", 10.0),)
+    made.mark_dead("controller.main", 3 * WALL_NS)  # of the dead since their death
+    assert made.waiting_for(2 * GATE_NS, 5 * WALL_NS, 5 * WALL_NS)[1] == Waiting("controller.main", "ground", 10.0)

@@ -28,31 +28,16 @@ def clock(history: MessageHistory, t_ns: int) -> None:
     history.add(keys.CLOCK, b"tick", t_ns)
 
 
-def test_the_last_value_of_a_key_is_answered():
+def test_the_last_values_of_an_expression_are_answered_however_old():
     history = MessageHistory()
-    history.add("drone/d1/truth", b"old", 0)
-    history.add("drone/d1/truth", b"new", 1)
-    assert history.last("drone/d1/truth") == [("drone/d1/truth", b"new")]
-    assert history.last("drone/d2/truth") == []
-
-
-def test_the_last_values_of_an_expression_are_answered():
-    history = MessageHistory()
-    for key in ("drone/d1/truth", "drone/d2/truth", "drone/d1/estimate", "clock"):
-        history.add(key, key.encode(), 0)
-    assert sorted(history.last("drone/*/truth")) == [
-        ("drone/d1/truth", b"drone/d1/truth"),
-        ("drone/d2/truth", b"drone/d2/truth"),
-    ]
-    assert len(history.last("**")) == 4
-
-
-def test_the_last_value_outlives_what_a_replay_brings():
-    history = MessageHistory()
-    history.add("drone/d1/truth", b"x", 0)
+    for payload in (b"old", b"new"):
+        for key in ("drone/d1/truth", "drone/d2/truth", "drone/d1/estimate"):
+            history.add(key, payload, 0)
     clock(history, 100 * SECOND_NS)
-    assert history.last("drone/d1/truth") == [("drone/d1/truth", b"x")]
-    assert since(history, -1, ["drone/**"]) == []
+    assert history.last("drone/d1/truth") == [("drone/d1/truth", b"new")]
+    assert sorted(history.last("drone/*/truth")) == [("drone/d1/truth", b"new"), ("drone/d2/truth", b"new")]
+    assert len(history.last("**")) == 4
+    assert history.last("drone/d3/truth") == since(history, -1, ["drone/**"]) == []
 
 
 def test_a_replay_brings_what_was_stamped_later_in_order_of_arrival():
@@ -80,18 +65,13 @@ def test_what_is_older_than_the_window_is_forgotten():
     assert kept == list(range(19 - KEEP_NS // SECOND_NS, 20))
 
 
-def test_a_sender_s_stamp_does_not_push_out_messages_of_others():
+def test_a_sender_s_stamp_pushes_out_no_messages_of_others_and_keeps_none_for_ever():
     history = MessageHistory()
     clock(history, 10 * SECOND_NS)
     history.add(IMU, b"mine", 10 * SECOND_NS)
     history.add("drone/d1/cmd/mode", b"from the future", 2**63 - 1)
     clock(history, 11 * SECOND_NS)
     assert [payload for _, payload in since(history, 0, [IMU])] == [b"mine"]
-
-
-def test_a_sender_s_stamp_does_not_keep_its_message_for_ever():
-    history = MessageHistory()
-    history.add("drone/d1/cmd/mode", b"from the future", 2**63 - 1)
     clock(history, 100 * SECOND_NS)
     assert since(history, -1, ["drone/**"]) == []
 
@@ -167,22 +147,24 @@ def samples(*outputs: Velocity) -> list[ReceivedSample]:
     return [ReceivedSample(VELOCITY, messages.encode(output)) for output in outputs]
 
 
-def test_what_has_not_come_is_found():
-    first, second, third = (command(t_ns, t_ns) for t_ns in (1, 2, 3))
-    assert history_of(second).lost_outputs(kept(first, second, third), 3) == samples(first, third)
+ONE, TWO, THREE = (command(t_ns, t_ns) for t_ns in (1, 2, 3))
 
 
-def test_what_its_next_done_counts_is_on_its_way():
-    assert history_of().lost_outputs(kept(command(2, 2), command(3, 3)), 2) == samples(command(2, 2))
-
-
-def test_what_it_kept_twice_comes_once():
-    assert history_of().lost_outputs(kept(command(1, 1), command(1, 1)), 1) == samples(command(1, 1))
-
-
-@pytest.mark.parametrize("other", [command(1, 1, "c.d"), command(1, 2)])
-def test_a_message_of_another_source_or_number_does_not_replace_it(other: Velocity):
-    assert history_of(other).lost_outputs(kept(command(1, 1)), 1) == samples(command(1, 1))
+@pytest.mark.parametrize(
+    ("came", "has_kept", "done_ns", "lost"),
+    [
+        ((TWO,), (ONE, TWO, THREE), 3, (ONE, THREE)),
+        ((), (TWO, THREE), 2, (TWO,)),  # the next done will count the other
+        ((), (ONE, ONE), 1, (ONE,)),
+        ((command(1, 1, "c.d"),), (ONE,), 1, (ONE,)),
+        ((command(1, 2),), (ONE,), 1, (ONE,)),
+    ],
+    ids=["some", "on its way", "kept twice", "another source's", "of another number"],
+)
+def test_outputs_that_have_not_arrived_are_found(
+    came: tuple[Velocity, ...], has_kept: tuple[Velocity, ...], done_ns: int, lost: tuple[Velocity, ...]
+):
+    assert history_of(*came).lost_outputs(kept(*has_kept), done_ns) == samples(*lost)
 
 
 def test_only_outputs_that_can_be_read_are_taken():

@@ -8,32 +8,26 @@ MS = 1_000_000
 GATE_NS = 20 * MS
 
 
-def test_no_command_has_no_age():
-    assert CommandAges().summary_ms() is None
-
-
-def test_the_age_of_a_command_is_counted_from_the_gate_that_it_answers():
+@pytest.mark.parametrize(
+    ("gates", "commands", "summary"),
+    [
+        ([], [], None),
+        ([(0, 0)], [(7, 5)], None),
+        ([(0, 100), (GATE_NS, 120)], [(0, 103), (GATE_NS, 121)], (2.0, 2.98, 3.0)),
+        ([(0, 0)], [(0, age_ms) for age_ms in range(101)], (50.0, 99.0, 100.0)),
+    ],
+    ids=["none", "of no gate", "of two gates", "many"],
+)
+def test_the_age_of_a_command_is_counted_from_the_gate_that_it_answers(
+    gates: list[tuple[int, int]], commands: list[tuple[int, int]], summary: tuple[float, ...] | None
+):
     ages = CommandAges()
-    ages.gate(0, 100 * MS)
-    ages.gate(GATE_NS, 120 * MS)
-    ages.command(0, 103 * MS)
-    ages.command(GATE_NS, 121 * MS)
-    assert ages.summary_ms() == pytest.approx({"p50": 2.0, "p99": 2.98, "max": 3.0})
-
-
-def test_percentiles_of_many_ages():
-    ages = CommandAges()
-    ages.gate(0, 0)
-    for age_ms in range(101):
-        ages.command(0, age_ms * MS)
-    assert ages.summary_ms() == pytest.approx({"p50": 50.0, "p99": 99.0, "max": 100.0})
-
-
-def test_a_command_that_answers_no_gate_has_no_age():
-    ages = CommandAges()
-    ages.gate(0, 0)
-    ages.command(7, 5 * MS)
-    assert ages.summary_ms() is None
+    for t_ns, wall_ms in gates:
+        ages.gate(t_ns, wall_ms * MS)
+    for t_ns, wall_ms in commands:
+        ages.command(t_ns, wall_ms * MS)
+    wanted = summary and dict(zip(("p50", "p99", "max"), summary, strict=True))
+    assert ages.summary_ms() == (pytest.approx(wanted) if wanted else None)
 
 
 def test_old_gates_are_forgotten():

@@ -1,7 +1,6 @@
-"""Who has died: a reader that publishes nothing for long, and a process whose token is lost."""
+"""Which processes have died, have fallen silent, or take nothing: what is reported of them, and when."""
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from fake_link import FakeLink
@@ -28,49 +27,50 @@ processes: {expect: [], on_death: {recorder: end}}
 
 
 class Case:
-    """A world, one participant, and who judges its death."""
+    """A world, one participant, and the monitor of its liveliness."""
 
     def __init__(self, name: str, period_ns: int = 0) -> None:
-        self.name = name
+        self.name, self.period_ns = name, period_ns
         self.take_in: Callable[[], None] = lambda: None
         self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
         run, link = Run(self.world, HealthMeter(WORLD)), FakeLink()
         self.liveliness = LivelinessMonitor(link, run, lambda: self.take_in())  # type: ignore[arg-type]
-        self.period_ns = period_ns
         self.join(incarnation=1, pid=7)
 
     def join(self, incarnation: int, pid: int) -> None:
-        role = self.name.split(".")[0]
-        join = Join(
-            0, 0, run_id="run1", incarnation=incarnation, role=role, host="h", pid=pid, period_ns=self.period_ns
-        )
+        join = Join(0, 0, "run1", incarnation, self.name.split(".")[0], "h", pid, self.period_ns)
         self.liveliness.before_join(self.name, join)
         self.world.handle(keys.process(self.name, "join"), join, 0)
 
     def events(self) -> list[str]:
-        return [
-            message.kind
-            for key, message in self.world.outbox.pending
-            if key == keys.EVENT and message.subject == self.name
-        ]
+        """Return the kinds of events about it."""
+        pending = self.world.outbox.pending
+        return [message.kind for key, message in pending if key == keys.EVENT and message.subject == self.name]
 
     def seconds(self, count: int) -> None:
         for _ in range(count):
             self.liveliness.count_second()
 
-    def deaths(self) -> list[Any]:
-        return [message for key, message in self.world.outbox.pending if key == keys.EVENT and message.kind == "death"]
 
-
-@pytest.mark.parametrize("name", ["recorder", "console.1"])
-def test_a_silent_reader_is_dead(name: str) -> None:
-    case = Case(name)
-    case.liveliness.health_received(name)
+@pytest.mark.parametrize(
+    ("name", "period_ns", "publisher", "dies"),
+    [
+        ("recorder", 0, "recorder", True),
+        ("console.1", 0, "console.1", True),
+        ("recorder", 0, None, False),  # it never published its health
+        ("estimator.d1", GATE_NS, "estimator.d1", False),  # time stands for it
+        ("recorder", 0, "somebody", False),
+    ],
+)
+def test_a_reader_that_falls_silent_is_dead(name: str, period_ns: int, publisher: str | None, dies: bool) -> None:
+    case = Case(name, period_ns)
+    if publisher:
+        case.liveliness.health_received(publisher)
     case.seconds(SILENT_S)
-    assert case.deaths() == []
+    assert "death" not in case.events()
     case.seconds(2)
-    assert [event.subject for event in case.deaths()] == [name]
-    assert (case.world.ended is not None) == (name == "recorder")
+    assert ("death" in case.events()) == dies
+    assert (case.world.ended is not None) == (dies and name == "recorder")
 
 
 def test_one_that_publishes_is_not() -> None:
@@ -78,27 +78,7 @@ def test_one_that_publishes_is_not() -> None:
     for _ in range(3):
         case.liveliness.health_received("recorder")
         case.seconds(SILENT_S)
-    assert case.deaths() == []
-
-
-def test_nor_one_that_never_published_its_health() -> None:
-    case = Case("recorder")
-    case.seconds(3 * SILENT_S)
-    assert case.deaths() == []
-
-
-def test_nor_one_that_gates_since_time_stands_for_it() -> None:
-    case = Case("estimator.d1", GATE_NS)
-    case.liveliness.health_received("estimator.d1")
-    case.seconds(3 * SILENT_S)
-    assert case.deaths() == []
-
-
-def test_nor_a_stranger() -> None:
-    case = Case("recorder")
-    case.liveliness.health_received("somebody")
-    case.seconds(3 * SILENT_S)
-    assert case.deaths() == []
+    assert "death" not in case.events()
 
 
 @pytest.mark.parametrize(("pid", "kinds"), [(8, ["death", "restart"]), (7, ["superseded"])])
@@ -161,15 +141,8 @@ def test_what_the_world_did_not_read_while_it_was_held_up_is_nobody_s_silence():
     case.watch.look(10 * S)
     case.watch.received(ME, 10 * S)
     case.watch.look(15 * S)
-    assert case.reports == []
-
-
-def test_nothing_is_expected_of_one_that_has_left():
-    case = Watched()
-    case.watch.look(10 * S)
-    case.watch.received(ME, 10 * S)
-    case.watch.forget(ME)
-    case.looks(10 * S, 15 * S)
+    case.watch.forget(ME)  # nothing is expected of one that has left
+    case.looks(15 * S, 20 * S)
     assert case.reports == []
 
 
@@ -198,14 +171,15 @@ def reported(readers: SlowReaders, closed: ClosedLink) -> dict[str, object]:
     return event.data
 
 
-def test_a_process_of_the_run_is_named_with_what_it_reads(readers: SlowReaders) -> None:
-    data = reported(readers, CONSOLE)
-    assert (data["host"], data["names"], data["reads"]) == ("192.0.2.7", ("console.1",), ["view/**", "world/event"])
-
-
-def test_a_stranger_on_this_machine_is_named_by_its_command(readers: SlowReaders) -> None:
-    data = reported(readers, STRANGER)
-    assert (data["host"], data["process"], data["reads"], data["times"]) == ("laptop", STRANGER.process, [], 2)
+@pytest.mark.parametrize(
+    ("closed", "host", "reads"), [(CONSOLE, "192.0.2.7", ["view/**", "world/event"]), (STRANGER, "laptop", [])]
+)
+def test_a_reader_is_named_by_what_is_known_of_it(
+    readers: SlowReaders, closed: ClosedLink, host: str, reads: list[str]
+) -> None:
+    data = reported(readers, closed)
+    found = (data["host"], data["process"], data["names"], data["reads"], data["times"])
+    assert found == (host, closed.process, closed.names, reads, closed.times)
 
 
 def test_ever_new_sessions_are_so_many_events_only(readers: SlowReaders) -> None:
