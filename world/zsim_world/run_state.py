@@ -20,10 +20,12 @@ Saved = dict[str, Any]
 
 def saved_state(part: Any) -> State:
     """Return the state of an object and of all that it consists of; `zsim.contract.snapshot.pack` encodes it."""
-    state = {name: getattr(part, name) for name in part.SAVED}
-    for name in (name for name, how in part.SAVED.items() if how is PART and state[name] is not None):
-        parts = state[name]
-        state[name] = [*map(saved_state, parts)] if isinstance(parts, list) else saved_state(parts)
+    state = {}
+    for name, how in part.SAVED.items():
+        value = getattr(part, name)
+        if how is PART and value is not None:
+            value = [*map(saved_state, value)] if isinstance(value, list) else saved_state(value)
+        state[name] = sorted(value) if isinstance(value, set) else value
     return state
 
 
