@@ -78,12 +78,13 @@ class WorldOutputs:
 
     def publish(self, output: Output) -> None:
         """Publish one message beside the outbox."""
-        payload = messages.encode(output.message)
-        self._run.enter(Published(output.key, output.message.seq, payload))
+        message: Any = output.message
+        payload = messages.encode(message)
+        self._run.enter(Published(output.key, message.seq, payload))
         self._journal.commit()
         self._link.put_raw(output.key, payload)
         self.put_batch()
-        self._on_message(output.key, output.message)
+        self._on_message(output.key, message)
 
     def forget(self) -> None:
         """Drop what was gathered: the former process of the world has published it."""

@@ -144,11 +144,9 @@ class WorldProcess:
     def _announce(self) -> None:
         if not self._history.last(keys.INFO):
             self._outputs.publish(Output(keys.INFO, self._world.info()))
-        others = (*rights.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries)
-        for expression in [
-            *(each for each in others if each != keys.INFO),
-            keys.INFO,
-        ]:  # last: it shows that all are there
+        answered = [*rights.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries]
+        answered.append(answered.pop(answered.index(keys.INFO)))  # who gets an answer there gets one everywhere
+        for expression in answered:
             self._link.declare_queryable(expression, self._on_query)
         self._tokens.watch()
         self._link.on_token(keys.token("*"), self._on_token)
@@ -355,8 +353,9 @@ class WorldProcess:
     def _answer(self, request: ControlRequest, process: str | None) -> ControlAnswer:
         """Answer a request on `world/control`, or of a process on its own key, by which access control knows it."""
         if request.op == "replay":
-            restricted = process is not None and self._link.guarded
-            readable = rights.of(process, self._world.scenario).reads if restricted else ("**",)
+            readable = ("**",)
+            if process is not None and self._link.guarded:
+                readable = rights.of(process, self._world.scenario).reads
             return self._history.replay(request.args, readable)
         if process is not None:
             return ControlAnswer(ok=False, error=f"op is {request.op[:40]!r}; must be replay")
