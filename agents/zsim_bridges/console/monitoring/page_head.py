@@ -34,7 +34,7 @@ def page_head(
         record_s: of a replay, the times of the first and the last gate on record [s].
     """
     level = "waiting" if run.level == "running" and _stands(clock) else run.level
-    title, detail = _words(run, clock, t_ns, world, record_s)
+    title, detail = _title_and_detail(run, clock, t_ns, world, record_s)
     lines = [each for each in (name, "a record is played back" if run.replayed else "", detail, *_phases(run)) if each]
     refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.grounded()}
     head = {"level": level, "title": title, "detail": " · ".join(lines), "t_s": t_ns / 1e9, "replay": run.replayed}
@@ -60,7 +60,7 @@ def _stands(clock: Clock | None) -> bool:
     return clock is not None and any(each.since_wall_s > STANDS_S for each in clock.waiting_for)
 
 
-def _words(
+def _title_and_detail(
     run: RunCondition, clock: Clock | None, t_ns: int, world: str, record_s: tuple[float, float] | None
 ) -> tuple[str, str]:
     """Return the title and the detail."""

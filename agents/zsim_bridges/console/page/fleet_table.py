@@ -14,7 +14,7 @@ from zsim_bridges.console.monitoring.flight_figures import FlightFigures
 MANY = 12  # drones, from which on the worst stand first unless one chooses otherwise: they do not fit on a page
 FILTER_MAX = 80  # characters that are looked at
 SEVERITIES = ("red", "amber", None)
-ORDERS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
+SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
     "as in the scenario": lambda _: (),
     "worst first": lambda row: (SEVERITIES.index(row.severity), row.battery_percent, -row.link_badness),
     "battery, lowest first": lambda row: (row.battery_percent,),
@@ -23,7 +23,7 @@ ORDERS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
 }
 """By what rows are sorted; those that are equal stay in the scenario's order."""
 ALL = "all"
-CHOICES: dict[str, Callable[[DroneRow, "frozenset[str]"], bool]] = {
+FILTERS: dict[str, Callable[[DroneRow, "frozenset[str]"], bool]] = {
     ALL: lambda row, selected: True,
     "with an alarm": lambda row, selected: row.severity is not None,
     "in the air": lambda row, selected: row.state not in DOWN,
@@ -38,20 +38,20 @@ class Filtered(NamedTuple):
     """How rows are sorted, and which are shown.
 
     Attributes:
-        order: one of `ORDERS`.
-        choice: one of `CHOICES`.
+        order: one of `SORTINGS`.
+        choice: one of `FILTERS`.
         text: words, each of which must be in a row: in its name, state, commander, faults or link.
     """
 
-    order: str = next(iter(ORDERS))
+    order: str = next(iter(SORTINGS))
     choice: str = ALL
     text: str = ""
 
     def rows(self, rows: Sequence[DroneRow], selected: frozenset[str] = frozenset()) -> list[DroneRow]:
         """Return the rows that are shown, in their order."""
         words = self.text[:FILTER_MAX].lower().split()
-        shown = [row for row in rows if CHOICES[self.choice](row, selected) and _has(row, words)]
-        return sorted(shown, key=ORDERS[self.order])
+        shown = [row for row in rows if FILTERS[self.choice](row, selected) and _has(row, words)]
+        return sorted(shown, key=SORTINGS[self.order])
 
 
 def _has(row: DroneRow, words: Sequence[str]) -> bool:
@@ -76,10 +76,10 @@ class FleetTable:
         self._changed = changed
         self._selected: frozenset[str] = frozenset()
         self._shown: tuple[str, ...] = self._names
-        orders, are_many = list(ORDERS), len(names) > MANY
+        orders, are_many = list(SORTINGS), len(names) > MANY
         with gui.add_folder("Sort, filter, select", expand_by_default=are_many):
             self._order = gui.add_dropdown("sort by", orders, initial_value=orders[are_many])
-            self._choice = gui.add_dropdown("show", list(CHOICES))
+            self._choice = gui.add_dropdown("show", list(FILTERS))
             self._text = gui.add_text("filter", "", hint="Parts of a name, state, commander, fault or link")
             select = gui.add_button_group("select", ["all shown", "none"])
         select.on_click(lambda _: self._select_shown(select.value == "all shown"))

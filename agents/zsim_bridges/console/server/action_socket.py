@@ -11,6 +11,7 @@ from zsim_bridges.console.flying.manual_flight import ManualFlight
 from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.record_player import RecordPlayer
 from zsim_bridges.console.scene.camera_follow import CameraFollow
+from zsim_bridges.console.server.http_proxy import HEARTBEAT_S
 from zsim_bridges.console.server.page_actions import (
     DECODER,
     ChooseDrone,
@@ -27,7 +28,6 @@ from zsim_bridges.console.server.page_actions import (
 from zsim_bridges.console.server.page_tokens import OPERATOR
 
 ACTION_MAX = 2_000  # bytes
-HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed
 
 Answer = dict[str, Any]
 

@@ -10,14 +10,12 @@ from msgspec import Meta, Struct
 
 from zsim_bridges.console.cameras.camera_feed import CameraFeed
 from zsim_bridges.console.scene.camera_frustums import CameraFrustums
+from zsim_bridges.console.server.http_proxy import HEARTBEAT_S
+from zsim_bridges.console.server.page_actions import Name
 
 PERIOD_S = 0.1  # wall, from a picture of a camera to the next, at least
 WANTED_MAX = 16  # pictures on one page
 REQUEST_MAX = 10_000  # bytes
-HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed
-NAME_MAX = 64  # characters of a camera's name, or of a page's
-
-Name = Annotated[str, Meta(max_length=NAME_MAX)]
 
 
 class PicturesRequest(Struct, frozen=True, forbid_unknown_fields=True):

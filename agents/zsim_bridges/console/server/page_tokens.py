@@ -3,10 +3,10 @@
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
+from zsim_bridges.console.page.control_desk import OPERATOR, VIEWER
 from zsim_bridges.web.loopback import is_loopback_authority
 from zsim_bridges.web.web_server import check_token, tokens_match
 
-OPERATOR, VIEWER = "operator", "viewer"
 VIEW_PATH = "/view"
 
 
