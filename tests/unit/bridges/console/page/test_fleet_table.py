@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from zsim_bridges.console.console_tables import DroneRow, drone_table
-from zsim_bridges.console.page.fleet_table import CHOICES, MANY, NO_ROW, ORDERS, Filtered, FleetTable
+from zsim_bridges.console.page.fleet_table import FILTERS, MANY, NO_ROW, SORTINGS, Filtered, FleetTable
 
 
 def row(name: str, **changes: Any) -> DroneRow:
@@ -63,8 +63,8 @@ def test_rows_are_filtered(choice: str, text: str, expected: str):
 
 
 def test_every_order_and_choice_is_tried():
-    assert len(ORDERS) == 5
-    assert len(CHOICES) == 6
+    assert len(SORTINGS) == 5
+    assert len(FILTERS) == 6
 
 
 class Control:
