@@ -13,7 +13,7 @@ from zsim.contract import flight_messages, keys, messages
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import ZsimError
 from zsim.transport.session import Session, Unanswered
-from zsim_bridges.console.monitoring.view_buffer import ViewBuffer, arguments_text
+from zsim_bridges.console.view_buffer import ViewBuffer, arguments_text
 
 Task = Callable[[], None]
 

@@ -11,20 +11,15 @@ import viser
 
 from zsim.contract.messages import Info
 from zsim.transport.session import Session
-from zsim_bridges.console.flying.page_flying import PageFlying
-from zsim_bridges.console.monitoring.page_head import no_run_head
 from zsim_bridges.console.orders import OrderRequest
-from zsim_bridges.console.record_player import RecordPlayer
+from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.page_flying import PageFlying
+from zsim_bridges.console.page_server import OPERATOR, VIEWER, HttpProxy, ListenAddress, RunFiles, ViserBackend
+from zsim_bridges.console.page_sockets import ActionSockets, CameraSockets
+from zsim_bridges.console.private_viser import PageControls, PrivateViser, is_permitted
+from zsim_bridges.console.run_condition import no_run_head
 from zsim_bridges.console.run_page import RunPage
-from zsim_bridges.console.scene.camera_follow import CameraFollow
-from zsim_bridges.console.scene.camera_frustums import CameraFrustums
-from zsim_bridges.console.server.action_socket import ActionSockets
-from zsim_bridges.console.server.camera_socket import CameraSockets
-from zsim_bridges.console.server.http_proxy import HttpProxy, ListenAddress, ViserBackend
-from zsim_bridges.console.server.page_messages import PageControls, is_permitted
-from zsim_bridges.console.server.page_tokens import OPERATOR, VIEWER
-from zsim_bridges.console.server.private_viser import PrivateViser
-from zsim_bridges.console.server.run_files import RunFiles
+from zsim_bridges.console.time_monitor import RecordPlayer
 from zsim_bridges.observer_process import ObserverProcess
 
 REASON_S = 0.1  # wall; between two looks for a reason to end

@@ -11,8 +11,8 @@ import viser
 from msgspec import UNSET
 
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Event
-from zsim.contract.views import EstimateView, ViewCluster
+from zsim.contract.run_messages import Event, Fault
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones
 from zsim.errors import DocumentError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -22,25 +22,19 @@ from zsim.transport.session import Session
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
-from zsim_bridges.console.cameras.camera_feed import CameraFeed
+from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, PastInstant, RequestOutcome
+from zsim_bridges.console.console_page import ConsolePage, PageForms
 from zsim_bridges.console.console_tables import TableRows
-from zsim_bridges.console.flying.page_flying import PageFlying
-from zsim_bridges.console.monitoring.flight_figures import FlightFigures
-from zsim_bridges.console.monitoring.run_monitor import RunMonitor
-from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
-from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
+from zsim_bridges.console.control_desk import RUN, ControlDesk
 from zsim_bridges.console.orders import OrderBook, OrderRequest
-from zsim_bridges.console.page.console_page import ConsolePage
-from zsim_bridges.console.page.control_desk import RUN, ControlDesk
-from zsim_bridges.console.page.page_forms import PageForms
-from zsim_bridges.console.record_player import KEPT_S, RecordPlayer
-from zsim_bridges.console.run_state import console_state
-from zsim_bridges.console.scene.camera_follow import CameraFollow
-from zsim_bridges.console.scene.camera_frustums import CameraFrustums
-from zsim_bridges.console.scene.picture import DronePoses, FormationShape, drone_poses
-from zsim_bridges.console.scene.picture_rate import picture_rate_hz
-from zsim_bridges.console.scene.run_scene import RunScene
+from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.page_flying import PageFlying
+from zsim_bridges.console.picture import DronePoses, FormationShape, drone_poses
+from zsim_bridges.console.run_monitor import FlightFigures, RunMonitor
+from zsim_bridges.console.scene_nodes import RunScene
+from zsim_bridges.console.time_monitor import KEPT_S, RecordPlayer, TimeMonitor
+from zsim_bridges.console.view_buffer import ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
@@ -388,3 +382,67 @@ class RunPage:
     def _notify(self, what: str, refusal: str) -> None:
         for client in self._server.get_clients().values():
             client.add_notification(f"Refused: {what}", refusal, color="red", auto_close_seconds=NOTICE_S)
+
+
+EVENTS_MAX = 20
+SILENT = "silent"  # in place of the clock's state, where the world answers nothing
+
+
+def console_state(
+    run_id: str, views: ViewBuffer, time_monitor: TimeMonitor, shapes: Mapping[str, FormationShape | None]
+) -> dict[str, Any]:
+    """Return what is shown of a run, as plain data; called in another thread than that which draws.
+
+    Args:
+        run_id: of the run.
+        views: the newest ones.
+        time_monitor: of the run's clock.
+        shapes: the formations as they truly stand.
+    """
+    view, clock, clusters = views.drones, time_monitor.clock, dict(views.clusters)
+    silent_s = time_monitor.silent_s
+    return {
+        "run_id": run_id,
+        "t_s": view.t_ns / 1e9 if view else 0.0,
+        "clock": SILENT if silent_s else clock.state if clock else None,
+        "silent_s": silent_s,
+        "drones": _drones(view, views) if view else [],
+        "clusters": [_cluster(name, each, shapes.get(name)) for name, each in clusters.items()],
+        "faults": [_fault(fault) for fault in views.faults],
+        "events": [{"t_s": e.t_ns / 1e9, "kind": e.kind, "text": e.text} for e in list(views.events)[:EVENTS_MAX]],
+    }
+
+
+def _drones(view: ViewDrones, views: ViewBuffer) -> list[dict[str, Any]]:
+    sigmas = {name: received.sigma_m for name, received in views.estimates().items() if received.fresh}
+    return [
+        {"name": d.name, "position_m": list(d.position_m), "state": d.state, "sigma_m": sigmas.get(d.name)}
+        for d in view.drones
+    ]
+
+
+def _fault(fault: Fault) -> dict[str, Any]:
+    until_s = None if fault.until_ns is None else fault.until_ns / 1e9
+    about = {"id": fault.id, "kind": fault.kind, "target": fault.target}
+    return {**about, "from_s": fault.from_ns / 1e9, "until_s": until_s}
+
+
+def _cluster(name: str, view: ViewCluster, true_shape: FormationShape | None) -> dict[str, Any]:
+    return {
+        "name": name,
+        "phase": view.phase,
+        "reason": view.reason,
+        "desired": dict(zip(view.names, view.desired, strict=True)),
+        "value": dict(zip(view.names, view.value, strict=True)),
+        "true": {} if true_shape is None else dict(zip(view.names, true_shape.c.tolist(), strict=True)),
+    }
+
+
+FEW_DRONES = 20  # drones from which on pictures come half as often
+RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
+FAST_RATE = 4.0  # x real time; from then on the rate is halved, too: the run needs the processors
+
+
+def picture_rate_hz(drones: int, rate: float) -> float:
+    """Return how many pictures a second suit so many drones, and a run that goes so many times as fast as real time."""
+    return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ

@@ -5,15 +5,220 @@ import errno
 import hmac
 import logging
 import threading
-from collections.abc import Callable, Coroutine, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from typing import Any, NamedTuple, TypeVar
 
 from aiohttp import web
 
 from zsim.errors import RunError
-from zsim_bridges.web.http_connections import HttpConnections
 from zsim_bridges.web.loopback import is_loopback
+
+STRANGERS_MAX = 100  # connections at once; the oldest makes room for the next
+REQUEST_S = 5.0  # wall time in which a request has to come, its body too; a browser on a bad link takes 1 s
+SMALL_BYTES = 16_384  # a body that is let in at any time; commands and requests have a few hundred
+BODY_BYTES_MAX = 16_000_000  # of all larger bodies at once; 16 of the largest that the gateway takes
+CONNECTIONS_MAX = 1000  # twice the gateway's clients
+REFUSED_FROM = 400  # HTTP status
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class HttpConnections:
+    """Counts the connections of a server, and closes those that have to make room.
+
+    Args:
+        strangers_max, connections_max: at once.
+        request_s: wall time in which a request has to come since its first byte; and its head, from a stranger, since
+            the connection was opened or its last request answered.
+        body_bytes_max: of all bodies beyond SMALL_BYTES at once; more wait within their time.
+    """
+
+    def __init__(
+        self,
+        strangers_max: int = STRANGERS_MAX,
+        connections_max: int = CONNECTIONS_MAX,
+        request_s: float = REQUEST_S,
+        body_bytes_max: int = BODY_BYTES_MAX,
+    ) -> None:
+        self._strangers_max = strangers_max
+        self._connections_max = connections_max
+        self._request_s = request_s
+        self._body_bytes_max = body_bytes_max
+        self._body_bytes = 0
+        self._body_gone = asyncio.Condition()
+        self._open: dict[asyncio.BaseTransport, HttpConnection] = {}
+        self._strangers: dict[HttpConnection, None] = {}  # in the order in which they began to wait
+        self._idle: dict[HttpConnection, None] = {}  # known, without a request now; in that order
+
+    def protocol(self, http: asyncio.Protocol) -> "HttpConnection":
+        """Return the protocol of a new connection; `http` speaks HTTP on it."""
+        return HttpConnection(http, self)
+
+    @web.middleware
+    async def observe(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Keep a connection while its request is answered; to be the innermost, behind any check of access."""
+        connection = self._open.get(request.transport) if request.transport else None
+        if connection is None:
+            return await handler(request)
+        since_s = connection.since_s
+        self._forget(connection)
+        try:
+            async with AsyncExitStack() as room:
+                await self._receive(request, connection, since_s, room)
+                connection.is_whole = True
+                response = await handler(request)
+            connection.known = connection.known or response.status < REFUSED_FROM
+            return response
+        finally:
+            if connection.is_open:
+                self._wait(connection)
+
+    async def _receive(
+        self, request: web.Request, connection: "HttpConnection", since_s: float | None, room: AsyncExitStack
+    ) -> None:
+        """Receive the body of a request, which the handler then finds read; `room` is kept for it until that is done.
+
+        Raises:
+            HTTPRequestTimeout: it did not come in its time, or there was no room for it.
+            HTTPRequestEntityTooLarge: it is longer than the application takes.
+        """
+        if not request.can_read_body:
+            return
+        longest = request.client_max_size
+        size = longest if request.content_length is None else min(request.content_length, longest)
+        until_s = (asyncio.get_running_loop().time() if since_s is None else since_s) + self._request_s
+        try:
+            async with asyncio.timeout_at(until_s):
+                if size > SMALL_BYTES:
+                    await room.enter_async_context(self._body_room(size))
+                await request.read()
+        except TimeoutError:
+            connection.known = False  # what else it sends is waited for no longer than for a stranger's
+            raise web.HTTPRequestTimeout(text=f"a request must be whole within {self._request_s:g} s") from None
+
+    @asynccontextmanager
+    async def _body_room(self, size: int) -> AsyncIterator[None]:
+        """Wait until a body has room beside the others, and keep it."""
+        async with self._body_gone:
+            await self._body_gone.wait_for(lambda: self._body_bytes + size <= self._body_bytes_max)
+            self._body_bytes += size
+        try:
+            yield
+        finally:
+            self._body_bytes -= size
+            async with self._body_gone:
+                self._body_gone.notify_all()
+
+    def enter(self, connection: "HttpConnection", transport: asyncio.Transport) -> bool:
+        """Take a new connection; False where there is no room, as all others have a request under way."""
+        if len(self._open) >= self._connections_max and not self._make_room(self._strangers, self._idle):
+            return False
+        if len(self._strangers) >= self._strangers_max:
+            self._make_room(self._strangers)
+        self._open[transport] = connection
+        self._wait(connection)
+        return True
+
+    def leave(self, connection: "HttpConnection", transport: asyncio.BaseTransport) -> None:
+        """Forget a connection that is closed."""
+        self._open.pop(transport, None)
+        self._forget(connection)
+
+    def _make_room(self, *groups: "dict[HttpConnection, None]") -> bool:
+        """Close the connection that has waited longest, of the first group that has one."""
+        for group in groups:
+            if group:
+                next(iter(group)).cut()
+                return True
+        return False
+
+    def _wait(self, connection: "HttpConnection") -> None:
+        """Let a connection wait for its next request; aiohttp ends the wait of one that is known and sends nothing."""
+        (self._idle if connection.known else self._strangers)[connection] = None
+        if not connection.known:
+            connection.timer = asyncio.get_running_loop().call_later(self._request_s, connection.cut)
+        if connection.has_more:
+            self.begin(connection)
+        connection.is_whole = connection.has_more = False
+
+    def begin(self, connection: "HttpConnection") -> None:
+        """Take the first bytes of a request on a connection that waits for one."""
+        if connection.since_s is not None or not (connection in self._idle or connection in self._strangers):
+            return
+        loop = asyncio.get_running_loop()
+        connection.since_s = loop.time()
+        connection.timer = connection.timer or loop.call_later(self._request_s, connection.cut)
+
+    def _forget(self, connection: "HttpConnection") -> None:
+        self._strangers.pop(connection, None)
+        self._idle.pop(connection, None)
+        connection.since_s = None
+        if connection.timer is not None:
+            connection.timer.cancel()
+            connection.timer = None
+
+
+class HttpConnection(asyncio.Protocol):
+    """One connection: what comes is handed on to who speaks HTTP.
+
+    Attributes:
+        known: whether one of its requests was answered without an error.
+        since_s: when the first byte of its next request came, None where it has not [s, of the loop].
+        timer: cuts it when the time for that request is over.
+        is_whole: whether the request that is under way has come.
+        has_more: whether something of the next one has come meanwhile.
+    """
+
+    def __init__(self, http: asyncio.Protocol, connections: HttpConnections) -> None:
+        self._http = http
+        self._connections = connections
+        self._transport: asyncio.Transport | None = None
+        self.known = self.is_whole = self.has_more = False
+        self.since_s: float | None = None
+        self.timer: asyncio.TimerHandle | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it was let in and is not closed yet."""
+        return self._transport is not None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        if not self._connections.enter(self, transport):
+            transport.abort()
+            return
+        self._transport = transport
+        self._http.connection_made(transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._transport is not None:
+            self._connections.leave(self, self._transport)
+            self._transport = None
+            self._http.connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        if self._transport is None:
+            return
+        self.has_more = self.has_more or self.is_whole
+        self._connections.begin(self)
+        self._http.data_received(data)
+
+    def eof_received(self) -> bool | None:
+        return self._http.eof_received() if self._transport is not None else None
+
+    def pause_writing(self) -> None:
+        self._http.pause_writing()
+
+    def resume_writing(self) -> None:
+        self._http.resume_writing()
+
+    def cut(self) -> None:
+        """Close it at once; what it has sent is not answered."""
+        if self._transport is not None:
+            transport = self._transport
+            self._connections.leave(self, transport)
+            transport.abort()
+
 
 ANY_PORT = 0  # of the kernel's choice
 BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own

@@ -7,16 +7,17 @@ from refused import has_terms, without_tags
 
 from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import ViewCluster
+from zsim_bridges.console import alarms
+from zsim_bridges.console.alarms import KEPT, Alarm, AlarmBoard, DroneCondition, FaultWatch, Losses
 from zsim_bridges.console.console_tables import preflight_lines
-from zsim_bridges.console.monitoring import alarms
-from zsim_bridges.console.monitoring.alarms import Alarm, AlarmBoard, DroneCondition, Losses
-from zsim_bridges.console.monitoring.fault_watch import KEPT, FaultWatch
-from zsim_bridges.console.monitoring.preflight import Check, preflight_checks, takeoff_refusal
-from zsim_bridges.console.monitoring.run_condition import (
+from zsim_bridges.console.run_condition import (
+    Check,
     RunCondition,
     drone_refusals,
     fleet_refusals,
     formation_refusals,
+    preflight_checks,
+    takeoff_refusal,
 )
 
 DEAD, LOW = Alarm("red", "estimator.drone1", "dead"), Alarm("amber", "drone1", "battery", "17 %")

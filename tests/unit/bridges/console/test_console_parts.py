@@ -19,18 +19,24 @@ from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_agents.formation.trajectory import ExpressionTrajectory
-from zsim_bridges.console import console_tables
-from zsim_bridges.console.monitoring.alarms import DroneCondition, drone_alarms
-from zsim_bridges.console.monitoring.event_log import EventRow
-from zsim_bridges.console.monitoring.sensor_rates import SensorRates
-from zsim_bridges.console.page import operator_input
-from zsim_bridges.console.page.operator_input import primary_variables, slider_ranges
-from zsim_bridges.console.scene import picture as pic
-from zsim_bridges.console.scene.picture import SPACING_M, TRAIL_POINTS_MAX, TRAILS_S, CanvasTrails
-from zsim_bridges.console.scene.variable_history import HISTORY_POINTS_MAX, INTERVAL_S, SPAN_S, VariableHistory
-from zsim_bridges.console.server.http_proxy import ListenAddress
-from zsim_bridges.console.server.page_messages import PageControls, ViewerCamera, is_permitted
-from zsim_bridges.console.server.page_tokens import OPERATOR, VIEWER, PageRequest, PageTokens
+from zsim_bridges.console import console_tables, operator_input
+from zsim_bridges.console import picture as pic
+from zsim_bridges.console.alarms import DroneCondition, drone_alarms
+from zsim_bridges.console.console_tables import SensorRates
+from zsim_bridges.console.histories import (
+    HISTORY_POINTS_MAX,
+    INTERVAL_S,
+    SPACING_M,
+    SPAN_S,
+    TRAIL_POINTS_MAX,
+    TRAILS_S,
+    CanvasTrails,
+    VariableHistory,
+)
+from zsim_bridges.console.operator_input import primary_variables, slider_ranges
+from zsim_bridges.console.page_server import OPERATOR, VIEWER, ListenAddress, PageRequest, PageTokens
+from zsim_bridges.console.private_viser import PageControls, ViewerCamera, is_permitted
+from zsim_bridges.console.view_buffer import EventRow
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 LEVEL = (1.0, 0.0, 0.0, 0.0)

@@ -1,7 +1,7 @@
 """The events as a page shows them: counted, kept apart from a flood, chosen by drone and kind."""
 
 from zsim.contract.run_messages import Event
-from zsim_bridges.console.monitoring.event_log import ALL, OWN, ROWS_KEPT, EventLog, chosen_rows
+from zsim_bridges.console.view_buffer import ALL, OWN, ROWS_KEPT, EventLog, chosen_rows
 
 OWN_NAME = "console.1"
 

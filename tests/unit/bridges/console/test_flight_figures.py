@@ -6,7 +6,7 @@ import pytest
 
 from zsim.contract.views import DroneView, ViewDrones
 from zsim.math import frames
-from zsim_bridges.console.monitoring.flight_figures import FlightMeter
+from zsim_bridges.console.run_monitor import FlightMeter
 
 S = 1_000_000_000
 

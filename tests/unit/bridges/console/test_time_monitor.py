@@ -14,11 +14,10 @@ from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Wait
 from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_tables import TableRows
-from zsim_bridges.console.monitoring.page_head import page_head
-from zsim_bridges.console.monitoring.run_condition import RunCondition
-from zsim_bridges.console.monitoring.time_monitor import BEAT_S, SILENT_S, TimeMonitor
-from zsim_bridges.console.monitoring.view_buffer import ReceivedEstimate, ViewBuffer
-from zsim_bridges.console.run_state import console_state
+from zsim_bridges.console.run_condition import RunCondition, page_head
+from zsim_bridges.console.run_page import console_state
+from zsim_bridges.console.time_monitor import BEAT_S, SILENT_S, TimeMonitor
+from zsim_bridges.console.view_buffer import ReceivedEstimate, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
 S = 1_000_000_000  # ns

@@ -12,9 +12,8 @@ from refused import has_terms
 
 from zsim.contract import keys, messages
 from zsim.errors import SessionError
-from zsim_bridges.console.cameras.camera_feed import ASKED_S, SIGHTINGS_KEPT, CameraFeed
-from zsim_bridges.console.cameras.picture_check import PICTURE_BYTES_MAX
-from zsim_bridges.console.server.camera_socket import PageBatches
+from zsim_bridges.console.camera_feed import ASKED_S, PICTURE_BYTES_MAX, SIGHTINGS_KEPT, CameraFeed
+from zsim_bridges.console.page_sockets import PageBatches
 
 FRONT, BOTTOM = "drone1/front", "drone1/bottom"
 PAGE = "a page"

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zsim.contract.camera_messages import CameraInfo, Seen, Sightings
-from zsim_bridges.console.cameras.camera_marks import (
+from zsim_bridges.console.camera_feed import (
     AGE_MAX_NS,
     RADIUS_MIN_PX,
     field_of_view,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from refused import has_terms
 
 from zsim.sensors.jpeg_header import PictureError, frame_of
-from zsim_bridges.console.cameras.picture_check import PICTURE_BYTES_MAX, check_picture
+from zsim_bridges.console.camera_feed import PICTURE_BYTES_MAX, check_picture
 
 Image = pytest.importorskip("PIL.Image", reason="Pillow comes with viser; pip install '.[console]'")
 

@@ -10,8 +10,14 @@ from refused import has_terms
 from zsim.math.frames import turned_about_up
 from zsim.scenario import scenario_file
 from zsim.vehicles.vehicle import Limits
-from zsim_bridges.console.flying.flown_velocity import DronePose, Stick, stick_velocity, velocity_to
-from zsim_bridges.console.flying.geofence import Geofence, geofence_of
+from zsim_bridges.console.manual_flight import (
+    DronePose,
+    Geofence,
+    Stick,
+    geofence_of,
+    stick_velocity,
+    velocity_to,
+)
 
 FENCE = Geofence((-50.0, -50.0, 1.0), (50.0, 50.0, 30.0))
 LIMITS = Limits(horizontal_speed_m_s=2.0, vertical_speed_m_s=0.5, yaw_rate_deg_s=30.0)

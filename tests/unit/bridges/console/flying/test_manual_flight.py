@@ -9,10 +9,18 @@ from refused import has_terms
 
 from zsim.vehicles.vehicle import Limits
 from zsim_bridges.console.command_client import NoAnswer
-from zsim_bridges.console.flying.flight_conditions import DroneSight, RunSight
-from zsim_bridges.console.flying.flown_velocity import DronePose, Stick
-from zsim_bridges.console.flying.geofence import Geofence
-from zsim_bridges.console.flying.manual_flight import GONE_S, PERIOD_S, SETTLED_S, STALE_S, ManualFlight
+from zsim_bridges.console.manual_flight import (
+    GONE_S,
+    PERIOD_S,
+    SETTLED_S,
+    STALE_S,
+    DronePose,
+    DroneSight,
+    Geofence,
+    ManualFlight,
+    RunSight,
+    Stick,
+)
 
 NAME = "console.1"
 FORWARD = Stick(1.0, 0.0, 0.0, 0.0, 1.0)

@@ -9,9 +9,10 @@ import numpy as np
 from zsim.contract.views import DroneView, ViewCluster, ViewDrones
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space
-from zsim_bridges.console.flying import map_view
-from zsim_bridges.console.flying.geofence import geofence_of
-from zsim_bridges.console.scene.picture import CanvasTrails, drone_poses
+from zsim_bridges.console import page_flying
+from zsim_bridges.console.histories import CanvasTrails
+from zsim_bridges.console.manual_flight import geofence_of
+from zsim_bridges.console.picture import drone_poses
 
 FIELD = """
 name: field
@@ -31,7 +32,7 @@ def drone(name: str, x: float = 0.0) -> DroneView:
 
 def test_what_stands_around_the_drones():
     scenario = scenario_file.from_text(FIELD)
-    around = map_view.surroundings(scenario, geofence_of(scenario))
+    around = page_flying.surroundings(scenario, geofence_of(scenario))
     assert around["names"] == around["labels"] == ["drone1", "drone2"]
     assert len(set(around["colours"])) == 2
     assert around["fence"] == {"low_m": (-50.0, -50.0, 1.0), "high_m": (53.0, 50.0, 30.0)}
@@ -42,7 +43,7 @@ def test_what_stands_around_the_drones():
 
 def test_drones_by_place_heading_and_state_and_none_where_one_is_not_seen():
     poses = drone_poses(ViewDrones(0, 0, (drone("drone2", 3.456),), ()), ("drone1", "drone2"))
-    nobody, seen = map_view.positions(poses, {"drone2": "flying"})
+    nobody, seen = page_flying.positions(poses, {"drone2": "flying"})
     assert nobody is None
     assert seen == [3.46, 2.0, 5.0, 1.571, "flying"]
 
@@ -52,7 +53,7 @@ def test_a_formation_has_its_places_while_it_has_somewhere_to_be():
     p_W = np.array([(0.0, 1.5, 5.0), (-1.5, -1.5, 5.0), (1.5, -1.5, 5.0)])
     c = tuple(space.forward(p_W, np.zeros(3)).tolist())
     views = {phase: ViewCluster(0, 0, phase, space.names, c, c, "") for phase in ("idle", "engaged")}
-    shown: list[dict[str, Any]] = map_view.formations(
+    shown: list[dict[str, Any]] = page_flying.formations(
         {"idle": space, "engaged": space}, {"idle": [0, 1, 2], "engaged": [0, 1, 2]}, views
     )
     assert [each["phase"] for each in shown] == ["idle", "engaged"]
@@ -66,7 +67,7 @@ def test_trails_are_the_last_stretch_of_each_way():
     for x in range(4):
         poses = drone_poses(ViewDrones(x * 10**9, 0, (drone("drone1", float(x)),), ()), names)
         trails.add(float(x), poses.p_W)
-    way, nothing = map_view.trail_lines(trails, poses)
+    way, nothing = page_flying.trail_lines(trails, poses)
     assert way == [[0.0, 2.0, 0.0], [1.0, 2.0, 1.0], [2.0, 2.0, 2.0]]  # and from there to where it is
     assert nothing == []
 
@@ -75,4 +76,4 @@ def test_a_look_at_a_hundred_drones_is_small():
     """Ten looks a second of a page: a few kilobytes each."""
     names = tuple(f"drone{i}" for i in range(1, 101))
     poses = drone_poses(ViewDrones(0, 0, tuple(drone(name, 123.456) for name in names), ()), names)
-    assert len(json.dumps(map_view.positions(poses, dict.fromkeys(names, "flying")))) < 6_000
+    assert len(json.dumps(page_flying.positions(poses, dict.fromkeys(names, "flying")))) < 6_000

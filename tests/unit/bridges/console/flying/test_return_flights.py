@@ -8,9 +8,8 @@ import pytest
 
 from zsim.contract.views import ViewCluster
 from zsim.scenario import scenario_file
-from zsim_bridges.console.flying.flight_conditions import DroneSight, FlightAnswer
-from zsim_bridges.console.flying.flown_velocity import DronePose
-from zsim_bridges.console.flying.return_flights import ReturnFlights
+from zsim_bridges.console.manual_flight import DronePose, DroneSight, FlightAnswer
+from zsim_bridges.console.page_flying import ReturnFlights
 
 SCENARIO = scenario_file.load(Path(__file__).parents[5] / "scenarios" / "step.yaml")
 NAMES = ("x_c", "y_c", "z_c")

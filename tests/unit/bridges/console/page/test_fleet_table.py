@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from zsim_bridges.console.console_tables import DroneRow, drone_table
-from zsim_bridges.console.page.fleet_table import FILTERS, MANY, NO_ROW, SORTINGS, Filtered, FleetTable
+from zsim_bridges.console.drone_forms import FILTERS, MANY, NO_ROW, SORTINGS, Filtered, FleetTable
 
 
 def row(name: str, **changes: Any) -> DroneRow:

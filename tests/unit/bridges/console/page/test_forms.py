@@ -21,11 +21,12 @@ from zsim_agents.formation.flight_check import place_fault
 from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, REJOINING, EngagementLimits
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.monitoring.run_condition import RunCondition, fleet_refusals
-from zsim_bridges.console.page.console_page import SWITCHES, ConsolePage
-from zsim_bridges.console.page.formation_form import OPERATIONS, REST_S, FormationForm
-from zsim_bridges.console.page.operator_input import slider_ranges
-from zsim_bridges.console.page.run_forms import (
+from zsim_bridges.console.console_page import SWITCHES, ConsolePage
+from zsim_bridges.console.formation_form import OPERATIONS, REST_S, STILL_S, FormationForm
+from zsim_bridges.console.operator_input import slider_ranges
+from zsim_bridges.console.picture import FlightPreview
+from zsim_bridges.console.run_condition import RunCondition, fleet_refusals
+from zsim_bridges.console.run_forms import (
     DRONE_MODES,
     DURATION_S,
     DroneForm,
@@ -33,8 +34,6 @@ from zsim_bridges.console.page.run_forms import (
     FleetForm,
     RunForm,
 )
-from zsim_bridges.console.page.variable_slider import STILL_S
-from zsim_bridges.console.scene.flight_preview import FlightPreview
 
 SCENARIOS = Path(__file__).parents[5] / "scenarios"
 PERSON, NOBODY = 1, None  # who moved a slider

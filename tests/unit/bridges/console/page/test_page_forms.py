@@ -6,11 +6,11 @@ from unittest.mock import MagicMock
 
 from refused import has_terms, without_tags
 
-from zsim_bridges.console.monitoring.run_condition import RunCondition
-from zsim_bridges.console.page.control_desk import LOST_S, RUN, ControlDesk
-from zsim_bridges.console.page.page_forms import ControlForm, PageForms
-from zsim_bridges.console.page.run_forms import DroneForm
-from zsim_bridges.console.scene import ground_grid
+from zsim_bridges.console import scene_nodes
+from zsim_bridges.console.console_page import ControlForm, PageForms
+from zsim_bridges.console.control_desk import LOST_S, RUN, ControlDesk
+from zsim_bridges.console.run_condition import RunCondition
+from zsim_bridges.console.run_forms import DroneForm
 
 NAMES = ["drone1", "drone2"]
 
@@ -88,7 +88,7 @@ def test_the_ground_of_a_page_has_its_theme():
     page = pages.clients[1]
     theme = page.gui.add_checkbox.return_value
     (switch,) = theme.on_update.call_args.args
-    for dark, colours in ((True, ground_grid.DARK), (False, ground_grid.LIGHT)):
+    for dark, colours in ((True, scene_nodes.DARK), (False, scene_nodes.LIGHT)):
         theme.value = dark
         switch(None)
         assert page.scene.add_box.call_args.args[:2] == ("/field", colours[0])

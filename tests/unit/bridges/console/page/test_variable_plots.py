@@ -12,8 +12,10 @@ import pytest
 from zsim.contract.views import EstimateView
 from zsim.math import frames
 from zsim.scenario import scenario_file
-from zsim_bridges.console.page.operator_input import SliderRange
-from zsim_bridges.console.page.variable_plots import (
+from zsim_bridges.console.histories import SPAN_S
+from zsim_bridges.console.operator_input import SliderRange
+from zsim_bridges.console.picture import DronePoses
+from zsim_bridges.console.variable_plots import (
     STEPS_PER_WINDOW,
     WINDOWS_S,
     AxisRange,
@@ -21,8 +23,6 @@ from zsim_bridges.console.page.variable_plots import (
     VariablePlots,
     flight_history,
 )
-from zsim_bridges.console.scene.picture import DronePoses
-from zsim_bridges.console.scene.variable_history import SPAN_S
 
 CLUSTER = scenario_file.load(Path(__file__).parents[5] / "scenarios" / "step.yaml").clusters[0]
 RANGES = [SliderRange(name, "m", 0.0, 9.0, 0.1) for name in ("x_c", "y_c", "z_c", "p")]

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim_bridges.console.scene.camera_follow import CameraFollow
-from zsim_bridges.console.scene.page_camera import DISTANCE_MIN_M, fit_distance_m
+from zsim_bridges.console.page_cameras import DISTANCE_MIN_M, CameraFollow, fit_distance_m
 
 UP_W = np.array([0.0, 0.0, 1.0])
 TRIANGLE = np.array([(0.0, 3.5, 15.0), (-3.5, -3.5, 15.0), (3.5, -3.5, 15.0)])

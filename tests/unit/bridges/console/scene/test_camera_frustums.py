@@ -12,9 +12,8 @@ import pytest
 import synthetic_camera
 
 from zsim.math import frames
-from zsim_bridges.console.scene.camera_frustums import CameraFrustums, drone_index, frustum_pose
-from zsim_bridges.console.scene.page_camera import OFFSET_M
-from zsim_bridges.console.scene.picture import DronePoses, drone_on_ray
+from zsim_bridges.console.page_cameras import OFFSET_M, CameraFrustums, drone_index, frustum_pose
+from zsim_bridges.console.picture import DronePoses, drone_on_ray
 
 FRONT, BOTTOM = synthetic_camera.info_of("front"), synthetic_camera.info_of("bottom")
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

@@ -8,7 +8,7 @@ from refused import has_terms
 
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_bridges.console.scene.flight_preview import PreviewError, preview_of
+from zsim_bridges.console.picture import PreviewError, preview_of
 
 SCENARIO = scenario_file.load(Path(__file__).parents[5] / "scenarios" / "step.yaml")
 SPACE = scenario_space(SCENARIO, SCENARIO.clusters[0])

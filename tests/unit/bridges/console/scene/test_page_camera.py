@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from zsim_bridges.console.scene.page_camera import FAR_M, CameraView
+from zsim_bridges.console.page_cameras import FAR_M, CameraView
 
 NORTHWARDS = CameraView(np.zeros(3), np.array([0.0, 2.0, 0.0]), np.array([0.0, 0.0, 1.0]), math.radians(90), 1.5)
 

@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from zsim_bridges.console.flying.flight_conditions import FlightAnswer
-from zsim_bridges.console.flying.flown_velocity import Stick
-from zsim_bridges.console.server.action_socket import ActionSockets
-from zsim_bridges.console.server.page_tokens import OPERATOR, VIEWER
+from zsim_bridges.console.manual_flight import FlightAnswer, Stick
+from zsim_bridges.console.page_server import OPERATOR, VIEWER
+from zsim_bridges.console.page_sockets import ActionSockets
 
 LOOK = {"do": "look", "page": "key", "follows": True, "fits": False, "direction": "top"}
 

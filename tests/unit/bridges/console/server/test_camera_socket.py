@@ -10,8 +10,8 @@ import pytest
 import synthetic_camera
 from aiohttp import WSMsgType
 
-from zsim_bridges.console.server import camera_socket
-from zsim_bridges.console.server.camera_socket import CameraSockets, PicturesRequest
+from zsim_bridges.console import page_sockets
+from zsim_bridges.console.page_sockets import CameraSockets, PicturesRequest
 
 INFO = synthetic_camera.info_of("front")
 CAMERA = "drone1/front"
@@ -99,7 +99,7 @@ def periods(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         passed.append(delay_s)
         await sleep(0)
 
-    monkeypatch.setattr(camera_socket.asyncio, "sleep", pass_at_once)
+    monkeypatch.setattr(page_sockets.asyncio, "sleep", pass_at_once)
     return passed
 
 
@@ -141,7 +141,7 @@ def test_the_next_picture_is_sent_when_the_last_is_shown(periods: list[float]):
         assert (await page.socket.sent.get()).endswith(b"JPEG 2")
 
     with_page(steps)
-    assert set(periods) == {camera_socket.PERIOD_S}
+    assert set(periods) == {page_sockets.PERIOD_S}
 
 
 def test_what_is_asked_for_is_asked_of_the_feed_the_frustums_picture_too(periods: list[float]):
@@ -174,7 +174,7 @@ def test_too_many_pictures_are_no_request(periods: list[float]):
     page = Page()
 
     async def steps() -> None:
-        page.socket.say(want=("drone1/front",) * (camera_socket.WANTED_MAX + 1))
+        page.socket.say(want=("drone1/front",) * (page_sockets.WANTED_MAX + 1))
         await page.sockets.serve(page.socket)
 
     asyncio.run(steps())

@@ -3,7 +3,7 @@
 import asyncio
 import threading
 
-from zsim_bridges.console.server.private_viser import AnyThreadEvent, PrivateViser
+from zsim_bridges.console.private_viser import AnyThreadEvent, PrivateViser
 
 
 def test_another_thread_marks_it_and_the_loop_wakes_who_waits():

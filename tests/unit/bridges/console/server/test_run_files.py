@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from zsim_bridges.console.server import run_files
-from zsim_bridges.console.server.run_files import RunFiles
+from zsim_bridges.console import page_server
+from zsim_bridges.console.page_server import RunFiles
 
 PAGE = "a page"
 
@@ -36,7 +36,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr(run_files, "time", made)
+    monkeypatch.setattr(page_server, "time", made)
     return made
 
 
@@ -63,7 +63,7 @@ def test_a_page_is_waited_for_until_it_has_its_copies(clock: Clock, tmp_path: Pa
     files.shown(PAGE, has_copies=False)
     clock.at_sleep = lambda: files.shown(PAGE, has_copies=clock.now_s > 1005.0)  # type: ignore[func-returns-value]
     files.offer(20.0, deserted=lambda: False)
-    assert 1005.0 < clock.now_s < 1005.0 + 2 * run_files.POLL_S
+    assert 1005.0 < clock.now_s < 1005.0 + 2 * page_server.POLL_S
 
 
 def test_a_page_that_has_its_copies_keeps_nobody(clock: Clock, tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_page_that_never_has_its_copies_is_waited_for_so_long(clock: Clock, tm
     files.shown(PAGE, has_copies=False)
     clock.at_sleep = lambda: files.shown(PAGE, has_copies=False)  # type: ignore[func-returns-value]
     files.offer(20.0, deserted=lambda: False)
-    assert clock.now_s == pytest.approx(1020.0, abs=run_files.POLL_S)
+    assert clock.now_s == pytest.approx(1020.0, abs=page_server.POLL_S)
 
 
 def test_a_page_that_was_closed_is_waited_for_no_longer_than_its_looks_may_take(clock: Clock, tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_a_page_that_was_closed_is_waited_for_no_longer_than_its_looks_may_take(
     files.shown(PAGE, has_copies=False)
     files.shown("another page", has_copies=True)
     files.offer(20.0, deserted=lambda: False)
-    assert clock.now_s == pytest.approx(1000.0 + run_files.LOOKED_S, abs=2 * run_files.POLL_S)
+    assert clock.now_s == pytest.approx(1000.0 + page_server.LOOKED_S, abs=2 * page_server.POLL_S)
 
 
 def test_who_is_no_page_is_not_waited_for(clock: Clock, tmp_path: Path) -> None:
@@ -99,16 +99,16 @@ def test_who_is_no_page_is_not_waited_for(clock: Clock, tmp_path: Path) -> None:
 
 def test_the_pages_that_are_known_have_a_bound(clock: Clock, tmp_path: Path) -> None:
     files = RunFiles(tmp_path)
-    for number in range(10 * run_files.LOOKS_MAX):
+    for number in range(10 * page_server.LOOKS_MAX):
         files.shown(f"page {number}", has_copies=False)
-    assert len(files._looked_s) == run_files.LOOKS_MAX
+    assert len(files._looked_s) == page_server.LOOKS_MAX
 
 
 def test_who_is_deserted_waits_for_no_page(clock: Clock, tmp_path: Path) -> None:
     files = RunFiles(tmp_path)
     files.shown(PAGE, has_copies=False)
     files.offer(20.0, deserted=lambda: clock.now_s > 1001.0)
-    assert clock.now_s == pytest.approx(1001.0, abs=2 * run_files.POLL_S)
+    assert clock.now_s == pytest.approx(1001.0, abs=2 * page_server.POLL_S)
 
 
 def test_a_report_of_another_run_in_the_folder_is_not_shown(tmp_path: Path) -> None:
