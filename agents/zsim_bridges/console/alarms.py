@@ -1,7 +1,7 @@
-"""Alarms of a run: what an operator must see, in amber or red, with a name; which of them were acknowledged.
+"""Alarms of a run, amber or red, from its condition and events; and what injected faults have changed.
 
-Order of this file: what an alarm is; alarms of drones, formations and processes, which are pure; what was lost; the
-board that keeps since when each stands, and what was acknowledged.
+Order of this file: alarms of drones, formations and processes, which are pure; losses of processes; the board with the
+age of each alarm, and whether it was acknowledged; the watch on faults.
 """
 
 import threading
@@ -28,21 +28,14 @@ LOST = {
     "failure": "failed",
     "diverged": "diverged",
 }
-"""Kinds of events that report a process or drone that is lost, and the name of the alarm."""
-BACK = frozenset({"join", "restart", "superseded", "silent_end", "leave"})  # kinds that end it; a drop ends no death
-OFF_REFERENCE_M = 2.0  # of a length of an engaged formation; chosen: the paper's drones come as close as that
+"""Kinds of events that report the loss of a process or drone, with the name of the alarm."""
+BACK = frozenset({"join", "restart", "superseded", "silent_end", "leave"})  # kinds that end a loss; a drop does not
+OFF_REFERENCE_M = 2.0  # of a length of an engaged formation; chosen: as close as the paper's drones come
 FLOWN_PHASES = frozenset({"assembling", "engaged"})  # in which a formation's controller flies all of its drones
 
 
 class Alarm(NamedTuple):
-    """Something that an operator must see.
-
-    Attributes:
-        severity: amber: look at it; red: act.
-        subject: the drone, formation or process.
-        name: of the alarm; one subject has each name once.
-        text: with figures.
-    """
+    """An alarm: amber to look at, red to act on; `name` is unique to its subject, a drone, formation or process."""
 
     severity: Severity
     subject: str
@@ -51,7 +44,7 @@ class Alarm(NamedTuple):
 
 
 class DroneCondition(NamedTuple):
-    """What alarms of a drone are made of; None for what is not known, or does not apply."""
+    """What alarms and checks of a drone depend on; None where unknown or not applicable."""
 
     name: str
     state: str
@@ -61,7 +54,7 @@ class DroneCondition(NamedTuple):
     yaw_sigma_deg: float | None = None
     estimate_lost: bool = False
     tilt_deg: float | None = None
-    failsafe: str = ""  # why its firmware lands it or has stopped its rotors by itself; empty where it has not
+    failsafe: str = ""  # why its firmware lands it, or has stopped its rotors, by itself; otherwise empty
     commander: str | None = None
     is_external: bool = False
     link_age_s: float | None = None  # wall, since its driver has published the state of the link
@@ -98,21 +91,14 @@ def drone_alarms(drone: DroneCondition) -> list[Alarm]:
         add("amber", "estimate late", f"{drone.lag_ms:.0f} ms")
     if drone.sigma_m is not None and drone.sigma_m > SIGMA_HIGH_M:
         add("amber", "sigma", f"{drone.sigma_m:.1f} m")
-    return found + _link_alarms(drone)
-
-
-def _link_alarms(drone: DroneCondition) -> list[Alarm]:
     if drone.link_state == "lost":
-        return [Alarm("red", drone.name, "link lost")]
-    figures = (
-        ("link old", drone.link_age_ms, LINK_OLD_MS, "ms"),
-        ("link loss", drone.link_loss_percent, LINK_LOSS_PERCENT, "%"),
-    )
-    return [
-        Alarm("amber", drone.name, name, f"{value:.0f} {unit}")
-        for name, value, limit, unit in figures
-        if value is not None and value > limit
-    ]
+        add("red", "link lost")
+        return found
+    if drone.link_age_ms is not None and drone.link_age_ms > LINK_OLD_MS:
+        add("amber", "link old", f"{drone.link_age_ms:.0f} ms")
+    if drone.link_loss_percent is not None and drone.link_loss_percent > LINK_LOSS_PERCENT:
+        add("amber", "link loss", f"{drone.link_loss_percent:.0f} %")
+    return found
 
 
 def formation_alarms(
@@ -120,13 +106,7 @@ def formation_alarms(
     foreign: Mapping[str, Mapping[str, str]],
     views: Mapping[str, ViewCluster],
 ) -> list[Alarm]:
-    """Return the alarms of formations.
-
-    Args:
-        phases: phase and reason of each.
-        foreign: who flies drones of each instead of its controller, by drone.
-        views: the newest of each.
-    """
+    """Return the alarms of formations, from phase and reason of each, who else flies its drones, and its view."""
     found = []
     for name, (phase, reason) in phases.items():
         if TOO_NEAR in reason:
@@ -141,7 +121,7 @@ def formation_alarms(
 
 
 def foreign_text(commanders: Mapping[str, str]) -> str:
-    """Return in words who flies which drone instead of a formation's controller."""
+    """Describe who flies which drone instead of a formation's controller."""
     return ", ".join(f"{drone} is flown by {who}" for drone, who in commanders.items())
 
 
@@ -150,13 +130,12 @@ def foreign_commanders(
 ) -> dict[str, str]:
     """Return who flies drones of a formation instead of its controller, by drone.
 
-    A process of another name may control the formation; an operator's console does not.
-
     Args:
-        controller: name of the formation's process.
-        members: names of its drones.
+        controller: expected name of the formation's process; where it flies no drone, the controller may have another
+            name, so only consoles count as foreign.
+        members: names of the drones.
         commanders: who flies each drone.
-        roles: of processes, as far as they are known.
+        roles: of processes, as far as known.
     """
     others = {drone: who for drone in members if (who := commanders.get(drone)) and who != controller}
     if any(commanders.get(drone) == controller for drone in members):
@@ -165,7 +144,7 @@ def foreign_commanders(
 
 
 def _strayed(view: ViewCluster) -> str:
-    """Return the length of an engaged formation that is farthest from its reference; empty where all are near it."""
+    """Return the length of an engaged formation farthest from its reference; empty where all are near theirs."""
     apart = [
         (abs(value - desired), name, value, desired)
         for name, value, desired in zip(view.names, view.value, view.desired, strict=True)
@@ -175,40 +154,39 @@ def _strayed(view: ViewCluster) -> str:
     return f"{name} is {value:.1f} m, to be {desired:.1f} m" if away_m > OFF_REFERENCE_M else ""
 
 
-def process_alarms(losses: Mapping[str, Event]) -> list[Alarm]:
-    """Return the alarms of what was lost, by the newest event about each."""
-    return [Alarm("red", name, LOST[event.kind], event.text) for name, event in losses.items()]
-
-
-def fault_alarms(active: Iterable[Fault]) -> list[Alarm]:
-    """Return an alarm for each injected fault that acts."""
-    return [Alarm("amber", fault.target, fault.kind, parameters_text(fault)) for fault in active]
+def run_alarms(losses: Mapping[str, Event], active: Iterable[Fault], silent_s: float) -> list[Alarm]:
+    """Return the alarms of lost processes, of active injected faults, and of a world silent for so long."""
+    found = [Alarm("red", name, LOST[event.kind], event.text) for name, event in losses.items()]
+    if silent_s:
+        found.append(Alarm("red", "world", "silent", f"no answer for {silent_s:.0f} s"))
+    return found + [Alarm("amber", fault.target, fault.kind, parameters_text(fault)) for fault in active]
 
 
 def parameters_text(fault: Fault) -> str:
-    """Return the parameters of a fault as the terminal has them: NAME=VALUE."""
+    """Return the parameters of a fault as in the terminal: NAME=VALUE."""
     return " ".join(f"{name}={value}" for name, value in fault.parameters.items() if value not in (None, {}))
 
 
 class Losses:
-    """Keeps which processes and drones are lost, by the events about them; called in several threads.
+    """Keeps which processes and drones are lost; thread-safe.
 
     Attributes:
-        now: the newest event about each that is lost.
+        now: the newest event about each lost one.
     """
 
     def __init__(self) -> None:
         self.now: dict[str, Event] = {}
 
     def note(self, event: Event) -> None:
-        """Take an event: of a loss, or that somebody is back, as itself or in another process that does its work."""
-        if event.kind in LOST and not is_false_join(event):
+        """Take an event: of a loss, or of a return, as itself or in another process that does its work."""
+        no_process_joined = event.kind == "no_show" and "incarnation" in event.data  # that of its name is where it was
+        if event.kind in LOST and not no_process_joined:
             self.now = {**self.now, event.subject: event}
         elif event.kind in BACK:
             self._remove({event.subject, *map(str, event.data.get("serves") or ())})
 
     def note_health(self, name: str, health: Health) -> None:
-        """Take the health of a process: one that is not the one that was lost has come in its place."""
+        """Take the health of a process: one of another host or pid replaces a lost one."""
         lost = self.now.get(name)
         pid = None if lost is None else lost.data.get("pid")
         if lost is not None and pid and (lost.data.get("host"), pid) != (health.host, health.pid):
@@ -218,14 +196,9 @@ class Losses:
         self.now = {name: lost for name, lost in self.now.items() if name not in names}
 
 
-def is_false_join(event: Event) -> bool:
-    """Return whether nobody was behind a join: the process of that name is where it was."""
-    return event.kind == "no_show" and "incarnation" in event.data
-
-
 @dataclass
 class _Standing:
-    """An alarm on the board: how often it came, and since when it is over [s; wall]; None while it is not."""
+    """An alarm on the board: how often it was raised, and when it ended [s; wall]; None while it stands."""
 
     alarm: Alarm
     since_s: float
@@ -235,7 +208,7 @@ class _Standing:
 
 
 class AlarmBoard:
-    """The alarms that stand. A red one that ends stays until it was acknowledged: somebody may have looked away."""
+    """The standing alarms; an ended red one stays until it is acknowledged, since nobody may have been looking."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -243,7 +216,7 @@ class AlarmBoard:
         self.alarms: tuple[Alarm, ...] = ()
 
     def update(self, alarms: Sequence[Alarm], wall_s: float) -> None:
-        """Take over the alarms of now."""
+        """Take over the present alarms."""
         with self._lock:
             now = {(each.subject, each.name): each for each in alarms}
             for key, standing in list(self._standing.items()):
@@ -254,31 +227,28 @@ class AlarmBoard:
                 elif standing.over_s is None:
                     standing.over_s = wall_s
             for key, alarm in now.items():
-                self._set(key, alarm, wall_s)
+                standing = self._standing.setdefault(key, _Standing(alarm, wall_s))
+                if standing.over_s is not None:
+                    standing.since_s, standing.over_s, standing.times = wall_s, None, standing.times + 1
+                if alarm.severity != standing.alarm.severity:
+                    standing.acknowledged = False
+                standing.alarm = alarm
             self.alarms = tuple(sorted(now.values(), key=_rank))
 
-    def _set(self, key: tuple[str, str], alarm: Alarm, wall_s: float) -> None:
-        standing = self._standing.setdefault(key, _Standing(alarm, wall_s))
-        if standing.over_s is not None:
-            standing.since_s, standing.over_s, standing.times = wall_s, None, standing.times + 1
-        if alarm.severity != standing.alarm.severity:
-            standing.acknowledged = False
-        standing.alarm = alarm
-
     def acknowledge(self) -> None:
-        """Acknowledge all alarms, and forget those that are over; one that becomes red is new."""
+        """Acknowledge all alarms and remove ended ones; one that turns red later needs a new acknowledgement."""
         with self._lock:
             self._standing = {key: each for key, each in self._standing.items() if each.over_s is None}
             for standing in self._standing.values():
                 standing.acknowledged = True
 
     def clear(self) -> None:
-        """Forget all, as a replay does that goes back."""
+        """Remove all: a replay has gone back."""
         with self._lock:
             self._standing, self.alarms = {}, ()
 
     def rows(self, wall_s: float) -> list[dict[str, object]]:
-        """Return the alarms as plain data, red ones first, with how long each stands or has been over [s; wall]."""
+        """Return the alarms as plain data, red ones first, with how long each has stood or been over [s; wall]."""
         with self._lock:
             ordered = sorted(self._standing.values(), key=lambda each: _rank(each.alarm, each.over_s is not None))
             return [
@@ -293,7 +263,7 @@ class AlarmBoard:
             ]
 
     def severity_of(self, subject: str) -> Severity | None:
-        """Return the worst alarm of a drone, formation or process; None where it has none. For its colour."""
+        """Return the severity of the worst alarm of a drone, formation or process; None without one."""
         return next((each.severity for each in self.alarms if each.subject == subject), None)
 
 
@@ -311,11 +281,7 @@ WIND_GROWN_M_S = 0.3  # chosen: above the rounding of what is shown
 
 @dataclass(frozen=True)
 class Figures:
-    """What a fault may change of what it strikes: worst sigma and lag of its drones, wind, states and phases.
-
-    Attributes:
-        states: of drones, formations and processes, by name.
-    """
+    """What a fault may change: worst sigma and lag of its drones, wind, states of drones, formations and processes."""
 
     sigma_m: float = 0.0
     lag_ms: float = 0.0
@@ -333,13 +299,13 @@ class _Watched:
 
 
 class FaultWatch:
-    """Watches the faults of a run."""
+    """What injected faults strike, and what has changed since they began. Pure."""
 
     def __init__(self) -> None:
         self._watched: dict[int, _Watched] = {}
 
     def clear(self) -> None:
-        """Forget all, as a replay does that goes back."""
+        """Remove all: a replay has gone back."""
         self._watched.clear()
 
     def update(
@@ -351,11 +317,11 @@ class FaultWatch:
         lost: Iterable[str],
         wind_m_s: float,
     ) -> None:
-        """Take over what is seen now.
+        """Take over the present condition.
 
         Args:
-            begun: faults that have begun, those of an instant among them.
-            active: those that act.
+            begun: faults that have begun, instantaneous ones among them.
+            active: those that act now.
             drones: the condition of each.
             phases: of each formation.
             lost: processes that are dead or silent.
@@ -378,14 +344,14 @@ class FaultWatch:
             del self._watched[number]
 
     def lines(self, is_over: bool = False) -> list[str]:
-        """Return a line for each fault that acts, or that is over."""
+        """Return a line for each fault that acts, or for each that is over."""
         return [_line(each) for each in self._watched.values() if each.over == is_over]
 
 
 def _figures(
     fault: Fault, drones: Mapping[str, DroneCondition], phases: Mapping[str, str], lost: frozenset[str], wind_m_s: float
 ) -> Figures:
-    """Return the figures of what a fault strikes: a target names drones, or processes that are named after them."""
+    """Return the figures of a fault's target, which names drones, or processes named after them."""
     parts = fault.target.split("/")
     things = {part.rpartition(".")[2] for part in parts}
     everybody = not things & (set(drones) | set(phases))  # the world
@@ -399,7 +365,7 @@ def _figures(
 
 
 def _note(watched: _Watched, now: Figures) -> None:
-    """Keep the worst and every new state while the fault acts; a killed process dies, and comes back, after it."""
+    """Keep the worst figures and every new state while the fault acts; a killed process dies and returns after it."""
     if not watched.over:
         watched.worst = replace(
             watched.worst,

@@ -118,7 +118,7 @@ class CameraFeed:
         self.update()
 
     def update(self) -> None:
-        """Subscribe to the cameras that pages asked for lately and to no others; to be called several times a second."""
+        """Subscribe to the cameras that pages asked for lately, and no others; to be called several times a second."""
         with self._lock:
             now_s = self._wall_s()
             self._asked = {page: asked for page, asked in self._asked.items() if asked[1] > now_s}

@@ -1,7 +1,7 @@
 """The recent past of a run, in memory: trails of its drones, and points of variables as plots show them. Pure.
 
-Of a flight both go back a few minutes and begin anew when time goes back; of a record that is replayed they hold whatever
-was read of it, in any order, until it is far from the shown instant.
+Of a flight both go back a few minutes, and begin anew when time goes back. Of a replayed record they hold whatever was
+read of it, in any order, until it is far from the shown instant.
 """
 
 import math

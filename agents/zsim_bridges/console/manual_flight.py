@@ -1,6 +1,7 @@
-"""Drones that are flown from pages: a drone is taken, commanded at a steady rate while its page is there, given back.
+"""Drones flown from pages, by a stick or to a place on the map: acquired, commanded at a steady rate, given back.
 
-What is not asked for all the time is hover: a stick that is no longer held, a page that is silent, hidden or gone.
+Whatever is not requested continuously means hover: a stick that is released, a page that is silent, hidden or gone.
+Axes of W, unless a name ends otherwise.
 """
 
 import math
@@ -18,137 +19,33 @@ from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import Limits
 from zsim_bridges.console.command_client import CommandClient, NoAnswer
-from zsim_bridges.console.operator_input import HEIGHT_MAX_M, HEIGHT_MIN_M, SIDEWAYS_M
+from zsim_bridges.console.operator_input import SIDEWAYS_M, height_range_m
 
-BRAKE_S = 1.0  # over which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
-AXES = "xyz"
-
-
-class Geofence(NamedTuple):
-    """A box around the drones' starts.
-
-    Attributes:
-        low_m, high_m: corners [m; W].
-    """
-
-    low_m: tuple[float, float, float]
-    high_m: tuple[float, float, float]
-
-    def refusal(self, x_m: float, y_m: float) -> str:
-        """Return why no drone may be sent to a place; empty where it may."""
-        for axis, value in zip(AXES, (x_m, y_m), strict=False):
-            low, high = self.low_m[AXES.index(axis)], self.high_m[AXES.index(axis)]
-            if not low <= value <= high:
-                return f"{axis} is {value:.1f} m, outside of the geofence: {low:g} to {high:g} m"
-        return ""
-
-    def within(self, velocity_W: tuple[float, float, float], p_W: tuple[float, float, float]) -> tuple[float, ...]:
-        """Return a velocity [m/s] without what leads out: at `BRAKE_S` before the fence a drone begins to slow down.
-
-        Args:
-            velocity_W: that is wanted.
-            p_W: where the drone is [m]; from beyond the fence it may come back.
-        """
-        return tuple(
-            min(max(v, min(0.0, (low - p) / BRAKE_S)), max(0.0, (high - p) / BRAKE_S))
-            for v, p, low, high in zip(velocity_W, p_W, self.low_m, self.high_m, strict=True)
-        )
-
-
-def geofence_of(scenario: Scenario) -> Geofence:
-    """Return the fence of a scenario's drones: around all starts, and below the lowest ceiling."""
-    starts = [drone.position_m for drone in scenario.drones]
-    top_m = min(HEIGHT_MAX_M, *(drone.limits.altitude_m for drone in scenario.drones))
-    xs, ys, _ = zip(*starts, strict=True)
-    low_m = (round(min(xs)) - SIDEWAYS_M, round(min(ys)) - SIDEWAYS_M, min(HEIGHT_MIN_M, top_m / 2.0))
-    high_m = (round(max(xs)) + SIDEWAYS_M, round(max(ys)) + SIDEWAYS_M, top_m)
-    return Geofence(low_m, high_m)
-
-
-RATE_MAX = 5.0  # × real time; chosen: faster, nobody steers by hand, and the firmware takes the pauses for silence
-
-
-class DroneSight(NamedTuple):
-    """What is known of a drone.
-
-    Attributes:
-        state: of its firmware; empty before it was seen.
-        commander: who flies it.
-        pose: by its estimator; None where there is no estimate of the present.
-    """
-
-    state: str = ""
-    commander: str | None = None
-    pose: DronePose | None = None
-
-
-class RunSight(NamedTuple):
-    """What is known of the run.
-
-    Attributes:
-        off: why nothing can be flown; empty where something can.
-        silence: that the world does not answer, in words; empty where it does. A drone is taken all the same.
-        rate: simulated per wall second, as measured.
-        paused: whether it stands still.
-    """
-
-    off: str = ""
-    rate: float = 1.0
-    paused: bool = False
-    silence: str = ""
-
-
-class FlightAnswer(NamedTuple):
-    """What a page shows of the drone that it flies.
-
-    Attributes:
-        drone: its name; empty for none.
-        state: none, taking or flying.
-        text: why it is not flown, or what it does.
-        over: whether it may be taken over from who flies it.
-        commander: who that is.
-        id: of the page's request to take it.
-        goal: the place to which it flies [m; W]; None for none.
-    """
-
-    drone: str = ""
-    state: str = "none"
-    text: str = ""
-    over: bool = False
-    commander: str = ""
-    id: str = ""
-    goal: Vector | None = None
-
-
-def too_fast(rate: float) -> str:
-    """Return why nobody can fly by hand at a rate; empty where somebody can."""
-    if rate <= RATE_MAX:
-        return ""
-    return f"time goes {rate:.1f} × as fast as the wall clock; to fly by hand set the rate to {RATE_MAX:g} or less"
-
-
-CLIMB_SHARE = 0.5  # of the speed over the ground, up and down; chosen: on a page a height is harder to see
-YAW_RATE_RAD_S = math.radians(45.0)  # chosen: once around in 8 s
-SPEED_M_S = 1.5  # towards a place; chosen: as the formations of the paper
-GAIN_1_S = 0.6  # of the way to a place; as formations, `Gains.proportional_1_s`
+PERIOD_S = 0.05  # wall; of commands: at 5 × real time ten of them within a drone's silence of 0.5 s
+STALE_S = 0.5  # wall; a page silent for longer does not fly any more: as the firmware's silence
+GONE_S = 5.0  # wall; after which the drone of a lost page is given back: it may be reloaded meanwhile
+REPEAT_S = 1.0  # wall; after which a silent world is asked for a drone again
+SETTLED_S = 1.5  # wall; after which a view shows who has acquired a drone; views come 20 times a second
+RATE_MAX = 5.0  # × real time; chosen: faster, manual flight is hopeless, and the firmware takes pauses for silence
+CLIMB_SHARE = 0.5  # of the horizontal speed, up and down; chosen: height is harder to see on a page
+YAW_RATE_RAD_S = math.radians(45.0)  # chosen: a full turn in 8 s
+SPEED_M_S = 1.5  # towards a place; chosen: as the paper's formations
+GAIN_1_S = 0.6  # of the distance to a place; as of formations, `Gains.proportional_1_s`
+BRAKE_S = 1.0  # in which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
 
 
 class Stick(NamedTuple):
-    """How far a stick is moved, or keys are held: each from -1 to 1; in the drone's heading frame, and yaw to the left.
-
-    Attributes:
-        speed_m_s: at a full stick.
-    """
+    """Deflections of a stick, or of held keys, from -1 to 1, in the drone's heading frame; yaw to the left."""
 
     forward: float
     left: float
     up: float
     turn: float
-    speed_m_s: float
+    speed_m_s: float  # at full deflection
 
 
 class DronePose(NamedTuple):
-    """Where a drone is by its estimator [m; W], and its heading [rad]."""
+    """Position [m; W] and heading [rad] of a drone by its estimator."""
 
     p_W: Vector
     yaw_rad: float
@@ -164,8 +61,87 @@ class FlownVelocity(NamedTuple):
 HOVER = FlownVelocity()
 
 
+class DroneSight(NamedTuple):
+    """What is known of a drone: its firmware's state, empty before it is seen, who flies it, and a present estimate."""
+
+    state: str = ""
+    commander: str | None = None
+    pose: DronePose | None = None
+
+
+class RunSight(NamedTuple):
+    """What is known of the run.
+
+    Attributes:
+        off: why nothing can be flown; otherwise empty.
+        rate: simulated per wall second, as measured.
+        paused: whether it stands still.
+        silence: that the world does not answer, in words; otherwise empty. A drone is requested all the same.
+    """
+
+    off: str = ""
+    rate: float = 1.0
+    paused: bool = False
+    silence: str = ""
+
+
+class FlightAnswer(NamedTuple):
+    """What a page shows of the drone that it flies.
+
+    Attributes:
+        drone: its name; empty for none.
+        state: none, taking or flying.
+        text: why it is not flown, or what it does.
+        over: whether it may be taken over from its commander.
+        commander: who flies it.
+        id: of the page's request to take it.
+        goal: the place to which it flies [m; W].
+    """
+
+    drone: str = ""
+    state: str = "none"
+    text: str = ""
+    over: bool = False
+    commander: str = ""
+    id: str = ""
+    goal: Vector | None = None
+
+
+class Geofence(NamedTuple):
+    """A box around the drones' starts by its corners [m; W]; ranges of formations are those of their variables."""
+
+    low_m: Vector
+    high_m: Vector
+
+    def refusal(self, x_m: float, y_m: float) -> str:
+        """Return why no drone may be sent to a place; empty where it may."""
+        for axis, value, low, high in zip("xy", (x_m, y_m), self.low_m, self.high_m, strict=False):
+            if not low <= value <= high:
+                return f"{axis} is {value:.1f} m, outside of the geofence: {low:g} to {high:g} m"
+        return ""
+
+    def within(self, velocity_W: Vector, p_W: Vector) -> Vector:
+        """Return a wanted velocity [m/s] without what leads out; braking begins BRAKE_S before the fence.
+
+        From outside of the fence, a drone at p_W [m] may come back.
+        """
+        x, y, z = (
+            min(max(v, min(0.0, (low - p) / BRAKE_S)), max(0.0, (high - p) / BRAKE_S))
+            for v, p, low, high in zip(velocity_W, p_W, self.low_m, self.high_m, strict=True)
+        )
+        return x, y, z
+
+
+def geofence_of(scenario: Scenario) -> Geofence:
+    """Return the fence of a scenario's drones: around all starts, and below the lowest ceiling."""
+    xs, ys, _ = zip(*(drone.position_m for drone in scenario.drones), strict=True)
+    low_m, top_m = height_range_m(scenario.drones)
+    corner_m = (round(min(xs)) - SIDEWAYS_M, round(min(ys)) - SIDEWAYS_M, low_m)
+    return Geofence(corner_m, (round(max(xs)) + SIDEWAYS_M, round(max(ys)) + SIDEWAYS_M, top_m))
+
+
 def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofence) -> FlownVelocity:
-    """Return what a stick asks of a drone, within its limits and the fence."""
+    """Return the velocity that a stick demands, within the drone's limits and the fence."""
     speed = min(max(stick.speed_m_s, 0.0), limits.horizontal_speed_m_s)
     deflection = max(1.0, math.hypot(stick.forward, stick.left))
     climb = stick.up * min(CLIMB_SHARE * speed, limits.vertical_speed_m_s)
@@ -185,56 +161,55 @@ def velocity_to(place_W: Vector, pose: DronePose, limits: Limits, fence: Geofenc
 
 def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
     """Return a velocity of W in the heading frame, without what leads out of the fence."""
-    x, y, z = fence.within(velocity_W, pose.p_W)
-    return turned_about_up((x, y, z), -pose.yaw_rad)
+    return turned_about_up(fence.within(velocity_W, pose.p_W), -pose.yaw_rad)
 
 
-PERIOD_S = 0.05  # wall; of commands: at 5 × real time ten of them within a drone's silence of 0.5 s
-STALE_S = 0.5  # wall; a page that was silent for so long does not fly any more: as the firmware's silence
-GONE_S = 5.0  # wall; after which the drone of a page that is gone is given back: a page may be loaded anew meanwhile
-REPEAT_S = 1.0  # wall; after which a drone is asked for again of a world that has not answered
-SETTLED_S = 1.5  # wall; after which a view shows who has taken a drone; views come 20 times a second
+def _too_fast(rate: float) -> str:
+    """Return why nobody can fly by hand at a rate; empty where somebody can."""
+    if rate <= RATE_MAX:
+        return ""
+    return f"time goes {rate:.1f} × as fast as the wall clock; to fly by hand set the rate to {RATE_MAX:g} or less"
 
 
 @dataclass
 class _Flight:
-    """A drone that a page flies, or is about to.
+    """A drone that a page flies, or is about to; times in s, wall.
 
     Attributes:
-        modes: requested of the drone before; a later one ends the flight.
-        owned_s: since when it is commanded [s; wall], None before.
-        seen_s: when the page was heard last [s; wall].
-        sent_s: when it was commanded last [s; wall].
+        modes: number requested of the drone before; a later one ends the flight.
+        begun_s: when the page requested it.
+        seen_s: when the page was last heard.
+        id: of the page's request.
+        owned_s: since when it is commanded; None before.
+        sent_s: when it was last commanded.
         stick: that is held; None: hover, or on the way to `place_W`.
         lost: whether the page's connection is gone.
-        id: of the page's request.
-        begun_s: when the page wanted it [s; wall].
-        asked_s, asking: when the world was asked for the drone last [s; wall], and whether its answer is awaited.
+        asked_s, asking: when the world was last asked for the drone, and whether its answer is outstanding.
     """
 
     drone: str
     modes: int
+    begun_s: float
     seen_s: float
+    id: str = ""
     owned_s: float | None = None
     sent_s: float = 0.0
     stick: Stick | None = None
     place_W: Vector | None = None
     lost: bool = False
-    id: str = ""
-    begun_s: float = 0.0
     asked_s: float = 0.0
     asking: bool = False
 
 
 class ManualFlight:
-    """Flies drones for pages.
+    """Flies drones for pages, each identified by any hashable value; thread-safe.
 
     Args:
         client: sends commands.
         name: of the console's process.
         limits: of each drone.
         fence: of all.
-        gate_s: simulated seconds of a gate; of what is sent, no two commands are for the same one.
+        gate_s: simulated seconds of a gate, for which one command is sent at most.
         sight_of: returns what is known of a drone.
         run_sight: returns what is known of the run.
         wall_s: monotonic.
@@ -262,7 +237,7 @@ class ManualFlight:
         self._lock = threading.RLock()
         self._flights: dict[Any, _Flight] = {}
         self._texts: dict[Any, FlightAnswer] = {}  # why a page flies no more
-        self._released: dict[str, float] = {}  # drones that were given back, and when that is looked at again [s; wall]
+        self._released: dict[str, float] = {}  # drones given back, and when to check on them [s; wall]
         self._ticked_s = wall_s()
         self._wake = threading.Event()  # something has to be sent at once
 
@@ -270,7 +245,14 @@ class ManualFlight:
     def running(self) -> Iterator[None]:
         """Send commands meanwhile, in a thread of its own."""
         over = threading.Event()
-        thread = threading.Thread(target=self._run, args=(over,), name="manual", daemon=True)
+
+        def run() -> None:
+            while not over.is_set():
+                self.tick()
+                self._wake.wait(PERIOD_S)
+                self._wake.clear()
+
+        thread = threading.Thread(target=run, name="manual", daemon=True)
         thread.start()
         try:
             yield
@@ -283,9 +265,9 @@ class ManualFlight:
             self._give_back(self._wall_s())
 
     def take(self, page: Any, drone: str, over: bool, request: str = "") -> FlightAnswer:
-        """Take a drone for a page; `over` from whoever flies it, with an operator's priority.
+        """Take a drone for a page; `over`: even from whoever flies it, with an operator's priority.
 
-        A request that is repeated, with its id, is carried out once; a page that has connected anew has its drone back.
+        A repeated request, with its id, is carried out once; a page that has reconnected keeps its drone.
         """
         with self._lock:
             if request and self._texts.get(page, FlightAnswer()).id == request:
@@ -304,8 +286,8 @@ class ManualFlight:
                 text = refusal or f"{drone} is flown by {who}"
                 self._texts[page] = FlightAnswer(drone, text=text, over=may_be_over, commander=who or "", id=request)
                 return self._texts[page]
-            flight = _Flight(drone, self._client.modes_requested(drone), self._wall_s(), id=request)
-            flight.begun_s = self._wall_s()
+            now_s = self._wall_s()
+            flight = _Flight(drone, self._client.modes_requested(drone), now_s, now_s, request)
             self._flights[page] = flight
         self._ask(flight)
         return self.answer(page)
@@ -315,19 +297,19 @@ class ManualFlight:
         self._client.take(flight.drone, partial(self._on_taken, flight))
 
     def steer(self, page: Any, stick: Stick | None) -> FlightAnswer:
-        """Fly the page's drone by a stick; None: its dead-man key is not held, so hover, or go on to a place."""
+        """Fly the page's drone by a stick; None: its dead-man key is not held, so hover, or continue to a place."""
         with self._lock:
             flight = self._flights.get(page)
             if flight is not None:
                 if stick is not None:
-                    flight.place_W = None  # who takes the stick has done with the place
+                    flight.place_W = None  # the stick overrides the place
                 elif flight.stick is not None:
                     self._send_soon(flight)
                 flight.stick, flight.seen_s = stick, self._wall_s()
         return self.answer(page)
 
     def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None) -> FlightAnswer:
-        """Fly the page's drone to a place, at the height that it has unless another one is given."""
+        """Fly the page's drone to a place, at its present height unless another one is given."""
         with self._lock:
             flight = self._flights.get(page)
             if flight is None:
@@ -375,16 +357,23 @@ class ManualFlight:
                 silence = self._run_sight().silence
                 text = f"asked for {self._wall_s() - flight.begun_s:.1f} s ago, not confirmed"
                 return FlightAnswer(flight.drone, "taking", f"{text}: {silence}" if silence else text, id=flight.id)
-            return FlightAnswer(flight.drone, "flying", self._text(flight), id=flight.id, goal=flight.place_W)
+            if self._sight_of(flight.drone).pose is None:
+                text = f"hovers: no estimate of {flight.drone}"
+            elif flight.place_W is not None:
+                text = "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.place_W)
+            else:
+                text = "flown by hand" if flight.stick is not None else "hovers"
+            return FlightAnswer(flight.drone, "flying", text, id=flight.id, goal=flight.place_W)
 
     def tick(self) -> None:
         """Command every drone that is due; give back those that may not be flown any more.
 
-        All is sent from here, in one thread: no command follows a newer one, or comes after the drone was given back.
+        Everything is sent from here, in one thread: no command follows a newer one, or the return of a drone.
         """
         wall_s, run = self._wall_s(), self._run_sight()
         stood_s, self._ticked_s = wall_s - self._ticked_s, wall_s
         stall = f"the console stood still for {stood_s:.0f} s" if stood_s > GONE_S else ""
+        period_s = max(PERIOD_S * 0.9, self._gate_s / max(run.rate, 1e-3))  # a slow run has few gates
         for page, flight in list(self._flights.items()):
             reason = stall or self._end_reason(flight, run, wall_s)
             if reason:
@@ -392,14 +381,14 @@ class ManualFlight:
             elif flight.owned_s is None:
                 if not flight.asking and not run.silence and wall_s - flight.asked_s >= REPEAT_S:
                     self._ask(flight)
-            elif flight.owned_s is not None and not run.paused and wall_s - flight.sent_s >= self._period_s(run):
+            elif not run.paused and wall_s - flight.sent_s >= period_s:
                 flight.sent_s = wall_s
                 flown = self._velocity(flight, wall_s)
                 self._client.send_velocity(flight.drone, flown.velocity_m_s, flown.yaw_rate_rad_s)
         self._give_back(wall_s)
 
     def _give_back(self, wall_s: float) -> None:
-        """Release drones; once more where the world took a command after the release, which made us commander again."""
+        """Release drones; again if the world took a command after the release, which made the console commander."""
         with self._lock:
             due = [drone for drone, at_s in self._released.items() if wall_s >= at_s]
             flown = {flight.drone for flight in self._flights.values()}
@@ -409,23 +398,13 @@ class ManualFlight:
                     self._released[drone] = wall_s + SETTLED_S
                     self._client.give_back(drone)
 
-    def _run(self, over: threading.Event) -> None:
-        while not over.is_set():
-            self.tick()
-            self._wake.wait(PERIOD_S)
-            self._wake.clear()
-
-    def _period_s(self, run: RunSight) -> float:
-        """Return the time between two commands [wall]; a slow run has few gates, and each takes one."""
-        return max(PERIOD_S * 0.9, self._gate_s / max(run.rate, 1e-3))
-
     def _take_refusal(self, drone: str) -> str:
         run, sight = self._run_sight(), self._sight_of(drone)
         if drone not in self._limits:
             return f"drone is {drone!r}; must be one of the run's"
         if any(flight.drone == drone for flight in self._flights.values()):
             return f"{drone} is flown from another page"
-        return run.off or too_fast(run.rate) or state_refusal(drone, sight.state or "unseen", "velocity") or ""
+        return run.off or _too_fast(run.rate) or state_refusal(drone, sight.state or "unseen", "velocity") or ""
 
     def _on_taken(self, flight: _Flight, refusal: str) -> None:
         with self._lock:
@@ -435,7 +414,7 @@ class ManualFlight:
                 if not refusal or isinstance(refusal, NoAnswer):  # the page has given it up meanwhile
                     self._released[flight.drone] = -math.inf
             elif isinstance(refusal, NoAnswer):
-                return  # it is asked for again
+                return  # to be asked for again
             elif refusal:
                 del self._flights[page]
                 if not flight.lost:
@@ -452,7 +431,7 @@ class ManualFlight:
         if flight.owned_s is not None and wall_s - flight.owned_s > SETTLED_S and sight.commander != self._name:
             return f"{drone} is flown by {sight.commander or 'nobody'} now"
         off = run.off or (run.silence if flight.owned_s is not None else "")
-        return off or too_fast(run.rate / 2.0) or state_refusal(drone, sight.state, "velocity") or ""
+        return off or _too_fast(run.rate / 2.0) or state_refusal(drone, sight.state, "velocity") or ""
 
     def _velocity(self, flight: _Flight, wall_s: float) -> FlownVelocity:
         pose, limits = self._sight_of(flight.drone).pose, self._limits[flight.drone]
@@ -466,10 +445,3 @@ class ManualFlight:
         """Let a command be sent at once, not a period after the last one."""
         flight.sent_s = -math.inf
         self._wake.set()
-
-    def _text(self, flight: _Flight) -> str:
-        if self._sight_of(flight.drone).pose is None:
-            return f"hovers: no estimate of {flight.drone}"
-        if flight.place_W is not None:
-            return "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.place_W)
-        return "flown by hand" if flight.stick is not None else "hovers"

@@ -1,28 +1,33 @@
-"""Input of an operator: ranges of cluster variables, texts of trajectories, waypoints, fault parameters. Pure."""
+"""Input of an operator: ranges of cluster variables, texts of trajectories and waypoints, fault parameters. Pure.
+
+Pages show lengths in metres and angles in degrees; requests have metres and radians.
+"""
 
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from zsim.scenario.fault_kinds import FaultKind, expected, typed_rest, unstated
-from zsim.scenario.scenario import Cluster, Scenario
+from zsim.scenario.scenario import Cluster, Drone, Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
 from zsim_agents.formation.variable_values import DEGREES
 
-SIDEWAYS_M = 50.0  # of the drones' starts, sideways; chosen: as far as a page shows a formation well
+SIDEWAYS_M = 50.0  # around the drones' starts; chosen: as far as a page shows a formation well
 HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and within sight
 SIDE_MAX_M = 20.0  # of a formation; chosen
 DISPLACEMENT_M = 5.0  # of a robot from its place in a template; chosen
 TILT_MAX_DEG = 29.0  # of a formation; controllers take less than 30, flight_data.py
-CORNER_DEG = 10.0  # least angle at a corner; at 0 and at 180 degrees robots stand in line
+CORNER_DEG = 10.0  # least angle at a corner; at 0 and 180 degrees the robots are in line
 DIGITS = 6  # of a value as it is shown: 5.1, not 5.1000000000000005
 STEPS = {"m": 0.1, "deg": 1.0}
-SHOWN_MAX = 16  # variables that a page shows one by one; of more, those of the whole formation
+SHOWN_MAX = 16  # variables that a page shows one by one; of more, only those of the whole formation
+WAYPOINT_STEP_S = 20.0  # from the first to the second prefilled waypoint
+PREFILLED = ("x_c", "y_c", "z_c", "yaw")  # variables in prefilled waypoints, where a formation has them
 
 
 def range_refusal(name: str, value: float, low: float, high: float, unit: str = "") -> str | None:
-    """Return why a number that was typed may not be requested, None if it may; it is never changed to a limit."""
+    """Return why a typed number may not be requested, None if it may; it is never changed to a limit."""
     if low <= value <= high:
         return None
     in_unit = f" {unit}" if unit else ""
@@ -30,13 +35,7 @@ def range_refusal(name: str, value: float, low: float, high: float, unit: str = 
 
 
 class SliderRange(NamedTuple):
-    """A cluster variable on a slider.
-
-    Attributes:
-        name: of the variable.
-        unit: m or deg.
-        low, high, step: in that unit.
-    """
+    """The range of a cluster variable on a slider, in its unit, m or deg."""
 
     name: str
     unit: str
@@ -50,65 +49,72 @@ class SliderRange(NamedTuple):
 
     @property
     def label_unknown(self) -> str:
-        """The label while nothing is known of the variable: where the slider stands then means nothing."""
+        """The label while the variable is unknown, and the slider's position means nothing."""
         return f"{self.label}: not known"
 
     @property
     def start(self) -> float:
-        """Where the slider stands while nothing is known of the variable."""
+        """Position of the slider while the variable is unknown."""
         return min(max(0.0, self.low), self.high)
 
+    def in_unit(self, value: float) -> float:
+        """Return a value [m, rad] in the unit of the range; angles within ±180 degrees."""
+        return math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
+
+    def to_si(self, shown: float) -> float:
+        """Return a value in the unit of the range as [m, rad]."""
+        return math.radians(shown) if self.unit == "deg" else shown
+
     def to_display(self, value: float) -> float:
-        """Return a value [m, rad] in the unit of the range, to its step; one that is hardly beyond a limit, as it.
+        """Return a value [m, rad] in the unit of the range, rounded to its step; just beyond a limit, the limit.
 
         Limits need not be whole steps: those of sides are of the scenario.
         """
-        shown = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
+        shown = self.in_unit(value)
         rounded = round(round(shown / self.step) * self.step, DIGITS)
         within = min(max(rounded, self.low), self.high)
         return within if abs(shown - within) <= self.step / 2.0 else rounded
 
     def label_of(self, value: float) -> str:
-        """Return the label beside a value [m, rad]: with the value itself where the range does not hold it."""
-        shown = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
-        slack = self.step / 2.0
+        """Return the label for a value [m, rad], which it contains if that is out of range."""
+        shown, slack = self.in_unit(value), self.step / 2.0
         if self.low - slack <= shown <= self.high + slack:
             return self.label
         return f"{self.name} = {shown:.1f} {self.unit}: out of range"
-
-    def to_si(self, shown: float) -> float:
-        """Return a value in the unit of the range as [m, rad]."""
-        return math.radians(shown) if self.unit == "deg" else shown
 
     def refusal(self, shown: float) -> str | None:
         """Return why a value may not be requested, None if it may."""
         return range_refusal(self.name, shown, self.low, self.high, self.unit)
 
 
+def height_range_m(drones: Iterable[Drone]) -> tuple[float, float]:
+    """Return between which heights some drones may be sent, below the lowest of their ceilings."""
+    top_m = min(HEIGHT_MAX_M, *(drone.limits.altitude_m for drone in drones))
+    return min(HEIGHT_MIN_M, top_m / 2.0), top_m
+
+
 def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[SliderRange]:
     """Return the ranges of all variables of a formation, in their order."""
-    starts = [scenario.drone(name).position_m for name in cluster.drones]
-    top_m = min(HEIGHT_MAX_M, *(scenario.drone(name).limits.altitude_m for name in cluster.drones))
-    centre = [sum(p[axis] for p in starts) / len(starts) for axis in range(2)]
+    drones = [scenario.drone(name) for name in cluster.drones]
+    x, y = (round(sum(drone.position_m[axis] for drone in drones) / len(drones)) for axis in range(2))
     apart_m = max(cluster.gains.separation_min_m, STEPS["m"])
     side = (apart_m, max(SIDE_MAX_M, 2.0 * apart_m))
     bounds = {
-        "x_c": (round(centre[0]) - SIDEWAYS_M, round(centre[0]) + SIDEWAYS_M),
-        "y_c": (round(centre[1]) - SIDEWAYS_M, round(centre[1]) + SIDEWAYS_M),
-        "z_c": (min(HEIGHT_MIN_M, top_m / 2.0), top_m),
+        "x_c": (x - SIDEWAYS_M, x + SIDEWAYS_M),
+        "y_c": (y - SIDEWAYS_M, y + SIDEWAYS_M),
+        "z_c": height_range_m(drones),
         **dict.fromkeys(("p", "q", "rho"), side),
         **dict.fromkeys(("roll", "pitch", "elevation"), (-TILT_MAX_DEG, TILT_MAX_DEG)),
         "beta": (CORNER_DEG, 180.0 - CORNER_DEG),
     }
-    return [_range(name, bounds) for name in space.names]
-
-
-def _range(name: str, bounds: dict[str, tuple[float, float]]) -> SliderRange:
-    shown_in = "deg" if unit(name) == "rad" else "m"
-    whole = (-180.0, 180.0) if shown_in == "deg" else (-DISPLACEMENT_M, DISPLACEMENT_M)
-    stem = name.rpartition(".")[2].rstrip("0123456789").rstrip("_")
-    low, high = bounds.get(name) or bounds.get(stem) or whole
-    return SliderRange(name, shown_in, float(low), float(high), STEPS[shown_in])
+    ranges = []
+    for name in space.names:
+        shown_in = "deg" if unit(name) == "rad" else "m"
+        whole = (-180.0, 180.0) if shown_in == "deg" else (-DISPLACEMENT_M, DISPLACEMENT_M)
+        stem = name.rpartition(".")[2].rstrip("0123456789").rstrip("_")
+        low, high = bounds.get(name) or bounds.get(stem) or whole
+        ranges.append(SliderRange(name, shown_in, float(low), float(high), STEPS[shown_in]))
+    return ranges
 
 
 def primary_variables(names: Sequence[str]) -> list[str]:
@@ -118,7 +124,7 @@ def primary_variables(names: Sequence[str]) -> list[str]:
 
 
 class InputError(ValueError):
-    """A text of the operator that cannot be parsed; the message has the line and what is allowed."""
+    """An operator's text that cannot be parsed; the message has the line and what is allowed."""
 
 
 def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] = ()) -> dict[str, Any]:
@@ -154,33 +160,35 @@ def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] =
     return {"expressions": by_variable, "constants": constants}
 
 
-def parse_waypoints(text: str) -> dict[str, Any]:
-    """Return the arguments of a trajectory of lines `seconds: variable = value, …`.
+def parse_waypoints(text: str, ranges: Mapping[str, SliderRange]) -> dict[str, Any]:
+    """Return the arguments of a trajectory of lines `seconds: variable = value, …`, values in the ranges' units.
 
     Raises:
-        InputError: a line is none.
+        InputError: a line has another form.
     """
     points = []
     for number, line in _lines(text):
         at, colon, rest = line.partition(":")
-        pairs = [pair.partition("=") for pair in rest.split(",")]
-        if not colon or not all(name.strip() and sign for name, sign, _ in pairs):
+        pairs = [(name.strip(), sign, value) for name, sign, value in (pair.partition("=") for pair in rest.split(","))]
+        if not colon or not all(name and sign for name, sign, _ in pairs):
             raise InputError(f"line {number} is {line[:40]!r}; must be SECONDS: VARIABLE = VALUE, VARIABLE = VALUE, …")
-        values = {name.strip(): _number(value, f"line {number}: {name.strip()}") for name, _, value in pairs}
+        shown = {name: _number(value, f"line {number}: {name}") for name, _, value in pairs}
+        values = {name: ranges[name].to_si(value) if name in ranges else value for name, value in shown.items()}
         points.append({"at_s": _number(at, f"line {number}: the time"), "values": values})
     if not points:
         raise InputError("waypoints are empty; must have a line SECONDS: VARIABLE = VALUE at least")
     return {"waypoints": points}
 
 
-WAYPOINT_STEP_S = 20.0  # from the first to the second waypoint of those that are prefilled
-PREFILLED = ("x_c", "y_c", "z_c", "yaw")  # variables that are, where a formation has them
-
-
 def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str:
-    """Return waypoints that begin where a formation is (its variables [m, rad]), in the units of the page."""
+    """Return waypoints that begin where a formation is, in the units of the page.
+
+    Args:
+        value: of its variables [m, rad].
+        ranges: of its variables.
+    """
     pairs = [
-        f"{each.name} = {_in_unit(each, here):g}"
+        f"{each.name} = {round(each.in_unit(here), 2):g}"
         for each, here in zip(ranges, value, strict=True)
         if each.name in PREFILLED
     ]
@@ -188,37 +196,24 @@ def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str
 
 
 def is_apart(value: Sequence[float], other: Sequence[float], ranges: Sequence[SliderRange]) -> bool:
-    """Return whether a formation at one place (its variables [m, rad]) has other prefilled waypoints than at another.
+    """Return whether a formation's prefilled waypoints at one place differ from those at another by more than a step.
 
-    They are the same within a step of the sliders: text that followed each estimate would never stand still.
+    Text that followed every estimate would never rest.
     """
     return any(
-        abs(_in_unit(each, here - there)) > each.step
+        abs(round(each.in_unit(here - there), 2)) > each.step
         for each, here, there in zip(ranges, value, other, strict=True)
         if each.name in PREFILLED
     )
 
 
-def _in_unit(range_: SliderRange, value: float) -> float:
-    return round(math.degrees(math.remainder(value, math.tau)) if range_.unit == "deg" else value, 2)
-
-
-def waypoints_in_si(args: dict[str, Any], ranges: Mapping[str, SliderRange]) -> dict[str, Any]:
-    """Return the arguments of a trajectory of waypoints in the units of the page, in metres and radians."""
-    points = [
-        {**point, "values": {n: ranges[n].to_si(v) if n in ranges else v for n, v in point["values"].items()}}
-        for point in args["waypoints"]
-    ]
-    return {"waypoints": points}
-
-
 def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
-    """Return the parameters and times of a fault, as they are typed behind TARGET KIND in a terminal.
+    """Return the parameters and times of a fault, typed as behind TARGET KIND in a terminal.
 
-    Every magnitude must be stated, those too that have a default: an empty text must not strike all samples.
+    Every magnitude must be stated, even one with a default: an empty text must not strike all samples.
 
     Raises:
-        InputError: the text is no such list, names something that the kind has not, or leaves a magnitude out.
+        InputError: the text is no such list, names something unknown to the kind, or leaves a magnitude out.
     """
     where = f"parameters are {text[:40]!r}"
     try:
@@ -237,6 +232,7 @@ def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
 
 
 def _lines(text: str) -> list[tuple[int, str]]:
+    """Return the lines with their numbers, without comments and blank ones."""
     numbered = enumerate(text.splitlines(), start=1)
     return [(number, line.strip()) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
 

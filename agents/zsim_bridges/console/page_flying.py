@@ -1,38 +1,55 @@
-"""What pages may do with single drones in one run: choose one, see all from above, fly one."""
+"""Single drones and the plan view for the pages of one run: choose a drone, fly it, see all from above, return.
+
+A return to launch flies a drone back over its start, as if sent to a place on the map, and a formation, by its
+controller, over the middle of its starts; there they land. A later request ends a return.
+"""
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zsim.contract.messages import Info
 from zsim.contract.views import ViewCluster
 from zsim.drone_colours import drone_colours
 from zsim.math import frames
-from zsim.scenario.scenario import Obstacle, Scenario
+from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient
 from zsim_bridges.console.console_page import PageForms
 from zsim_bridges.console.histories import CanvasTrails
-from zsim_bridges.console.manual_flight import DronePose, DroneSight, Geofence, ManualFlight, RunSight, geofence_of
+from zsim_bridges.console.manual_flight import (
+    DronePose,
+    DroneSight,
+    Geofence,
+    ManualFlight,
+    RunSight,
+    geofence_of,
+)
 from zsim_bridges.console.picture import DronePoses, ghosts, short_names
+from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.run_monitor import RunMonitor
-from zsim_bridges.console.scene_nodes import LARGE_MAX, RunScene
+from zsim_bridges.console.scene import LARGE_MAX, RunScene
 from zsim_bridges.console.time_monitor import TimeMonitor
 from zsim_bridges.console.view_buffer import ViewBuffer
 
+DIGITS = 2  # of a metre: finer than a pixel
+HEADING_DIGITS = 3  # of a radian
+ABOVE_START_M = 0.5  # over the ground, from a start: near enough to land; chosen: as large as a hull
+OVER_STARTS_M = 0.5  # of a formation from the middle of its starts
+OVERRULED_M = 1.0  # by which its goal moves away again when somebody sends it elsewhere
+MIDDLE = ("x_c", "y_c")  # variables of a formation that a return sets
+
+Place = tuple[float, float]
+
 
 class PageFlying:
-    """Single drones, for the pages of one run.
+    """Single drones for the pages of one run, which viser's number identifies.
 
     Args:
-        info: of the run.
-        scenario: of the run.
-        spaces: of its formations.
+        run: what does not change of it.
         client: sends commands.
         name: of the console's process.
         views: the newest of everything.
@@ -40,18 +57,16 @@ class PageFlying:
         monitor: has the run's condition.
         scene: has the drones' poses and trails.
         pages: have the drone that each has chosen.
-        note: called with a drone or formation whose return does not go on, and why.
+        note: called with a drone or formation whose return is over, and why.
 
     Attributes:
         control: of the drones that are flown from pages.
-        returns: of the drones and formations that fly back to where they started.
+        returns: of drones and formations.
     """
 
     def __init__(
         self,
-        info: Info,
-        scenario: Scenario,
-        spaces: dict[str, ClusterSpace],
+        run: ShownRun,
         client: CommandClient,
         name: str,
         views: ViewBuffer,
@@ -61,51 +76,46 @@ class PageFlying:
         pages: PageForms,
         note: Callable[[str, str], None] = lambda subject, why: None,
     ) -> None:
+        self._run = run
         self._views = views
         self._time_monitor = time_monitor
         self._monitor = monitor
         self._scene = scene
         self._pages = pages
-        self._spaces = spaces
-        fence = geofence_of(scenario)
-        self._surroundings = surroundings(scenario, fence)
-        names = self._surroundings["names"]
-        self._members = {each.name: [names.index(drone) for drone in each.drones] for each in scenario.clusters}
-        limits = {drone.name: drone.limits for drone in scenario.drones}
-        self.control = ManualFlight(client, name, limits, fence, info.gate_ns / 1e9, self._sight, self._run_sight)
-        self.returns = ReturnFlights(scenario, client, self.control, self._sight, lambda: views.clusters, note)
-
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        """Send commands meanwhile."""
-        with self.control.running():
-            yield
+        self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
+        fence = geofence_of(run.scenario)
+        self._surroundings = surroundings(run.scenario, fence)
+        limits = {drone.name: drone.limits for drone in run.scenario.drones}
+        gate_s = run.info.gate_ns / 1e9
+        self.control = ManualFlight(client, name, limits, fence, gate_s, self._sight, self._run_sight)
+        self.returns = ReturnFlights(run.scenario, client, self.control, self._sight, lambda: views.clusters, note)
 
     def choose(self, client_id: int | None, drone: str) -> None:
         """Choose a drone on one page."""
-        if drone in self._surroundings["names"]:
+        if drone in self._run.names:
             self._pages.choose(client_id, drone)
 
     def take_refusal(self, client_id: int | None, drone: str) -> str:
-        """Return why a page may not fly a drone: another one is in control of its formation; empty where it may."""
+        """Return why a page may not fly a drone, whose formation another page controls; empty where it may."""
         return self._pages.use(client_id, drone) if client_id is not None else ""
 
     def select(self, client_id: int | None, drone: str) -> None:
-        """Select a drone on one page for one command with others, or no longer."""
+        """Select a drone on one page for a command to several, or unselect it."""
         self._pages.toggle(client_id, drone)
 
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
-        """Return the view from above; `whole`: with what does not change, and the trails of before."""
-        drones = self._scene.drones
+        """Return the view from above as plain data; `whole`: with what does not change, and the past trails."""
+        drones, chosen = self._scene.drones, self._pages.chosen(client_id)
         if drones is None:
-            return {"t_s": None, "chosen": self._pages.chosen(client_id)}
+            return {"t_s": None, "chosen": chosen}
         states = {each.name: each.state for each in self._views.drones.drones} if self._views.drones else {}
+        previews = list(self._scene.previews.values())
         shown = {
             "t_s": drones.t_ns / 1e9,
-            "chosen": self._pages.chosen(client_id),
+            "chosen": chosen,
             "drones": positions(drones, states),
-            "formations": formations(self._spaces, self._members, dict(self._views.clusters)),
-            "previews": [np.round(way[:, :, :2], DIGITS).tolist() for way in list(self._scene.previews.values())],
+            "formations": formations(self._run.spaces, self._members, dict(self._views.clusters)),
+            "previews": [np.round(way[:, :, :2], DIGITS).tolist() for way in previews],
             "trail_s": self._scene.trails.length_s,
             "trails_number": self._scene.trails.number,
         }
@@ -132,32 +142,33 @@ class PageFlying:
         return RunSight(off, clock.rate if clock else 1.0, stands, "" if off else silence)
 
 
-DIGITS = 2  # of a metre: finer than a pixel
-HEADING_DIGITS = 3  # of a radian
+# The plan view
 
 
 def surroundings(scenario: Scenario, fence: Geofence) -> dict[str, Any]:
-    """Return what does not change: names, labels and colours of the drones, the fence, obstacles seen from above."""
+    """Return what does not change: names, labels and colours of the drones, the fence, outlines of obstacles."""
     names = [drone.name for drone in scenario.drones]
     return {
         "names": names,
         "labels": names if len(names) <= LARGE_MAX else short_names(names),
         "colours": list(drone_colours(len(names))),
         "fence": {"low_m": fence.low_m, "high_m": fence.high_m},
-        "obstacles": [_outline(each) for each in scenario.environment.obstacles],
+        "obstacles": [
+            {
+                "name": each.name,
+                "x_m": each.position_m[0],
+                "y_m": each.position_m[1],
+                "yaw_deg": each.yaw_deg,
+                "radius_m": each.radius_m,  # of a disc; None for a box
+                "size_m": list(each.size_m[:2]) if each.size_m is not None else None,
+            }
+            for each in scenario.environment.obstacles
+        ],
     }
 
 
-def _outline(obstacle: Obstacle) -> dict[str, Any]:
-    """Return an obstacle from above: a disc, or a box that is turned about up."""
-    size_m = list(obstacle.size_m[:2]) if obstacle.size_m is not None else None
-    x_m, y_m, _ = obstacle.position_m
-    place = {"name": obstacle.name, "x_m": x_m, "y_m": y_m, "yaw_deg": obstacle.yaw_deg}
-    return {**place, "radius_m": obstacle.radius_m, "size_m": size_m}
-
-
 def positions(drones: DronePoses, states: Mapping[str, str]) -> list[list[Any] | None]:
-    """Return of each drone x, y, z [m], heading [rad] and state; None of one that is not in the view."""
+    """Return x, y, z [m; W], heading [rad] and state of each drone; None of one that is not in the view."""
     yaw = frames.heading(drones.q_WB)
     return [
         [*np.round(p_W, DIGITS).tolist(), round(float(yaw[i]), HEADING_DIGITS), states.get(drones.names[i], "")]
@@ -170,7 +181,7 @@ def positions(drones: DronePoses, states: Mapping[str, str]) -> list[list[Any] |
 def formations(
     spaces: Mapping[str, ClusterSpace], members: Mapping[str, list[int]], views: Mapping[str, ViewCluster]
 ) -> list[dict[str, Any]]:
-    """Return of each formation its phase, its drones by their place in the order, and where they are to be [m]."""
+    """Return phase, indices of drones, and desired places [m; W] of each formation."""
     shown = []
     for name, view in views.items():
         desired = ghosts(spaces[name], view)
@@ -180,36 +191,31 @@ def formations(
 
 
 def trail_lines(trails: CanvasTrails, drones: DronePoses) -> list[list[list[float]]]:
-    """Return of each drone the last stretch of its path: x and y [m], and when it was there [s]."""
+    """Return the trail of each drone: x and y [m; W], and when it was there [s]."""
     segments, owners, times = trails.segments(drones.t_ns / 1e9, drones.p_W)
     points = np.round(np.column_stack((segments[:, 0, :2], times)), DIGITS)
     return [points[owners == i].tolist() for i in range(len(drones.names))]
 
 
-ABOVE_START_M = 0.5  # over the ground, from a start: near enough to land; chosen: as large as a hull
-OVER_STARTS_M = 0.5  # of a formation from the middle of its starts
-OVERRULED_M = 1.0  # by which its goal moves away from there if somebody else sends it elsewhere
-MIDDLE = ("x_c", "y_c")  # variables of a formation that a return leads
-
-Place = tuple[float, float]
+# Returns
 
 
 class ReturningDrone(NamedTuple):
-    """Identifies the flight of a drone that returns, as a page does that of one which it flies."""
+    """Identifies a returning drone to ManualFlight, as a page does."""
 
     drone: str
 
 
 @dataclass
 class _ReturningFormation:
-    """A formation on its way: how many requests it was sent by then, and how near its goal has come to the middle."""
+    """Number of requests made of a formation up to its return, and how near its goal has come to the middle."""
 
     requests: int
     nearest_m: float = math.inf
 
 
 class ReturnFlights:
-    """Returns of the drones and formations of a run.
+    """Returns of the drones and formations of a run; thread-safe.
 
     Args:
         scenario: has the starts.
@@ -244,7 +250,7 @@ class ReturnFlights:
         self._formations: dict[str, _ReturningFormation] = {}
 
     def request_drones(self, drones: Sequence[str]) -> None:
-        """Let each drone fly over its start, at the height that it has, and land; it is taken from whoever flies it."""
+        """Take each drone, from whoever flies it, over its start at its present height, and land it."""
         for drone in drones:
             answer = self._control.take(ReturningDrone(drone), drone, over=True)
             if answer.state == "none":
@@ -254,34 +260,34 @@ class ReturnFlights:
                 self._drones.add(drone)
 
     def request_formation(self, cluster: str) -> None:
-        """Let a formation move over the middle of its starts, as it stands, and land."""
+        """Let a formation move over the middle of its starts in its present shape, and land."""
         values = dict(zip(MIDDLE, self.middles[cluster], strict=True))
         self._client.request_cluster(cluster, "target", values=values)
         with self._lock:
             self._formations[cluster] = _ReturningFormation(self._client.requests_to(cluster))
 
     def refused(self, cluster: str) -> None:
-        """Note that a formation was refused a request: it is not on its way."""
+        """Note that a formation was refused a request: its return is over."""
         with self._lock:
             self._formations.pop(cluster, None)
 
     def tick(self) -> None:
-        """Go on with all returns; to be called several times a second."""
+        """Continue all returns; to be called several times a second."""
         with self._lock:
             drones, formations = list(self._drones), list(self._formations.items())
         for drone in drones:
-            if not self._is_returning(drone):
+            if not self._continue_drone(drone):
                 with self._lock:
                     self._drones.discard(drone)
         for name, returning in formations:
-            if not self._leads_on(name, returning):
+            if not self._continue_formation(name, returning):
                 with self._lock:
                     self._formations.pop(name, None)
 
-    def _is_returning(self, drone: str) -> bool:
-        """Send a drone on its way, or land it at its end; return whether it is on its way."""
+    def _continue_drone(self, drone: str) -> bool:
+        """Send a drone on its way, or land it at the end; return whether it is on its way."""
         key, pose = ReturningDrone(drone), self._sight_of(drone).pose
-        answer = self._control.steer(key, None)  # as a page that is still there
+        answer = self._control.steer(key, None)  # as a page that is still open
         if answer.state == "none":
             self._note(drone, f"return of {drone} is over: {answer.text or 'it was given back'}")
             return False
@@ -296,15 +302,16 @@ class ReturnFlights:
             self._control.go(key, x_m, y_m)
         return True
 
-    def _leads_on(self, name: str, returning: _ReturningFormation) -> bool:
+    def _continue_formation(self, name: str, returning: _ReturningFormation) -> bool:
         """Land a formation that has come over its starts; return whether it is on its way."""
         view = self._clusters().get(name)
         if self._client.requests_to(name) != returning.requests or view is None:
-            return False  # somebody has asked it for something else
+            return False  # somebody has made another request
         if view.phase != "engaged":
             self._note(name, f"return of {name} is over: it is {view.phase}")
             return False
-        goal_m, away_m = (self._away_m(name, view.names, c) for c in (view.desired, view.value))
+        desired, value = (dict(zip(view.names, c, strict=True)) for c in (view.desired, view.value))
+        goal_m, away_m = (math.dist([c[each] for each in MIDDLE], self.middles[name]) for c in (desired, value))
         returning.nearest_m = min(returning.nearest_m, goal_m)
         if goal_m > returning.nearest_m + OVERRULED_M:
             self._note(name, f"return of {name} is over: it was sent elsewhere")
@@ -313,8 +320,3 @@ class ReturnFlights:
             return True
         self._client.request_cluster(name, "land")
         return False
-
-    def _away_m(self, name: str, variables: Sequence[str], c: Sequence[float]) -> float:
-        """Return how far from the middle of its starts a formation of these variables is, over the ground."""
-        value = dict(zip(variables, c, strict=True))
-        return math.hypot(*(value[each] - there for each, there in zip(MIDDLE, self.middles[name], strict=True)))

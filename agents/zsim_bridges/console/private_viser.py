@@ -1,4 +1,12 @@
-"""viser's server, on a port of loopback that refuses connections without a secret."""
+"""viser's server, reachable through the console's own HTTP server alone, and which messages of pages may reach it.
+
+This is the only file that uses internals of viser 1.1 and websockets, which have no public way to
+- refuse connections without a secret (`_requiring_secret`),
+- refuse one page the use of a control that all pages share (`_guard_controls`),
+- find a control by its id, or the id of a control (`control_ids`, `control_id`, `PageControls`),
+- show a JPEG on a camera's frustum without decoding it (`show_jpeg`),
+- wake the event loop safely from other threads, as viser's message buffer does (`AnyThreadEvent`).
+"""
 
 import asyncio
 import contextlib
@@ -22,11 +30,19 @@ from zsim.contract import flight_messages
 from zsim.schema import message
 from zsim_bridges.console.page_server import BACKEND_HOST, MESSAGE_MAX, OPERATOR, SECRET_HEADER
 
+NAME_MAX = 64  # characters of a key that modifies a click
+VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
+EXACT_MAX = 2**53  # a page's numbers are exact up to it; a larger one fits no message
+
+Value = bool | message.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
+Permits = Callable[[int, str], bool]
+"""Returns whether a page, by viser's number, may use a shared control, by its id."""
+
 
 class AnyThreadEvent(asyncio.Event):
-    """An event that other threads may set; the loop's own `set` wakes the tasks that wait.
+    """An event that other threads may set; the tasks that wait wake when the loop sets it, too.
 
-    An asyncio.Event iterates over its waiters, and fails when the loop changes them meanwhile.
+    An asyncio.Event iterates over its waiters, and fails if the loop changes them meanwhile.
     """
 
     def set(self) -> None:
@@ -39,7 +55,7 @@ class AnyThreadEvent(asyncio.Event):
 
 
 class _Buffer(AsyncMessageBuffer):
-    """A buffer of viser's, which sets its event from every thread, and once more on the loop."""
+    """viser's message buffer, which sets its event in every thread, and once more on the loop."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
@@ -49,15 +65,11 @@ class _Buffer(AsyncMessageBuffer):
 viser.infra._infra.AsyncMessageBuffer = _Buffer  # type: ignore[misc]
 
 
-Permits = Callable[[int, str], bool]
-"""Returns whether a page, by viser's number of it, may use a control of all pages, by its id."""
-
-
 class PrivateViser:
-    """A viser server on a port of loopback that refuses connections without the secret.
+    """A viser server on a port of loopback that refuses connections without a secret.
 
     Args:
-        permits: a use that it does not permit changes nothing, and the page shows the value of before again.
+        permits: a use that it does not permit changes nothing, and its page shows the previous value again.
 
     Attributes:
         server: viser's.
@@ -66,7 +78,7 @@ class PrivateViser:
 
     def __init__(self, permits: Permits = lambda *_: True) -> None:
         self.secret = secrets.token_urlsafe(24)
-        with _silent(), _requiring_secret(self.secret):
+        with contextlib.redirect_stdout(io.StringIO()), _requiring_secret(self.secret):
             self.server = viser.ViserServer(host=BACKEND_HOST, port=0, verbose=False)
         _guard_controls(self.server, permits)
 
@@ -75,13 +87,13 @@ class PrivateViser:
         return self.server.get_port()
 
     def close(self) -> None:
-        """Stop it."""
-        with _silent():
+        """Stop it, without the address that viser prints."""
+        with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
 
 def _guard_controls(server: viser.ViserServer, permits: Permits) -> None:
-    """Look at each use of a control before viser does: it shares controls, and cannot refuse one to a page."""
+    """Check each use of a shared control before viser handles it."""
     handle_update, pages = server.gui._handle_gui_updates, server.gui._websock_interface
 
     async def guarded(client_id: Any, message: GuiUpdateMessage) -> None:
@@ -91,23 +103,16 @@ def _guard_controls(server: viser.ViserServer, permits: Permits) -> None:
         control: Any = server.gui._gui_input_handle_from_uuid.get(message.uuid)
         page = server.get_clients().get(client_id)
         if control is not None and page is not None and not control._impl.is_button:
-            before = GuiUpdateMessage(message.uuid, {"value": control.value})
-            page.gui._websock_interface.queue_message(before)
+            previous = GuiUpdateMessage(message.uuid, {"value": control.value})
+            page.gui._websock_interface.queue_message(previous)
 
     pages.unregister_handler(GuiUpdateMessage, handle_update)
     pages.register_handler(GuiUpdateMessage, guarded)
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Keep viser from printing an address that is of no use to a person."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield
-
-
-@contextlib.contextmanager
 def _requiring_secret(secret: str) -> Iterator[None]:
-    """Let servers that are started meanwhile refuse connections without the secret: viser has no setting for it."""
+    """Let servers that are started meanwhile refuse connections without the secret."""
     serve = websockets.asyncio.server.serve
 
     def serve_checked(*args: Any, process_request: Callable[..., Any] | None = None, **more: Any) -> Any:
@@ -125,11 +130,24 @@ def _requiring_secret(secret: str) -> Iterator[None]:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-NAME_MAX = 64  # characters of what is no text of a user's
-VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
-EXACT_MAX = 2**53  # a page's numbers are exact up to it; a larger one fits no message
+def control_ids(gui: viser.GuiApi) -> frozenset[str]:
+    """Return the ids of all controls that were added."""
+    return frozenset(getattr(gui, "_gui_input_handle_from_uuid", ()))
 
-Value = bool | message.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
+
+def control_id(control: Any) -> str:
+    """Return the id of one of viser's controls; empty for other ones."""
+    return control._impl.uuid if hasattr(control, "_impl") else ""
+
+
+def show_jpeg(frustum: Any, data: bytes) -> None:
+    """Show a JPEG on a camera's frustum as it is; viser would decode and encode it again."""
+    if getattr(frustum, "_format", "") != "jpeg":
+        frustum._format = "jpeg"
+    frustum._image_data = data
+
+
+# Messages of pages
 
 
 class ViewerCamera(Struct, tag_field="type", tag="ViewerCameraMessage"):
@@ -159,7 +177,7 @@ class ControlUpdate(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unk
 
 
 class SceneClick(Struct, tag_field="type", tag="ScenePointerMessage"):
-    """A page sends this when somebody clicks into the scene; nothing but the ray is looked at."""
+    """A page sends this when somebody clicks into the scene; only the ray is used."""
 
     event_type: Literal["click"]
     ray_origin: message.Vector3
@@ -169,52 +187,33 @@ class SceneClick(Struct, tag_field="type", tag="ScenePointerMessage"):
 
 
 _DECODER = msgspec.msgpack.Decoder(ViewerCamera | ControlUpdate | SceneClick)
-"""All other messages are refused, such as to show the page on the Internet, or to upload files."""
+"""All other messages are refused, such as those to share the page on the Internet, or to upload files."""
 
 
 class PageControls:
-    """The controls that viser knows, and those that each page has for itself.
-
-    Args:
-        gui: of all pages.
-        pages: returns the GUI of each open page.
-    """
+    """The controls known to viser: those of all pages, and of each of the open `pages`."""
 
     def __init__(self, gui: viser.GuiApi, pages: Callable[[], Sequence[viser.GuiApi]] = tuple) -> None:
         self._gui = gui
         self._pages = pages
 
-    def _own(self, uuid: str) -> Any:
-        handles = (page._gui_input_handle_from_uuid.get(uuid) for page in self._pages())
-        return next((handle for handle in handles if handle is not None), None)
-
     def accepts(self, uuid: str, value: Value) -> bool:
-        """Return whether a control takes such a value: viser converts it to its type, and fails where it cannot."""
-        handle: Any = self._gui._gui_input_handle_from_uuid.get(uuid)  # viser has no public way to a control by its id
-        handle = handle or self._own(uuid)
-        return handle is not None and not getattr(handle, "disabled", False) and _accepts(handle, value)
-
-
-def _accepts(handle: Any, value: Value) -> bool:
-    options = getattr(handle, "options", None)
-    if options is not None:
-        return value in options
-    current = handle.value
-    if isinstance(current, bool) or isinstance(value, bool):
-        return isinstance(current, bool) and isinstance(value, bool)
-    if isinstance(current, str) or isinstance(value, str):
-        return isinstance(current, str) and isinstance(value, str)
-    return abs(value) <= EXACT_MAX
+        """Return whether a control accepts such a value, which viser would fail to convert otherwise."""
+        found = (gui._gui_input_handle_from_uuid.get(uuid) for gui in (self._gui, *self._pages()))
+        handle: Any = next((each for each in found if each is not None), None)
+        if handle is None or getattr(handle, "disabled", False):
+            return False
+        options = getattr(handle, "options", None)
+        if options is not None:
+            return value in options
+        for kind in (bool, str):
+            if isinstance(handle.value, kind) or isinstance(value, kind):
+                return isinstance(handle.value, kind) and isinstance(value, kind)
+        return abs(value) <= EXACT_MAX  # type: ignore[arg-type]
 
 
 def is_permitted(data: bytes, role: str, controls: PageControls) -> bool:
-    """Return whether a message of a page may reach the console.
-
-    Args:
-        data: one message of viser's: a msgpack map with its type.
-        role: of the page.
-        controls: of all pages.
-    """
+    """Return whether a message of a page of this role, a msgpack map with its type, may reach viser."""
     if len(data) > MESSAGE_MAX:
         return False
     try:

@@ -1,11 +1,11 @@
-"""The newest views of a run, kept until the next picture is drawn."""
+"""What a run has published: the newest views, kept undecoded until the next picture, and the log of its events."""
 
 import math
 import re
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -19,22 +19,30 @@ from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample, Session
-from zsim_bridges.console.alarms import Losses
+from zsim_bridges.console.alarms import BACK, LOST, Losses
 from zsim_bridges.observer_process import ObserverProcess
 
-FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
-
-FAULTS_KEPT = 8  # that have begun
+FRESH_S = 1.0  # simulated, or wall; views come 20 times a wall second: the estimator of an older one is dead, or stuck
+FAULTS_KEPT = 8  # the last that have begun
+EVENTS_KEPT = 200  # the newest, each by itself
+ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # of unequal events; of the console's own requests
+OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds by which an operator's request is answered
+ALL, OWN = "all", "own actions"
+INCIDENTS = frozenset({"emergency", "flip", "impact", "touchdown", "battery"})  # of drones
+KINDS: dict[str, frozenset[str]] = {
+    ALL: frozenset(),
+    OWN: frozenset(),
+    "refused": frozenset({"refused"}),
+    "faults": frozenset({"fault", "fault_end", "fault_clear", "collision", "diverged", *INCIDENTS}),
+    "flight": frozenset({"mode", "state", "commander", "release", "collision", "landing", "mission", *INCIDENTS}),
+    "processes": frozenset({*LOST, *BACK, "drop"} - {"diverged"}),
+}
+"""Filters, and the kinds of events in them; empty: all kinds."""
+_FIGURE = re.compile(r"\d[\d.e+-]*")
 
 
 class ReceivedEstimate(NamedTuple):
-    """A drone's estimate, as last received.
-
-    Attributes:
-        process: the estimator.
-        t_ns: simulated.
-        fresh: whether it is of the same time as the drones' view.
-    """
+    """A drone's last estimate, from an estimator's process; fresh if it is of the same time as the drones' view."""
 
     process: str
     t_ns: int
@@ -47,13 +55,13 @@ class ReceivedEstimate(NamedTuple):
 
     @property
     def sigma_m(self) -> float:
-        """Root of the mean variance of the position over its axes; 0 where that is negative, so none."""
+        """Root of the position's variance averaged over its axes; 0 where that is negative, so invalid."""
         xx, _, _, yy, _, zz = self.estimate.covariance_m2
         return math.sqrt(max(0.0, xx + yy + zz) / 3)
 
 
 class ReceivedLink(NamedTuple):
-    """The state of a driver's link to its drone, as last received, and how long ago that is [s; wall]."""
+    """The last state of a driver's link to its drone, and how long ago it was received [s; wall]."""
 
     state: LinkState
     age_s: float
@@ -62,14 +70,16 @@ class ReceivedLink(NamedTuple):
 class ViewBuffer:
     """Keeps the newest message of each key until the next update; those in between are never decoded.
 
+    Callbacks run in Zenoh's threads.
+
     Args:
         link: an open session.
         info: of the run.
         observer: of the console in it.
         variables: names of each formation's variables; views of other formations or variables are refused.
-        refused: called, in a thread of Zenoh's, with the event of a command of the console's that the world refused.
+        refused: called with the event of each of the console's commands that the world refuses.
         wall_s: monotonic.
-        asked: called, in a thread of Zenoh's, with a formation and what somebody else has asked it for, in words.
+        asked: called with a formation and a description of each request that somebody else makes of it.
 
     Attributes:
         drones: the newest view of the drones.
@@ -78,12 +88,12 @@ class ViewBuffer:
         healths: the newest of each process.
         external: names of the drones whose bodies are external.
         faults: injected ones, planned and active.
-        log: events as they are shown; events: newest first.
+        log: events as they are shown.
         losses: processes and drones that are lost.
         begun: the last injected faults that have begun.
-        failsafes: the event of a landing or stop of the rotors of each drone, until it is commanded another mode.
+        failsafes: the event of each drone's automatic landing or stop, until it is commanded another mode.
         end: why the run ended, by its last event; empty while it goes on.
-        on_own_event: called, in a thread of Zenoh's, with each event that a command of this console has caused.
+        on_own_event: called with each event that a command of this console causes.
     """
 
     def __init__(
@@ -115,7 +125,6 @@ class ViewBuffer:
         self._links: dict[str, LinkState] = {}
         self.faults: tuple[Fault, ...] = ()
         self.log = EventLog(observer.name)
-        self.events = self.log.newest
         self.losses = Losses()
         self.failsafes: dict[str, Event] = {}
         self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)
@@ -123,9 +132,9 @@ class ViewBuffer:
         self.on_own_event: Callable[[Event], None] = lambda _: None
 
     def open(self) -> None:
-        """Subscribe, and read the last values of before."""
-        of_drivers = map(keys.link, sorted(self.external))
-        for expression in ("view/**", keys.FAULTS, "process/*/health", *of_drivers):
+        """Subscribe, and read the values published last."""
+        links = map(keys.link, sorted(self.external))
+        for expression in ("view/**", keys.FAULTS, "process/*/health", *links):
             self._link.declare_subscriber(expression, self._on_publication)
         for cluster in self._variables:
             self._link.declare_subscriber(keys.cluster_request(cluster), self._on_request)
@@ -133,10 +142,10 @@ class ViewBuffer:
         samples = self._link.get(keys.FAULTS)
         with self._arrived:
             for sample in samples:
-                self._new.setdefault(sample.key, sample.payload)  # what has arrived meanwhile is newer
+                self._new.setdefault(sample.key, sample.payload)  # one that arrived meanwhile is newer
 
     def update(self) -> bool:
-        """Decode what has come since the last update; return whether there is a new view of the drones."""
+        """Decode what was received since the last update; return whether there is a new view of the drones."""
         with self._arrived:
             new, self._new = self._new, {}
         for key, payload in new.items():
@@ -147,47 +156,40 @@ class ViewBuffer:
         return keys.VIEW_DRONES in new
 
     def estimates(self) -> dict[str, ReceivedEstimate]:
-        """Return the newest estimate of each drone by name: of two estimators, one of them dead, that of the other.
-
-        Estimates of the future are from before a replay went back.
-        """
+        """Return the newest estimate of each drone by name, from whichever estimator; no future ones of a replay."""
         now_ns = self.drones.t_ns if self.drones else 0
         newest: dict[str, ReceivedEstimate] = {}
         for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
-            fresh = self._is_fresh(process, view.t_ns - now_ns)
+            seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
+            fresh = abs(view.t_ns - now_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S  # both views skip gates
             if fresh or view.t_ns <= now_ns:
-                names = (estimate for estimate in view.estimates if estimate.name in self._names)
-                newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in names}
+                known = (estimate for estimate in view.estimates if estimate.name in self._names)
+                newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in known}
         return newest
 
     def link_of(self, drone: str) -> ReceivedLink | None:
-        """Return the newest state of the link to an external drone, None before the first."""
+        """Return the newest state of an external drone's link, None before the first."""
         key = keys.link(drone)
         return ReceivedLink(self._links[key], self._wall_s() - self._received_s[key]) if key in self._links else None
 
     def active_faults(self) -> list[Fault]:
-        """Return the injected faults that act at the time of the newest view."""
+        """Return the injected faults active at the time of the newest view."""
         now_ns = self.drones.t_ns if self.drones else 0
         return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
 
     def lag_ms(self, received: ReceivedEstimate) -> float:
-        """Return how far an estimator is behind: by its health, or by its view where that is old."""
+        """Return an estimator's lag: by its health, or by its view where that is old."""
         health = self.healths.get(received.process)
         if health is not None and received.fresh:
             return health.lag_ns / 1e6
         return max(0, (self.drones.t_ns if self.drones else 0) - received.t_ns) / 1e6
-
-    def _is_fresh(self, process: str, ahead_ns: int) -> bool:
-        """Return whether an estimator's view is of the time of the drones' view; both skip gates."""
-        seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
-        return abs(ahead_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S
 
     def answered_commands(self, drone: str) -> int:
         """Return how many commands to a drone the world has accepted or refused."""
         return self._answers[drone]
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
-        """Wait, but not for ever, until more commands to a drone than that have been answered."""
+        """Wait up to a time until more commands to a drone than `beyond` have been answered."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._answers[drone] > beyond, within_s)
 
@@ -200,7 +202,11 @@ class ViewBuffer:
         if isinstance(message, ViewDrones):
             self.drones, self._received_s[key] = message, self._wall_s()
         elif isinstance(message, ViewCluster):
-            self._store_cluster(key.rpartition("/")[2], message)
+            cluster, size = key.rpartition("/")[2], len(message.names)
+            if self._variables.get(cluster) == message.names and len(message.value) == len(message.desired) == size:
+                self.clusters[cluster] = message
+            else:
+                self._observer.health.refused += 1  # of a controller of another scenario
         elif isinstance(message, ViewEstimates):
             self._received_s[key] = self._wall_s()
             self.estimators[key.rpartition("/")[2]] = message
@@ -212,15 +218,8 @@ class ViewBuffer:
         elif isinstance(message, run_messages.Faults):
             self.faults = message.faults
 
-    def _store_cluster(self, cluster: str, view: ViewCluster) -> None:
-        """Store a view, unless it is from a controller of another scenario."""
-        if self._variables.get(cluster) == view.names and len(view.value) == len(view.desired) == len(view.names):
-            self.clusters[cluster] = view
-        else:
-            self._observer.health.refused += 1
-
     def _on_request(self, sample: RawSample) -> None:
-        """Note what somebody else has asked a formation for, such as another console."""
+        """Log a request that somebody else, such as another console, has made of a formation."""
         try:
             request: run_messages.ClusterRequest = messages.decode(sample.key, sample.payload)
         except DecodeError:
@@ -238,7 +237,7 @@ class ViewBuffer:
             return  # not an event of the world
         if event.kind in ("command", "refused"):
             with self._arrived:
-                self._answers[_drone(event)] += 1
+                self._answers[commanded_drone(event)] += 1
                 self._arrived.notify_all()
         self.losses.note(event)
         if event.kind in ("landing", "emergency"):
@@ -246,11 +245,11 @@ class ViewBuffer:
         elif event.kind == "mode" and event.data.get("mode") != "emergency":
             self.failsafes = {name: each for name, each in self.failsafes.items() if name != event.subject}
         elif event.kind == "fault":
-            with suppress(msgspec.ValidationError):  # an event as anybody may publish it
+            with suppress(msgspec.ValidationError):  # anybody may publish an event
                 self.begun.append(msgspec.convert(event.data, Fault))
         elif event.kind == "end":
             self.end = event.text
-        if event.kind != "command":  # an event of a mode or of a refusal follows, with more in it
+        if event.kind != "command":  # a more specific event, of a mode or a refusal, follows
             self.log.add(event)
         if event.source == self._observer.name:
             self.on_own_event(event)
@@ -259,7 +258,7 @@ class ViewBuffer:
 
 
 def arguments_text(args: Mapping[str, Any]) -> str:
-    """Return the arguments of a request in words."""
+    """Describe the arguments of a request."""
     return ", ".join(f"{name} {_value_text(value)}" for name, value in args.items())
 
 
@@ -274,45 +273,13 @@ def _value_text(value: Any) -> str:
     return str(value)[:120]
 
 
-def _drone(event: Event) -> str:
-    """Return the drone that a command was for: of a refused one, the subject is the key."""
-    return keys.thing(event.subject) if event.kind == "refused" and "/" in event.subject else event.subject
-
-
-EVENTS_KEPT = 200  # the newest, each by itself
-ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # of unequal events; of the console's own requests
-OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds by which an operator's request is answered
-ALL, OWN = "all", "own actions"
-INCIDENTS = frozenset({"emergency", "flip", "impact", "touchdown", "battery"})  # of drones
-KINDS: dict[str, frozenset[str]] = {
-    ALL: frozenset(),
-    OWN: frozenset(),
-    "refused": frozenset({"refused"}),
-    "faults": frozenset({"fault", "fault_end", "fault_clear", "collision", "diverged", *INCIDENTS}),
-    "flight": frozenset({"mode", "state", "commander", "release", "collision", "landing", "mission", *INCIDENTS}),
-    "processes": frozenset(
-        {
-            "join",
-            "leave",
-            "restart",
-            "superseded",
-            "death",
-            "drop",
-            "failure",
-            "overdue",
-            "silent",
-            "silent_end",
-            "no_show",
-        }
-    ),
-}
-"""What may be chosen, and the kinds of events in it; empty: of any kind."""
-
-_FIGURE = re.compile(r"\d[\d.e+-]*")
+def commanded_drone(event: Event) -> str:
+    """Return the drone that an event about a command concerns; the subject of a refusal is the command's key."""
+    return keys.thing(event.subject) if "/" in event.subject else event.subject
 
 
 class EventRow(NamedTuple):
-    """The newest of equal events, and how many there were; they are equal but for their figures."""
+    """The newest of events that differ by their figures alone, and how many there were."""
 
     event: Event
     times: int
@@ -320,13 +287,13 @@ class EventRow(NamedTuple):
 
 
 class EventLog:
-    """Keeps the newest events, and rows of equal ones.
+    """Keeps the newest events, and a row for all that are equal but for their figures; thread-safe.
 
     Args:
-        name: of the console's process, whose own events no others push out.
+        name: of the console's process; rows of its own events are kept apart from others.
 
     Attributes:
-        newest: each event by itself, newest first.
+        newest: single events, newest first.
     """
 
     def __init__(self, name: str) -> None:
@@ -336,39 +303,29 @@ class EventLog:
         self.newest: deque[Event] = deque(maxlen=EVENTS_KEPT)
 
     def add(self, event: Event) -> None:
-        """Add an event; may be called in any thread."""
         key = (event.kind, event.source, event.subject, _FIGURE.sub("#", event.text))
         own = event.source == self._name and event.kind in OWN_KINDS
         with self._lock:
             self.newest.appendleft(event)
             before = self._rows.pop(key, None)
             self._rows[key] = EventRow(event, before.times + 1 if before else 1, own)
-            self._drop_oldest(own)
+            same = [key for key, row in self._rows.items() if row.own == own]
+            if len(same) > (OWN_ROWS_KEPT if own else ROWS_KEPT):
+                del self._rows[same[0]]
 
     def rows(self) -> list[EventRow]:
         """Return the rows, newest first."""
         with self._lock:
             return list(reversed(self._rows.values()))
 
-    def _drop_oldest(self, own: bool) -> None:
-        """Drop the oldest row of the operator's own, or of the others, where there are too many of them."""
-        keys = [key for key, row in self._rows.items() if row.own == own]
-        if len(keys) > (OWN_ROWS_KEPT if own else ROWS_KEPT):
-            del self._rows[keys[0]]
-
 
 def chosen_rows(rows: Iterable[EventRow], drone: str = ALL, kind: str = ALL) -> list[EventRow]:
     """Return the rows about a drone (or `ALL`), of one of `KINDS`."""
-    kinds: Collection[str] = KINDS[kind]
+    kinds, name = KINDS[kind], re.compile(rf"(?<![\w-]){re.escape(drone)}(?![\w-])")
     return [
         row
         for row in rows
-        if (drone == ALL or is_about(row.event, drone))
+        if (drone == ALL or name.search(f"{row.event.subject} {row.event.text}"))
         and (row.own or kind != OWN)
         and (not kinds or row.event.kind in kinds)
     ]
-
-
-def is_about(event: Event, drone: str) -> bool:
-    """Return whether an event names a drone: as its subject, or in its text."""
-    return re.search(rf"(?<![\w-]){re.escape(drone)}(?![\w-])", f"{event.subject} {event.text}") is not None

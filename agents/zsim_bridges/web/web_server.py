@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 from aiohttp import web
 
 from zsim.errors import RunError
-from zsim_bridges.web.loopback import is_loopback
+from zsim_bridges.web import is_loopback
 
 STRANGERS_MAX = 100  # connections at once; the oldest makes room for the next
 REQUEST_S = 5.0  # wall time in which a request has to come, its body too; a browser on a bad link takes 1 s

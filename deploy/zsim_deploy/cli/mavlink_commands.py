@@ -90,7 +90,7 @@ def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
     """Return the address of HOST:PORT."""
     from socket import gaierror, gethostbyname
 
-    from zsim_bridges.web.loopback import is_loopback
+    from zsim_bridges.web import is_loopback
 
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) <= PORT_MAX:

@@ -392,7 +392,7 @@ def test_expressions_of_angles_are_in_degrees_as_the_sliders_are():
 
 
 def test_waypoints_are_read():
-    assert operator_input.parse_waypoints("0: x_c = 1, p=4\n20.5: x_c=2") == {
+    assert operator_input.parse_waypoints("0: x_c = 1, p=4\n20.5: x_c=2", {}) == {
         "waypoints": [{"at_s": 0.0, "values": {"x_c": 1.0, "p": 4.0}}, {"at_s": 20.5, "values": {"x_c": 2.0}}]
     }
 
@@ -414,7 +414,7 @@ def test_an_invalid_expression_is_refused_by_line_and_value(text: str, terms: tu
 @pytest.mark.parametrize("text", ["x_c = 1", "0 x_c=1", "0: 5", "a: x_c = 1", ""])
 def test_a_waypoint_that_is_none_is_refused_in_words(text: str):
     with pytest.raises(operator_input.InputError):
-        operator_input.parse_waypoints(text)
+        operator_input.parse_waypoints(text, {})
 
 
 # Who may pass

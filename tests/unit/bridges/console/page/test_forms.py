@@ -22,18 +22,12 @@ from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, 
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_page import SWITCHES, ConsolePage
+from zsim_bridges.console.drone_forms import DRONE_MODES, DroneForm
 from zsim_bridges.console.formation_form import OPERATIONS, REST_S, STILL_S, FormationForm
 from zsim_bridges.console.operator_input import slider_ranges
 from zsim_bridges.console.picture import FlightPreview
-from zsim_bridges.console.run_condition import RunCondition, fleet_refusals
-from zsim_bridges.console.run_forms import (
-    DRONE_MODES,
-    DURATION_S,
-    DroneForm,
-    FaultForm,
-    FleetForm,
-    RunForm,
-)
+from zsim_bridges.console.run_condition import RunCondition, ShownRun, fleet_refusals
+from zsim_bridges.console.run_forms import DURATION_S, FaultForm, FleetForm, RunForm
 
 SCENARIOS = Path(__file__).parents[5] / "scenarios"
 PERSON, NOBODY = 1, None  # who moved a slider
@@ -324,9 +318,8 @@ def test_what_is_previewed_is_flown_once_it_is_asked_for(bench: Bench):
 def test_all_drones_are_in_formations_or_none_is(bench: Bench, alone: bool):
     scenario = mixed()
     clusters, drones = ([], scenario.drones[4:]) if alone else (scenario.clusters, scenario.drones[:4])
-    FleetForm(bench.gui, bench.client, msgspec.structs.replace(scenario, clusters=clusters, drones=drones)).request_all(
-        "takeoff"
-    )
+    FleetForm(bench.gui, bench.client, msgspec.structs.replace(scenario, clusters=clusters, drones=drones))
+    bench.gui.press("Take off all")
     formations = [("main", "takeoff", {}), ("other", "takeoff", {})]
     assert bench.client.asked == ([(("d5", "d6"), "takeoff")] if alone else formations)
 
@@ -856,9 +849,10 @@ def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
 
 def test_switches_change_the_scene(bench: Bench):
     shown: list[tuple[str, bool]] = []
-    spaces = {bench.cluster.name: bench.space}
+    info: Any = SimpleNamespace(rate=2.0, drones=(), replay_of="")
+    run = ShownRun(info, bench.scenario, {bench.cluster.name: bench.space})
     show = lambda *switched: shown.append(switched)  # noqa: E731
-    page = ConsolePage(bench.gui, bench.scenario, spaces, bench.client, bench.outcomes.append, show, 2.0)
+    page = ConsolePage(bench.gui, run, bench.client, bench.outcomes.append, show)
     assert bench.gui.at["rate"].value == 2.0
     assert page.chosen == bench.cluster.name
     for what, label in SWITCHES.items():

@@ -6,11 +6,11 @@ from unittest.mock import MagicMock
 
 from refused import has_terms, without_tags
 
-from zsim_bridges.console import scene_nodes
+from zsim_bridges.console import scene
 from zsim_bridges.console.console_page import ControlForm, PageForms
 from zsim_bridges.console.control_desk import LOST_S, RUN, ControlDesk
+from zsim_bridges.console.drone_forms import DroneForm
 from zsim_bridges.console.run_condition import RunCondition
-from zsim_bridges.console.run_forms import DroneForm
 
 NAMES = ["drone1", "drone2"]
 
@@ -68,9 +68,9 @@ class Pages:
 
 
 def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
-    pages, folder = Pages(), MagicMock()
+    pages, shared = Pages(), MagicMock(parts={})
     server: Any = pages
-    forms = PageForms(server, MagicMock(), NAMES, MagicMock(), ControlDesk(["main"]), part_of, {}, *[folder] * 5)
+    forms = PageForms(server, MagicMock(), shared, NAMES, MagicMock(), ControlDesk(["main"]), part_of)
     pages.open(1)
     pages.open(2)
     pages.figures[1].removed = True
@@ -81,14 +81,14 @@ def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
 
 
 def test_the_ground_of_a_page_has_its_theme():
-    pages, folder = Pages(), MagicMock()
+    pages, shared = Pages(), MagicMock(parts={})
     server: Any = pages
-    PageForms(server, MagicMock(), NAMES, MagicMock(), ControlDesk(["main"]), part_of, {}, *[folder] * 5)
+    PageForms(server, MagicMock(), shared, NAMES, MagicMock(), ControlDesk(["main"]), part_of)
     pages.open(1)
     page = pages.clients[1]
     theme = page.gui.add_checkbox.return_value
     (switch,) = theme.on_update.call_args.args
-    for dark, colours in ((True, scene_nodes.DARK), (False, scene_nodes.LIGHT)):
+    for dark, colours in ((True, scene.DARK), (False, scene.LIGHT)):
         theme.value = dark
         switch(None)
         assert page.scene.add_box.call_args.args[:2] == ("/field", colours[0])

@@ -5,7 +5,7 @@ import pytest
 
 from zsim.drone_colours import drone_colours, rgb
 from zsim_bridges.console import airframe
-from zsim_bridges.console.scene_nodes import DARK, LIGHT, LUMINANCE_MIN, lightened, linear, luminance
+from zsim_bridges.console.scene import DARK, LIGHT, LUMINANCE_MIN, lightened, linear, luminance
 
 CONTRAST_MIN = 2.3  # of what is drawn with the ground; text, which is finer, needs 4.5 (WCAG 2.2)
 

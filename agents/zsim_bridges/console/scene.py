@@ -1,20 +1,23 @@
-"""The scene of the page: viser's nodes; only what has changed is sent."""
+"""The 3-D scene of a run: its newest views as viser's nodes, of which only changes are sent.
+
+`RunScene` decides what is drawn, `SceneNodes` draws it for all pages; the ground follows each page's own theme, and the
+ring about the chosen drone is of one page alone.
+"""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zsim.contract.messages import DroneInfo, Info
+from zsim.contract.messages import DroneInfo
 from zsim.contract.views import ViewDrones
 from zsim.drone_colours import drone_colours, rgb
 from zsim.math import frames
-from zsim.scenario.scenario import Obstacle, Scenario
+from zsim.scenario.scenario import Obstacle
 from zsim.vehicles.vehicle import cross_layout
-from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console import airframe
 from zsim_bridges.console.histories import CanvasTrails
 from zsim_bridges.console.page_cameras import CameraFollow
@@ -33,16 +36,17 @@ from zsim_bridges.console.picture import (
     rotor_poses,
     short_names,
 )
+from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.view_buffer import ViewBuffer
 
 NAMED_MAX = 60  # drones with their names beside them; more would hide each other
-LARGE_MAX = 12  # names in full, at full size; of more drones what tells them apart, smaller
+LARGE_MAX = 12  # names in full, at full size; of more drones short names, smaller
 SMALL = 0.8  # of the size of a name
 SOLID = (134, 142, 150)
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
 PREVIEW = (217, 72, 15)
-PREVIEW_PX = 3.0  # of a way that would be flown
-SIDE_PX = 2.0  # of a formation's sides: as wide from afar
+PREVIEW_PX = 3.0  # of a previewed way
+SIDE_PX = 2.0  # of a formation's sides, at any distance
 WIND_M_PER_M_S = 0.5  # length of the arrow
 WIND_MIN_M_S = 0.05  # below it no arrow
 WIND_ABOVE_M = 1.5  # of the arrow over the highest drone
@@ -50,18 +54,117 @@ LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name over its drone
 MIDDLE = "center-center"  # of a label
 LABELS_MAX = 3  # p, q and beta
 LUMINANCE_MIN = 0.12  # of a trail: 2.5 times as bright as the ground of the dark theme, as WCAG 2.2 counts contrast
-HIDDEN = (0.0, 0.0, -1000.0)  # m; position of instances that are not shown, since they cannot be hidden one by one
+HIDDEN = (0.0, 0.0, -1000.0)  # m; of instances that are not shown: viser cannot hide them one by one
+HALF_M = 150.0  # half a side of the ground
+FIELD_BELOW_M = 0.15  # of the field below the grid; a depth buffer cannot order surfaces that are nearer to each other
+THICK_M = 0.02
+LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # of the field, of the grid's cells and of its sections
+DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
+CHOSEN = (25, 113, 194)
+
+
+class RunScene:
+    """The scene of one run; it replaces that of another run.
+
+    Attributes:
+        nodes: viser's.
+        drones: their newest poses, None before the first view.
+        shapes: the formations' true shapes by name; None where a drone of one is missing.
+        trails: of the drones.
+        previews: ways (n, M, 3) [m] of formations, by name, that would be flown.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, camera_follow: CameraFollow
+    ) -> None:
+        self._run = run
+        self._views = views
+        self._camera_follow = camera_follow
+        self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
+        self._drawn_ghosts: dict[str, Any] = {}
+        self.drones: DronePoses | None = None
+        self.shapes: dict[str, FormationShape | None] = {}
+        self.previews: dict[str, Array] = {}
+        self.trails = CanvasTrails(len(run.names), around=run.is_replay)
+        robots = sum(space.n for space in run.spaces.values())
+        arms_m = [drone.arm_m for drone in run.scenario.drones]
+        self.nodes = SceneNodes(server, run.info.drones, arms_m, robots, len(run.spaces))
+        self.nodes.obstacles(run.scenario.environment.obstacles)
+        camera_follow.restart()
+
+    def clicked(self, event: viser.SceneClickEvent) -> str | None:
+        """Return the drone that a click hits."""
+        if self.drones is None:
+            return None
+        return drone_on_ray(self.drones, self.nodes.radii_m, event.ray_origin, event.ray_direction)
+
+    def store(self, view: ViewDrones) -> DronePoses:
+        """Keep and return the drones' newest poses, at which cameras of later pages look."""
+        drones = drone_poses(view, self._run.names)
+        self.drones = drones
+        self.trails.add(drones.t_ns / 1e9, drones.p_W)
+        self.shapes = self.shapes_of(drones)
+        self._camera_follow.set_target(self._camera_targets(drones))
+        return drones
+
+    def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
+        """Draw a view of the drones, and return their poses.
+
+        Rotors turn for `longest_s` at most from one picture to the next; `chosen` is the formation with figures.
+        """
+        before_ns = self.drones.t_ns if self.drones is not None else 0
+        drones = self.store(view)
+        self.nodes.drones(drones, min(longest_s, max(0.0, (drones.t_ns - before_ns) / 1e9)))
+        estimates = self._views.estimates().values()
+        self.nodes.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
+        if self.shapes:
+            self.nodes.shapes(list(self.shapes.values()), list(self.shapes).index(chosen))
+        desired = {name: (view.phase, view.desired) for name, view in self._views.clusters.items()}
+        if desired != self._drawn_ghosts:
+            self._drawn_ghosts = desired
+            poses = [ghosts(self._run.spaces[name], view) for name, view in self._views.clusters.items()]
+            shown = [(np.zeros((0, 3)), np.zeros((0, 4))), *(each for each in poses if each is not None)]
+            self.nodes.ghosts(np.concatenate([p_W for p_W, _ in shown]), np.concatenate([q for _, q in shown]))
+        self._camera_follow.follow(self._camera_targets(drones))
+        return drones
+
+    def preview(self, cluster: str, shown: FlightPreview | None) -> None:
+        """Show what a formation would fly in place of its previous preview; None: nothing."""
+        others = {name: paths_W for name, paths_W in self.previews.items() if name != cluster}
+        self.previews = {**others, cluster: shown.paths_W} if shown else others
+        self.nodes.previews(list(self.previews.values()))
+
+    def draw_trails(self) -> None:
+        """Draw what changes slowly: trails and wind."""
+        if self.drones is not None:
+            segments, owners, _ = self.trails.segments(self.drones.t_ns / 1e9, self.drones.p_W)
+            self.nodes.trails(segments, owners)
+            self.nodes.wind(self.drones)
+
+    def shapes_of(self, drones: DronePoses) -> dict[str, FormationShape | None]:
+        """Return the formations' true shapes by name; None where a drone of one is missing."""
+        there, yaw = drones.present, frames.heading(drones.q_WB)
+        return {
+            name: formation_shape(space, drones.p_W[members], yaw[members]) if there[members].all() else None
+            for name, space in self._run.spaces.items()
+            for members in [self._members[name]]
+        }
+
+    def _camera_targets(self, drones: DronePoses) -> Array:
+        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""
+        members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
+        return drones.p_W[members][drones.present[members]]
 
 
 class SceneNodes:
     """The nodes of one run.
 
     Args:
-        server: viser's; what another run has left on it is removed.
+        server: viser's; its scene is cleared.
         drones: of the run.
         arms_m: centre to rotor, of each.
-        robots: how many drones are in formations, and so have a ghost.
-        clusters: how many formations there are.
+        robots: number of drones in formations, each with a ghost.
+        clusters: number of formations.
 
     Attributes:
         radii_m: (N,), how far each drone reaches from its centre.
@@ -124,7 +227,7 @@ class SceneNodes:
                 self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
 
     def drones(self, drones: DronePoses, dt_s: float) -> None:
-        """Move the drones, whose rotors have turned for dt_s."""
+        """Move the drones, and turn their rotors for dt_s."""
         drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
         self._airframes.move(drones)
         self._rotors.move(drones, dt_s)
@@ -134,12 +237,12 @@ class SceneNodes:
     def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
         """Call back with viser's event of each click into the scene.
 
-        Not of the drones' nodes: a page of viser 1.1.1 fails on opening where a batched mesh is clickable already.
+        Not on the drones' nodes: a page of viser 1.1.1 fails to open when a batched mesh is clickable already.
         """
         self._scene.on_click()(act)
 
     def close(self) -> None:
-        """Call back no more; the nodes stay."""
+        """End callbacks; the nodes stay."""
         self._scene.remove_click_callback("all")
 
     def wind(self, drones: DronePoses) -> None:
@@ -170,7 +273,7 @@ class SceneNodes:
             self._ghosts.batched_positions, self._ghosts.batched_wxyzs = positions, attitudes
 
     def previews(self, ways: Sequence[Array]) -> None:
-        """Draw the ways (n, M, 3) that formations would fly, with a mark at the end of each drone's; none: nothing."""
+        """Draw ways (n, M, 3) that formations would fly, with a mark at the end of each drone's."""
         lines = [np.stack((way[:, :-1], way[:, 1:]), axis=2).reshape(-1, 2, 3) for way in ways]
         ends = [way[:, -1] for way in ways]
         segments = np.asarray(np.concatenate(lines) if lines else np.tile(HIDDEN, (1, 2, 1)), np.float32)
@@ -186,7 +289,7 @@ class SceneNodes:
 
     def trails(self, segments: Array, owners: NDArray[np.int64]) -> None:
         """Draw the drones' trails."""
-        if not len(segments):  # after a replay went back, the old ones must be removed
+        if not len(segments):  # a replay went back: the old ones must vanish
             segments, owners = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
         colours = np.repeat(self._trail_colours[owners][:, None], 2, axis=1)
         if self._trail_node is None:
@@ -225,7 +328,7 @@ class SceneNodes:
 
 
 class _AirframeNodes:
-    """The drones without their rotors: a node for all that look alike."""
+    """The drones without their rotors, one node for all that look alike."""
 
     def __init__(self, scene: viser.SceneApi, looks: Sequence[airframe.DroneShape]) -> None:
         self.nodes: list[tuple[NDArray[np.int64], Any]] = []
@@ -241,7 +344,7 @@ class _AirframeNodes:
 
 
 class _RotorNodes:
-    """The rotors of all drones, as one node; each is as large as it is."""
+    """The rotors of all drones as one node, each at its size."""
 
     def __init__(self, drones: Sequence[DroneInfo], looks: Sequence[airframe.DroneShape], batch: Any) -> None:
         self._owners = np.repeat(np.arange(len(looks)), [len(look.hubs_B) for look in looks])
@@ -298,64 +401,15 @@ class _FormationNodes:
                 label.text, label.position = texts[i]
 
 
-def luminance(colour: Sequence[float]) -> float:
-    """Return the relative luminance of an sRGB colour, 0 to 255 (WCAG 2.2)."""
-    return float(np.dot((0.2126, 0.7152, 0.0722), linear(np.array(colour, float)) / 255.0))
-
-
-def lightened(colour: Sequence[float]) -> Sequence[float]:
-    """Return a colour with as much white in it that it is seen on the ground of the dark theme; not of a light one."""
-    mixed = (np.array(colour) + share * (255.0 - np.array(colour)) for share in np.arange(0.0, 1.01, 0.05))
-    return next(each.tolist() for each in mixed if luminance(each.tolist()) >= LUMINANCE_MIN)
-
-
-def linear(colours: Array) -> NDArray[np.uint8]:
-    """Return sRGB colours, 0 to 255, in linear light, in which viser takes those of a line's points.
-
-    IEC 61966-2-1, 5.3.
-    """
-    share = colours / 255
-    return np.round(255 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)).astype(np.uint8)
-
-
 def _padded(count: int, p_W: Array, q: Array) -> tuple[Array, Array, Array]:
-    """Return positions (count, 3), attitudes (count, 4) and scales (count, 3); beyond p_W and q they are hidden."""
+    """Return positions (count, 3), attitudes (count, 4) and scales (count, 3); those beyond p_W and q are hidden."""
     positions, attitudes = np.tile(np.array(HIDDEN), (count, 1)), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
     positions[: len(p_W)], attitudes[: len(q)] = p_W, q
     return positions, attitudes, np.ones((count, 3))
 
 
-HALF_M = 150.0  # half a side of the ground
-FIELD_BELOW_M = 0.15  # of the field below the grid: which of two nearer ones is in front a depth buffer cannot tell
-THICK_M = 0.02
-LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # of the field, of the grid's cells and of its sections
-DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
-
-
-def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:
-    """Draw the ground, in the place of what was drawn before.
-
-    Opaque, and no background image: what viser draws of a grid's plane or of a sky hides whatever is transparent.
-    """
-    field, cells, sections = DARK if dark else LIGHT
-    position = (0.0, 0.0, -FIELD_BELOW_M - THICK_M / 2.0)
-    scene.add_box("/field", field, (2 * HALF_M, 2 * HALF_M, THICK_M), position=position, cast_shadow=False)
-    scene.add_grid(
-        "/ground", 2 * HALF_M, 2 * HALF_M, cell_size=1.0, section_size=5.0, cell_color=cells, section_color=sections,
-        fade_distance=80.0, shadow_opacity=0.0,
-    )  # fmt: skip
-
-
-CHOSEN = (25, 113, 194)
-
-
 class ChosenRing:
-    """The ring of one page.
-
-    Args:
-        scene: viser's of that page.
-        radii_m: of the drones, in the order of their poses.
-    """
+    """A ring about the chosen drone in the scene of one page; `radii_m` are the drones', in their order."""
 
     def __init__(self, scene: viser.SceneApi, radii_m: Array) -> None:
         self._radii_m = radii_m
@@ -368,7 +422,7 @@ class ChosenRing:
         )  # fmt: skip
 
     def move(self, drones: DronePoses, chosen: str) -> None:
-        """Put the ring about the chosen drone; out of sight while that one is not there."""
+        """Put the ring about the chosen drone; out of sight while that is missing."""
         index = drones.names.index(chosen)
         self._node.batched_positions = drones.p_W[[index]] if drones.present[index] else np.reshape(HIDDEN, (1, 3))
         if index != self._chosen:
@@ -376,120 +430,32 @@ class ChosenRing:
             self._node.batched_scales = np.full((1, 3), self._radii_m[index])
 
 
-class RunScene:
-    """The scene of one run.
+def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:
+    """Draw a field with a grid in place of the previous ground.
 
-    Args:
-        server: viser's; what another run has left in its scene is removed.
-        info: of the run.
-        scenario: of the run.
-        spaces: of its formations.
-        views: the newest of everything.
-        camera_follow: moves the page's cameras that follow the formation.
-
-    Attributes:
-        nodes: viser's.
-        drones: their newest poses, None before the first view.
-        shapes: the formations as they truly stand, by name; None where a drone of one is missing.
-        trails: of the drones.
-        previews: ways (n, M, 3) [m] of the drones of formations, by name, that would be flown.
+    It is opaque, without a background image: viser's plane of a grid, or a sky, would hide whatever is transparent.
     """
+    field, cells, sections = DARK if dark else LIGHT
+    position = (0.0, 0.0, -FIELD_BELOW_M - THICK_M / 2.0)
+    scene.add_box("/field", field, (2 * HALF_M, 2 * HALF_M, THICK_M), position=position, cast_shadow=False)
+    scene.add_grid(
+        "/ground", 2 * HALF_M, 2 * HALF_M, cell_size=1.0, section_size=5.0, cell_color=cells, section_color=sections,
+        fade_distance=80.0, shadow_opacity=0.0,
+    )  # fmt: skip
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        info: Info,
-        scenario: Scenario,
-        spaces: Mapping[str, ClusterSpace],
-        views: ViewBuffer,
-        camera_follow: CameraFollow,
-    ) -> None:
-        self._names = tuple(drone.name for drone in info.drones)
-        self._spaces = spaces
-        self._views = views
-        self._camera_follow = camera_follow
-        self._members = {c.name: [self._names.index(d) for d in c.drones] for c in scenario.clusters}
-        self._drawn_ghosts: dict[str, Any] = {}
-        self.drones: DronePoses | None = None
-        self.shapes: dict[str, FormationShape | None] = {}
-        self.previews: dict[str, Array] = {}
-        self.trails = CanvasTrails(len(self._names), around=bool(info.replay_of))
-        robots = sum(space.n for space in spaces.values())
-        arms_m = [drone.arm_m for drone in scenario.drones]
-        self.nodes = SceneNodes(server, info.drones, arms_m, robots, len(spaces))
-        self.nodes.obstacles(scenario.environment.obstacles)
-        camera_follow.restart()
 
-    def clicked(self, event: viser.SceneClickEvent) -> str | None:
-        """Return the drone that a click has hit."""
-        if self.drones is None:
-            return None
-        return drone_on_ray(self.drones, self.nodes.radii_m, event.ray_origin, event.ray_direction)
+def luminance(colour: Sequence[float]) -> float:
+    """Return the relative luminance of an sRGB colour, 0 to 255 (WCAG 2.2)."""
+    return float(np.dot((0.2126, 0.7152, 0.0722), linear(np.array(colour, float)) / 255.0))
 
-    def store(self, view: ViewDrones) -> DronePoses:
-        """Store the drones' newest poses, and return them; cameras of later pages look at them."""
-        drones = drone_poses(view, self._names)
-        self.drones = drones
-        self.trails.add(drones.t_ns / 1e9, drones.p_W)
-        self.shapes = self.shapes_of(drones)
-        self._camera_follow.set_target(self._camera_targets(drones))
-        return drones
 
-    def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
-        """Draw a view of the drones, and return their poses.
+def lightened(colour: Sequence[float]) -> Sequence[float]:
+    """Return a colour, mixed with white until it stands out from the ground of the dark theme."""
+    mixed = (np.array(colour) + share * (255.0 - np.array(colour)) for share in np.arange(0.0, 1.01, 0.05))
+    return next(each.tolist() for each in mixed if luminance(each.tolist()) >= LUMINANCE_MIN)
 
-        Args:
-            view: of the drones.
-            longest_s: for which rotors turn at most, from one picture to the next.
-            chosen: the formation whose figures are drawn.
-        """
-        before_ns = self.drones.t_ns if self.drones is not None else 0
-        drones = self.store(view)
-        self.nodes.drones(drones, min(longest_s, max(0.0, (drones.t_ns - before_ns) / 1e9)))
-        estimates = self._views.estimates().values()
-        self.nodes.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
-        if self.shapes:
-            self.nodes.shapes(list(self.shapes.values()), list(self.shapes).index(chosen))
-        self._draw_ghosts()
-        self._camera_follow.follow(self._camera_targets(drones))
-        return drones
 
-    def preview(self, cluster: str, shown: FlightPreview | None) -> None:
-        """Show what a formation would fly, in place of what was shown before; None for nothing."""
-        self.previews = {**self.previews, cluster: shown.paths_W} if shown else {
-            name: paths_W for name, paths_W in self.previews.items() if name != cluster
-        }  # fmt: skip
-        self.nodes.previews(list(self.previews.values()))
-
-    def draw_trails(self) -> None:
-        """Draw trails and wind, which change slowly."""
-        if self.drones is not None:
-            segments, owners, _ = self.trails.segments(self.drones.t_ns / 1e9, self.drones.p_W)
-            self.nodes.trails(segments, owners)
-            self.nodes.wind(self.drones)
-
-    def _draw_ghosts(self) -> None:
-        """Move the ghosts where a formation's desired shape has changed."""
-        clusters = self._views.clusters
-        wanted = {name: (view.phase, view.desired) for name, view in clusters.items()}
-        if wanted == self._drawn_ghosts:
-            return
-        self._drawn_ghosts = wanted
-        poses = [ghosts(self._spaces[name], view) for name, view in clusters.items()]
-        shown = [each for each in poses if each is not None]
-        p_W = np.concatenate([p for p, _ in shown]) if shown else np.zeros((0, 3))
-        self.nodes.ghosts(p_W, np.concatenate([q for _, q in shown]) if shown else np.zeros((0, 4)))
-
-    def shapes_of(self, drones: DronePoses) -> dict[str, FormationShape | None]:
-        """Return the formations as they truly stand, by name; None where a drone of one is missing."""
-        there, yaw = drones.present, frames.heading(drones.q_WB)
-        return {
-            name: formation_shape(space, drones.p_W[members], yaw[members]) if there[members].all() else None
-            for name, space in self._spaces.items()
-            for members in [self._members[name]]
-        }
-
-    def _camera_targets(self, drones: DronePoses) -> Array:
-        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""
-        members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
-        return drones.p_W[members][drones.present[members]]
+def linear(colours: Array) -> NDArray[np.uint8]:
+    """Return sRGB colours, 0 to 255, in linear light, as viser takes the colours of lines; IEC 61966-2-1, 5.3."""
+    share = colours / 255
+    return np.round(255 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)).astype(np.uint8)
