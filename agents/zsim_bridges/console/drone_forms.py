@@ -20,19 +20,19 @@ FILTER_MAX = 80  # characters
 SEVERITIES = ("red", "amber", None)
 SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
     "as in the scenario": lambda _: (),
-    "worst first": lambda row: (SEVERITIES.index(row.severity), row.battery_percent, -row.link_badness),
-    "battery, lowest first": lambda row: (row.battery_percent,),
+    "worst first": lambda row: (SEVERITIES.index(row.severity), row.drone.battery_percent, -row.link_badness),
+    "battery, lowest first": lambda row: (row.drone.battery_percent,),
     "link, worst first": lambda row: (-row.link_badness,),
-    "σ, largest first": lambda row: (-math.inf if row.sigma_m is None else -row.sigma_m,),
+    "σ, largest first": lambda row: (-math.inf if row.drone.sigma_m is None else -row.drone.sigma_m,),
 }
 """Sort keys of rows; equal ones stay in the scenario's order."""
 ALL = "all"
 FILTERS: dict[str, Callable[[DroneRow, "frozenset[str]"], bool]] = {
     ALL: lambda row, selected: True,
     "with an alarm": lambda row, selected: row.severity is not None,
-    "in the air": lambda row, selected: row.state not in DOWN,
-    "on the ground": lambda row, selected: row.state in DOWN,
-    "battery low": lambda row, selected: row.battery_percent < BATTERY_LOW_PERCENT,
+    "in the air": lambda row, selected: row.drone.state not in DOWN,
+    "on the ground": lambda row, selected: row.drone.state in DOWN,
+    "battery low": lambda row, selected: row.drone.battery_percent < BATTERY_LOW_PERCENT,
     "selected": lambda row, selected: row.name in selected,
 }
 NO_ROW = "no drone is like that; change the filter"
@@ -162,7 +162,13 @@ class Filtered(NamedTuple):
         words = self.text[:FILTER_MAX].lower().split()
 
         def has_words(row: DroneRow) -> bool:
-            texts = row.name, row.state.replace("_", " "), row.commander or "nobody", *row.faults, row.link[0]
+            texts = (
+                row.name,
+                row.drone.state.replace("_", " "),
+                row.drone.commander or "nobody",
+                *row.faults,
+                row.link[0],
+            )
             return all(any(word in text.lower() for text in texts) for word in words)
 
         shown = [row for row in rows if FILTERS[self.choice](row, selected) and has_words(row)]

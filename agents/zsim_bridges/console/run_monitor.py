@@ -14,7 +14,7 @@ from zsim_bridges.console.alarms import AlarmBoard, DroneCondition, FaultWatch
 from zsim_bridges.console.orders import PendingRequest, PendingRequests
 from zsim_bridges.console.run_condition import RunCondition, ShownRun, page_head, preflight_checks
 from zsim_bridges.console.time_monitor import TimeMonitor
-from zsim_bridges.console.view_buffer import ReceivedEstimate, ViewBuffer
+from zsim_bridges.console.view_buffer import ViewBuffer
 
 ROUNDING_NS = 1_000.0  # of a time given in seconds
 SPEED_S = 0.2  # simulated, over which a speed is averaged; over less it would show the rounding of positions
@@ -67,11 +67,9 @@ class RunMonitor:
     def update(self, wall_s: float) -> list[PendingRequest]:
         """Take over the newest views; return the requests that were done meanwhile."""
         views, clock = self._views, self._time_monitor.clock
-        seen = views.drones.drones if views.drones else ()
         self._forget_future(views.drones.t_ns if views.drones else 0)
-        estimates = views.estimates()
-        drones = {drone.name: self._drone(drone, estimates.get(drone.name)) for drone in seen}
-        commanders = {drone.name: drone.commander for drone in seen}
+        drones = views.conditions()
+        commanders = {name: drone.commander for name, drone in drones.items()}
         roles = {name: health.role for name, health in views.healths.items()}
         foreign = {
             name: alarms.foreign_commanders(f"controller.{name}", members, commanders, roles)
@@ -89,7 +87,7 @@ class RunMonitor:
             ended=self._ended,
             replayed=self._run.is_replay,
             at_end=clock is not None and clock.state == "paused" and clock.t_ns >= end_s * 1e9 - ROUNDING_NS,
-            drones={drone.name: drone.state for drone in seen},
+            drones={name: drone.state for name, drone in drones.items()},
             phases=phases,
             members=self._members,
             checks={
@@ -132,32 +130,6 @@ class RunMonitor:
         members = (drones[drone] for drone in self._members[name] if drone in drones)
         notes += [d.failsafe for d in members if d.failsafe and d.state in ("landing", "emergency", "landed")]
         return "; ".join(filter(None, (view.reason, *notes)))
-
-    def _drone(self, drone: DroneView, received: ReceivedEstimate | None) -> DroneCondition:
-        _, x, y, _ = drone.orientation_wxyz
-        failsafe = self._views.failsafes.get(drone.name)
-        found = DroneCondition(
-            drone.name,
-            drone.state,
-            drone.battery_percent,
-            tilt_deg=math.degrees(math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))),
-            commander=drone.commander,
-            failsafe=failsafe.text if failsafe else "",
-            is_external=drone.name in self._views.external,
-        )
-        if received is not None:
-            found = found._replace(lag_ms=self._views.lag_ms(received), estimate_lost=not received.fresh)
-            if received.fresh:
-                found = found._replace(sigma_m=received.sigma_m, yaw_sigma_deg=received.yaw_sigma_deg)
-        link = self._views.link_of(drone.name)
-        if link is None:
-            return found
-        return found._replace(
-            link_state=link.state.state,
-            link_age_ms=link.state.age_ms,
-            link_loss_percent=link.state.loss_percent,
-            link_age_s=link.age_s,
-        )
 
 
 class FlightFigures(NamedTuple):

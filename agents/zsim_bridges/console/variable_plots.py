@@ -19,36 +19,28 @@ from zsim_bridges.console.picture import Array, DronePoses
 PLOTS_SHOWN = 3  # plots
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # of SERIES
 HEIGHT_PX = 150
-PADDING_PX = (8, 24, 0, 0)  # above, so that the highest figure is whole; to the right as viser has it
-AXIS_PX = 56  # of figures such as -12.5, which would be clipped
-CURSOR_COLOUR = "#7048e8"  # of the instant at which a replay is
+PADDING_PX = (8, 24, 0, 0)  # at the top, for the whole of the highest figure; at the right as viser's
+AXIS_PX = 56  # wide enough for figures such as -12.5
+CURSOR_COLOUR = "#7048e8"  # of the instant that a replay shows
 BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # of a plot without points yet
 NONE = "none"
-STEPS_PER_WINDOW = 6  # by which the time axis moves on; chosen: plots are made anew every 30 s at most
+STEPS_PER_WINDOW = 6  # of the time axis; chosen: plots are recreated every 30 s at most
 LEAST_POINTS = 2  # of a curve
-VALUES_LEAST = 0.01  # of a unit: curves that differ less are shown as much apart
+VALUES_LEAST = 0.01  # least range of values, in their unit
 WINDOWS_S = (SPAN_S, 60.0, 20.0)  # simulated
 FLIGHT = {"x": "m", "y": "m", "z": "m", "yaw": "deg", "roll": "deg", "pitch": "deg"}  # of each drone, with units
-ESTIMATED = 4  # of them, the first ones: views of estimates have no roll and pitch
+ESTIMATED = 4  # the first of them: views of estimates have no roll and pitch
 DESIRED, TRUE = SERIES.index("desired"), SERIES.index("true")
 
 
 class PlottedVariable(NamedTuple):
-    """A variable that can be plotted.
-
-    Attributes:
-        history: where its points are.
-        column: in it.
-        label: with its unit.
-        angular: whether it is an angle.
-        reference: the one of SERIES from which errors are counted.
-    """
+    """A variable that can be plotted."""
 
     history: VariableHistory
-    column: int
-    label: str
+    column: int  # in the history
+    label: str  # with its unit
     angular: bool
-    reference: int
+    reference: int  # index in SERIES of the curve that errors are relative to
 
 
 class FlightHistory(NamedTuple):
@@ -58,7 +50,7 @@ class FlightHistory(NamedTuple):
     history: VariableHistory
 
     def add(self, drones: DronePoses, estimates: Mapping[str, EstimateView]) -> None:
-        """Add where the drones truly are, and where they are estimated to be, if the last point is old enough."""
+        """Add the drones' true and estimated poses, if the last point is old enough."""
         if not self.history.is_due(drones.t_ns / 1e9):
             return
         believed = np.full((len(self.names), len(FLIGHT)), np.nan)
@@ -79,65 +71,6 @@ class FlightHistory(NamedTuple):
         ]
 
 
-def flight_history(names: Sequence[str], around: bool = False) -> FlightHistory:
-    """Return an empty history of drones; `around`: of a record."""
-    return FlightHistory(tuple(names), VariableHistory(len(names) * len(FLIGHT), around))
-
-
-class AxisRange(NamedTuple):
-    """What of an axis is shown, in whole steps, since a plot with another range is made anew."""
-
-    low: float
-    high: float
-
-    @classmethod
-    def of_times(cls, t_s: Array, span_s: float, at_s: float | None = None) -> "AxisRange":
-        """Return the range of points of those times (M,) [s], M > 0, in a window of `span_s`, around at_s if given.
-
-        Viser keeps an automatic range by its share of the former data, read before the first range has been committed:
-        a page that draws slowly then shows a stretch without data for ever.
-        """
-        step_s = span_s / STEPS_PER_WINDOW
-        if at_s is not None:
-            low_s = math.floor((at_s - span_s / 2.0) / step_s) * step_s
-            return cls(low_s, low_s + span_s + step_s)
-        return cls(math.floor(t_s[0] / step_s) * step_s, (math.floor(t_s[-1] / step_s) + 1) * step_s)
-
-    @classmethod
-    def of_values(cls, values: Sequence[Array], always: bool = False) -> "AxisRange | None":
-        """Return the range of curves of which one is not known at all: uPlot finds none then. None where it does.
-
-        Args:
-            values: (M,) each, of one unit; NaN for what is not known.
-            always: of others, too.
-        """
-        known = np.concatenate(values)
-        known = known[np.isfinite(known)]
-        if not len(known) or not (always or any(np.isnan(each).all() for each in values)):
-            return None
-        least, greatest = float(known.min()), float(known.max())
-        step = 10.0 ** math.floor(math.log10(max(greatest - least, VALUES_LEAST)))
-        return cls((math.floor(least / step) - 0.5) * step, (math.ceil(greatest / step) + 0.5) * step)
-
-
-def _with_cursor(curves: Sequence[Array], at_s: float) -> tuple[Array, ...]:
-    """Return curves with one more, a line across all of the plot at an instant."""
-    place = int(np.searchsorted(curves[0], at_s))
-    nearest = min(place, len(curves[0]) - 1)
-    values = AxisRange.of_values(curves[1:], always=True)
-    cursor = np.full(len(curves[0]) + 2, np.nan)
-    cursor[place : place + 2] = values or (0.0, 1.0)
-    doubled = (np.insert(each, place, (each[nearest], each[nearest])) for each in curves[1:])
-    return np.insert(curves[0], place, (at_s, at_s)), *doubled, cursor
-
-
-def _scales(curves: Sequence[Array], span_s: float, at_s: float | None) -> dict[str, uplot.Scale]:
-    """Return the axes of curves as uPlot takes them."""
-    scales = {"x": uplot.Scale(time=False, range=AxisRange.of_times(curves[0], span_s, at_s))}
-    values = AxisRange.of_values(curves[1:], always=at_s is not None)
-    return scales if values is None else {**scales, "y": uplot.Scale(time=False, range=values)}
-
-
 class VariablePlots:
     """Plots of one formation and of its drones, three variables at a time.
 
@@ -146,7 +79,7 @@ class VariablePlots:
         cluster: the formation.
         ranges: of its variables.
         flights: of the drones of the run.
-        replayed: whether a record is played: curves then go on beyond the instant at which the replay is.
+        replayed: whether it is a replay, whose curves extend beyond the shown instant.
 
     Attributes:
         history: of the formation's variables.
@@ -185,19 +118,22 @@ class VariablePlots:
             control.on_update(lambda _: self._redraw())
 
     def draw(self, t_s: float = 0.0) -> None:
-        """Send the curves that are chosen, unless they are to stand still; a replay is at t_s."""
+        """Send the chosen curves, unless they are to stand still; t_s is the instant that a replay shows."""
         if self._cursor_s is not None:
             self._cursor_s = t_s
         if not self._still.value:
             self._redraw()
 
     def _redraw(self) -> None:
-        """Send the curves that are chosen, as they are now: after the end of a run, too."""
+        """Send the chosen curves; after the end of a run, too."""
         with self._lock:
             shown = self._choices.get(self._choice.value, ())
             if shown != self._shown:
                 self._shown = shown
-                self._retitle()
+                for index, plot in enumerate(self._plots):
+                    plot.visible = index < len(shown)
+                    if plot.visible:
+                        plot.title = shown[index].label
             for index, each in enumerate(shown):
                 self._send(index, each)
 
@@ -209,22 +145,68 @@ class VariablePlots:
         if len(curves[0]) < LEAST_POINTS:
             plot.data = BLANK if at_s is None else (*BLANK, BLANK[1])
             return
-        scales = _scales(curves, span_s, at_s)
+        scales = {"x": uplot.Scale(time=False, range=AxisRange.of_times(curves[0], span_s, at_s))}
+        values = AxisRange.of_values(curves[1:], always=at_s is not None)
+        if values is not None:
+            scales["y"] = uplot.Scale(time=False, range=values)
         if at_s is not None:
-            curves = _with_cursor(curves, at_s)
+            curves = _with_cursor(curves, at_s, values or AxisRange(0.0, 1.0))
         if scales != self._scales.get(index):
             self._scales[index] = plot.scales = scales
         plot.data = curves
 
-    def _retitle(self) -> None:
-        for index, plot in enumerate(self._plots):
-            plot.visible = index < len(self._shown)
-            if plot.visible:
-                plot.title = self._shown[index].label
+
+class AxisRange(NamedTuple):
+    """The shown range of an axis, in whole steps, since viser recreates a plot when its range changes."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def of_times(cls, t_s: Array, span_s: float, at_s: float | None = None) -> "AxisRange":
+        """Return the range of points of these times (M,) [s], M > 0, in a window of `span_s`, around at_s if given.
+
+        viser derives an automatic range from the previous data before the first range is committed: a page that draws
+        slowly would show a stretch without data for ever.
+        """
+        step_s = span_s / STEPS_PER_WINDOW
+        if at_s is not None:
+            low_s = math.floor((at_s - span_s / 2.0) / step_s) * step_s
+            return cls(low_s, low_s + span_s + step_s)
+        return cls(math.floor(t_s[0] / step_s) * step_s, (math.floor(t_s[-1] / step_s) + 1) * step_s)
+
+    @classmethod
+    def of_values(cls, values: Sequence[Array], always: bool = False) -> "AxisRange | None":
+        """Return the range of curves (M,) of one unit, NaN where unknown; None where uPlot finds it itself.
+
+        It does not where a curve is entirely unknown; `always`: return the range of other curves, too.
+        """
+        known = np.concatenate(values)
+        known = known[np.isfinite(known)]
+        if not len(known) or not (always or any(np.isnan(each).all() for each in values)):
+            return None
+        least, greatest = float(known.min()), float(known.max())
+        step = 10.0 ** math.floor(math.log10(max(greatest - least, VALUES_LEAST)))
+        return cls((math.floor(least / step) - 0.5) * step, (math.ceil(greatest / step) + 0.5) * step)
+
+
+def flight_history(names: Sequence[str], around: bool = False) -> FlightHistory:
+    """Return an empty history of drones; `around`: of a record."""
+    return FlightHistory(tuple(names), VariableHistory(len(names) * len(FLIGHT), around))
+
+
+def _with_cursor(curves: Sequence[Array], at_s: float, values: AxisRange) -> tuple[Array, ...]:
+    """Return curves with one more, a line across the range of values at an instant."""
+    place = int(np.searchsorted(curves[0], at_s))
+    nearest = min(place, len(curves[0]) - 1)
+    cursor = np.full(len(curves[0]) + 2, np.nan)
+    cursor[place : place + 2] = values
+    doubled = (np.insert(each, place, (each[nearest], each[nearest])) for each in curves[1:])
+    return np.insert(curves[0], place, (at_s, at_s)), *doubled, cursor
 
 
 def _triples(of: str, variables: list[PlottedVariable]) -> dict[str, tuple[PlottedVariable, ...]]:
-    """Return variables as many at a time as are plotted, by what one chooses them by."""
+    """Return variables, as many at a time as are plotted, by their label in the dropdown."""
     triples = [variables[k : k + PLOTS_SHOWN] for k in range(0, len(variables), PLOTS_SHOWN)]
     return {of + ", ".join(each.label.partition(" ")[0] for each in triple): tuple(triple) for triple in triples}
 

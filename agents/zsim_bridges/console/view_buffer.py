@@ -19,7 +19,7 @@ from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample, Session
-from zsim_bridges.console.alarms import BACK, LOST, Losses
+from zsim_bridges.console.alarms import BACK, LOST, DroneCondition, Losses
 from zsim_bridges.observer_process import ObserverProcess
 
 FRESH_S = 1.0  # simulated, or wall; views come 20 times a wall second: the estimator of an older one is dead, or stuck
@@ -166,6 +166,34 @@ class ViewBuffer:
                 known = (estimate for estimate in view.estimates if estimate.name in self._names)
                 newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in known}
         return newest
+
+    def conditions(self) -> dict[str, DroneCondition]:
+        """Return the condition of each drone in the newest view, by name."""
+        estimates, found = self.estimates(), {}
+        for drone in self.drones.drones if self.drones else ():
+            _, x, y, _ = drone.orientation_wxyz
+            failsafe, link = self.failsafes.get(drone.name), self.link_of(drone.name)
+            condition = DroneCondition(
+                drone.name,
+                drone.state,
+                drone.battery_percent,
+                tilt_deg=math.degrees(math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))),
+                commander=drone.commander,
+                failsafe=failsafe.text if failsafe else "",
+                is_external=drone.name in self.external,
+            )
+            received = estimates.get(drone.name)
+            if received is not None:
+                condition = condition._replace(lag_ms=self.lag_ms(received), estimate_lost=not received.fresh)
+            if received is not None and received.fresh:
+                condition = condition._replace(sigma_m=received.sigma_m, yaw_sigma_deg=received.yaw_sigma_deg)
+            if link is not None:
+                state, age_ms, loss = link.state.state, link.state.age_ms, link.state.loss_percent
+                condition = condition._replace(
+                    link_state=state, link_age_ms=age_ms, link_loss_percent=loss, link_age_s=link.age_s
+                )
+            found[drone.name] = condition
+        return found
 
     def link_of(self, drone: str) -> ReceivedLink | None:
         """Return the newest state of an external drone's link, None before the first."""

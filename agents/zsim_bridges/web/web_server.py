@@ -1,4 +1,9 @@
-"""What the web servers of console and gateway share: event loop thread, listening, and who may reach them."""
+"""What the web servers of console and gateway share: event loop thread, listening, access, and bounded connections.
+
+aiohttp waits for the end of a request without a limit, and keeps what has arrived of its body; a thousand connections
+that never end theirs would take all the files that a process may open, and a gigabyte. A connection is a stranger until
+one of its requests has been answered without an error, or is being answered; strangers never take the places of others.
+"""
 
 import asyncio
 import errno
@@ -15,22 +20,136 @@ from zsim.errors import RunError
 from zsim_bridges.web import is_loopback
 
 STRANGERS_MAX = 100  # connections at once; the oldest makes room for the next
-REQUEST_S = 5.0  # wall time in which a request has to come, its body too; a browser on a bad link takes 1 s
-SMALL_BYTES = 16_384  # a body that is let in at any time; commands and requests have a few hundred
-BODY_BYTES_MAX = 16_000_000  # of all larger bodies at once; 16 of the largest that the gateway takes
+REQUEST_S = 5.0  # wall time for a request to arrive with its body; a browser on a bad link takes 1 s
+SMALL_BYTES = 16_384  # of a body that is always accepted; commands and requests have a few hundred
+BODY_BYTES_MAX = 16_000_000  # of all larger bodies at once; 16 of the largest that the gateway accepts
 CONNECTIONS_MAX = 1000  # twice the gateway's clients
 REFUSED_FROM = 400  # HTTP status
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+ANY_PORT = 0  # of the kernel's choice
+BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own
+READ_BYTES = 16_384  # of a body that no handler has read yet; a connection holds twice as many
+Resource = TypeVar("Resource")
+_NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests other than HTTP are answered, not logged
+
+
+class ServedSite(NamedTuple):
+    """A web application on a port."""
+
+    runner: web.AppRunner
+    listener: asyncio.Server
+
+    @property
+    def port(self) -> int:
+        return self.listener.sockets[0].getsockname()[1]
+
+    async def cleanup(self) -> None:
+        """Stop listening, and end requests in progress."""
+        self.listener.close()
+        await self.runner.cleanup()
+
+
+async def start_site(app: web.Application, host: str, ports: Sequence[int], shutdown_s: float) -> ServedSite:
+    """Serve an application, on a bounded number of connections.
+
+    Args:
+        app: the application.
+        host: on whose address.
+        ports: the first of them that is free; ANY_PORT for any free one.
+        shutdown_s: how long requests in progress may take at the end [wall].
+
+    Raises:
+        OSError: none of them can be opened.
+    """
+    connections = HttpConnections()
+    app.middlewares.append(connections.observe)
+    runner = web.AppRunner(app, access_log=None, logger=_NO_LOG, shutdown_timeout=shutdown_s, read_bufsize=READ_BYTES)
+    await runner.setup()
+    server = runner.server
+    assert server is not None
+    try:
+        listener = await _listen(lambda: connections.protocol(server()), host, ports)
+    except OSError:
+        await runner.cleanup()
+        raise
+    return ServedSite(runner, listener)
+
+
+async def _listen(protocol: Callable[[], asyncio.Protocol], host: str, ports: Sequence[int]) -> asyncio.Server:
+    loop = asyncio.get_running_loop()
+    try:
+        return await loop.create_server(protocol, host, ports[0], backlog=BACKLOG)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE or len(ports) == 1:
+            raise
+    return await _listen(protocol, host, ports[1:])
+
+
+@contextmanager
+def open_on_thread(
+    loop: asyncio.AbstractEventLoop,
+    name: str,
+    enter: Callable[[], Coroutine[Any, Any, Resource]],
+    leave: Callable[[Resource], Coroutine[Any, Any, None]],
+) -> Iterator[None]:
+    """Run an event loop on a thread of its own, open a resource on it, and close both at the end.
+
+    Exceptions of `enter`, which opens the resource, are raised here.
+    """
+    thread = threading.Thread(target=loop.run_forever, name=name, daemon=True)
+    thread.start()
+    try:
+        resource = asyncio.run_coroutine_threadsafe(enter(), loop).result()
+        try:
+            yield
+        finally:
+            asyncio.run_coroutine_threadsafe(leave(resource), loop).result()
+    finally:
+        asyncio.run_coroutine_threadsafe(cancel_other_tasks(), loop).result()
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+async def cancel_other_tasks() -> None:
+    """Cancel all other tasks of the loop and wait for them, since asyncio warns of tasks pending at the end."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
+
+
+def check_token(process: str, host: str, token: str | None) -> None:
+    """Refuse to listen where other machines could connect without a token.
+
+    Raises:
+        RunError: the token is empty, or there is none and the host is not loopback.
+    """
+    if token == "":
+        raise RunError(f"{process}: the token is empty; give it one, or leave ZSIM_TOKEN and --token away")
+    if token is None and not is_loopback(host):
+        remedy = "set ZSIM_TOKEN (or --token, which everybody on this machine can read), or --listen 127.0.0.1"
+        raise RunError(f"{process}: {host} can be reached by others; {remedy}")
+
+
+def tokens_match(received: str, token: str) -> bool:
+    """Compare in constant time; the received one may hold any bytes of a header."""
+    return hmac.compare_digest(received.encode(errors="surrogatepass"), token.encode(errors="surrogatepass"))
+
+
+def url_host(host: str) -> str:
+    """Return a host as written in URLs: an IPv6 address in brackets."""
+    return f"[{host}]" if ":" in host else host
 
 
 class HttpConnections:
-    """Counts the connections of a server, and closes those that have to make room.
+    """Counts the connections of a server, and closes those that must make room.
 
     Args:
         strangers_max, connections_max: at once.
-        request_s: wall time in which a request has to come since its first byte; and its head, from a stranger, since
-            the connection was opened or its last request answered.
-        body_bytes_max: of all bodies beyond SMALL_BYTES at once; more wait within their time.
+        request_s: wall time for a request to arrive, from its first byte; and for a stranger's head, from the opening
+            of the connection or its last answer.
+        body_bytes_max: of all bodies beyond SMALL_BYTES at once; further ones wait within their time.
     """
 
     def __init__(
@@ -47,8 +166,8 @@ class HttpConnections:
         self._body_bytes = 0
         self._body_gone = asyncio.Condition()
         self._open: dict[asyncio.BaseTransport, HttpConnection] = {}
-        self._strangers: dict[HttpConnection, None] = {}  # in the order in which they began to wait
-        self._idle: dict[HttpConnection, None] = {}  # known, without a request now; in that order
+        self._strangers: dict[HttpConnection, None] = {}  # an ordered set, by when they began to wait
+        self._idle: dict[HttpConnection, None] = {}  # likewise, of known ones without a request
 
     def protocol(self, http: asyncio.Protocol) -> "HttpConnection":
         """Return the protocol of a new connection; `http` speaks HTTP on it."""
@@ -56,7 +175,7 @@ class HttpConnections:
 
     @web.middleware
     async def observe(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Keep a connection while its request is answered; to be the innermost, behind any check of access."""
+        """Keep a connection while its request is answered; to be the innermost middleware, after checks of access."""
         connection = self._open.get(request.transport) if request.transport else None
         if connection is None:
             return await handler(request)
@@ -76,11 +195,11 @@ class HttpConnections:
     async def _receive(
         self, request: web.Request, connection: "HttpConnection", since_s: float | None, room: AsyncExitStack
     ) -> None:
-        """Receive the body of a request, which the handler then finds read; `room` is kept for it until that is done.
+        """Receive the body of a request before the handler; `room` is kept for it until that is done.
 
         Raises:
-            HTTPRequestTimeout: it did not come in its time, or there was no room for it.
-            HTTPRequestEntityTooLarge: it is longer than the application takes.
+            HTTPRequestTimeout: it did not arrive in time, or there was no room for it.
+            HTTPRequestEntityTooLarge: it is longer than the application accepts.
         """
         if not request.can_read_body:
             return
@@ -93,7 +212,7 @@ class HttpConnections:
                     await room.enter_async_context(self._body_room(size))
                 await request.read()
         except TimeoutError:
-            connection.known = False  # what else it sends is waited for no longer than for a stranger's
+            connection.known = False  # what it sends next is waited for as for a stranger's
             raise web.HTTPRequestTimeout(text=f"a request must be whole within {self._request_s:g} s") from None
 
     @asynccontextmanager
@@ -110,7 +229,7 @@ class HttpConnections:
                 self._body_gone.notify_all()
 
     def enter(self, connection: "HttpConnection", transport: asyncio.Transport) -> bool:
-        """Take a new connection; False where there is no room, as all others have a request under way."""
+        """Accept a new connection; False if there is no room, since all others have a request in progress."""
         if len(self._open) >= self._connections_max and not self._make_room(self._strangers, self._idle):
             return False
         if len(self._strangers) >= self._strangers_max:
@@ -120,12 +239,12 @@ class HttpConnections:
         return True
 
     def leave(self, connection: "HttpConnection", transport: asyncio.BaseTransport) -> None:
-        """Forget a connection that is closed."""
+        """Remove a closed connection."""
         self._open.pop(transport, None)
         self._forget(connection)
 
     def _make_room(self, *groups: "dict[HttpConnection, None]") -> bool:
-        """Close the connection that has waited longest, of the first group that has one."""
+        """Close the connection that has waited longest, of the first group that is not empty."""
         for group in groups:
             if group:
                 next(iter(group)).cut()
@@ -133,7 +252,7 @@ class HttpConnections:
         return False
 
     def _wait(self, connection: "HttpConnection") -> None:
-        """Let a connection wait for its next request; aiohttp ends the wait of one that is known and sends nothing."""
+        """Let a connection wait for its next request; aiohttp itself closes idle ones that are known."""
         (self._idle if connection.known else self._strangers)[connection] = None
         if not connection.known:
             connection.timer = asyncio.get_running_loop().call_later(self._request_s, connection.cut)
@@ -159,14 +278,14 @@ class HttpConnections:
 
 
 class HttpConnection(asyncio.Protocol):
-    """One connection: what comes is handed on to who speaks HTTP.
+    """One connection, between its transport and the protocol that speaks HTTP.
 
     Attributes:
         known: whether one of its requests was answered without an error.
-        since_s: when the first byte of its next request came, None where it has not [s, of the loop].
-        timer: cuts it when the time for that request is over.
-        is_whole: whether the request that is under way has come.
-        has_more: whether something of the next one has come meanwhile.
+        since_s: when the first byte of its next request arrived [s, of the loop]; None before.
+        timer: closes it when the time for that request is over.
+        is_whole: whether the request in progress has arrived.
+        has_more: whether something of the next one has arrived meanwhile.
     """
 
     def __init__(self, http: asyncio.Protocol, connections: HttpConnections) -> None:
@@ -179,7 +298,6 @@ class HttpConnection(asyncio.Protocol):
 
     @property
     def is_open(self) -> bool:
-        """Whether it was let in and is not closed yet."""
         return self._transport is not None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -213,128 +331,8 @@ class HttpConnection(asyncio.Protocol):
         self._http.resume_writing()
 
     def cut(self) -> None:
-        """Close it at once; what it has sent is not answered."""
+        """Close it at once, without an answer."""
         if self._transport is not None:
             transport = self._transport
             self._connections.leave(self, transport)
             transport.abort()
-
-
-ANY_PORT = 0  # of the kernel's choice
-BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own
-READ_BYTES = 16_384  # of a body that no handler has read yet; a connection holds twice as many
-Resource = TypeVar("Resource")
-_NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, not logged
-
-
-class ServedSite(NamedTuple):
-    """A web application on a port."""
-
-    runner: web.AppRunner
-    listener: asyncio.Server
-
-    @property
-    def port(self) -> int:
-        """Return the port on which it is served."""
-        return self.listener.sockets[0].getsockname()[1]
-
-    async def cleanup(self) -> None:
-        """Stop listening, and end what is under way."""
-        self.listener.close()
-        await self.runner.cleanup()
-
-
-async def start_site(app: web.Application, host: str, ports: Sequence[int], shutdown_s: float) -> ServedSite:
-    """Serve an application, on a bounded number of connections.
-
-    Args:
-        app: the application.
-        host: on whose address.
-        ports: the first of them that is not taken; ANY_PORT for one that is not.
-        shutdown_s: how long what is under way may take at the end [wall].
-
-    Raises:
-        OSError: none of them can be opened.
-    """
-    connections = HttpConnections()
-    app.middlewares.append(connections.observe)
-    runner = web.AppRunner(app, access_log=None, logger=_NO_LOG, shutdown_timeout=shutdown_s, read_bufsize=READ_BYTES)
-    await runner.setup()
-    server = runner.server
-    assert server is not None
-    try:
-        listener = await _listen(lambda: connections.protocol(server()), host, ports)
-    except OSError:
-        await runner.cleanup()
-        raise
-    return ServedSite(runner, listener)
-
-
-async def _listen(protocol: Callable[[], asyncio.Protocol], host: str, ports: Sequence[int]) -> asyncio.Server:
-    loop = asyncio.get_running_loop()
-    try:
-        return await loop.create_server(protocol, host, ports[0], backlog=BACKLOG)
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE or len(ports) == 1:
-            raise
-    return await _listen(protocol, host, ports[1:])
-
-
-def check_token(process: str, host: str, token: str | None) -> None:
-    """Refuse to listen where others could connect without a token.
-
-    Raises:
-        RunError: the token is empty, or there is none and the host is not loopback.
-    """
-    if token == "":
-        raise RunError(f"{process}: the token is empty; give it one, or leave ZSIM_TOKEN and --token away")
-    if token is None and not is_loopback(host):
-        remedy = "set ZSIM_TOKEN (or --token, which everybody on this machine can read), or --listen 127.0.0.1"
-        raise RunError(f"{process}: {host} can be reached by others; {remedy}")
-
-
-def tokens_match(received: str, token: str) -> bool:
-    """Compare in constant time; what was received may hold any bytes of a header."""
-    return hmac.compare_digest(received.encode(errors="surrogatepass"), token.encode(errors="surrogatepass"))
-
-
-def url_host(host: str) -> str:
-    """Return a host as URLs write it: an IPv6 address in brackets."""
-    return f"[{host}]" if ":" in host else host
-
-
-@contextmanager
-def open_on_thread(
-    loop: asyncio.AbstractEventLoop,
-    name: str,
-    enter: Callable[[], Coroutine[Any, Any, Resource]],
-    leave: Callable[[Resource], Coroutine[Any, Any, None]],
-) -> Iterator[None]:
-    """Run an event loop on a thread of its own, open a resource on it, and close both at the end.
-
-    Args:
-        loop: is closed at the end.
-        name: of the thread.
-        enter, leave: open and close the resource; exceptions of `enter` are raised here.
-    """
-    thread = threading.Thread(target=loop.run_forever, name=name, daemon=True)
-    thread.start()
-    try:
-        resource = asyncio.run_coroutine_threadsafe(enter(), loop).result()
-        try:
-            yield
-        finally:
-            asyncio.run_coroutine_threadsafe(leave(resource), loop).result()
-    finally:
-        asyncio.run_coroutine_threadsafe(cancel_other_tasks(), loop).result()
-        loop.call_soon_threadsafe(loop.stop)
-        thread.join()
-        loop.close()
-
-
-async def cancel_other_tasks() -> None:
-    """Cancel all other tasks of the loop and wait for them: a loop that closes over a task complains of it."""
-    others = asyncio.all_tasks() - {asyncio.current_task()}
-    for task in others:
-        task.cancel()
-    await asyncio.gather(*others, return_exceptions=True)

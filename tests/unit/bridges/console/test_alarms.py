@@ -160,7 +160,9 @@ def test_an_engaged_formation_with_a_drone_flown_by_hand_is_an_alarm_with_its_fi
 
 def test_an_alarm_of_a_fault_has_its_magnitudes_as_the_terminal_writes_them():
     fault = Fault(1, "link_loss", "world/a", {"probability": 0.3, "one_way": False, "place": {}}, 0)
-    assert alarms.fault_alarms([fault]) == [Alarm("amber", "world/a", "link_loss", "probability=0.3 one_way=False")]
+    assert alarms.run_alarms({}, [fault], 0.0) == [
+        Alarm("amber", "world/a", "link_loss", "probability=0.3 one_way=False")
+    ]
 
 
 # Before a take-off

@@ -568,7 +568,9 @@ def test_nobody_says_what_no_control_says(change: bytes):
 
 
 def test_tables_show_text_of_others_as_text():
-    row = console_tables.DroneRow("d1", "flying", 9.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
+    row = console_tables.DroneRow(
+        DroneCondition("d1", "flying", 9.0, 400.0, commander="<script>"), "3 / 1", ("gps_dropout",)
+    )
     html = console_tables.drone_table([row])
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
@@ -596,7 +598,7 @@ def html_marks(html: str) -> list[str]:
     [(20.0, "inherit"), (17.0, console_tables.AMBER), (10.0, console_tables.AMBER), (9.0, console_tables.RED)],
 )
 def test_a_battery_has_the_colour_of_its_alarm(percent: float, colour: str):
-    html = console_tables.drone_table([console_tables.DroneRow("d1", "flying", percent, 0.0, None, "–", ())])
+    html = console_tables.drone_table([console_tables.DroneRow(DroneCondition("d1", "flying", percent))])
     assert f"<span style='color:{colour}'>{percent:.0f} %" in html
     alarms = drone_alarms(DroneCondition("d1", "flying", percent))
     assert [console_tables.SEVERITY_COLOURS[each.severity] for each in alarms] == [c for c in [colour] if c[0] == "#"]

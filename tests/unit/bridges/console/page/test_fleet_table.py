@@ -1,25 +1,29 @@
 """How a page sorts and filters its drones, and selects several of them for one command."""
 
-import math
 from contextlib import nullcontext
 from typing import Any
 
 import pytest
 
+from zsim_bridges.console.alarms import DroneCondition
 from zsim_bridges.console.console_tables import DroneRow, drone_table
 from zsim_bridges.console.drone_forms import FILTERS, MANY, NO_ROW, SORTINGS, Filtered, FleetTable
 
 
-def row(name: str, **changes: Any) -> DroneRow:
-    return DroneRow(name, "flying", 80.0, 5.0, "controller.main", "9 / 1", (), sigma_m=0.1)._replace(**changes)
+def row(
+    name: str, faults: tuple[str, ...] = (), link: Any = ("", ""), severity: Any = None, **changes: Any
+) -> DroneRow:
+    drone = DroneCondition(name, "flying", 80.0, 5.0, 0.1, commander="controller.main")._replace(**changes)
+    return DroneRow(drone, "9 / 1", faults, link, severity)
 
 
+LOST = {"is_external": True, "link_state": "lost", "link_age_s": 0.0}
 ROWS = [
     row("drone1", sigma_m=0.3),
     row("drone2", battery_percent=15.0, severity="amber"),
     row("drone3", battery_percent=8.0, severity="red", state="landing", faults=("gps_dropout",)),
-    row("drone4", sigma_m=None, link_badness=math.inf, severity="red", link=("external; lost: 10.0.0.4", "red")),
-    row("drone5", state="landed", commander=None, battery_percent=60.0, link_badness=0.4, sigma_m=2.5),
+    row("drone4", sigma_m=None, severity="red", link=("external; lost: 10.0.0.4", "red"), **LOST),
+    row("drone5", state="landed", commander=None, battery_percent=60.0, lag_ms=80.0, sigma_m=2.5),
 ]
 
 
