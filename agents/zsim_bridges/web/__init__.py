@@ -1,6 +1,6 @@
 """What web servers share: listening on a thread of their own, access, connections, streams of pictures.
 
-Console and gateway serve HTTP by it. This file imports no aiohttp: other bridges ask by it which hosts are this machine.
+Console and gateway serve HTTP by it. This file imports no aiohttp, since other bridges use it, too.
 """
 
 from ipaddress import ip_address

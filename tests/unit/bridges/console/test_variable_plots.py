@@ -24,7 +24,7 @@ from zsim_bridges.console.variable_plots import (
     flight_history,
 )
 
-CLUSTER = scenario_file.load(Path(__file__).parents[5] / "scenarios" / "step.yaml").clusters[0]
+CLUSTER = scenario_file.load(Path(__file__).parents[4] / "scenarios" / "step.yaml").clusters[0]
 RANGES = [SliderRange(name, "m", 0.0, 9.0, 0.1) for name in ("x_c", "y_c", "z_c", "p")]
 
 

@@ -1,12 +1,92 @@
-"""What a run leaves behind, for pages that are open when its console leaves."""
+"""Who may open a page, and where it is. What a run leaves behind, for pages that are open when its console leaves."""
 
 import os
+import socket
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from zsim.errors import RunError
 from zsim_bridges.console import page_server
-from zsim_bridges.console.page_server import RunFiles
+from zsim_bridges.console import picture as pic
+from zsim_bridges.console.page_server import OPERATOR, VIEWER, ListenAddress, PageRequest, PageTokens, RunFiles
+
+SCENARIOS = Path(__file__).parents[4] / "scenarios"
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+RNG = np.random.default_rng(4)
+
+
+def some_attitudes(count: int) -> np.ndarray:
+    q = RNG.normal(size=(count, 4))
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def drones(p_W: np.ndarray, q_WB: np.ndarray, t_ns: int = 0) -> pic.DronePoses:
+    names = tuple(f"drone{i}" for i in range(len(p_W)))
+    return pic.DronePoses(t_ns, names, p_W, q_WB, np.full((len(p_W), 4), 300.0), np.zeros(3))
+
+
+def asked(path: str = "/", host: str = "127.0.0.1:8080", origin: str | None = None, token: str = "", **cookies: str):
+    return PageRequest(path, host, origin, token, cookies)
+
+
+def test_on_this_machine_alone_no_token_is_asked_for():
+    guard = PageTokens("127.0.0.1", 8080, None, "look")
+    assert guard.role_of(asked()) == OPERATOR
+    assert guard.role_of(asked("/view/state")) == VIEWER
+    assert guard.role_of(asked(origin="http://127.0.0.1:8080")) == OPERATOR
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("evil.example:8080", None),
+        ("127.0.0.1:8080", "http://evil.example"),
+        ("127.0.0.1:8080", "http://127.0.0.1:9000"),
+        ("127.0.0.1:8080", "null"),
+        ("[::1:8080", None),
+    ],
+)
+def test_a_stranger_s_page_may_not_ask(host: str, origin: str | None):
+    assert PageTokens("127.0.0.1", 8080, None, "look").role_of(asked(host=host, origin=origin)) is None
+
+
+def test_with_a_token_only_who_shows_it_comes_in():
+    guard = PageTokens("0.0.0.0", 8080, "steer", "look")
+    assert guard.role_of(asked(host="lab:8080")) is None
+    assert guard.role_of(asked(token="wrong")) is None
+    assert guard.role_of(asked(token="steer")) == OPERATOR
+    assert guard.role_of(asked(zsim_operator_8080="steer")) == OPERATOR
+    assert guard.role_of(asked(zsim_operator_8081="steer")) is None
+    assert guard.role_of(asked(origin="http://evil.example", zsim_operator_8080="steer")) is None
+    assert guard.role_of(asked(origin="http://[bad", zsim_operator_8080="steer")) is None
+
+
+def test_the_viewers_token_opens_the_viewers_page_alone():
+    guard = PageTokens("0.0.0.0", 8080, "steer", "look")
+    assert guard.role_of(asked("/view", token="look")) == VIEWER
+    assert guard.role_of(asked("/view", zsim_viewer_8080="look")) == VIEWER
+    assert guard.role_of(asked("/view", token="steer")) == VIEWER
+    assert guard.role_of(asked("/", token="look")) is None
+    assert guard.role_of(asked("/", zsim_viewer_8080="look", zsim_operator_8080="look")) is None
+
+
+def test_others_need_a_token():
+    with pytest.raises(RunError, match=r"0\.0\.0\.0"):
+        PageTokens("0.0.0.0", 8080, None, "look")
+    with pytest.raises(RunError, match="token"):
+        PageTokens("127.0.0.1", 8080, "", "look")
+
+
+def test_a_link_names_this_machine_where_all_may_come():
+    assert ListenAddress("127.0.0.1", 8080).url() == "http://127.0.0.1:8080/"
+    assert ListenAddress("::1", 8080).url("/view") == "http://[::1]:8080/view"
+    for everywhere in ("0.0.0.0", "::"):
+        assert ListenAddress(everywhere, 8080).url("/", "a b&#").endswith(":8080/?token=a%20b%26%23")
+        address = ListenAddress(everywhere, 8080).url("/", "steer")
+        assert address == f"http://{socket.gethostname()}:8080/?token=steer"
+
 
 PAGE = "a page"
 

@@ -29,7 +29,7 @@ from zsim_bridges.console.picture import FlightPreview
 from zsim_bridges.console.run_condition import RunCondition, ShownRun, fleet_refusals
 from zsim_bridges.console.run_forms import DURATION_S, FaultForm, FleetForm, RunForm
 
-SCENARIOS = Path(__file__).parents[5] / "scenarios"
+SCENARIOS = Path(__file__).parents[4] / "scenarios"
 PERSON, NOBODY = 1, None  # who moved a slider
 LATER_S = 1e9  # on the wall: long after any move
 
