@@ -1,7 +1,7 @@
-"""Multirotors as meshes, made of simple solids; B is x ahead, y left, z up, its origin at the centre of mass.
+"""Multirotors as meshes of simple solids; B is x ahead, y left, z up, its origin at the centre of mass.
 
-They look like the AR.Drone, as large as their arms are long and with the rotors that they have. Lengths are in metres;
-those that have no name are the AR.Drone's, chosen for the looks, and used in no computation.
+They look like the AR.Drone, scaled by the length of their arms, with their own rotors. Lengths are in metres; those
+without a name are the AR.Drone's, chosen for the looks, and used in no computation.
 """
 
 import math
@@ -40,24 +40,24 @@ class Mesh(NamedTuple):
 
 
 class DroneShape(NamedTuple):
-    """What a drone looks like: its rotors' axes (x, y) and their radius [m]."""
+    """The look of a drone: its rotors' axes (x, y) and their radius [m]."""
 
     hubs_B: tuple[tuple[float, float], ...]
     radius_m: float
 
     @property
     def size(self) -> float:
-        """Return how much larger it is than the AR.Drone, by the longest arm."""
+        """Size relative to the AR.Drone, by the longest arm."""
         return max(math.hypot(x, y) for x, y in self.hubs_B) / ARM_M
 
     @property
     def reach_m(self) -> float:
-        """Return how far its hull reaches from the centre [m]."""
+        """How far its hull reaches from the centre [m]."""
         return self.size * ARM_M + RING * self.radius_m
 
 
 def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
-    """Return what a drone looks like; one whose rotors are not named has four, in a cross of this arm [m]."""
+    """Return the look of a drone; one without named rotors has four, in a cross of this arm [m]."""
     if not drone.rotors:
         hubs = tuple((rotor.x_m, rotor.y_m) for rotor in cross_layout(arm_m))
         return DroneShape(hubs, ROTOR_RADIUS_M * arm_m / ARM_M)
@@ -66,11 +66,11 @@ def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
 
 @cache
 def coloured(shape: DroneShape) -> bytes:
-    """Return a drone without its rotors as GLB, with one surface for each colour."""
+    """Return a drone without rotors as GLB, with one surface for each colour."""
     scene = trimesh.Scene()
     for name, solids in _solids(shape).items():
         solid = _joined(solids)
-        solid.unmerge_vertices()  # else light would run round the edges
+        solid.unmerge_vertices()  # otherwise shading would blur the edges
         look = PBRMaterial(baseColorFactor=(*COLOURS[name], 255), metallicFactor=0.0, roughnessFactor=0.75)
         solid.visual = TextureVisuals(material=look)
         scene.add_geometry(solid, geom_name=name)
@@ -84,22 +84,41 @@ def whole(shape: DroneShape) -> Mesh:
 
 
 def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
-    """Return the solids of a drone by their colour: drawn as large as the AR.Drone, then scaled."""
+    """Return the solids of a drone by colour: drawn as large as the AR.Drone, then scaled."""
     hubs = [(x / shape.size, y / shape.size) for x, y in shape.hubs_B]
-    radius = shape.radius_m / shape.size
+    radius = RING * shape.radius_m / shape.size
+    cross = []
+    for x, y in hubs:
+        beam = box((math.hypot(x, y), 0.014, 0.012))
+        motor, foot = cylinder(0.017, 0.034, sections=12), cylinder(0.006, 0.058, sections=8)
+        cross.append(_moved(beam, (x / 2, y / 2, 0.004), math.atan2(y, x)))
+        cross += [_moved(motor, (x, y, ROTOR_Z_M / 2)), _moved(foot, (0.92 * x, 0.92 * y, -0.029))]
+    ahead = trimesh.transformations.rotation_matrix(math.pi / 2, (0, 1, 0))
+    lens = cylinder(0.013, 0.03, sections=14)  # of the front camera
+    lens.apply_transform(ahead)
+    rings = [annulus(radius - 0.016, radius, 0.042, sections=28) for _ in hubs]  # foam, of the indoor hull
+    body = capsule(height=0.19, radius=0.045, count=[14, 14])  # with the battery, from nose to tail
+    body.apply_transform(ahead)
+    body.apply_scale((1.0, 1.0, 0.72))
+    nose = icosphere(subdivisions=2, radius=0.042)
+    nose.apply_scale((1.25, 1.0, 0.78))
     solids = {
-        "cross": [*map(_arm, hubs), *map(_motor, hubs), *map(_foot, hubs), _lens()],
-        "hull": [*(_ring(hub, RING * radius) for hub in hubs), _body()],
-        "nose": [_nose()],
+        "cross": [*cross, _moved(lens, (0.162, 0, 0.012))],
+        "hull": [
+            *(_moved(ring, (*hub, 0.022)) for ring, hub in zip(rings, hubs, strict=True)),
+            _moved(body, (-body.centroid[0], 0, 0.012)),
+        ],
+        "nose": [_moved(nose, (0.115, 0, 0.012))],
     }
     for solid in (solid for of_one in solids.values() for solid in of_one):
         solid.apply_scale(shape.size)
-    return {**solids, "hat": [_hat()]}
+    hats = Hats()  # by which drones see each other, as large as the cameras have them
+    return {**solids, "hat": [_moved(icosphere(subdivisions=3, radius=hats.diameter_m / 2), hats.position_m)]}
 
 
 @cache
 def rotor() -> Mesh:
-    """Return a propeller about its own axis: two blades, one for the other after half a turn."""
+    """Return a propeller of two blades about its own axis."""
     blades = [_moved(box((ROTOR_RADIUS_M, 0.016, 0.002)), (side * ROTOR_RADIUS_M / 2, 0, 0)) for side in (-1, 1)]
     for side, blade in zip((-1, 1), blades, strict=True):
         blade.apply_transform(trimesh.transformations.rotation_matrix(side * 0.2, (1, 0, 0)))
@@ -133,49 +152,3 @@ def _moved(solid: trimesh.Trimesh, by_m: tuple[float, float, float], yaw: float 
     solid.apply_transform(trimesh.transformations.rotation_matrix(yaw, (0, 0, 1)))
     solid.apply_translation(by_m)
     return solid
-
-
-def _arm(hub: tuple[float, float]) -> trimesh.Trimesh:
-    """The carbon beam from the centre to a rotor."""
-    x, y = hub
-    return _moved(box((math.hypot(x, y), 0.014, 0.012)), (x / 2, y / 2, 0.004), math.atan2(y, x))
-
-
-def _motor(hub: tuple[float, float]) -> trimesh.Trimesh:
-    return _moved(cylinder(0.017, 0.034, sections=12), (*hub, ROTOR_Z_M / 2))
-
-
-def _foot(hub: tuple[float, float]) -> trimesh.Trimesh:
-    return _moved(cylinder(0.006, 0.058, sections=8), (0.92 * hub[0], 0.92 * hub[1], -0.029))
-
-
-def _ring(hub: tuple[float, float], radius: float) -> trimesh.Trimesh:
-    """The foam ring of the indoor hull about a rotor."""
-    return _moved(annulus(radius - 0.016, radius, 0.042, sections=28), (*hub, 0.022))
-
-
-def _body() -> trimesh.Trimesh:
-    """The long body with the battery, from nose to tail."""
-    body = capsule(height=0.19, radius=0.045, count=[14, 14])
-    body.apply_transform(trimesh.transformations.rotation_matrix(math.pi / 2, (0, 1, 0)))
-    body.apply_scale((1.0, 1.0, 0.72))
-    return _moved(body, (-body.centroid[0], 0, 0.012))
-
-
-def _nose() -> trimesh.Trimesh:
-    nose = icosphere(subdivisions=2, radius=0.042)
-    nose.apply_scale((1.25, 1.0, 0.78))
-    return _moved(nose, (0.115, 0, 0.012))
-
-
-def _lens() -> trimesh.Trimesh:
-    """The front camera."""
-    lens = cylinder(0.013, 0.03, sections=14)
-    lens.apply_transform(trimesh.transformations.rotation_matrix(math.pi / 2, (0, 1, 0)))
-    return _moved(lens, (0.162, 0, 0.012))
-
-
-def _hat() -> trimesh.Trimesh:
-    """The ball by which drones see each other, as large as the cameras have it."""
-    hats = Hats()
-    return _moved(icosphere(subdivisions=3, radius=hats.diameter_m / 2), hats.position_m)

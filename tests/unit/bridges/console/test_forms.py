@@ -228,40 +228,39 @@ def bench() -> Bench:
 
 
 @pytest.mark.parametrize(
-    ("label", "asked"),
+    ("label", "gates", "rate", "op", "args"),
     [
-        ("Pause", ("pause", {})),
-        ("Resume", ("resume", {})),
-        ("Step", ("step", {"gates": 7})),
-        ("Set rate", ("rate", {"value": 2.5})),
+        ("Pause", 1.0, 1.0, "pause", {}),
+        ("Resume", 1.0, 1.0, "resume", {}),
+        ("Step", 7.0, 1.0, "step", {"gates": 7}),
+        ("Step", 2.5, 1.0, "step", {"gates": 2.5}),  # what is typed is sent as it is, and the world refuses it
+        ("Set rate", 1.0, 2.5, "rate", {"value": 2.5}),
+        ("Set rate", 1.0, -1.0, "rate", {"value": -1.0}),
     ],
 )
-def test_the_run_is_asked_for_what_the_button_says(bench: Bench, label: str, asked: tuple[Any, ...]):
+def test_the_run_is_asked_for_what_the_button_says(
+    bench: Bench, label: str, gates: float, rate: float, op: str, args: dict[str, Any]
+):
     RunForm(bench.gui, bench.client, 1.0)
-    bench.gui.at["gates"].value, bench.gui.at["rate"].value = 7.0, 2.5
+    bench.gui.at["gates"].value, bench.gui.at["rate"].value = gates, rate
     bench.gui.press(label)
-    assert bench.client.asked == [("world", *asked)]
-    assert all(isinstance(gates, int) for gates in bench.client.asked[0][2].values() if asked[0] == "step")
+    ((_, asked_op, asked),) = bench.client.asked
+    assert (asked_op, asked) == (op, args)
+    assert {name: type(value) for name, value in asked.items()} == {name: type(value) for name, value in args.items()}
 
 
-@pytest.mark.parametrize(
-    ("label", "mode"),
-    [("Take off", "takeoff"), ("Reset", "reset")],
-)
-def test_the_chosen_drone_alone_gets_its_mode(bench: Bench, label: str, mode: str):
+@pytest.mark.parametrize(("label", "mode"), [("Take off", "takeoff"), ("Reset", "reset")])
+def test_the_chosen_drone_alone_gets_its_mode_and_another_page_chooses_for_itself(bench: Bench, label: str, mode: str):
+    other: Any = Gui()
     form = DroneForm(bench.gui, bench.client, bench.names)
+    DroneForm(other, bench.client, bench.names)
     bench.gui.at["drone"].put(bench.names[1])
+    other.at["drone"].put(bench.names[2])
     button = bench.gui.at[f"{label} {bench.names[0]}"]
     assert button.label == f"{label} {bench.names[1]}"
     button.put(None)
     assert form.chosen == bench.names[1]
     assert bench.client.asked == [((bench.names[1],), mode)]
-
-
-def test_all_formations_and_all_drones_of_none_take_off(bench: Bench):
-    FleetForm(bench.gui, bench.client, mixed())
-    bench.gui.press("Take off all")
-    assert bench.client.asked == [("main", "takeoff", {}), ("other", "takeoff", {}), (("d5", "d6"), "takeoff")]
 
 
 def test_a_command_is_for_all_that_are_selected_and_would_not_refuse_it(bench: Bench):
@@ -314,14 +313,15 @@ def test_what_is_previewed_is_flown_once_it_is_asked_for(bench: Bench):
     assert bench.outcomes == []
 
 
-@pytest.mark.parametrize("alone", [True, False])
-def test_all_drones_are_in_formations_or_none_is(bench: Bench, alone: bool):
+@pytest.mark.parametrize(("led", "single"), [(True, True), (True, False), (False, True)])
+def test_all_formations_and_all_drones_of_none_take_off(bench: Bench, led: bool, single: bool):
     scenario = mixed()
-    clusters, drones = ([], scenario.drones[4:]) if alone else (scenario.clusters, scenario.drones[:4])
+    drones = scenario.drones[0 if led else 4 : 6 if single else 4]
+    clusters = scenario.clusters if led else []
     FleetForm(bench.gui, bench.client, msgspec.structs.replace(scenario, clusters=clusters, drones=drones))
     bench.gui.press("Take off all")
     formations = [("main", "takeoff", {}), ("other", "takeoff", {})]
-    assert bench.client.asked == ([(("d5", "d6"), "takeoff")] if alone else formations)
+    assert bench.client.asked == [*formations * led, *[(("d5", "d6"), "takeoff")] * single]
 
 
 @pytest.mark.parametrize(("label", "op", "held"), [("Land", "land", False), ("Emergency", "emergency", True)])
@@ -332,13 +332,6 @@ def test_the_chosen_drone_alone_is_ordered_to_land_or_stop(bench: Bench, label: 
     assert button.label == f"{label} {bench.names[1]}"
     hold = {"zsim-hold": "1"} if held else {}
     assert button.order == {"zsim-order": op, "drone": bench.names[1], **hold}
-
-
-@pytest.mark.parametrize("op", ["hold", "land"])
-def test_a_formation_is_ordered_to_hold_and_to_land(bench: Bench, op: str):
-    bench.formation()
-    button: Any = bench.gui.at[op.capitalize()]
-    assert button.order == {"zsim-order": op, "cluster": bench.cluster.name}
 
 
 def test_an_order_is_given_to_a_world_that_is_silent(bench: Bench):
@@ -475,16 +468,6 @@ def test_all_drones_that_stopped_are_reset_at_once(bench: Bench):
     assert bench.client.asked == [(("drone1", "drone3"), "reset")]
 
 
-def test_the_choice_of_one_page_is_not_that_of_another(bench: Bench):
-    other = Gui()
-    mine = DroneForm(bench.gui, bench.client, bench.names)
-    DroneForm(other, bench.client, bench.names)  # type: ignore[arg-type]
-    other.at["drone"].put(bench.names[2])
-    bench.gui.press(f"Reset {bench.names[0]}")
-    assert mine.chosen == bench.names[0]
-    assert bench.client.asked == [((bench.names[0],), "reset")]
-
-
 def test_a_drone_is_offered_what_its_state_takes_and_always_its_emergency(bench: Bench):
     form = DroneForm(bench.gui, bench.client, bench.names)
     form.refresh(flown())
@@ -493,29 +476,22 @@ def test_a_drone_is_offered_what_its_state_takes_and_always_its_emergency(bench:
     assert locked == {"Take off": True, "Land": False, "Emergency": False, "Reset": True}
 
 
-def test_a_value_out_of_range_stands_beside_its_slider(bench: Bench):
-    form = bench.formation()
-    slider = bench.gui.at["p [m]"]
-    assert has_terms(slider.label, "p", "not known")
-    form.refresh(bench.view(p=25.37), LATER_S)
-    assert has_terms(slider.label, "p", "25.4 m")
-    form.refresh(bench.view(p=4.0), LATER_S)
-    assert slider.label == "p [m]"
-
-
 def test_a_slider_shows_a_value_out_of_its_range_as_it_is_and_does_not_ask_for_it(bench: Bench):
     form = bench.formation()
     height, tilt, side = (bench.gui.at[label] for label in ("z_c [m]", "pitch [deg]", "p [m]"))
     limits = [(each.min, each.max) for each in (height, tilt, side)]
+    assert has_terms(side.label, "p", "not known")
     form.refresh(bench.view(z_c=0.1, pitch=math.radians(74.9), p=25.37), LATER_S)
     assert (height.value, tilt.value, side.value) == (0.1, 75.0, 25.4)
     assert (height.min, tilt.max, side.max) == (0.1, 75.0, 25.4)
+    assert has_terms(side.label, "p", "25.4 m")
     tilt.put(60.0)
     form.send(LATER_S)
     assert bench.client.asked == []
     assert has_terms(bench.outcomes[0].refusal, "pitch", "60 deg")
     form.refresh(bench.view(z_c=3.0, p=4.0), LATER_S)
     assert [(each.min, each.max) for each in (height, tilt, side)] == limits
+    assert side.label == "p [m]"
 
 
 def test_waypoints_begin_where_the_formation_is_in_the_units_of_the_page(bench: Bench):
@@ -545,13 +521,12 @@ def test_waypoints_follow_the_formation_until_somebody_edits_them(bench: Bench):
 
 
 def test_waypoints_stand_still_in_the_noise_of_an_estimate_and_end_where_the_formation_does(bench: Bench):
-    form, text = bench.formation(), bench.gui.at[WAYPOINTS]
-    form.refresh(bench.view(x_c=5.0), LATER_S)
-    first = text.value
-    form.refresh(bench.view(x_c=5.05), LATER_S)
-    assert text.value == first
-    form.refresh(bench.view(x_c=5.05), LATER_S)
-    assert has_terms(text.value, "x_c = 5.05")
+    form, text, shown = bench.formation(), bench.gui.at[WAYPOINTS], []
+    for x_c in (5.0, 5.05, 5.05):
+        form.refresh(bench.view(x_c=x_c), LATER_S)
+        shown.append(text.value)
+    assert shown[0] == shown[1]
+    assert has_terms(shown[2], "x_c = 5.05")
 
 
 # Faults
@@ -589,17 +564,16 @@ def test_a_common_fault_strikes_what_it_says_with_its_magnitude(
     told = without_tags(form._strikes.content.replace("<br>", "\n"))
     struck = "drones" if target == "world" else target.rpartition("/")[2]
     assert has_terms(told, label, struck)
+    assert has_terms(told, "Messages lost", "processes", "world", "no radio")  # a link of processes is none
     assert magnitude is None or has_terms(told, label, f"{magnitude[1]:g}")
-
-
-def test_a_link_of_processes_is_not_called_a_radio(bench: Bench):
-    form = FaultForm(bench.gui, bench.client, bench.outcomes.append, bench.scenario)
-    told = without_tags(form._strikes.content.replace("<br>", "\n"))
-    assert has_terms(told, "Messages lost", "processes", "world", "estimator.drone1", "no radio")
 
 
 def test_a_fault_of_no_duration_lasts_until_it_is_cleared(bench: Bench):
     bench.faults()
+    bench.gui.at["for [s]"].value = -1.0
+    bench.gui.press("GPS lost")
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, "for", "-1 s", "from 0")
     bench.gui.at["for [s]"].value = 0.0
     bench.gui.press("GPS lost")
     bench.gui.press("Clear all faults")
@@ -615,6 +589,9 @@ def test_any_fault_is_injected_as_it_is_typed_in_a_terminal(bench: Bench):
     bench.gui.press("Inject it")
     asked = {"kind": "accel_bias", "target": "drone3", "value_m_s2": [0.5, 0, 0], "for_s": 5.0, "at_s": 120.0}
     assert bench.client.asked == [("world", "fault_add", asked)]
+    bench.gui.at["kind"].put("process_kill")
+    bench.gui.press("Inject it")  # without a duration
+    assert bench.client.asked[1:] == [("world", "fault_add", {"kind": "process_kill", "target": "estimator.drone1"})]
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
@@ -636,61 +613,39 @@ def test_a_kind_that_is_chosen_has_a_target_that_it_may_strike_and_its_magnitude
         ("gps_dropout", "probability=", ("probability", "missing", "from 0 to 1")),
         ("rotor_efficiency", "", ("rotor", "missing", "front_left")),
         ("gust", "", ("velocity_m_s", "missing", "m/s")),
+        *(
+            (None, text, ("parameters",))
+            for text in ("value", "'" * 3, "probability=1 probability=0", "probability=[", "probability: 1")
+        ),
+        *((None, f"probability=1 {text}", (text.split()[0], "10s")) for text in ("--for", "--for 10h", "--at soon")),
+        *(
+            (None, f"{name}=x", (repr(name), "known", "probability=VALUE", "--at", "--for"))
+            for name in ("op", "self", "value")
+        ),
     ],
 )
-def test_a_magnitude_that_is_not_stated_is_refused_and_nothing_is_struck(
-    bench: Bench, kind: str, text: str, terms: tuple[str, ...]
+def test_parameters_that_are_not_understood_are_refused_and_nothing_is_struck(
+    bench: Bench, kind: str | None, text: str, terms: tuple[str, ...]
 ):
     bench.faults()
-    bench.gui.at["kind"].put(kind)
+    if kind:
+        bench.gui.at["kind"].put(kind)
     bench.gui.at["parameters"].value = text
     bench.gui.press("Inject it")
     assert bench.client.asked == []
     assert has_terms(bench.outcomes[0].refusal, *terms)
 
 
-def test_a_kill_by_its_kind_is_sent_without_a_duration(bench: Bench):
-    bench.faults()
-    bench.gui.at["kind"].put("process_kill")
-    bench.gui.press("Inject it")
-    assert bench.client.asked == [("world", "fault_add", {"kind": "process_kill", "target": "estimator.drone1"})]
-
-
-@pytest.mark.parametrize("text", ["value", "'" * 3, "probability=1 probability=0", "probability=[", "probability: 1"])
-def test_parameters_that_are_none_are_told_and_not_sent(bench: Bench, text: str):
-    bench.faults()
-    bench.gui.at["parameters"].value = text
-    bench.gui.press("Inject it")
-    assert bench.client.asked == []
-    assert "parameters" in bench.outcomes[0].refusal
-
-
-@pytest.mark.parametrize("text", ["--for", "--for 10h", "--at soon"])
-def test_a_time_that_is_none_is_told_and_not_sent(bench: Bench, text: str):
-    bench.faults()
-    bench.gui.at["parameters"].value = f"probability=1 {text}"
-    bench.gui.press("Inject it")
-    assert bench.client.asked == []
-    assert has_terms(bench.outcomes[0].refusal, text.split()[0], "10s")
-
-
-@pytest.mark.parametrize("name", ["op", "self", "value"])
-def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name: str):
-    bench.faults()
-    bench.gui.at["parameters"].value = f"{name}=x"
-    bench.gui.press("Inject it")
-    assert bench.client.asked == []
-    assert has_terms(bench.outcomes[0].refusal, f"{name!r}", "known", "probability=VALUE", "--at", "--for")
-
-
 # A formation
 
 
-@pytest.mark.parametrize(("label", "op"), [("Take off", "takeoff"), ("Engage", "engage")])
-def test_a_formation_is_asked_for_its_phase(bench: Bench, label: str, op: str):
+def test_a_formation_is_asked_for_its_phase_or_ordered_to_hold_and_land(bench: Bench):
     bench.formation()
-    bench.gui.press(label)
-    assert bench.client.asked == [(bench.cluster.name, op, {})]
+    for label in ("Take off", "Engage"):
+        bench.gui.press(label)
+    assert bench.client.asked == [(bench.cluster.name, "takeoff", {}), (bench.cluster.name, "engage", {})]
+    orders: list[Any] = [bench.gui.at[label].order for label in ("Hold", "Land")]
+    assert orders == [{"zsim-order": op, "cluster": bench.cluster.name} for op in ("hold", "land")]
 
 
 def test_sliders_that_rest_are_sent_together_and_once(bench: Bench):
@@ -725,17 +680,13 @@ def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: B
     assert bench.gui.at["p [m]"].value == 5.1
 
 
-def test_people_are_told_of_targets_in_the_units_of_the_page(bench: Bench):
-    bench.formation().request_target({"p": 5.0, "yaw": 180.0})
-    (line,) = bench.client.shown
-    assert has_terms(line, "p 5 m", "yaw 180 deg")
-
-
-def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):
+def test_a_move_lasts_as_long_as_is_asked_for_and_is_told_in_the_units_of_the_page(bench: Bench):
     form = bench.formation()
     bench.gui.at["over [s]"].value = 20.0
-    form.request_target({"p": 5.0})
-    assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0}, "over_s": 20.0})]
+    form.request_target({"p": 5.0, "yaw": 180.0})
+    values = {"p": 5.0, "yaw": pytest.approx(math.pi)}
+    assert bench.client.asked == [(bench.cluster.name, "target", {"values": values, "over_s": 20.0})]
+    assert has_terms(bench.client.shown[0], "p 5 m", "yaw 180 deg")
 
 
 def test_a_number_out_of_range_is_refused_and_its_limit_is_flown_when_it_is_typed(bench: Bench):
@@ -774,28 +725,6 @@ def test_a_time_out_of_range_is_refused_with_the_move(bench: Bench, over_s: floa
     form.request_target({"p": 5.0})
     assert bench.client.asked == []
     assert has_terms(bench.outcomes[0].refusal, "over", f"{over_s:g} s", "0 to 3600")
-
-
-def test_what_is_typed_for_the_run_is_asked_for_as_it_is(bench: Bench):
-    RunForm(bench.gui, bench.client, 1.0)
-    bench.gui.at["rate"].value, bench.gui.at["gates"].value = -1.0, 2.5
-    bench.gui.press("Set rate")
-    bench.gui.press("Step")
-    assert bench.client.asked == [("world", "rate", {"value": -1.0}), ("world", "step", {"gates": 2.5})]
-
-
-def test_a_fault_of_no_time_is_refused(bench: Bench):
-    bench.faults()
-    bench.gui.at["for [s]"].value = -1.0
-    bench.gui.press("GPS lost")
-    assert bench.client.asked == []
-    assert has_terms(bench.outcomes[0].refusal, "for", "-1 s", "from 0")
-
-
-def test_a_value_out_of_range_is_told_and_not_sent(bench: Bench):
-    bench.formation().request_target({"p": 0.5})
-    assert bench.client.asked == []
-    assert has_terms(bench.outcomes[0].refusal, "p", "0.5 m")
 
 
 def test_of_many_variables_the_others_are_moved_one_at_a_time():
