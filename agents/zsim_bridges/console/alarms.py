@@ -133,8 +133,6 @@ def foreign_commanders(
     Args:
         controller: expected name of the formation's process; where it flies no drone, the controller may have another
             name, so only consoles count as foreign.
-        members: names of the drones.
-        commanders: who flies each drone.
         roles: of processes, as far as known.
     """
     others = {drone: who for drone in members if (who := commanders.get(drone)) and who != controller}
@@ -322,10 +320,7 @@ class FaultWatch:
         Args:
             begun: faults that have begun, instantaneous ones among them.
             active: those that act now.
-            drones: the condition of each.
-            phases: of each formation.
             lost: processes that are dead or silent.
-            wind_m_s: over the drones.
         """
         acting = {fault.id: fault for fault in active}
         known = {fault.id: fault for fault in begun} | acting

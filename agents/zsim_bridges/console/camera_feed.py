@@ -67,11 +67,9 @@ class CameraFeed:
     """The cameras of one run, each named `DRONE/CAMERA`; only those that a page watches are subscribed to.
 
     Args:
-        link: an open session.
         observer: of the console in the run; counts what is received and refused.
         drones: of the run; cameras of others are ignored.
         hat_m: diameter of a hat [m].
-        wall_s: monotonic.
 
     Attributes:
         refused: number of refused pictures by camera.

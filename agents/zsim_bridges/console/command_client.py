@@ -62,7 +62,6 @@ class CommandClient:
     """Sends requests in the console's name.
 
     Args:
-        link: an open session.
         name: of the console's process.
         views: know which commands have been answered.
         now_ns: simulated time for a stamp; may poll the world.

@@ -37,8 +37,6 @@ class ConsolePage:
 
     Args:
         gui: viser's; the controls of another run are removed.
-        run: what does not change.
-        client: sends requests.
         report: called with requests that are refused here.
         show: shows or hides one of `SWITCHES` in the scene.
         choose_trail: sets the length of trails [s].
@@ -176,11 +174,8 @@ class PageForms:
     """Adds its own controls to each page of a run, and keeps them.
 
     Args:
-        server: viser's.
-        client: sends requests.
         shared: the controls of all pages, with folders for those of each.
         names, radii_m: of the drones.
-        desk: which page is in control.
         part_of: returns what a page must be in control of to let a drone take off.
         request_return: lets drones return to their starts.
     """

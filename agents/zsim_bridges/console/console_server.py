@@ -27,11 +27,8 @@ class Console:
     """One console.
 
     Args:
-        address: where pages are served.
-        name: process name.
         token: of operators; None on this machine alone.
         rate_hz: pictures a second; None: by the number of drones.
-        say: prints a line.
         world: where a run is looked for, in words.
         folder: where the run that is shown is recorded, if known here.
 

@@ -89,7 +89,6 @@ class TableRows:
     """Makes rows and tables of the newest views.
 
     Args:
-        views: the newest ones.
         own_rates: of the user's sensors [Hz], by drone and sensor.
         severity_of: returns the severity of a drone's worst alarm.
     """
@@ -170,7 +169,6 @@ def drone_table(
     """Return a table of drones.
 
     Args:
-        rows: in their order.
         figures: of their flight by name.
         selected: names of those that one command is for.
         chosen: whose instruments are shown.

@@ -55,7 +55,6 @@ class ControlDesk:
     Args:
         parts: the formations; RUN is added.
         tell: shows a line of text on a page.
-        wall_s: monotonic.
     """
 
     def __init__(
@@ -201,8 +200,6 @@ class ControlForm:
     """Who is in control, on one page, with buttons to ask for control, grant it and give it up.
 
     Args:
-        gui: viser's of that page, in the folder where it is to be.
-        desk: which page is in control.
         page: viser's number of this one.
         part_of: part of each shared control by its id, which its element on the page has, too.
     """

@@ -51,9 +51,6 @@ class DroneForm:
     """Modes of one drone, or of all that are selected, on one page.
 
     Args:
-        gui: viser's of that page, in the folder where they are to be.
-        client: sends requests.
-        names: of the drones.
         may: returns why this page may not let a drone take off or reset it; with true, it takes control to do so.
         request_return: lets drones return to their starts, and land.
     """

@@ -73,12 +73,7 @@ class FormationForm:
     """Controls of one formation.
 
     Args:
-        gui: viser's, in the folder where they are to be.
-        client: sends requests.
         report: called with requests that are refused here.
-        cluster: of the scenario.
-        space: of the formation.
-        ranges: of its variables.
         request_return: lets a formation move over the middle of its starts, and land.
         show_preview: shows in the scene what would be flown; None: nothing.
 

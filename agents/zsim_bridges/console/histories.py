@@ -130,7 +130,6 @@ class VariableHistory:
     """Points of some variables, each with the values of `SERIES`.
 
     Args:
-        size: number of variables.
         around: whether they are of a record.
     """
 
@@ -185,8 +184,6 @@ class VariableHistory:
         A curve is broken (NaN) where an angle wraps around.
 
         Args:
-            index: of the variable.
-            angular: whether it is an angle.
             span_s: length of the curves.
             less: the one of `SERIES` that is subtracted, for errors; None for values.
             at_s: the middle of the curves; None: they end with the newest point.

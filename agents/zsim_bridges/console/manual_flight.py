@@ -205,14 +205,10 @@ class ManualFlight:
     """Flies drones for pages, each identified by any hashable value; thread-safe.
 
     Args:
-        client: sends commands.
         name: of the console's process.
-        limits: of each drone.
-        fence: of all.
         gate_s: simulated seconds of a gate, for which one command is sent at most.
         sight_of: returns what is known of a drone.
         run_sight: returns what is known of the run.
-        wall_s: monotonic.
     """
 
     def __init__(

@@ -131,7 +131,6 @@ def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] =
     """Return the arguments of a trajectory of lines `variable = expression`; other names are constants.
 
     Args:
-        text: of the operator.
         names: of the formation's variables.
         angles: those of them whose expressions are in degrees; `NAME_deg` is the same as `NAME`.
 
@@ -181,12 +180,7 @@ def parse_waypoints(text: str, ranges: Mapping[str, SliderRange]) -> dict[str, A
 
 
 def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str:
-    """Return waypoints that begin where a formation is, in the units of the page.
-
-    Args:
-        value: of its variables [m, rad].
-        ranges: of its variables.
-    """
+    """Return waypoints that begin where a formation is, in the units of the page."""
     pairs = [
         f"{each.name} = {round(each.in_unit(here), 2):g}"
         for each, here in zip(ranges, value, strict=True)

@@ -117,15 +117,11 @@ class OrderBook:
     """Carries out orders of one run; thread-safe.
 
     Args:
-        client: sends to the world.
-        run_id: of the run.
         members: drones of each formation.
-        drones: names of all.
         refusal: returns why nothing can be flown at all, apart from a silent world; otherwise empty.
         now_ns: returns the simulated time of the newest clock.
         silent_s: returns for how long the world has not answered [s; wall].
         external: drones whose modes the world only forwards; their states alone show an effect.
-        wall_s: monotonic.
     """
 
     def __init__(

@@ -49,14 +49,7 @@ class PageFlying:
     """Single drones for the pages of one run, which viser's number identifies.
 
     Args:
-        run: what does not change of it.
-        client: sends commands.
         name: of the console's process.
-        views: the newest of everything.
-        time_monitor: of the run's clock.
-        monitor: has the run's condition.
-        scene: has the drones' poses and trails.
-        pages: have the drone that each has chosen.
         note: called with a drone or formation whose return is over, and why.
 
     Attributes:
@@ -218,8 +211,6 @@ class ReturnFlights:
     """Returns of the drones and formations of a run; thread-safe.
 
     Args:
-        scenario: has the starts.
-        client: sends requests.
         control: flies drones to places.
         sight_of: returns what is known of a drone.
         clusters: returns the newest view of each formation.

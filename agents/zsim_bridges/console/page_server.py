@@ -177,9 +177,7 @@ class HttpProxy:
     """One server of pages.
 
     Args:
-        address: where pages are served.
         token: of operators; None where only this machine can connect.
-        backend: see ViserBackend.
 
     Raises:
         RunError: others could reach it, and there is no token.

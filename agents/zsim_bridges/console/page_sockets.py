@@ -128,7 +128,6 @@ class ActionSockets:
 
     Args:
         client_id: returns viser's number of a page by its key, None if it is not open.
-        cameras: of all pages.
         record: returns what a replay plays, None without a run.
         flying: returns what pages may do with single drones, None without a run.
     """
@@ -280,7 +279,6 @@ class CameraSockets:
 
     Args:
         feed: returns the cameras of the run that is shown, None without one.
-        frustums: in the scenes of the pages.
     """
 
     def __init__(self, feed: Callable[[], CameraFeed | None], frustums: CameraFrustums) -> None:

@@ -206,7 +206,6 @@ def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Arra
     """Return the ways of a `target` or `trajectory`; the controller may still refuse it, or fly it slower.
 
     Args:
-        space: of the formation.
         op, args: of the request, as sent.
         base: (4n,), where the formation is desired now.
         apart_min_m: least distance of two drones that the controller demands.

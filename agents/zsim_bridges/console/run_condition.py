@@ -90,7 +90,6 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
     """Return the checks of a drone.
 
     Args:
-        drone: its condition.
         in_formation: whether a controller flies it, which needs its estimator.
         foreign: who flies it, if neither this console nor its formation's controller; otherwise empty.
     """
@@ -324,9 +323,6 @@ def page_head(
     """Return the head of the page of a run as plain data.
 
     Args:
-        name: of the scenario.
-        run: its condition.
-        clock: the newest.
         t_ns: simulated time of what is shown.
         alarms: as `AlarmBoard.rows`.
         single: drones of no formation.

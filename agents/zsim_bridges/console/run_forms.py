@@ -125,8 +125,6 @@ class FaultForm:
     """Controls of faults: common ones of a chosen drone, and any fault.
 
     Args:
-        gui: viser's, in the folder where they are to be.
-        client: sends requests.
         report: called with requests that are refused here.
         scenario: has the drones and processes.
         drones: of the run, with the names of their rotors; where they have none, the AR.Drone's.
@@ -252,9 +250,6 @@ class OrderButton:
     """A button of an order, which its page repeats until it is confirmed: the page's own HTML, not one of viser's.
 
     Args:
-        gui: viser's, in the folder where it is to be.
-        label: of the button.
-        op: see `OrderRequest`.
         of: what it concerns: {"drone": name}, several separated by commas, or {"cluster": name}.
         held: whether it must be held for a while.
     """

@@ -27,9 +27,6 @@ class RunMonitor:
     """Follows the condition of a run.
 
     Args:
-        views: the newest ones.
-        time_monitor: of the run's clock.
-        run: what does not change.
         world: where the run is, in words.
 
     Attributes:

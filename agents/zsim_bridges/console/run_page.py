@@ -52,9 +52,6 @@ class RunPage:
 
     Args:
         server: viser's; what another run has left on it is removed.
-        link: an open session.
-        info: of the run.
-        observer: of the console in it.
         camera_follow: moves the page's cameras that follow the formation.
         frustums: of the drones' cameras, on the pages where they are chosen.
         rate_hz: pictures a second; None: by the number of drones and the rate of the run.

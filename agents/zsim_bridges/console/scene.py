@@ -161,10 +161,8 @@ class SceneNodes:
 
     Args:
         server: viser's; its scene is cleared.
-        drones: of the run.
         arms_m: centre to rotor, of each.
         robots: number of drones in formations, each with a ghost.
-        clusters: number of formations.
 
     Attributes:
         radii_m: (N,), how far each drone reaches from its centre.

@@ -67,10 +67,8 @@ class TimeMonitor:
     """Polls the run's clock in a thread of its own, so that drawing waits for no answer.
 
     Args:
-        link: an open session.
         observer: of the console in the run; it follows the run's clock.
         stamp_age_s: simulated; how old the time of a stamp may be.
-        wall_s: monotonic.
 
     Attributes:
         clock: the newest answer.
@@ -167,10 +165,7 @@ class RecordPlayer:
     """Controls the time of a replay, and reads its record around the shown instant, piece by piece.
 
     Args:
-        client: sends requests.
-        time_monitor: of the run's clock.
         is_replay: whether the run is a replay; otherwise everything here does nothing.
-        drones: number of drones.
 
     Attributes:
         timeline: from_s, to_s [s] and marks (t_s, kind, text); empty before `load`.

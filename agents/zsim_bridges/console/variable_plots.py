@@ -75,10 +75,6 @@ class VariablePlots:
     """Plots of one formation and of its drones, three variables at a time.
 
     Args:
-        gui: viser's, in the folder where they are to be.
-        cluster: the formation.
-        ranges: of its variables.
-        flights: of the drones of the run.
         replayed: whether it is a replay, whose curves extend beyond the shown instant.
 
     Attributes:

@@ -73,12 +73,8 @@ class ViewBuffer:
     Callbacks run in Zenoh's threads.
 
     Args:
-        link: an open session.
-        info: of the run.
-        observer: of the console in it.
         variables: names of each formation's variables; views of other formations or variables are refused.
         refused: called with the event of each of the console's commands that the world refuses.
-        wall_s: monotonic.
         asked: called with a formation and a description of each request that somebody else makes of it.
 
     Attributes:
