@@ -1,9 +1,11 @@
 """Controls that each page has for itself: a page that goes takes nothing with it."""
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
+from fake_gui import Control, Gui
 from refused import has_terms, without_tags
 
 from zsim_bridges.console import scene
@@ -182,30 +184,11 @@ def test_a_page_that_asks_and_is_closed_is_not_given_control():
     assert desk.holders() == [ONE, ""]
 
 
-class Button(SimpleNamespace):
-    def press(self) -> None:
-        self.act(None)
+class ControlGui(Gui):
+    """The controls of one page, of which several may have the same label."""
 
-
-class ControlGui:
-    """The controls of one page, by the order in which they were added."""
-
-    def __init__(self) -> None:
-        self.html: list[Any] = []
-        self.buttons: list[Any] = []
-
-    def add_html(self, _: str) -> Any:
-        self.html.append(SimpleNamespace(content=""))
-        return self.html[-1]
-
-    def add_button(self, label: str, **look: Any) -> Any:
-        made = Button(label=label, visible=look.get("visible", True), disabled=False, hint=None)
-        made.on_click = lambda act: setattr(made, "act", act)
-        self.buttons.append(made)
-        return made
-
-    def add_dropdown(self, _: str, options: list[str]) -> Any:
-        return SimpleNamespace(value=options[0], on_update=lambda _: None)
+    def _add(self, label: str | None, value: Any = None, options: Sequence[str] = ()) -> Control:
+        return Control(value, label or "", options)
 
     def offered(self) -> list[str]:
         return [button.label for button in self.buttons if button.visible]

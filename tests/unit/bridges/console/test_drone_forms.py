@@ -1,9 +1,9 @@
 """How a page sorts and filters its drones, and selects several of them for one command."""
 
-from contextlib import nullcontext
 from typing import Any
 
 import pytest
+from fake_gui import Gui
 
 from zsim_bridges.console.alarms import DroneCondition
 from zsim_bridges.console.console_tables import DroneRow, drone_table
@@ -71,41 +71,11 @@ def test_every_order_and_choice_is_tried():
     assert len(FILTERS) == 6
 
 
-class Control:
-    def __init__(self, value: Any = "") -> None:
-        self.value, self.content, self.act = value, "", lambda _: None
-
-    def on_click(self, act: Any) -> None:
-        self.act = act
-
-
-class Gui:
-    """Controls that keep what they are given."""
-
-    def __init__(self) -> None:
-        self.by_label: dict[str, Control] = {}
-
-    def add_dropdown(self, label: str, options: list[str], initial_value: str = "") -> Control:
-        return self.by_label.setdefault(label, Control(initial_value or options[0]))
-
-    def add_folder(self, _: str, expand_by_default: bool) -> Any:
-        return nullcontext()
-
-    def add_text(self, label: str, value: str, **_: Any) -> Control:
-        return self.by_label.setdefault(label, Control(value))
-
-    def add_button_group(self, label: str, options: list[str]) -> Control:
-        return self.by_label.setdefault(label, Control(options[0]))
-
-    def add_html(self, _: str) -> Control:
-        return Control()
-
-
 @pytest.mark.parametrize(("count", "order"), [(MANY, "as in the scenario"), (MANY + 1, "worst first")])
 def test_of_many_drones_the_worst_stand_first(count: int, order: str):
     gui: Any = Gui()
     FleetTable(gui, [f"drone{i}" for i in range(count)], lambda: None)
-    assert gui.by_label["sort by"].value == order
+    assert gui.at["sort by"].value == order
 
 
 def test_drones_are_selected_one_by_one_and_as_they_are_shown():
@@ -117,19 +87,19 @@ def test_drones_are_selected_one_by_one_and_as_they_are_shown():
     table.toggle("stranger")
     assert seen == [["drone3"], ["drone1", "drone3"]]
     table.toggle("drone3")
-    gui.by_label["show"].value = "battery low"
+    gui.at["show"].value = "battery low"
     table.show(ROWS, {}, "drone2")
-    gui.by_label["select"].act(None)
+    gui.at["select"].press()
     assert table.selected == ["drone1", "drone2", "drone3"]
     table.show(ROWS, {}, "drone2")
     html = str(table.table.content)
     assert html.count("aria-checked=true") == 2
     assert html.count("data-zsim-chosen") == 2  # both rows of the drone whose instruments are shown
-    gui.by_label["filter"].value = "nothing like that"
+    gui.at["filter"].value = "nothing like that"
     table.show(ROWS, {}, "drone2")
     assert NO_ROW in str(table.table.content)
-    gui.by_label["select"].value = "none"
-    gui.by_label["select"].act(None)
+    gui.at["select"].value = "none"
+    gui.at["select"].press()
     assert table.selected == []
 
 

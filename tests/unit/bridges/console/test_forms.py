@@ -1,14 +1,13 @@
 """The console's forms: what each control of the page asks for. The page is one that notes its controls."""
 
 import math
-import re
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
+from fake_gui import NOBODY, Gui, OrderHtml
 from refused import has_terms, without_tags
 
 from zsim.contract.views import ViewCluster
@@ -30,151 +29,7 @@ from zsim_bridges.console.run_condition import RunCondition, ShownRun, fleet_ref
 from zsim_bridges.console.run_forms import DURATION_S, FaultForm, FleetForm, RunForm
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
-PERSON, NOBODY = 1, None  # who moved a slider
 LATER_S = 1e9  # on the wall: long after any move
-
-
-class Control:
-    """A control: its value, and what happens when somebody uses it."""
-
-    def __init__(self, value: Any = None) -> None:
-        self.value = value
-        self.min, self.max = -math.inf, math.inf  # of a slider
-        self.content = ""
-        self.visible = True
-        self.disabled = False
-        self.hint: str | None = None
-        self.label = ""
-        self.acts: list[Callable[[Any], None]] = []
-
-    def __enter__(self) -> "Control":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return
-
-    def on_click(self, act: Callable[[Any], None]) -> None:
-        self.acts.append(act)
-
-    on_update = on_click
-
-    def put(self, value: Any, client_id: int | None = PERSON) -> None:
-        """Change the value as a page does, or as the console itself does."""
-        self.value = value
-        for act in self.acts:
-            act(SimpleNamespace(client_id=client_id))
-
-    def add_tab(self, label: str, icon: Any = None) -> "Control":
-        return Control()
-
-    def dock_left(self) -> None:
-        return
-
-    dock_right = dock_left
-
-    def set_width(self, _: float) -> None:
-        return
-
-
-class OrderHtml(Control):
-    """A button of an order: HTML, of which the page makes the order when it is pressed."""
-
-    @property
-    def order(self) -> dict[str, str]:
-        return dict(re.findall(r'data-([\w-]+)="([^"]*)"', self.content))
-
-    @property
-    def label(self) -> str:
-        return re.findall(r">([^<>]+)</button>", self.content)[0] if self.content else ""
-
-    @label.setter
-    def label(self, _: str) -> None: ...
-
-    @property
-    def hint(self) -> str | None:
-        return re.findall(r'title="([^"]*)"', self.content)[0] or None
-
-    @hint.setter
-    def hint(self, _: str | None) -> None: ...  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    @property
-    def disabled(self) -> bool:
-        return " disabled>" in self.content
-
-    @disabled.setter
-    def disabled(self, _: bool) -> None: ...
-
-
-class Gui:
-    """A page that notes its controls by their label."""
-
-    def __init__(self) -> None:
-        self.main_panel = Control()
-        self.at: dict[str, Control] = {}
-
-    def _add(self, label: str | None, value: Any = None) -> Control:
-        control = Control(value)
-        if label is not None:
-            assert label not in self.at, f"two controls are called {label!r}"
-            self.at[label] = control
-        return control
-
-    def add_button(self, label: str, **_: Any) -> Control:
-        return self._add(label)
-
-    def add_button_group(self, label: str, options: list[str]) -> Control:
-        return self._add(label, options[0])
-
-    def add_dropdown(self, label: str, options: list[str], initial_value: str | None = None) -> Control:
-        return self._add(None if label in self.at else label, initial_value or options[0])
-
-    def add_number(self, label: str, value: float, **_: Any) -> Control:
-        return self._add(label, value)
-
-    def add_slider(self, label: str, low: float, high: float, step: float, value: float) -> Control:
-        slider = self._add(label, value)
-        slider.min, slider.max = low, high
-        return slider
-
-    def add_text(self, label: str, value: str, **_: Any) -> Control:
-        return self._add(label, value)
-
-    def add_checkbox(self, label: str, value: bool, **_: Any) -> Control:
-        return self._add(label, value)
-
-    def add_folder(self, label: str | None, **_: Any) -> Control:
-        return Control()
-
-    def add_html(self, content: str, **_: Any) -> Control:
-        if "data-zsim-order" not in content:
-            return Control()
-        button = OrderHtml()
-        button.content = content
-        self.at[button.label] = button
-        return button
-
-    def add_uplot(self, *_: Any, **__: Any) -> Control:
-        return Control()
-
-    def add_markdown(self, _: str) -> Control:
-        return Control()
-
-    def add_tab_group(self) -> Control:
-        return Control()
-
-    add_panel = add_tab_group
-
-    def reset(self) -> None:
-        return
-
-    def configure_theme(self, **_: Any) -> None:
-        return
-
-    def set_panel_label(self, _: str) -> None:
-        return
-
-    def press(self, label: str) -> None:
-        self.at[label].put(None)
 
 
 class FakeCommandClient:

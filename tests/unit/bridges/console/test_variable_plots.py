@@ -1,13 +1,12 @@
 """What can be plotted, and what a plot shows."""
 
 import math
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from fake_gui import Gui
 
 from zsim.contract.views import EstimateView
 from zsim.math import frames
@@ -43,44 +42,6 @@ def filled(seconds: int) -> FlightHistory:
     return flights
 
 
-class Choice:
-    """A control whose value a page changes."""
-
-    def __init__(self, value: Any, options: Sequence[str] = ()) -> None:
-        self.value = value
-        self.options = options
-        self.acts: list[Callable[[Any], None]] = []
-
-    def on_update(self, act: Callable[[Any], None]) -> None:
-        self.acts.append(act)
-
-    def put(self, value: Any) -> None:
-        self.value = value
-        for act in self.acts:
-            act(None)
-
-
-class Gui:
-    """Controls that keep what they are given."""
-
-    def __init__(self) -> None:
-        self.plots: list[Any] = []
-        self.by_label: dict[str, Any] = {}
-
-    def add_dropdown(self, label: str, options: list[str], initial_value: str | None = None) -> Any:
-        return self.by_label.setdefault(label, Choice(initial_value or options[0], options))
-
-    def add_checkbox(self, label: str, value: bool, **_: Any) -> Any:
-        return self.by_label.setdefault(label, Choice(value))
-
-    def add_markdown(self, _: str) -> None:
-        return
-
-    def add_uplot(self, data: Any, series: Any, title: str, scales: Any, **_: Any) -> Any:
-        self.plots.append(SimpleNamespace(data=data, title=title, visible=True, scales=scales))
-        return self.plots[-1]
-
-
 def test_every_drone_has_its_flight_true_and_estimated():
     flights = filled(3)
     shown = {each.label.partition(" ")[0]: each for each in flights.variables("drone1")}
@@ -96,14 +57,14 @@ def test_every_drone_has_its_flight_true_and_estimated():
 def test_any_variable_of_any_drone_can_be_chosen_with_its_error_and_its_window():
     gui: Any = Gui()
     plots = VariablePlots(gui, CLUSTER, RANGES, filled(100))
-    choice = gui.by_label["variables"]
+    choice = gui.at["variables"]
     assert len(choice.options) == 1 + 2 + 2 * len(CLUSTER.drones)
     choice.value = next(each for each in choice.options if each.startswith("drone1"))
     plots.draw()
     assert [plot.visible for plot in gui.plots] == [True] * 3
     assert gui.plots[0].data[2][-1] == pytest.approx(1.5)
-    gui.by_label["Errors"].value = True
-    window = gui.by_label["window"]
+    gui.at["Errors"].value = True
+    window = gui.at["window"]
     window.value = window.options[-1]
     plots.draw()
     assert gui.plots[0].data[2][-1] == pytest.approx(0.5)
@@ -114,10 +75,10 @@ def test_plots_that_stand_still_keep_what_they_show():
     gui: Any = Gui()
     flights = filled(100)
     plots = VariablePlots(gui, CLUSTER, RANGES, flights)
-    gui.by_label["variables"].value = gui.by_label["variables"].options[-1]
+    gui.at["variables"].value = gui.at["variables"].options[-1]
     plots.draw()
     plots.draw()
-    gui.by_label["Stand still"].value = True
+    gui.at["Stand still"].value = True
     before = gui.plots[0].data
     flights.add(poses(100.0), {})
     plots.draw()
@@ -148,7 +109,7 @@ def test_a_plot_is_made_anew_only_where_its_time_axis_moves_on():
     gui: Any = Gui()
     flights = filled(10)
     plots = VariablePlots(gui, CLUSTER, RANGES, flights)
-    gui.by_label["variables"].put(next(each for each in gui.by_label["variables"].options if "drone1" in each))
+    gui.at["variables"].put(next(each for each in gui.at["variables"].options if "drone1" in each))
     scales = gui.plots[0].scales
     low, high = scales["x"]["range"]
     flights.add(poses(10.0), {})
@@ -163,14 +124,14 @@ def test_a_plot_is_made_anew_only_where_its_time_axis_moves_on():
 def test_what_is_chosen_is_shown_though_nothing_is_drawn_any_more():
     gui: Any = Gui()
     VariablePlots(gui, CLUSTER, RANGES, filled(100))
-    gui.by_label["variables"].put(next(each for each in gui.by_label["variables"].options if "drone3" in each))
+    gui.at["variables"].put(next(each for each in gui.at["variables"].options if "drone3" in each))
     assert gui.plots[0].data[3][-1] == pytest.approx(7.0)
-    gui.by_label["Errors"].put(True)
+    gui.at["Errors"].put(True)
     assert gui.plots[0].data[3][-1] == pytest.approx(0.0)
 
 
 def test_a_variable_of_which_nothing_is_known_has_no_curve():
     gui: Any = Gui()
     VariablePlots(gui, CLUSTER, RANGES, filled(0))
-    gui.by_label["variables"].put(gui.by_label["variables"].options[-1])
+    gui.at["variables"].put(gui.at["variables"].options[-1])
     assert all(np.isnan(plot.data[1:]).all() for plot in gui.plots)
