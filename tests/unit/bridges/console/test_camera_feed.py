@@ -14,7 +14,7 @@ import pytest
 import synthetic_camera
 from hypothesis import given
 from hypothesis import strategies as st
-from refused import has_terms
+from refused import has_terms, refused
 
 from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraInfo, Seen, Sightings
@@ -126,15 +126,11 @@ def test_without_cameras_nothing_is_subscribed_to_and_nothing_is_shown(run: Run)
     assert PageBatches().next(run.feed, ()) is None
 
 
-def test_without_a_page_no_picture_is_subscribed_to(run: Run):
+def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
     run.say_infos()
     run.feed.update()
     assert [name for name, _ in run.feed.cameras()] == [FRONT, BOTTOM]
     assert run.link.pictures() == set()
-
-
-def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
-    run.say_infos()
     run.say_infos("drone2")
     run.watch(FRONT)
     assert run.link.pictures() == {"drone/drone1/camera/front"}
@@ -232,9 +228,10 @@ def test_a_bad_picture_is_left_out_and_counted_and_nothing_else_is_touched(watch
     assert shown.image.t_ns == 3
 
 
+@pytest.mark.parametrize("key", [keys.camera("drone1", "front"), keys.detections("drone1")])
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80"])
-def test_what_is_no_message_on_a_cameras_key_is_counted(watched: Run, payload: bytes):
-    watched.say(keys.camera("drone1", "front"), payload)
+def test_what_is_no_message_is_counted(watched: Run, key: str, payload: bytes):
+    watched.say(key, payload)
     assert watched.feed.picture(FRONT) is None
     assert watched.health.refused == 1
 
@@ -278,12 +275,6 @@ def test_few_sightings_are_kept(watched: Run):
     for number in range(SIGHTINGS_KEPT + 1):
         detected(watched, number * 1_000_000_000)
     assert watched.feed.marks(FRONT) == ()  # that of the picture's time is gone
-
-
-@pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80"])
-def test_sightings_that_are_none_are_counted(watched: Run, payload: bytes):
-    watched.say(keys.detections("drone1"), payload)
-    assert watched.health.refused == 1
 
 
 # What a page is sent
@@ -375,9 +366,19 @@ def test_sides_are_those_of_the_body(info: CameraInfo, direction: Any, left: boo
     assert (dv < -10) is bool(above) if above is not None else abs(dv) < 0.1
 
 
-@pytest.mark.parametrize("direction", [(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 3.0, 0.0), (0.0, 0.0, -1.0)])
-def test_what_the_picture_does_not_show_has_no_mark(direction: Any):
-    assert marks_of(FRONT_INFO, [seen(direction)], HAT_M) == ()
+@pytest.mark.parametrize(
+    ("direction", "range_m"),
+    [
+        ((-1.0, 0.0, 0.0), 4.1),
+        ((0.0, 1.0, 0.0), 4.1),
+        ((1.0, 3.0, 0.0), 4.1),
+        ((0.0, 0.0, -1.0), 4.1),
+        (AHEAD, 0.0),
+        (AHEAD, -1.0),
+    ],
+)
+def test_what_the_picture_does_not_show_and_a_range_that_is_none_have_no_mark(direction: Any, range_m: float):
+    assert marks_of(FRONT_INFO, [seen(direction, range_m)], HAT_M) == ()
 
 
 def test_a_turned_quaternion_of_any_length_turns_the_camera():
@@ -418,11 +419,6 @@ def test_a_circle_is_as_large_as_the_hat_and_two_sigma():
     assert huge.radius == FRONT_INFO.height
 
 
-@pytest.mark.parametrize("range_m", [0.0, -1.0])
-def test_a_range_that_is_none_has_no_mark(range_m: float):
-    assert marks_of(FRONT_INFO, [seen(AHEAD, range_m)], HAT_M) == ()
-
-
 @pytest.mark.parametrize(("sigma_m", "text"), [(0.2, "4.1 ± 0.2 m"), (0.04, "4.10 ± 0.04 m")])
 def test_a_range_has_the_digits_of_its_sigma(sigma_m: float, text: str):
     assert range_text(seen(AHEAD, 4.1, sigma_m=sigma_m)) == text
@@ -447,13 +443,10 @@ def test_the_angle_of_view_is_from_top_to_bottom():
     assert field_of_view(FRONT_INFO) == pytest.approx(2 * math.atan(180 / FRONT_INFO.K[0]))
 
 
-def test_sightings_of_the_pictures_time_are_taken_and_else_the_nearest():
+def test_sightings_of_the_pictures_time_are_taken_and_else_the_nearest_unless_they_are_old():
     kept = [sightings(t_ns) for t_ns in (0, 100_000_000, 200_000_000)]
     assert sightings_of(100_000_000, kept) is kept[1]
     assert sightings_of(170_000_000, kept) is kept[2]
-
-
-def test_old_sightings_are_not_drawn():
     assert sightings_of(AGE_MAX_NS, [sightings(0)]) is not None
     assert sightings_of(AGE_MAX_NS + 1, [sightings(0)]) is None
     assert sightings_of(0, [sightings(AGE_MAX_NS + 1)]) is None  # a replay has gone back
@@ -510,23 +503,18 @@ def test_a_byte_that_is_wrong_does_no_harm(at: int, byte: int):
         check_picture(bytes(data), 40, 30)
 
 
-def test_the_message_and_the_picture_say_the_same_size():
+@pytest.mark.parametrize(
+    ("data", "width", "height", "terms"),
+    [
+        (encoded(), 30, 40, ("40 × 30", "30 × 40")),
+        (encoded(4000, 4000), 4000, 4000, ("4000 × 4000", "2304000")),  # it would fill a browser's memory
+        (encoded()[:-2] + bytes(PICTURE_BYTES_MAX) + encoded()[-2:], 40, 30, (str(PICTURE_BYTES_MAX),)),
+    ],
+    ids=["another size", "too many pixels", "too many bytes"],
+)
+def test_a_picture_of_another_size_or_too_large_is_refused(
+    data: bytes, width: int, height: int, terms: tuple[str, ...]
+):
     check_picture(encoded(), 40, 30)
-    with pytest.raises(PictureError) as refusal:
-        check_picture(encoded(), 30, 40)
-    assert has_terms(str(refusal.value), "40 × 30", "30 × 40")
-
-
-def test_a_picture_that_would_fill_a_browsers_memory_is_refused():
-    data = encoded(4000, 4000)
-    assert len(data) < PICTURE_BYTES_MAX
-    with pytest.raises(PictureError) as refusal:
-        check_picture(data, 4000, 4000)
-    assert has_terms(str(refusal.value), "4000 × 4000", "2304000")
-
-
-def test_too_many_bytes_are_refused():
-    data = encoded()
-    with pytest.raises(PictureError) as refusal:
-        check_picture(data[:-2] + bytes(PICTURE_BYTES_MAX) + data[-2:], 40, 30)
-    assert has_terms(str(refusal.value), str(PICTURE_BYTES_MAX))
+    with refused(PictureError, *terms):
+        check_picture(data, width, height)
