@@ -1,4 +1,4 @@
-"""The console: one run on a web page that viser draws, for operators who steer it and viewers who look. Imports viser and aiohttp.
+"""The console: one run on a web page that viser draws, for operators who steer it and viewers who look.
 
 From what a browser reaches down to what is pure:
 - serving: `console_server`, `page_server` (HTTP, tokens), `page_sockets` (actions, pictures), `private_viser`;
@@ -6,5 +6,5 @@ From what a browser reaches down to what is pure:
   scene, `page_flying` and `manual_flight` fly single drones;
 - requests: `command_client` sends them, `orders` follows them, `control_desk` decides which page may make them;
 - what is known: `view_buffer`, `time_monitor`, `run_monitor`, `run_condition`, `alarms`, `camera_feed`, `histories`.
-The parts of the page beside viser's are HTML files in `frame`.
+The parts of the page beside viser's are HTML files in `frame`. Imports viser and aiohttp.
 """

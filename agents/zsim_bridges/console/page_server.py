@@ -339,8 +339,10 @@ class HttpProxy:
         try:
             connecting = self._client.ws_connect(url, protocols=protocols, headers=headers, compress=0, max_msg_size=0)
             async with connecting as viser:
-                permits = partial(self._backend.permits, role=role)
-                ways = forward(viser, page, lambda _: True), forward(page, viser, permits)
+                ways = (
+                    forward(viser, page, lambda _: True),
+                    forward(page, viser, lambda data: self._backend.permits(data, role)),
+                )
                 tasks = [asyncio.ensure_future(way) for way in ways]
                 await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
                 for task in tasks:

@@ -299,7 +299,7 @@ def _value_text(value: Any) -> str:
 
 def commanded_drone(event: Event) -> str:
     """Return the drone that an event about a command concerns; the subject of a refusal is the command's key."""
-    return keys.thing(event.subject) if "/" in event.subject else event.subject
+    return keys.thing(event.subject) if event.kind == "refused" and "/" in event.subject else event.subject
 
 
 class EventRow(NamedTuple):
