@@ -66,7 +66,7 @@ def test_codes_of_a_terminal_are_written_out() -> None:
 
 HOME = Path(__file__).parents[3]
 DRAWN_IN = (
-    "agents/zsim_bridges/console/scene/scene_nodes.py",
+    "agents/zsim_bridges/console/scene.py",
     "deploy/zsim_analysis/export/foxglove_scene.py",
     "deploy/zsim_analysis/report/figures/plan_view.py",
     "deploy/zsim_analysis/report/figures/drone_panels.py",
