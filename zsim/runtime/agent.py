@@ -25,8 +25,8 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import ClusterRequest, ControlAnswer, ControlRequest, Faults
 from zsim.contract.snapshot import State
 from zsim.errors import DecodeError, UserCodeError
+from zsim.runtime.inbox import GateRouter, Input, RoutingTable, one_by_one
 from zsim.runtime.link_faults import LinkFaults
-from zsim.runtime.routing import GateRouter, Input, RoutingTable, one_by_one
 from zsim.schema import plugin
 
 

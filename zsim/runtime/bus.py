@@ -14,8 +14,7 @@ from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
-from zsim.runtime.routing import RoutingTable
+from zsim.runtime.inbox import NEVER_NS, Inbox, RoutingTable, output_hold_ns
 from zsim.scenario.fault_kinds import PROCESS_KILL
 
 INCARNATION = 0  # of every agent: in one process none comes back

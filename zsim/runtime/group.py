@@ -16,8 +16,7 @@ from zsim.contract.run_messages import ControlAnswer, ControlRequest, Faults
 from zsim.contract.snapshot import State
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.inbox import is_held
-from zsim.runtime.routing import GateRouter, Input, RoutingTable, canonical
+from zsim.runtime.inbox import GateRouter, Input, RoutingTable, canonical, is_held
 
 
 class AgentGroup(Agent):

@@ -16,7 +16,7 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate
 from zsim.contract.run_messages import Fault, Faults
 from zsim.contract.snapshot import State
-from zsim.runtime.routing import Input, canonical
+from zsim.runtime.inbox import Input, canonical
 from zsim.scenario import fault_kinds
 
 WORLD, RADIO = "world", "radio"

@@ -14,8 +14,7 @@ from zsim.contract.world_events import WorldEvent
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Agent
 from zsim.runtime.health import HealthMeter
-from zsim.runtime.inbox import Inbox, output_hold_ns
-from zsim.runtime.routing import RoutingTable
+from zsim.runtime.inbox import Inbox, RoutingTable, output_hold_ns
 from zsim.transport.session import Query, RawSample, ReceivedSample, Session, Subscription
 
 

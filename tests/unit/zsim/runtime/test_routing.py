@@ -9,7 +9,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import Status
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import Baro, encode
-from zsim.runtime.routing import GateRouter, RoutingTable, one_by_one
+from zsim.runtime.inbox import GateRouter, RoutingTable, one_by_one
 
 GATE_NS = 20_000_000
 DRONES = ("d1", "d2", "d3")
