@@ -7,8 +7,7 @@ from typing import Any
 
 from zsim.contract.messages import Info
 from zsim.errors import DocumentError, NotTrustedError, RunError, ScenarioError
-from zsim.runtime.agent import Agent
-from zsim.runtime.group import AgentGroup
+from zsim.runtime.agent import Agent, AgentGroup
 from zsim.runtime.inbox import output_hold_ns
 from zsim.scenario.role_table import AGENTS, agent_names
 from zsim.scenario.scenario import Scenario

@@ -16,8 +16,7 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import Info
 from zsim.errors import NoWorldError, SessionError, SupersededError, UserCodeError, ZsimError, printable
 from zsim.output_folder import no_locks
-from zsim.runtime.agent import Agent
-from zsim.runtime.group import AgentGroup
+from zsim.runtime.agent import Agent, AgentGroup
 from zsim.runtime.inbox import output_hold_ns
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file

@@ -7,7 +7,7 @@ import pytest
 from refused import has_terms, refused
 
 from zsim.errors import RunError, ScenarioError
-from zsim.runtime.group import AgentGroup
+from zsim.runtime.agent import AgentGroup
 from zsim.scenario import rights, scenario_file
 from zsim.scenario.role_table import AGENTS, Role
 from zsim.transport.tls import Identity
