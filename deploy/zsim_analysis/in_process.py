@@ -13,7 +13,7 @@ from zsim.errors import RunError, UserCodeError
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
-from zsim.runtime.collector import rare_collections
+from zsim.runtime.health import rare_collections
 from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Scenario

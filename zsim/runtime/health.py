@@ -1,12 +1,13 @@
 """The health of a process: counters, published once a wall second."""
 
+import gc
 import os
 import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 from zsim.contract.run_messages import Health
 
@@ -86,3 +87,23 @@ def resident_bytes() -> int:
         with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # no file may be left to open
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0
+
+
+ALLOCATIONS = 50_000  # between two collections, chosen: a gate allocates hundreds of objects and leaves no cycle
+
+
+@contextmanager
+def rare_collections() -> Iterator[None]:
+    """Collect rarely, and never look through what was there before.
+
+    By default Python collects after 700 allocations, every few gates, and now and then looks through all objects.
+    """
+    gc.collect()
+    gc.freeze()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(ALLOCATIONS, *thresholds[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()

@@ -20,8 +20,7 @@ from zsim.contract.run_messages import ControlAnswer
 from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
-from zsim.runtime.collector import rare_collections
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.health import HealthMeter, rare_collections
 from zsim.runtime.inbox import Inbox, RoutingTable, output_hold_ns
 from zsim.runtime.membership import Membership
 from zsim.scenario.fault_kinds import PROCESS_KILL

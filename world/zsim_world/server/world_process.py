@@ -11,8 +11,7 @@ from typing import Any
 
 from zsim.contract import keys, run_messages
 from zsim.runtime.agent import Output
-from zsim.runtime.collector import rare_collections
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.health import HealthMeter, rare_collections
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
 from zsim.transport.session import Query, Session
