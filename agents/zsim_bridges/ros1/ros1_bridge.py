@@ -11,12 +11,11 @@ from zsim.contract.messages import Info
 from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
+from zsim_bridges.intake import PictureIntake, TrafficIntake
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.picture_intake import PictureIntake
 from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics, ros1_name
 from zsim_bridges.ros1.node import Ros1Node
-from zsim_bridges.traffic_intake import TrafficIntake
 from zsim_bridges.vehicle_links import onboard_state
 
 POLL_S = 0.1  # how often a stop is looked for

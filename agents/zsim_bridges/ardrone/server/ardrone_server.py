@@ -14,9 +14,8 @@ from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges.ardrone.server.addresses import AllowedHosts, drone_addresses
 from zsim_bridges.ardrone.server.drone_server import DroneServer
+from zsim_bridges.intake import PictureIntake, TrafficIntake
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.picture_intake import PictureIntake
-from zsim_bridges.traffic_intake import TrafficIntake
 from zsim_bridges.vehicle_links import onboard_state
 from zsim_bridges.vehicle_links.run_pace import set_pace
 

@@ -16,6 +16,7 @@ from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone
 from zsim.transport.session import Session
+from zsim_bridges.intake import TrafficIntake
 from zsim_bridges.mavlink.autopilot.enums import COMPONENT_AUTOPILOT
 from zsim_bridges.mavlink.autopilot.personality import PERSONALITIES
 from zsim_bridges.mavlink.serve.peers import Address
@@ -25,7 +26,6 @@ from zsim_bridges.mavlink.vehicle.mavlink_vehicle import MavlinkVehicle, Options
 from zsim_bridges.mavlink.wire.frame import Link, Received, Version
 from zsim_bridges.mavlink.wire.signing import Signing
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.traffic_intake import TrafficIntake
 from zsim_bridges.vehicle_links.command_sender import CommandSender
 from zsim_bridges.vehicle_links.run_pace import set_pace
 

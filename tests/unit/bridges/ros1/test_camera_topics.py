@@ -12,8 +12,8 @@ from synthetic_pictures import AHEAD, FRONT_P_BK, NO_JPEG, image, info, jpeg
 from zsim.contract import keys, messages
 from zsim.scenario import scenario_file
 from zsim.transport.session import RawSample
+from zsim_bridges.intake import WAITING_MAX, PictureIntake
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.picture_intake import WAITING_MAX, PictureIntake
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.ros1_bridge import Ros1Bridge
 

@@ -14,12 +14,12 @@ from zsim.errors import RunError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.transport.session import ReceivedSample
-from zsim_bridges import traffic_intake
+from zsim_bridges import intake as traffic_intake
+from zsim_bridges.intake import TrafficIntake
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import tcpros
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.ros1_bridge import Ros1Bridge, check_names
-from zsim_bridges.traffic_intake import TrafficIntake
 
 LEVEL, ZERO, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 
