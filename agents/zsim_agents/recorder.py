@@ -9,23 +9,24 @@ Order of this file: `record`, the process, catching up, what arrives.
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 
 import msgspec
 
 from zsim.contract import keys, messages, run_messages
+from zsim.contract.flight_messages import ClusterState, Command, Estimate
 from zsim.contract.framing import run_key_table
-from zsim.errors import RecordError, RunError, SupersededError
-from zsim.record import RecordWriter
+from zsim.contract.run_messages import Clock, ClusterRequest
+from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
+from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.record.completeness import GateCount
 from zsim.record.record_writer import CHANNELS_MAX
 from zsim.runtime.health import HealthMeter
+from zsim.transport.connection import read_info
 from zsim.transport.session import ReceivedSample, Session
-from zsim.transport.traffic import Passed, Traffic, samples
-from zsim_agents.known_messages import KnownMessages, is_of_run
-from zsim_agents.missed_messages import MissedMessages
+from zsim.transport.traffic import Passed, Traffic, replay, samples
 from zsim_agents.participation import Participation
 
 NAME = "recorder"
@@ -361,3 +362,142 @@ class Recorder:
             self._traffic.wake()
             if self.health.due():
                 self._part.publish("health", self.health.message(self._now_ns, self._part.next("health")))
+
+
+OUTPUTS = (Command, Estimate, ClusterState, ClusterRequest)
+KNOWN_MAX = 2_000_000  # messages remembered: 7 s of 1000 drones
+TAIL_NS = 7_000_000_000  # simulated, at the end of a record; the world's history has 5 s
+
+
+class KnownMessages:
+    """Messages that are written, so that none is written twice; the oldest are forgotten beyond KNOWN_MAX."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, bytes], None] = {}
+        self._outputs_only = False
+
+    def __bool__(self) -> bool:
+        return bool(self._known)
+
+    def __contains__(self, entry: tuple[str, bytes]) -> bool:
+        return entry in self._known
+
+    def add(self, key: str, payload: bytes) -> None:
+        """Remember a message."""
+        self._known[key, payload] = None
+        self._outputs_only = False
+        if len(self._known) > KNOWN_MAX:
+            del self._known[next(iter(self._known))]
+
+    def add_tail(self, path: Path) -> Recorded | None:
+        """Remember what stands at the end of a record; return the newest clock there."""
+        with RecordReader(path) as reader:
+            last = reader.last(keys.CLOCK)
+            last_ns = last.t_ns if last else 0
+            for recorded in reader.messages(by_time=False, from_ns=max(0, last_ns - TAIL_NS)):
+                self.add(recorded.key, recorded.payload)
+        return last
+
+    def keep_outputs(self) -> None:
+        """Forget all but outputs of participants, who repeat them after a rejoin; anything else that comes is new."""
+        if not self._outputs_only:
+            self._known = {entry: None for entry in self._known if _is_output(*entry)}
+            self._outputs_only = True
+
+    def clear(self) -> None:
+        """Forget all of them: what passes from now on is new."""
+        self._known.clear()
+
+
+def _is_output(key: str, payload: bytes) -> bool:
+    kind = messages.type_of(key)
+    if kind is None or not issubclass(kind, OUTPUTS):
+        return False
+    try:
+        messages.decode(key, payload)
+    except DecodeError:
+        return False
+    return True
+
+
+def is_of_run(path: Path, run_id: str) -> bool:
+    """Tell whether a file is the record of a run, or one that ends before it says of which run it is.
+
+    Raises:
+        RecordError: it is no record.
+    """
+    if not path.exists() or not path.stat().st_size:
+        return path.exists()
+    with RecordReader(path) as reader:
+        recorded = next(reader.messages([keys.INFO]), None)
+        if recorded is None:
+            return not reader.topics()
+    try:
+        return messages.decode(keys.INFO, recorded.payload).run_id == run_id
+    except DecodeError:
+        return False
+
+
+REPLAY_S = 5.0  # a hub answers within milliseconds
+Message = tuple[str, bytes]  # key, payload
+
+
+class MissedMessages:
+    """Asks the world of a run for what has passed.
+
+    Args:
+        link: to the world.
+        name: who asks.
+        run_id: of the run.
+        pauses: waits a little; False once the asking is to end.
+    """
+
+    def __init__(self, link: Session, name: str, run_id: str, pauses: Callable[[], bool]) -> None:
+        self._link = link
+        self._name = name
+        self._run_id = run_id
+        self._pauses = pauses
+        self._clock = msgspec.msgpack.Decoder(Clock)
+
+    def info(self) -> messages.Info | None:
+        """Return what the world says of its run, which may take a while where it was just started again."""
+        until_s = time.monotonic() + REPLAY_S
+        while (info := read_info(self._link)) is None and time.monotonic() < until_s and self._pauses():
+            pass
+        return info
+
+    def reaches_run(self) -> bool:
+        """Tell whether the world of this run answers."""
+        info = self.info()
+        return info is not None and info.run_id == self._run_id
+
+    def messages(self, before: Clock | None) -> Iterator[Message]:
+        """Yield what the world replays, asking until it has answered; see `_replayed`. Some may come twice then."""
+        while True:
+            try:
+                yield from self._replayed(before)
+            except NoWorldError:
+                if self._pauses():
+                    continue
+            return
+
+    def _replayed(self, before: Clock | None) -> Iterator[Message]:
+        """Yield what the world replays, up to a clock that has arrived: what came after that is on its way as well."""
+        held: list[Message] = []
+        for entry in replay(self._link, self._name, -1, ["**"], REPLAY_S):
+            held.append(entry)
+            clock = self.clock_in(entry[1]) if before is not None and entry[0] == keys.CLOCK else None
+            if before is not None and clock is not None and clock.seq >= before.seq:
+                yield from held[:-1] if clock.seq == before.seq else ()
+                return
+            if before is None or clock is not None:
+                yield from held
+                held.clear()
+
+    def clock_in(self, payload: bytes) -> Clock | None:
+        """Return the clock of this run; None for garbage by somebody else on `clock`."""
+        try:
+            clock = self._clock.decode(payload)
+        except messages.REFUSALS:
+            return None
+        return clock if clock.run_id == self._run_id else None

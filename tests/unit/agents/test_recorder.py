@@ -22,7 +22,7 @@ from zsim.errors import RecordError
 from zsim.record import Completeness, RecordReader, RecordWriter, completeness
 from zsim.record.completeness import GateGap
 from zsim.record.mcap_layout import places
-from zsim_agents import known_messages, recorder
+from zsim_agents import recorder
 from zsim_agents.recorder import record
 
 GATE_NS = 20_000_000
