@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadGroupScheduling
 
-from zsim_deploy.roles.priority import lower
+from zsim_deploy.roles.process_control import lower
 
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
 LEAST = 3  # workers of which one is quiet

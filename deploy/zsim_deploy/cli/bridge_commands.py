@@ -106,7 +106,7 @@ def gateway(
     from zsim.transport.open_files import SERVER_FILES, allow_files, require_files
     from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
     from zsim_bridges.web.http_connections import CONNECTIONS_MAX
-    from zsim_deploy.roles.priority import lower_priority
+    from zsim_deploy.roles.process_control import lower_priority
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import log_printer, serve_runs
 
@@ -155,7 +155,7 @@ def ros1(
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     require("ros1", ROS1_NEEDS)
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
-    from zsim_deploy.roles.priority import lower_priority
+    from zsim_deploy.roles.process_control import lower_priority
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import serve_runs
 
@@ -188,7 +188,7 @@ def ros2(
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
-    from zsim_deploy.roles.priority import lower_priority
+    from zsim_deploy.roles.process_control import lower_priority
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import serve_runs
 

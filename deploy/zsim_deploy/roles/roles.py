@@ -32,10 +32,10 @@ from zsim_agents.hosting import agent_class, chosen, hosted, made
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_deploy import USER_FAULT
 from zsim_deploy.arguments import RUN_ID, WorldAccess
+from zsim_deploy.roles.process_control import StopChannel
 from zsim_deploy.roles.process_identity import check_certificate
 from zsim_deploy.roles.record_folder import RECORD, make, record_folder
 from zsim_deploy.roles.router_links import RouterLinks
-from zsim_deploy.roles.stop_channel import StopChannel
 
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why

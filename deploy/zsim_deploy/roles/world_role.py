@@ -21,7 +21,7 @@ from zsim.transport import connection
 from zsim.transport.open_files import hub_files, require_files
 from zsim.transport.session import check_expression
 from zsim.transport.tls import Identity
-from zsim_deploy.roles.stop_channel import StopChannel
+from zsim_deploy.roles.process_control import StopChannel
 
 if TYPE_CHECKING:
     from zsim.record import RecordReader

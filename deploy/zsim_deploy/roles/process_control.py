@@ -10,19 +10,21 @@ With the process ends the lease of the private key that `zsim up` has copied to 
 
 import atexit
 import contextlib
+import io
 import os
+import select
 import signal
+import stat
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from zsim.transport.tls import KEY, Identity
 from zsim_deploy import INTERRUPTED
-from zsim_deploy.roles.closed_output import CLOSED, redirect_output, write_error
 
 REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
 HANGUP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()  # not on Windows
@@ -199,3 +201,119 @@ def _stamp(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_ino, status.st_ctime_ns
+
+
+STREAMS = 1, 2  # standard output and error
+CLOSED = "the terminal was closed"
+
+
+class _Output(io.FileIO):
+    """A standard stream that loses what its file does not take; only that nobody is at the end of a pipe is raised."""
+
+    _lost = False
+
+    def write(self, data: Any, /) -> int | None:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            raise
+        except OSError as error:  # a full disk, a terminal that is gone
+            if not self._lost and self.fileno() != STREAMS[-1]:
+                write_error(f"standard output cannot be written ({error.strerror}); what follows is lost")
+            self._lost = True
+            return len(data)
+
+
+def write_error(text: str) -> None:
+    """Write a line to standard error without Python's stream, as from a signal handler; it may be lost."""
+    with contextlib.suppress(OSError):
+        os.write(STREAMS[-1], f"{text}\n".encode(errors="replace"))
+
+
+def renew_streams() -> None:
+    """Open Python's standard streams anew, so that nothing ends because one of them is closed, or its disk full.
+
+    To be called before any file is opened: it would take the number of a stream that is closed, and then also what a
+    library prints.
+    """
+    for number in (0, *STREAMS):
+        try:
+            os.fstat(number)
+        except OSError:
+            empty = os.open(os.devnull, os.O_RDWR)
+            if empty != number:
+                os.dup2(empty, number)
+                os.close(empty)
+    encodings = [getattr(stream, "encoding", None) for stream in (sys.stdin, sys.stdout, sys.stderr)]
+    sys.stdin = os.fdopen(0, encoding=encodings[0], errors=getattr(sys.stdin, "errors", None), closefd=False)
+    out, error = (io.BufferedWriter(_Output(number, "w", closefd=False)) for number in STREAMS)
+    # a question mark for a character that the terminal's encoding lacks, rather than the end of the command
+    sys.stdout = io.TextIOWrapper(out, encodings[1], "replace", line_buffering=os.isatty(STREAMS[0]))
+    sys.stderr = io.TextIOWrapper(error, encodings[2], "replace", line_buffering=True)
+
+
+def is_unread(stream: int) -> bool:
+    """Tell whether a stream is a pipe at the end of which nobody is."""
+    with contextlib.suppress(OSError):
+        if stat.S_ISFIFO(os.fstat(stream).st_mode) and hasattr(select, "poll"):  # not on Windows
+            poller = select.poll()
+            poller.register(stream, 0)
+            return bool(poller.poll(0))  # an error is reported whatever is asked for
+    return False
+
+
+def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
+    """Send to a file what is written from now on to a terminal or a pipe, which may take nothing any more."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+    try:
+        into = os.open(log, flags, 0o644)
+    except OSError:
+        into = os.open(os.devnull, os.O_WRONLY)
+    lost = [stream for stream in streams if not _is_file(stream)]
+    if lost:
+        write_error(f"{why}; what there is still to say is in {log}")
+    for stream in lost:
+        os.dup2(into, stream)
+    os.close(into)
+
+
+def _is_file(stream: int) -> bool:
+    """Tell whether a stream is a file already, or is not open at all."""
+    try:
+        return stat.S_ISREG(os.fstat(stream).st_mode)
+    except OSError:
+        return True
+
+
+NICE = 5  # of processes for which no gate waits
+AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
+TRIES = 5
+AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
+
+
+def lower_priority() -> None:
+    """Let the world go first. Threads to come, too."""
+    lower(NICE)
+
+
+def lower(niceness: int) -> None:
+    """Make this process nicer, and with it the session that it leads, if it does.
+
+    Where Linux shares processors between sessions, niceness counts within each of them only.
+    """
+    if hasattr(os, "nice"):
+        os.nice(niceness)
+    if sys.platform == "linux" and os.getsid(0) == os.getpid():
+        _lower_session(niceness)
+
+
+def _lower_session(niceness: int) -> None:
+    for _ in range(TRIES):
+        try:
+            AUTOGROUP.write_text(str(niceness))
+        except BlockingIOError:
+            time.sleep(AGAIN_S)
+        except OSError:
+            return  # not shared that way here, or not ours to set
+        else:
+            return
