@@ -33,8 +33,7 @@ def serve(
     from zsim_bridges.ardrone.server.addresses import peer_addresses
     from zsim_bridges.ardrone.server.ardrone_server import ArdroneOptions
     from zsim_bridges.ardrone.server.ardrone_server import serve as serve_run
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import serve_runs
+    from zsim_deploy.roles.roles import process_name, serve_runs
 
     options = ArdroneOptions(addresses, peer_addresses(peer or ()), rate)
     serve_runs(process_name("ardrone", name, reach.who), partial(serve_run, options=options), reach)

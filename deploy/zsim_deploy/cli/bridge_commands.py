@@ -74,8 +74,7 @@ def console(
     from zsim.transport.open_files import SERVER_FILES, require_files
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.server.http_proxy import ListenAddress
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import log_printer, serve_runs
+    from zsim_deploy.roles.roles import log_printer, process_name, serve_runs
 
     # Of normal priority: an operator's emergency goes through it, and one that gave way would be reported as silent.
     own_name = process_name("console", name, reach.who, "*")
@@ -107,8 +106,7 @@ def gateway(
     from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
     from zsim_bridges.web.http_connections import CONNECTIONS_MAX
     from zsim_deploy.roles.process_control import lower_priority
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import log_printer, serve_runs
+    from zsim_deploy.roles.roles import log_printer, process_name, serve_runs
 
     lower_priority()
     who = reach.who
@@ -156,8 +154,7 @@ def ros1(
     require("ros1", ROS1_NEEDS)
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
     from zsim_deploy.roles.process_control import lower_priority
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import serve_runs
+    from zsim_deploy.roles.roles import process_name, serve_runs
 
     lower_priority()
     own_name = process_name("ros1", name, reach.who)
@@ -189,8 +186,7 @@ def ros2(
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
     from zsim_deploy.roles.process_control import lower_priority
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import serve_runs
+    from zsim_deploy.roles.roles import process_name, serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"

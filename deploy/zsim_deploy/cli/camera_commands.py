@@ -64,8 +64,7 @@ def _serve(
     """Serve one run after the other with lower priority, as the process that the command means."""
     from zsim_deploy.roles.camera_roles import slack_ns, stands_for
     from zsim_deploy.roles.process_control import lower_priority
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import serve_runs
+    from zsim_deploy.roles.roles import process_name, serve_runs
 
     lower_priority()
     own_name = process_name(role, name, reach.who, _thing(drones))

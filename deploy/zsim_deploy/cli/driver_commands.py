@@ -102,7 +102,6 @@ def _options(
 
 
 def _serve(drive: "Serve", reach: WorldAccess, drone: str) -> None:
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import serve_runs
+    from zsim_deploy.roles.roles import process_name, serve_runs
 
     serve_runs(process_name("driver", "", reach.who, drone), drive, reach)

@@ -64,8 +64,7 @@ def serve(
     """Offer each drone as a vehicle: QGroundControl, MAVSDK, DroneKit, MAVProxy fly it."""
     from zsim_bridges.mavlink.serve.mavlink_server import MavlinkOptions
     from zsim_bridges.mavlink.serve.mavlink_server import serve as serve_vehicles
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import serve_runs
+    from zsim_deploy.roles.roles import process_name, serve_runs
 
     ahead = first_system_id - 1  # as of PX4's simulation, whose ports go by the system id too
     options = MavlinkOptions(

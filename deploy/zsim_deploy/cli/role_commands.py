@@ -84,9 +84,9 @@ def _agent_command(name: str, role: Role) -> Callable[..., None]:
     several_help = f"{about.capitalize()}s, or patterns: '{about}*'."
 
     def start(things: list[str], reach: WorldAccess) -> None:
-        from zsim_deploy.roles import process_identity, roles
+        from zsim_deploy.roles import roles
 
-        roles.agent(roles.agent_of(name, things), reach, process_identity.process_of(name, things))
+        roles.agent(roles.agent_of(name, things), reach, roles.process_of(name, things))
 
     def several(
         reach: WorldAccess,

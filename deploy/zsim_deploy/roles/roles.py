@@ -5,16 +5,29 @@ The console and the gateway are of the latter kind.
 
 import gc
 import os
+import re
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import NoWorldError, SessionError, SupersededError, UserCodeError, ZsimError, printable
+from zsim.contract.run_messages import Join
+from zsim.errors import (
+    DecodeError,
+    NoWorldError,
+    RecordError,
+    RunError,
+    SessionError,
+    SupersededError,
+    UserCodeError,
+    ZsimError,
+    printable,
+)
 from zsim.output_folder import no_locks
 from zsim.runtime.agent import Agent, AgentGroup
 from zsim.runtime.inbox import output_hold_ns
@@ -25,7 +38,9 @@ from zsim.scenario.role_table import AGENTS, things
 from zsim.scenario.scenario import Scenario
 from zsim.transport import tls
 from zsim.transport.connection import find_world, route
-from zsim.transport.session import Session
+from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch
+from zsim.transport.session import RawSample, Session
+from zsim.transport.session_tokens import SessionTokens
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_agents.hosting import agent_class, chosen, hosted, made
@@ -33,9 +48,6 @@ from zsim_bridges.observer_process import ObserverProcess
 from zsim_deploy import USER_FAULT
 from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.process_control import StopChannel
-from zsim_deploy.roles.process_identity import check_certificate
-from zsim_deploy.roles.record_folder import RECORD, make, record_folder
-from zsim_deploy.roles.router_links import RouterLinks
 
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
@@ -300,3 +312,117 @@ def _serve(serve: Serve, link: Session, presence: ObserverProcess, info: Info, s
     reason = presence.end_reason or stop.reason() or "stopped"
     presence.leave(reason)
     say(f"{presence.name}: left, {reason}")
+
+
+RECORD = "run.mcap"
+RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # an id of a run that is part of a folder's name
+
+
+def record_folder(out: Path, run_id: str) -> Path:
+    """Return the folder of a run's record.
+
+    Raises:
+        RecordError: the id, which the world gives, would lead to another folder.
+    """
+    if RUN_ID not in out.name:
+        return out
+    if not RUN_NAME.fullmatch(run_id):
+        allowed = f"must be 1 to 64 of A-Z a-z 0-9 _ -; give --out without {RUN_ID}"
+        raise RecordError(f"{out}: run is {run_id[:40]!r}; {allowed}")
+    return out.with_name(out.name.replace(RUN_ID, run_id))
+
+
+def make(folder: Path) -> None:
+    """Make the folder of a record.
+
+    Raises:
+        RecordError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
+
+
+PATTERN = "*?["  # signs of a pattern; fnmatch
+
+
+def process_of(role: str, names: Sequence[str]) -> str:
+    """Return the name of the process that is the agent of one drone or cluster; empty for patterns, and for several."""
+    return f"{role}.{names[0]}" if len(names) == 1 and not set(names[0]) & set(PATTERN) else ""
+
+
+def process_name(role: str, name: str, who: Identity, thing: str = "main") -> str:
+    """Return a process's name: as given, or its certificate's, or the role's first.
+
+    Raises:
+        SessionError: the certificate is of no use.
+    """
+    if name or who.tls is None:
+        return name or f"{role}.{thing}"
+    if fault := tls.own_fault(who):
+        raise SessionError(fault)
+    return tls.own_name(who)
+
+
+def check_certificate(made: Agent, identity: Identity) -> None:
+    """Refuse to publish for other processes where access control would drop it without a word."""
+    if not identity.tls:
+        return
+    if made.serves:
+        others = ", ".join(made.serves)
+        raise RunError(
+            f"{made.name}: a certificate is for one process, and this one stands for {others} too; "
+            "run each by itself, or without TLS"
+        )
+    if fault := tls.own_fault(identity._replace(process=made.name)):
+        raise RunError(fault)
+
+
+JOINS_MAX = 10_000  # remembered; names cost a stranger nothing
+
+
+class RouterLinks:
+    """Watches the links of a router.
+
+    Args:
+        link: its session.
+        say: takes a line for each link that was closed.
+
+    Attributes:
+        watch: closes the links.
+    """
+
+    def __init__(self, link: Session, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._tokens = SessionTokens(link)
+        self._joins: dict[str, Join] = {}
+        self._tokens.watch()
+        link.declare_subscriber(keys.process("*", "join"), self._on_join)
+        self.watch = LinkWatch(link, self._tokens, self.awaited)
+
+    def _on_join(self, sample: RawSample) -> None:
+        with suppress(DecodeError):
+            join = messages.decode_as(Join, sample.payload, sample.key)
+            if len(self._joins) >= JOINS_MAX:
+                self._joins.clear()
+            self._joins[keys.thing(sample.key)] = join
+
+    def awaited(self) -> list[Awaited]:
+        """Return who must lose nothing; callable from any thread."""
+        joins = self._joins.copy()
+        awaited = [Awaited((name,), 0) for name in self._tokens.shown() if name not in joins]
+        for name, join in joins.items():
+            if (join.period_ns > 0 or join.slack_ns > 0) and self._tokens.is_alive(name):
+                awaited.append(Awaited((name, *join.serves), join.pid))
+        return awaited
+
+    def report(self) -> None:
+        """Show the links that were closed since the last time."""
+        while self.watch.closed:
+            self._say(_text(self.watch.closed.popleft()))
+
+
+def _text(closed: ClosedLink) -> str:
+    who = f"{closed.process or 'somebody'} at {closed.address} ({', '.join(closed.names) or 'no process of the run'})"
+    return f"{who} took nothing of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"

@@ -12,7 +12,7 @@ from zsim.scenario import rights, scenario_file
 from zsim.scenario.role_table import AGENTS, Role
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, made
-from zsim_deploy.roles import process_identity, roles
+from zsim_deploy.roles import roles
 from zsim_world.flight.world import World
 
 STEP = scenario_file.load(Path(__file__).parents[3] / "scenarios" / "step.yaml")
@@ -93,8 +93,8 @@ def test_a_certificate_is_for_one_process(tmp_path: Path):
         r"controller\.main: a certificate is for one process, and this one stands for estimator\.drone1, .*; run each"
     )
     with pytest.raises(RunError, match=pattern):
-        process_identity.check_certificate(group, Identity(tls=tmp_path))
-    process_identity.check_certificate(group, Identity())
+        roles.check_certificate(group, Identity(tls=tmp_path))
+    roles.check_certificate(group, Identity())
 
 
 def test_every_class_that_a_scenario_names_is_loaded_before_it_flies():

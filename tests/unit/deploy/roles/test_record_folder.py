@@ -6,7 +6,7 @@ import pytest
 from refused import refused
 
 from zsim.errors import RecordError
-from zsim_deploy.roles.record_folder import record_folder
+from zsim_deploy.roles.roles import record_folder
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ from refused import has_terms
 from zsim.contract import keys
 from zsim.contract.run_messages import Join
 from zsim.transport.link_watch import Awaited, ClosedLink
-from zsim_deploy.roles import router_links
-from zsim_deploy.roles.router_links import RouterLinks
+from zsim_deploy.roles.roles import RouterLinks
 
 ESTIMATOR, RECORDER, CONSOLE, OWN = "estimator.d1", "recorder", "console.1", "planner.own"
 
