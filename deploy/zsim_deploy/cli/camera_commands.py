@@ -9,7 +9,7 @@ import typer
 from zsim_deploy.arguments import WorldAccess, participant_options, positive, require
 
 if TYPE_CHECKING:
-    from zsim_deploy.roles.camera_roles import Drones as Chosen
+    from zsim_deploy.roles.roles import Drones as Chosen
     from zsim_deploy.roles.roles import Serve
 
 ROLES = "Roles, started by hand, on any machine, in any order"
@@ -31,10 +31,10 @@ def camera(
 ) -> None:
     """Draw what the cameras of one drone see, or of several in one process, as JPEG."""
     require("camera", CAMERA_NEEDS)
-    from zsim_deploy.roles import camera_roles
+    from zsim_deploy.roles import roles
 
-    serve = partial(camera_roles.camera, names=drones or ())
-    _serve("camera", serve, camera_roles.of_camera, reach, drones, name)
+    serve = partial(roles.camera, names=drones or ())
+    _serve("camera", serve, roles.of_camera, reach, drones, name)
 
 
 @app.command(rich_help_panel=ROLES)
@@ -52,19 +52,18 @@ def detect(
 ) -> None:
     """Find magenta hats in the pictures of one drone, or of several in one process."""
     require("detect", CAMERA_NEEDS)
-    from zsim_deploy.roles import camera_roles
+    from zsim_deploy.roles import roles
 
-    serve = partial(camera_roles.detector, names=drones or (), diameter_m=diameter)
-    _serve("detector", serve, camera_roles.of_detector, reach, drones, name)
+    serve = partial(roles.detector, names=drones or (), diameter_m=diameter)
+    _serve("detector", serve, roles.of_detector, reach, drones, name)
 
 
 def _serve(
     role: str, serve: "Serve", chosen: "Chosen", reach: WorldAccess, drones: Sequence[str] | None, name: str
 ) -> None:
     """Serve one run after the other with lower priority, as the process that the command means."""
-    from zsim_deploy.roles.camera_roles import slack_ns, stands_for
     from zsim_deploy.roles.process_control import lower_priority
-    from zsim_deploy.roles.roles import process_name, serve_runs
+    from zsim_deploy.roles.roles import process_name, serve_runs, slack_ns, stands_for
 
     lower_priority()
     own_name = process_name(role, name, reach.who, _thing(drones))

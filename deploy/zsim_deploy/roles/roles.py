@@ -14,6 +14,8 @@ from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
+from msgspec import UNSET
+
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Join
@@ -33,9 +35,10 @@ from zsim.runtime.agent import Agent, AgentGroup
 from zsim.runtime.inbox import output_hold_ns
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import RECORDER, ROUTER
+from zsim.scenario.rights import RECORDER, ROUTER, watched
 from zsim.scenario.role_table import AGENTS, things
 from zsim.scenario.scenario import Scenario
+from zsim.sensors.camera import Hats
 from zsim.transport import tls
 from zsim.transport.connection import find_world, route
 from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch
@@ -43,6 +46,7 @@ from zsim.transport.session import RawSample, Session
 from zsim.transport.session_tokens import SessionTokens
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
+from zsim_agents.cameras import camera_process, detector_process
 from zsim_agents.hosting import agent_class, chosen, hosted, made
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_deploy import USER_FAULT
@@ -426,3 +430,82 @@ class RouterLinks:
 def _text(closed: ClosedLink) -> str:
     who = f"{closed.process or 'somebody'} at {closed.address} ({', '.join(closed.names) or 'no process of the run'})"
     return f"{who} took nothing of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"
+
+
+SLACK_GATES = 3  # a picture between two gates needs the second; one more, and the world and the cameras work at once
+Drones = Callable[[Info, Sequence[str]], list[str]]
+
+
+def camera(
+    link: Session, info: Info, presence: ObserverProcess, stopped: Stopped, say: Say, names: Sequence[str]
+) -> None:
+    """Serve a run with pictures of the cameras of some drones, named or by patterns.
+
+    Raises:
+        RunError: no drone with a camera has such a name.
+    """
+    drones = of_camera(info, names)
+    say(f"{presence.name}: draws for {', '.join(drones)}")
+    camera_process.serve(link, info, presence, stopped, scenario_file.from_text(info.scenario), drones)
+
+
+def detector(
+    link: Session,
+    info: Info,
+    presence: ObserverProcess,
+    stopped: Stopped,
+    say: Say,
+    names: Sequence[str],
+    diameter_m: float | None,
+) -> None:
+    """Serve a run with what is seen in the pictures of some drones; their cameras need not be zsim's.
+
+    Args:
+        diameter_m: of a hat; None for the scenario's.
+
+    Raises:
+        RunError: no drone has such a name.
+    """
+    drones = of_detector(info, names)
+    say(f"{presence.name}: looks at the pictures of {', '.join(drones)}")
+    diameter_m = diameter_m or hat_diameter_m(scenario_file.from_text(info.scenario))
+    detector_process.serve(link, presence, stopped, say, drones, diameter_m)
+
+
+def of_camera(info: Info, names: Sequence[str]) -> list[str]:
+    """Return the drones of a camera process.
+
+    Raises:
+        RunError: no drone with a camera has such a name.
+    """
+    scenario = scenario_file.from_text(info.scenario)
+    with_cameras = [drone.name for drone in scenario.drones if drone.sensors.cameras()]
+    return chosen("camera: drone with a camera", names or ["*"], with_cameras)
+
+
+def of_detector(info: Info, names: Sequence[str]) -> list[str]:
+    """Return the drones of a detector process; their cameras need not be zsim's.
+
+    Raises:
+        RunError: no drone has such a name.
+    """
+    scenario = scenario_file.from_text(info.scenario)
+    everybody = [drone.name for drone in scenario.drones]
+    return chosen("detect: drone", names, everybody) if names else watched("", scenario) or everybody
+
+
+def stands_for(role: str, drones: Drones, names: Sequence[str], info: Info) -> tuple[str, ...]:
+    """Return the names of the processes, one for each drone, whose work a process for several does."""
+    return tuple(f"{role}.{drone}" for drone in drones(info, names))
+
+
+def slack_ns(role: str, info: Info) -> int:
+    """Return by how much the world may be ahead of a role; 0 for any, where nothing waits for it, as in a replay."""
+    gates = not info.replay_of and scenario_file.from_text(info.scenario).gates(role)
+    return SLACK_GATES * info.gate_ns if gates else 0
+
+
+def hat_diameter_m(scenario: Scenario) -> float:
+    """Return the diameter of the hats of a scenario."""
+    hats = scenario.environment.hats
+    return (Hats() if hats is UNSET else hats).diameter_m
