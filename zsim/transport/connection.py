@@ -14,9 +14,8 @@ from functools import partial
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError, NoWorldError, SessionError
 from zsim.transport import tls, zenoh_settings
-from zsim.transport.permissions import Permissions, permissions_of
 from zsim.transport.session import Query, Session, config_of, open_session
-from zsim.transport.tls import Identity
+from zsim.transport.tls import Identity, Permissions, permissions_of
 from zsim.transport.zenoh_settings import Mode, Settings
 
 ATTEMPT_S = 1.0  # one try to connect, so that waiting can be shown and interrupted

@@ -16,8 +16,7 @@ from zsim.errors import NoWorldError, SessionError
 from zsim.scenario.scenario import DRONES_MAX
 from zsim.transport import connection, zenoh_settings
 from zsim.transport.connection import find_world
-from zsim.transport.permissions import Permissions
-from zsim.transport.tls import Identity
+from zsim.transport.tls import Identity, Permissions
 
 
 class Silent:

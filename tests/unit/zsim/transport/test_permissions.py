@@ -6,7 +6,7 @@ from rights_table import KEYS, ROLES, SCENARIO, keys_of
 
 from zsim.contract import keys, messages
 from zsim.scenario import scenario_file
-from zsim.transport.permissions import Act, Permissions, permissions_of
+from zsim.transport.tls import Act, Permissions, permissions_of
 from zsim_deploy.inventory.enrolment import access_control
 
 ACTS: dict[Act, str] = {"publish": "p", "read": "r", "ask": "g"}
