@@ -5,17 +5,70 @@ a key alike. Participants must lose nothing, so everything blocks; a reader that
 before its link is full, or at once if it comes back and does so again.
 """
 
+import os
+import socket
+import stat
+import struct
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
-from zsim.transport.link_sockets import LinkSockets
-from zsim.transport.peer_process import command, local_socket, owner
+from zsim.contract import keys
 from zsim.transport.session import FarEnd, Session
-from zsim.transport.session_tokens import SessionTokens
+
+Sessions = frozenset[str]  # by Zenoh's names of them: hexadecimal digits
+
+
+class SessionTokens:
+    """The tokens that are there, kept up to date in threads of Zenoh's.
+
+    Args:
+        link: the listening session.
+    """
+
+    def __init__(self, link: Session) -> None:
+        self._link = link
+        self._sessions: dict[str, Sessions] = {}  # by process
+        self._alive: set[str] = set()
+
+    def watch(self) -> None:
+        """Keep up with the tokens from now on; those that are there are known at once."""
+        self._link.on_token(keys.token("**"), self._on_token)
+
+    def sessions(self, process: str) -> Sessions:
+        """Return the sessions that stand for a process; none for one that does not say so."""
+        return self._sessions.get(process, Sessions())
+
+    def shown(self) -> list[str]:
+        """Return the processes of which sessions are known."""
+        return list(self._sessions)
+
+    def is_alive(self, process: str) -> bool:
+        """Tell whether any session has a token of a process."""
+        return process in self._alive or process in self._sessions
+
+    def processes(self, session: str) -> tuple[str, ...]:
+        """Return the processes that a session stands for."""
+        return tuple(process for process, sessions in list(self._sessions.items()) if session in sessions)
+
+    def _on_token(self, key: str, alive: bool) -> None:
+        _, process, what = keys.parts(key)
+        if not what:
+            (self._alive.add if alive else self._alive.discard)(process)
+        elif session := keys.session_of(key):
+            others = self.sessions(process) - {session}
+            present = others | {session} if alive else others
+            if present:
+                self._sessions[process] = present
+            else:
+                self._sessions.pop(process, None)
+
 
 LOOK_S = 0.05  # wall time between two looks
 # Zenoh's thread that closes links is also the one that passes on what participants publish. Once that is blocked by a
@@ -195,3 +248,145 @@ class LinkWatch:
             self._refreshed_s = now_s
             self._far_ends = self._link.far_ends()
         return self._far_ends.get(address)
+
+
+if sys.platform == "linux":
+    import fcntl
+    import termios
+
+OWN_FILES = "/proc/self/fd"
+TCP_INFO = struct.Struct("68xI48xQ")  # tcpi_rtt [µs] and tcpi_bytes_acked in struct tcp_info, linux/tcp.h
+RESET, IN_BACKGROUND = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)  # struct linger, socket(7)
+QUEUED = struct.Struct("i")  # of SIOCOUTQ, linux/sockios.h: bytes that the far end has not acknowledged
+
+
+class Progress(NamedTuple):
+    """How many bytes a far end has acknowledged so far, -1 if it is gone, and how long that takes [s]."""
+
+    acknowledged: int
+    round_trip_s: float
+
+
+class LinkSockets:
+    """The connections as they are now; callable from any thread."""
+
+    def __init__(self) -> None:
+        self._far: dict[tuple[int, int], str] = {}  # address by file and inode; empty for what is no connection
+
+    def queued(self) -> dict[str, int]:
+        """Return how many bytes wait for each far end in the kernel."""
+        if sys.platform != "linux":
+            return {}
+        waiting = {}
+        for file, address in self._connections().items():
+            with suppress(OSError):
+                waiting[address] = QUEUED.unpack(fcntl.ioctl(file, termios.TIOCOUTQ, bytes(QUEUED.size)))[0]
+        return waiting
+
+    def progress(self, address: str) -> Progress:
+        """Return how far a far end has come."""
+        with suppress(OSError), self._open(address) as connection:
+            info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO.size)
+            round_trip_us, acknowledged = TCP_INFO.unpack(info)
+            return Progress(acknowledged, round_trip_us / 1e6)
+        return Progress(-1, 0.0)
+
+    def close(self, address: str) -> None:
+        """Close a connection and forget what it holds back; for Zenoh it is lost then."""
+        with suppress(OSError), self._open(address) as connection:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+            connection.shutdown(socket.SHUT_RDWR)
+
+    def _open(self, address: str) -> socket.socket:
+        """Return a connection as a socket of our own.
+
+        Raises:
+            OSError: it is gone.
+        """
+        for file, far in self._connections().items():
+            if far == address:
+                duplicate = socket.socket(fileno=os.dup(file))
+                if _far_end(duplicate) == address:
+                    return duplicate
+                duplicate.close()
+        raise OSError(f"{address}: no connection")
+
+    def _connections(self) -> dict[int, str]:
+        found = {}
+        for name in os.listdir(OWN_FILES):
+            with suppress(OSError):
+                status = os.fstat(int(name))
+                if stat.S_ISSOCK(status.st_mode):
+                    found[int(name), status.st_ino] = ""
+        self._far = {key: self._far[key] if key in self._far else _first_seen(key[0]) for key in found}
+        return {file: address for (file, _), address in self._far.items() if address}
+
+
+def _first_seen(file: int) -> str:
+    """Return the far end of a file, empty where it is no connection; who closes it from now on does not linger."""
+    try:
+        with socket.socket(fileno=os.dup(file)) as duplicate:
+            if address := _far_end(duplicate):
+                duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, IN_BACKGROUND)
+            return address
+    except OSError:
+        return ""
+
+
+def _far_end(connection: socket.socket) -> str:
+    """Return the far end of a TCP connection as Zenoh writes it, empty for any other socket."""
+    if connection.family not in (socket.AF_INET, socket.AF_INET6) or connection.type != socket.SOCK_STREAM:
+        return ""
+    try:
+        host, port, *_ = connection.getpeername()
+    except OSError:
+        return ""  # it listens
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+TABLES = ("/proc/net/tcp", "/proc/net/tcp6")
+COMMAND_MAX = 80  # characters of a command line that are shown
+
+
+def local_socket(address: str) -> str:
+    """Return the inode of the socket whose end has an address; empty if it is not on this machine."""
+    host, _, port = address.rpartition(":")
+    return _inode(f"{_table_form(host.strip('[]'))}:{int(port):04X}")
+
+
+def command(pid: str) -> str:
+    """Return pid and command of a process; empty without a pid."""
+    if not pid:
+        return ""
+    with suppress(OSError):
+        line = (Path("/proc") / pid / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        return f"pid {pid} ({' '.join(line.split())[:COMMAND_MAX]})"
+    return f"pid {pid}"
+
+
+def owner(inode: str) -> str:
+    """Return the pid of the process that has a socket open; empty if there is none, or we may not know."""
+    for pid in filter(str.isdigit, os.listdir("/proc")) if inode else ():
+        with suppress(OSError), os.scandir(f"/proc/{pid}/fd") as files:
+            for file in files:
+                with suppress(OSError):  # closed meanwhile
+                    if os.readlink(file.path) == f"socket:[{inode}]":
+                        return pid
+    return ""
+
+
+def _table_form(host: str) -> str:
+    """Return an address as those tables have it: 32-bit words in this machine's order, as on all that Linux has."""
+    packed = socket.inet_pton(socket.AF_INET6 if ":" in host else socket.AF_INET, host)
+    words = struct.unpack(f"={len(packed) // 4}I", packed)
+    return "".join(f"{word:08X}" for word in words)
+
+
+def _inode(end: str) -> str:
+    for table in TABLES:
+        with suppress(OSError), open(table, encoding="ascii") as lines:
+            for line in lines:
+                fields = line.split()
+                if fields[1] == end and fields[9] != "0":
+                    return fields[9]
+    return ""

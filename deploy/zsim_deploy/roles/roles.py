@@ -41,9 +41,8 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Hats
 from zsim.transport import tls
 from zsim.transport.connection import find_world, route
-from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch
+from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch, SessionTokens
 from zsim.transport.session import RawSample, Session
-from zsim.transport.session_tokens import SessionTokens
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_agents.cameras import camera_process, detector_process

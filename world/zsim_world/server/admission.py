@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import Join
-from zsim.transport.session_tokens import Sessions, SessionTokens
+from zsim.transport.link_watch import Sessions, SessionTokens
 from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.journal.journal_entries import Entry, FalselyJoined, Joined, NotShown

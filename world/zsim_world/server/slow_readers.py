@@ -6,9 +6,8 @@ import msgspec
 
 from zsim.contract import keys
 from zsim.contract.run_messages import Health
-from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch
+from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch, SessionTokens
 from zsim.transport.session import Session
-from zsim.transport.session_tokens import SessionTokens
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.journal.journal_entries import ReaderClosed
 from zsim_world.journal.run_journal import RunJournal

@@ -14,8 +14,8 @@ from zsim.runtime.agent import Output
 from zsim.runtime.health import HealthMeter, rare_collections
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
+from zsim.transport.link_watch import SessionTokens
 from zsim.transport.session import Query, Session
-from zsim.transport.session_tokens import SessionTokens
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator

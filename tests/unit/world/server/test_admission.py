@@ -6,7 +6,7 @@ from fake_link import FakeLink
 from zsim.contract import keys
 from zsim.contract.run_messages import ControlRequest, Done, Event, Join
 from zsim.scenario import scenario_file
-from zsim.transport.session_tokens import SessionTokens
+from zsim.transport.link_watch import SessionTokens
 from zsim_world.flight.budgets import STRANGERS_MAX
 from zsim_world.flight.world import World
 from zsim_world.server.admission import DONE_NS, HELD_NS, LOOK_NS, SHOWN_NS, TOKEN_NS, WITHHELD_MAX, Admission

@@ -6,8 +6,7 @@ from fake_link import FakeLink
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import Health
 from zsim.scenario import scenario_file
-from zsim.transport.link_watch import ClosedLink
-from zsim.transport.session_tokens import SessionTokens
+from zsim.transport.link_watch import ClosedLink, SessionTokens
 from zsim_world.flight.budgets import STRANGERS_MAX
 from zsim_world.flight.world import World
 from zsim_world.journal.run_journal import RunJournal

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from zsim.transport.link_sockets import LinkSockets
+from zsim.transport.link_watch import LinkSockets
 
 LINGER = struct.Struct("ii")  # socket(7): whether, and for how many seconds
 

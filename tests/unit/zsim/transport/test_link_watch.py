@@ -6,7 +6,6 @@ import socket
 from fake_link import FakeLink
 
 from zsim.contract import keys
-from zsim.transport.link_sockets import Progress
 from zsim.transport.link_watch import (
     HELD_BYTES,
     KEPT_OUT_S,
@@ -17,9 +16,10 @@ from zsim.transport.link_watch import (
     TOLD_S,
     Awaited,
     LinkWatch,
+    Progress,
+    SessionTokens,
 )
 from zsim.transport.session import FarEnd
-from zsim.transport.session_tokens import SessionTokens
 
 READER, RECORDER, ROUTER, ESTIMATOR = (f"10.0.0.{number}:{number}" for number in range(1, 5))
 FAR_ENDS = {READER: FarEnd("r", False), RECORDER: FarEnd("rec", False), ROUTER: FarEnd("x", True)}
