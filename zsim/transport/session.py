@@ -18,9 +18,8 @@ from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
 from zsim.transport import tls, zenoh_settings
-from zsim.transport.open_files import SESSION_FILES, require_files
 from zsim.transport.tls import Act, Identity, Permissions
-from zsim.transport.zenoh_settings import Mode, Settings
+from zsim.transport.zenoh_settings import SESSION_FILES, Mode, Settings, require_files
 
 QUEUE_MAX = 1_000_000  # messages; a subscription that is not read blocks the whole link once it is full
 

@@ -71,7 +71,7 @@ def console(
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
     require("console", CONSOLE_NEEDS)
     from zsim.runtime.progress import JsonProgress
-    from zsim.transport.open_files import SERVER_FILES, require_files
+    from zsim.transport.zenoh_settings import SERVER_FILES, require_files
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.server.http_proxy import ListenAddress
     from zsim_deploy.roles.roles import log_printer, process_name, serve_runs
@@ -102,7 +102,7 @@ def gateway(
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     require("gateway", GATEWAY_NEEDS)
     from zsim.transport.connection import find_world
-    from zsim.transport.open_files import SERVER_FILES, allow_files, require_files
+    from zsim.transport.zenoh_settings import SERVER_FILES, allow_files, require_files
     from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
     from zsim_bridges.web.http_connections import CONNECTIONS_MAX
     from zsim_deploy.roles.process_control import lower_priority

@@ -48,7 +48,7 @@ def up(
     """
     require("up", UP_NEEDS | (REPORT_NEEDS if report else {}))
     from zsim.scenario.rights import ROUTER
-    from zsim.transport.open_files import host_launcher_files, require_files
+    from zsim.transport.zenoh_settings import host_launcher_files, require_files
     from zsim_deploy.cli.record_commands import conclude
     from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
     from zsim_deploy.hosts.status_table import StatusTable

@@ -21,8 +21,8 @@ from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.external_bodies import driver_lines
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
-from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
+from zsim.transport.zenoh_settings import launcher_files, require_files
 from zsim_agents.hosting import agents_of
 from zsim_deploy.arguments import changed_options, load_scenario, pace_options
 from zsim_deploy.inventory.processes import COMMANDS

@@ -18,9 +18,9 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport import connection
-from zsim.transport.open_files import hub_files, require_files
 from zsim.transport.session import check_expression
 from zsim.transport.tls import Identity
+from zsim.transport.zenoh_settings import hub_files, require_files
 from zsim_deploy.roles.process_control import StopChannel
 
 if TYPE_CHECKING:
