@@ -8,7 +8,6 @@ import math
 import re
 import sys
 import threading
-import time
 from collections.abc import Callable
 from typing import Any, Protocol, Self
 
@@ -58,21 +57,6 @@ class SlowStart:
     def over(self) -> None:
         """Say nothing any more: it has started, or will not."""
         self._timer.cancel()
-
-
-class Throttle:
-    """Lets one in PERIOD_S pass."""
-
-    def __init__(self, period_s: float = PERIOD_S) -> None:
-        self._period_s = period_s
-        self._last_s = 0.0
-
-    def passes(self) -> bool:
-        now_s = time.monotonic()
-        if now_s - self._last_s < self._period_s:
-            return False
-        self._last_s = now_s
-        return True
 
 
 class HoldReasons:

@@ -8,7 +8,7 @@ import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Iterator
 from operator import itemgetter
 from typing import Any
 
@@ -22,7 +22,7 @@ from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
 from zsim.runtime.health import HealthMeter, rare_collections
 from zsim.runtime.inbox import Inbox, RoutingTable, output_hold_ns
-from zsim.runtime.membership import Membership
+from zsim.runtime.participant import AgentParticipant
 from zsim.scenario.fault_kinds import PROCESS_KILL
 from zsim.schema import plugin
 from zsim.transport.session import Query, RawSample, ReceivedSample, Session, Subscription
@@ -41,7 +41,8 @@ class Runner:
         agent: what to run.
         stopped: asked every TICK_S; True ends the process with a bye.
         say: called with lines for the user.
-        deserted: asked at the end; True leaves without a bye, as one that dies, so that the world waits for a new one.
+        deserted: asked at the end; True leaves without a bye, as a process that dies, so that the world waits for a
+            successor.
         snapshot_ns: simulated time between two snapshots of the agent; 0 for none.
 
     Attributes:
@@ -64,16 +65,16 @@ class Runner:
         self._stopped = stopped
         self._say = say
         self._deserted = deserted
-        self.health = HealthMeter(agent.role, host=link.host, reads=link.reads)
+        self._member = AgentParticipant(link, info, agent, self._take_in, say, stopped=stopped)
+        self.health = self._member.health
         self._inputs = RunnerInputs(link, info, agent, self.health, say)
         self._inbox = self._inputs.inbox
-        self._member = Membership(link, info, agent, self._inputs.take_in, say, stopped=stopped)
         self._snapshot_ns = snapshot_ns
         self._snapshot_due_ns = 0
         self._resumed_ns: int | None = None
         self._list_seq = -1
         self._kills: dict[int, run_messages.Fault] = {}  # by id
-        self._lives_after_ns: int | None = None  # what was to die up to this gate was an earlier one of its name
+        self._lives_after_ns: int | None = None  # faults up to this gate were to kill a predecessor
         self._lacks = False
         self._view_wall_s = 0.0
         self._end_ns: int | None = None
@@ -122,6 +123,9 @@ class Runner:
             self._member.leave(self._leave)
         return self._leave
 
+    def _take_in(self, sample: ReceivedSample) -> None:
+        self._inputs.take_in(sample)
+
     # One turn
 
     def _turn(self) -> None:
@@ -136,13 +140,10 @@ class Runner:
         if self._leave is None:
             self._look_for_end()
         if self._leave is None and not stepped:
-            self._wait()
-
-    def _wait(self) -> None:
-        try:
-            self._inputs.wait()
-        except SessionError:
-            self._leave = self._leave or "session closed"
+            try:
+                self._inputs.wait()
+            except SessionError:
+                self._leave = self._leave or "session closed"
 
     def _ready_gate(self) -> int | None:
         """Return the gate to step now, None if it must be waited for."""
@@ -152,9 +153,12 @@ class Runner:
             return None
         if self._inbox.missing(t_ns) is None:
             return t_ns
-        if self._info.mode == "realtime":
-            return self._give_up(t_ns)
-        return self._find_lost(t_ns)
+        if self._info.mode == "lockstep":
+            return self._find_lost(t_ns)
+        if self._inbox.latest_gate_ns() == t_ns:
+            return None
+        self.health.dropped += 1  # the next gate is there: this one is stepped with what has come
+        return t_ns
 
     def _reaches_back(self, t_ns: int) -> bool:
         """Tell whether, after a snapshot, the gate that follows it is there, which the world brings again."""
@@ -178,13 +182,6 @@ class Runner:
         self._lacks = self._inbox.missing(t_ns) is not None
         return None if self._lacks else t_ns
 
-    def _give_up(self, t_ns: int) -> int | None:
-        """In realtime an incomplete gate is stepped with what there is once the next one is there."""
-        if self._inbox.latest_gate_ns() == t_ns:
-            return None
-        self.health.dropped += 1
-        return t_ns
-
     def _step(self, t_ns: int) -> None:
         start_ns = time.perf_counter_ns()
         self._update_faults(t_ns)
@@ -193,43 +190,35 @@ class Runner:
         outputs = self._agent.answer(t_ns, self._inbox.take(t_ns))
         if outputs is None:
             return
-        self._member.publish(t_ns, outputs)
-        self._take_snapshot(t_ns)
-        self._show(t_ns)
-        self._die(t_ns)
-        self.health.step(time.perf_counter_ns() - start_ns)
-        newest_ns = self._inbox.latest_gate_ns()
-        self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
-
-    def _take_snapshot(self, t_ns: int) -> None:
+        self._member.publish_gate(t_ns, outputs)
         if self._snapshot_ns and t_ns >= self._snapshot_due_ns and t_ns > self._member.published_ns:
             self._snapshot_due_ns = t_ns + self._snapshot_ns
             self._member.publish_snapshot(t_ns)
-
-    def _show(self, t_ns: int) -> None:
-        """Publish what is to be displayed, as often as people can follow."""
         now_s = time.monotonic()
         if now_s - self._view_wall_s >= VIEW_PERIOD_S:
             self._view_wall_s = now_s
             for key, message in self._agent.views(t_ns):
                 self._link.put(key, message)
+        self._die(t_ns)
+        self.health.step(time.perf_counter_ns() - start_ns)
+        newest_ns = self._inbox.latest_gate_ns()
+        self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
 
     def _update_faults(self, t_ns: int) -> None:
-        """Take the lists of faults that the world published before a gate."""
+        """Take the lists of faults that the world published before a gate.
+
+        A list may have forgotten a kill that a late process has still to die of; one that has not begun when a list
+        is published, and is not on it, has been cleared.
+        """
         for faults in self._inputs.fault_lists_before(t_ns):
             self._agent.update_faults(self._info, faults)
             if faults.seq > self._list_seq:
                 self._list_seq = faults.seq
-                self._update_kills(faults)
-
-    def _update_kills(self, faults: run_messages.Faults) -> None:
-        """Note which kills are its own: a list may have forgotten one that a late process has still to die of.
-
-        One that has not begun when a list is published, and is not on it, is cleared.
-        """
-        names, t_ns = (self._agent.name, *self._agent.serves), faults.t_ns
-        begun = {n: kill for n, kill in self._kills.items() if kill.until_ns is not None and kill.until_ns <= t_ns}
-        self._kills = begun | {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
+                kills = self._kills.values()
+                begun = {f.id: f for f in kills if f.until_ns is not None and f.until_ns <= faults.t_ns}
+                names = self._agent.name, *self._agent.serves
+                listed = {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
+                self._kills = begun | listed
 
     def _die(self, t_ns: int) -> None:
         """End, if a fault kills it in one of the gates that it has lived; their outputs still go out."""
@@ -239,8 +228,6 @@ class Runner:
         for fault in self._kills.values():
             if lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
                 self._leave, self.killed = f"killed by fault {fault.id}", True
-
-    # Beginning and end
 
     def _look_for_end(self) -> None:
         if self._stopped():
@@ -256,10 +243,7 @@ class Runner:
         while not self._over.wait(TICK_S):
             if self._stopped() or self._end_ns is not None or self._lacks or self._member.owes:
                 self._inputs.wake()
-            if self.health.due():
-                seq = self._agent.next_seq("health")
-                health = self.health.message(max(0, self._member.done_ns), seq)
-                self._link.put(keys.process(self._agent.name, "health"), health)
+            self._member.publish_health()
 
     def _serve_rare(self) -> None:
         while self._inputs.notices:
@@ -280,7 +264,7 @@ class Runner:
         elif read.kind in ("drop", "leave"):
             self._inputs.ignore_estimates(read.subject)
         elif isinstance(read.data, ProcessEntry) and read.subject == self._agent.name:
-            self._member.taken_in(read.data)
+            self._member.take_entry(read.data)
         elif isinstance(read.data, ProcessEntry) and read.kind == "join":
             self._inputs.expect_estimates(read.subject, read.data.from_ns)
 
@@ -305,7 +289,7 @@ class Runner:
 
 
 class RunnerInputs:
-    """The subscriptions of one agent.
+    """The subscriptions of one agent, sorted into its inbox, and what other threads of Zenoh bring.
 
     Args:
         link: an open session.
@@ -339,15 +323,25 @@ class RunnerInputs:
         self._subscriptions: dict[str, Subscription] = {}
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
         self._table = run_key_table(info)
-        self._gate_key = _gate_key(agent, self._external)
+        self._gate_key = self._choose_gate_key()
         self.notices: deque[WorldEvent] = deque()
         self.queries: deque[Query] = deque()
         self.links: deque[bool] = deque()
         self._fault_lists: deque[run_messages.Faults] = deque()
         self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and number
 
+    def _choose_gate_key(self) -> str:
+        """Return the key on which the agent takes the sensors of a gate as GateMessages; empty for none.
+
+        Sensors of external drones come on their own keys, from drivers.
+        """
+        of_world = [drone for drone in self._agent.counted if drone not in self._external]
+        if of_world and len(self._agent.counted) > 1:
+            return keys.GATE
+        return keys.gate(of_world[0]) if of_world and self._agent.takes_gates else ""
+
     def subscribe(self) -> None:
-        """Subscribe to all that the agent reads, and answer its requests; show that the process lives."""
+        """Subscribe to all that the agent reads, answer its requests, and show that the process lives."""
         closing = [self._agent.reads[place] for place in self._expressions.readers_of_any(self._agent.gate_keys)]
         for expression in dict.fromkeys([*closing, *self._agent.reads]):
             of_world = keys.is_sensor(expression) and keys.thing(expression) not in self._external
@@ -359,9 +353,8 @@ class RunnerInputs:
         if self._is_realtime:
             self._link.declare_subscriber(keys.CLOCK, self._on_clock)
         self._link.on_link(self._on_link)
-        for key in self._agent.control_keys():
+        for key in (*self._agent.control_keys(), keys.process(self._agent.name, "outputs")):
             self._link.declare_queryable(key, self._on_query)
-        self._link.declare_queryable(keys.process(self._agent.name, "outputs"), self._on_query)
         self._link.declare_process(self._agent.name)
 
     def wait(self) -> None:
@@ -375,6 +368,12 @@ class RunnerInputs:
         self._blocking = None
         if sample is not None:
             self._open(sample)
+
+    def _blocking_expression(self) -> str:
+        """Return the subscription from which the next missing message comes."""
+        wanted = self.inbox.last_missing() or self._agent.gate_keys[-1]
+        expression = self._agent.reads[self._expressions.readers(wanted)[0]]
+        return expression if expression in self._subscriptions else self._gate_key
 
     def wake(self) -> None:
         """Let a `wait` of another thread return."""
@@ -420,6 +419,11 @@ class RunnerInputs:
             self._estimated_by[sample.key] = message.source
         self.inbox.put(sample.key, message)
 
+    def _refuse(self, error: DecodeError) -> None:
+        self._health.refused += 1
+        if self._health.refused == 1:
+            self._say(str(error))
+
     def fault_lists_before(self, t_ns: int) -> list[run_messages.Faults]:
         """Return the lists of faults that were published before a gate, and forget them; an older one is of no use."""
         if not self._fault_lists:
@@ -429,23 +433,10 @@ class RunnerInputs:
         return sorted((faults for faults in lists if faults.t_ns < t_ns), key=lambda faults: faults.seq)
 
     def repeated(self, t_ns: int) -> Iterator[tuple[str, Any]]:
-        """Yield, and forget, the requests that a former incarnation took before a gate."""
+        """Yield, and forget, the requests that the predecessor took before a gate."""
         if self._repeated:
             for (key, _), request in sorted(self._repeated.pop(t_ns, {}).items(), key=itemgetter(0)):
                 yield key, request
-
-    def _refuse(self, error: DecodeError) -> None:
-        self._health.refused += 1
-        if self._health.refused == 1:
-            self._say(str(error))
-
-    def _blocking_expression(self) -> str:
-        """Return the subscription from which the next missing message comes."""
-        t_ns = self.inbox.next_gate_ns()
-        missing = self.inbox.missing_last(t_ns) if t_ns is not None else self.inbox.awaited_last()
-        wanted = missing or self._agent.gate_keys[-1]
-        expression = self._agent.reads[self._expressions.readers(wanted)[0]]
-        return expression if expression in self._subscriptions else self._gate_key
 
     def ignore_estimates(self, process: str) -> None:
         """Wait no longer for the estimates of a process: those that it published last, or has the name for."""
@@ -459,20 +450,20 @@ class RunnerInputs:
             if process in (self._estimated_by.get(key), stock):
                 self.inbox.expect(key, from_ns)
 
-    # From threads of Zenoh's
+    # In threads of Zenoh
 
     def _on_event(self, sample: RawSample) -> None:
         try:
             read = world_events.read(sample.payload)
         except DecodeError:
-            self._health.refused += 1  # somebody else's; the world's own events can be read
+            self._health.refused += 1  # of somebody else; the world's own events can be read
             return
         if read is not None:
             self.notices.append(read)
             self.wake()
 
     def _on_clock(self, sample: RawSample) -> None:
-        """Wake who waits, in realtime, for a gate behind which the world is: what it lacks may never come."""
+        """In realtime, end a wait for a gate that the world has left behind: what it lacks may never come."""
         blocking = self._blocking
         if blocking is None:
             return
@@ -494,14 +485,3 @@ class RunnerInputs:
     def _on_query(self, query: Query) -> None:
         self.queries.append(query)
         self.wake()
-
-
-def _gate_key(agent: Agent, external: Container[str]) -> str:
-    """Return on which key an agent takes the sensors of a gate as GateMessages; none for one that does not.
-
-    What drivers publish of external drones comes on the keys of these.
-    """
-    of_world = [drone for drone in agent.counted if drone not in external]
-    if of_world and len(agent.counted) > 1:
-        return keys.GATE
-    return keys.gate(of_world[0]) if of_world and agent.takes_gates else ""

@@ -10,6 +10,7 @@ from typing import Any
 import viser
 
 from zsim.contract.messages import Info
+from zsim.runtime.participant import Participant
 from zsim.transport.session import Session
 from zsim_bridges.console.flying.page_flying import PageFlying
 from zsim_bridges.console.monitoring.page_head import no_run_head
@@ -25,7 +26,6 @@ from zsim_bridges.console.server.page_messages import PageControls, is_permitted
 from zsim_bridges.console.server.page_tokens import OPERATOR, VIEWER
 from zsim_bridges.console.server.private_viser import PrivateViser
 from zsim_bridges.console.server.run_files import RunFiles
-from zsim_bridges.observer_process import ObserverProcess
 
 REASON_S = 0.1  # wall; between two looks for a reason to end
 OFFER_S = 20.0  # wall; how long pages may take to copy what a run left behind: 100 MB over Wi-Fi of 40 Mbit/s
@@ -96,7 +96,7 @@ class Console:
         self,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         stopped: Callable[[], bool],
         say: Callable[[str], None],
     ) -> None:

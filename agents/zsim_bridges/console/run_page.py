@@ -14,6 +14,7 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
 from zsim.contract.views import EstimateView, ViewCluster
 from zsim.errors import DocumentError, RunError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Hats
@@ -41,7 +42,6 @@ from zsim_bridges.console.scene.camera_frustums import CameraFrustums
 from zsim_bridges.console.scene.picture import DronePoses, FormationShape, drone_poses
 from zsim_bridges.console.scene.picture_rate import picture_rate_hz
 from zsim_bridges.console.scene.run_scene import RunScene
-from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
 STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
@@ -88,7 +88,7 @@ class RunPage:
         server: viser.ViserServer,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         camera_follow: CameraFollow,
         frustums: CameraFrustums,
         rate_hz: float | None,

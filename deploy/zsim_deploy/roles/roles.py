@@ -33,6 +33,7 @@ from zsim.errors import (
 from zsim.output_folder import no_locks
 from zsim.runtime.agent import Agent, AgentGroup
 from zsim.runtime.inbox import output_hold_ns
+from zsim.runtime.participant import Participant
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, ROUTER, watched
@@ -47,7 +48,6 @@ from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_agents.cameras import camera_process, detector_process
 from zsim_agents.hosting import agent_class, chosen, hosted, made
-from zsim_bridges.observer_process import ObserverProcess
 from zsim_deploy import USER_FAULT
 from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.process_control import StopChannel
@@ -59,7 +59,7 @@ PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits
 
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
-Serve = Callable[[Session, Info, ObserverProcess, Stopped, Say], None]
+Serve = Callable[[Session, Info, Participant, Stopped, Say], None]
 """Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
 StandsFor = Callable[[Info], tuple[str, ...]]  # names of processes whose work a process does in a run
 SlackNs = Callable[[Info], int]  # by how much the world of a run may be ahead of a process; 0 for any
@@ -259,7 +259,7 @@ def serve_runs(
             ):
                 if info.run_id != served:
                     own_name = _free(link, own_name)
-                    presence = ObserverProcess(link, info, own_name, stands_for(info), slack_ns(info))
+                    presence = Participant(link, info, own_name, stands_for(info), slack_ns(info))
                     try:
                         _serve(serve, link, presence, info, stop, say)
                         served = info.run_id
@@ -291,7 +291,7 @@ def _free(link: Session, name: str) -> str:
     return next(free for i in count(1) if keys.token(free := f"{role}.{i}") not in taken)
 
 
-def _next(name: str, presence: ObserverProcess) -> str:
+def _next(name: str, presence: Participant) -> str:
     """Return the name under which to come in again; two that were to choose a number may have chosen the same one.
 
     Raises:
@@ -303,7 +303,7 @@ def _next(name: str, presence: ObserverProcess) -> str:
     return f"{role}.{int(presence.name.rpartition('.')[2]) + 1}"
 
 
-def _serve(serve: Serve, link: Session, presence: ObserverProcess, info: Info, stop: StopChannel, say: Say) -> None:
+def _serve(serve: Serve, link: Session, presence: Participant, info: Info, stop: StopChannel, say: Say) -> None:
     if not presence.gates:
         presence.announce()
     say(f"{presence.name}: in run {info.run_id}")
@@ -436,7 +436,7 @@ Drones = Callable[[Info, Sequence[str]], list[str]]
 
 
 def camera(
-    link: Session, info: Info, presence: ObserverProcess, stopped: Stopped, say: Say, names: Sequence[str]
+    link: Session, info: Info, presence: Participant, stopped: Stopped, say: Say, names: Sequence[str]
 ) -> None:
     """Serve a run with pictures of the cameras of some drones, named or by patterns.
 
@@ -451,7 +451,7 @@ def camera(
 def detector(
     link: Session,
     info: Info,
-    presence: ObserverProcess,
+    presence: Participant,
     stopped: Stopped,
     say: Say,
     names: Sequence[str],

@@ -7,14 +7,14 @@ from fake_link import FakeLink
 from zsim.contract import keys
 from zsim.contract.messages import Info, Origin
 from zsim.contract.run_messages import Event
-from zsim_bridges.observer_process import ObserverProcess
+from zsim.runtime.participant import Participant
 
 INFO = Info(0, 0, 1, "r", "zsim", "lockstep", 0.0, 1, 1, 1, 1, Origin(0.0, 0.0, 0.0), (), (), "", "", "", "")
 ME = "console.1"
 
 
-def joined(link: FakeLink) -> ObserverProcess:
-    observer = ObserverProcess(link, INFO, ME)  # type: ignore[arg-type]
+def joined(link: FakeLink) -> Participant:
+    observer = Participant(link, INFO, ME)  # type: ignore[arg-type]
     observer.announce()
     tell(link, "join", link.published_on("process/*/join")[0].incarnation, os.getpid())
     return observer

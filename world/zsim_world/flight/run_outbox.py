@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys, run_messages
 from zsim.contract.snapshot import State
+from zsim.runtime.rate_limit import SUBJECTS_MAX, RateLimit
 from zsim.scenario.rights import WORLD
-from zsim_world.flight.budgets import CHANGES_MAX, SECOND_NS, SUBJECTS_MAX, ChangeBudget
+from zsim_world.flight.budgets import CHANGES_MAX, SECOND_NS
 
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
 EVENTS_MAX = 20  # events per source, subject and reason; further refusals are counted only
@@ -51,7 +52,7 @@ class RefusalLog:
 
     def __init__(self, now_ns: Callable[[], int] = lambda: 0) -> None:
         self.count = 0
-        self._total = ChangeBudget(now_ns, SECOND_NS, REFUSED_MAX)
+        self._total = RateLimit(SECOND_NS, REFUSED_MAX, now_ns)
         self._counts: dict[tuple[str, str], dict[str, int]] = {}
 
     def add(self, source: str, subject: str, reason: str) -> str | None:
@@ -105,7 +106,7 @@ class RunOutbox:
         self.refusals = RefusalLog(now_ns)
         self.refused_requests = RefusalLog(now_ns)
         self.left_out = 0
-        self._notices = ChangeBudget(now_ns, SECOND_NS)
+        self._notices = RateLimit(SECOND_NS, CHANGES_MAX, now_ns)
 
     def snapshot(self) -> State:
         """Return the numbers of the keys, and what was refused."""

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
 from zsim.errors import DecodeError, ZsimError
+from zsim.runtime.participant import Participant
 from zsim.sensors.camera import CAMERAS
 from zsim.sensors.jpeg_header import PictureError
 from zsim.transport.session import RawSample, Session
 from zsim_bridges.console.cameras import camera_marks
 from zsim_bridges.console.cameras.camera_marks import Mark
 from zsim_bridges.console.cameras.picture_check import PICTURE_BYTES_MAX, check_picture
-from zsim_bridges.observer_process import ObserverProcess
 
 ASKED_S = 15.0  # wall; a page that has shown nothing for so long sleeps: a slow one takes seconds for a picture
 MESSAGE_BYTES = 1_000  # of a picture's message beside its data, at most; chosen
@@ -64,7 +64,7 @@ class CameraFeed:
     def __init__(
         self,
         link: Session,
-        observer: ObserverProcess,
+        observer: Participant,
         drones: Iterable[str],
         hat_m: float,
         wall_s: Callable[[], float] = time.monotonic,

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from zsim.contract import keys, run_messages
 from zsim.errors import ZsimError
+from zsim.runtime.participant import Participant
 from zsim.transport.session import Session
-from zsim_bridges.observer_process import ObserverProcess
 
 POLL_S = 0.25  # wall; rarely, since a message of each gate costs the world time
 ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
@@ -82,7 +82,7 @@ class TimeMonitor:
     def __init__(
         self,
         link: Session,
-        observer: ObserverProcess,
+        observer: Participant,
         stamp_age_s: float = math.inf,
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:

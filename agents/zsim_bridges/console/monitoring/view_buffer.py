@@ -17,10 +17,10 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
+from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
 from zsim_bridges.console.monitoring.alarms import Losses
 from zsim_bridges.console.monitoring.event_log import EventLog
-from zsim_bridges.observer_process import ObserverProcess
 
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
 
@@ -90,7 +90,7 @@ class ViewBuffer:
         self,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         variables: Mapping[str, tuple[str, ...]],
         refused: Callable[[Event], None],
         wall_s: Callable[[], float] = time.monotonic,

@@ -12,8 +12,8 @@ from fake_link import FakeLink
 from zsim.contract import keys
 from zsim.contract.messages import Info, Origin
 from zsim.errors import NoWorldError, RunError
+from zsim.runtime.participant import Participant
 from zsim.transport.tls import Identity
-from zsim_bridges.observer_process import ObserverProcess
 from zsim_deploy.roles import roles
 
 ME = "driver.ghost"
@@ -35,7 +35,7 @@ class NotStopped:
 
 def test_who_refuses_a_run_says_bye_with_the_reason():
     link: Any = FakeLink()
-    presence = ObserverProcess(link, INFO, ME)
+    presence = Participant(link, INFO, ME)
     stop: Any = NotStopped()
 
     def serve(*_: object) -> None:

@@ -15,9 +15,9 @@ from zsim.contract.run_messages import Clock, ControlAnswer, Snapshot
 from zsim.contract.snapshot import VERSION, pack
 from zsim.contract.world_events import ProcessEntry
 from zsim.errors import DecodeError, NoWorldError
-from zsim.runtime import membership
+from zsim.runtime import participant
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.membership import RETRY_S, Membership, replay
+from zsim.runtime.participant import RETRY_S, AgentParticipant, replay
 from zsim.transport.session import ReceivedSample
 
 GATE_NS = 20_000_000
@@ -45,7 +45,7 @@ class Wall:
 
 def test_what_is_not_answered_is_asked_for_again_after_a_while():
     link, wall, came = FakeLink(), Wall(), []
-    member = Membership(link, INFO, Quiet(), came.append, lambda text: None, wall)  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), came.append, lambda text: None, wall)  # type: ignore[arg-type]
     for turns in (1, 2, 3):
         for _ in range(5):
             member.ask_again(3 * GATE_NS, "drone/d1/truth")
@@ -61,7 +61,7 @@ def test_what_is_not_answered_is_asked_for_again_after_a_while():
 
 def test_another_gate_is_asked_for_at_once():
     link = FakeLink()
-    member = Membership(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     for gate in (3, 4):
         member.ask_again(gate * GATE_NS, "drone/d1/truth")
     assert [args["from_ns"] // GATE_NS for _, args in link.requests] == [2, 3]
@@ -73,7 +73,7 @@ def test_what_an_inbox_holds_back_is_asked_for_where_there_is_such_a_hold(mode: 
     link, agent = FakeLink(), Quiet()
     agent.reads = (*Quiet.reads, "drone/d2/estimate")
     info = replace(INFO, mode=mode)
-    member = Membership(link, info, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    member = AgentParticipant(link, info, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     member.ask_again(3 * GATE_NS, "drone/d1/truth")
     assert [args["from_ns"] // GATE_NS for _, args in link.requests] == [from_gate]
 
@@ -81,7 +81,7 @@ def test_what_an_inbox_holds_back_is_asked_for_where_there_is_such_a_hold(mode: 
 def test_who_did_not_join_as_the_news_of_its_own_process_say_joins_again():
     link = FakeLink()
     link.last = {keys.INFO: messages.encode(INFO)}
-    member = Membership(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     member.enter()
     member.taken_in(ProcessEntry(7, link.host, os.getpid(), 0, former_pid=os.getpid()))
     first, second = link.published_on("process/*/join")
@@ -98,7 +98,7 @@ def test_who_did_not_join_as_the_news_of_its_own_process_say_joins_again():
 def test_a_join_is_repeated_until_the_world_has_taken_it_in():
     link, wall = FakeLink(), Wall()
     link.admits, link.last = False, {keys.INFO: messages.encode(INFO)}
-    member = Membership(link, INFO, Quiet(), lambda sample: None, lambda text: None, wall)  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), lambda sample: None, lambda text: None, wall)  # type: ignore[arg-type]
     member.enter()
     for _ in range(3):
         wall.now_s += RETRY_S
@@ -126,15 +126,17 @@ def test_a_snapshot_is_asked_for_until_a_world_answers(monkeypatch: pytest.Monke
         keys.CLOCK: messages.encode(Clock(2 * GATE_NS, 0, "r", 2, "running", 1.0)),
         keys.INFO: messages.encode(INFO),
     }
-    monkeypatch.setattr(membership.time, "sleep", lambda wall_s: link.last.update(kept))  # it is there when asked again
-    member = Membership(link, INFO, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    monkeypatch.setattr(
+        participant.time, "sleep", lambda wall_s: link.last.update(kept)
+    )  # it is there when asked again
+    member = AgentParticipant(link, INFO, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     assert (member.resume(), states) == (GATE_NS, [{"count": 3}])
 
 
 def test_whoever_is_to_end_waits_for_no_world():
     link = FakeLink()
     settings = (lambda sample: None, lambda text: None, Wall(), lambda: True)
-    member = Membership(link, INFO, Quiet(), *settings)  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), *settings)  # type: ignore[arg-type]
     assert member.resume() is None
 
 

@@ -26,7 +26,7 @@ from zsim.contract.run_messages import (
 )
 from zsim.contract.snapshot import VERSION, State, pack, unpack
 from zsim.errors import BehindError, RunError, SupersededError, UserCodeError
-from zsim.runtime import membership
+from zsim.runtime import participant
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
 
@@ -321,7 +321,7 @@ def test_after_a_lost_link_it_rejoins_as_soon_as_the_world_answers(hears: bool):
     joins = world.published_on(keys.process(ME, "join"))
     again = 1 if hears else len(joins) - 1
     assert (again > 1) != hears
-    assert again <= 1 + membership.REJOINS_MAX
+    assert again <= 1 + participant.REJOINS_MAX
     assert [done.done_ns // GATE_NS for done in dones[:4]] == [0, 1, 0, 1]
     assert {done.done_ns // GATE_NS for done in dones[4:]} >= set(range(2, END + 1))
     assert len(dones) == END + 3 or not hears
@@ -505,7 +505,7 @@ def test_it_steps_again_what_came_since_its_snapshot_and_publishes_what_the_form
         snapshot_of(1, own={"count": 7, "raises": True}),
         snapshot_of(Restarting.DIED + 1),
         Snapshot(GATE_NS, 0, ME, VERSION, b"\xc1"),
-        replace(snapshot_of(1), t_ns=-2 * membership.RESUME_NS),
+        replace(snapshot_of(1), t_ns=-2 * participant.RESUME_NS),
     ],
     ids=["other version", "other state", "half of it", "of the future", "garbage", "old"],
 )
