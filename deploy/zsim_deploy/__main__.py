@@ -15,7 +15,7 @@ def main() -> None:
     takes_interrupts = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where a shell has it ignored
     if takes_interrupts:
         signal.signal(signal.SIGINT, _leave)
-    from zsim_deploy.roles.process_control import renew_streams
+    from zsim_deploy.roles.closed_output import renew_streams
 
     renew_streams()
     from zsim_deploy.cli import cli

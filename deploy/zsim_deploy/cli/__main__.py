@@ -1,6 +1,6 @@
 """`python -m zsim_deploy.cli`: the command line of this interpreter's environment."""
 
-from zsim_deploy.roles.process_control import renew_streams
+from zsim_deploy.roles.closed_output import renew_streams
 
 renew_streams()
 

@@ -105,8 +105,8 @@ def gateway(
     from zsim.transport.zenoh_settings import SERVER_FILES, allow_files, require_files
     from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
     from zsim_bridges.web.http_connections import CONNECTIONS_MAX
-    from zsim_deploy.roles.process_control import lower_priority
     from zsim_deploy.roles.roles import log_printer, process_name, serve_runs
+    from zsim_deploy.roles.stop_channel import lower_priority
 
     lower_priority()
     who = reach.who
@@ -153,8 +153,8 @@ def ros1(
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     require("ros1", ROS1_NEEDS)
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
-    from zsim_deploy.roles.process_control import lower_priority
     from zsim_deploy.roles.roles import process_name, serve_runs
+    from zsim_deploy.roles.stop_channel import lower_priority
 
     lower_priority()
     own_name = process_name("ros1", name, reach.who)
@@ -185,8 +185,8 @@ def ros2(
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
-    from zsim_deploy.roles.process_control import lower_priority
     from zsim_deploy.roles.roles import process_name, serve_runs
+    from zsim_deploy.roles.stop_channel import lower_priority
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"

@@ -62,8 +62,8 @@ def _serve(
     role: str, serve: "Serve", chosen: "Chosen", reach: WorldAccess, drones: Sequence[str] | None, name: str
 ) -> None:
     """Serve one run after the other with lower priority, as the process that the command means."""
-    from zsim_deploy.roles.process_control import lower_priority
     from zsim_deploy.roles.roles import process_name, serve_runs, slack_ns, stands_for
+    from zsim_deploy.roles.stop_channel import lower_priority
 
     lower_priority()
     own_name = process_name(role, name, reach.who, _thing(drones))

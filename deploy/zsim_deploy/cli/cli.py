@@ -51,7 +51,8 @@ from zsim_deploy.cli import (
     record_commands,
     role_commands,
 )
-from zsim_deploy.roles.process_control import STREAMS, interruptible, is_unread
+from zsim_deploy.roles.closed_output import STREAMS, is_unread
+from zsim_deploy.roles.stop_channel import interruptible
 
 app = typer.Typer(
     name="zsim",

@@ -23,7 +23,7 @@ from typing import NoReturn
 
 from zsim.errors import printable
 from zsim_deploy import SAFE_PATH
-from zsim_deploy.roles.process_control import renew_streams
+from zsim_deploy.roles.closed_output import renew_streams
 
 READY = b"ready"
 PACKET_MAX = 1 << 17  # bytes, of a command line

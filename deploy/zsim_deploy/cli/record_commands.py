@@ -29,7 +29,7 @@ from zsim_deploy.arguments import (
     check_range,
     require,
 )
-from zsim_deploy.roles.process_control import interruptible
+from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:
     from zsim_analysis.export.make_export import ExportResult

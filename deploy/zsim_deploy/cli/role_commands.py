@@ -140,7 +140,7 @@ def record(
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
-    from zsim_deploy.roles.process_control import lower_priority
+    from zsim_deploy.roles.stop_channel import lower_priority
 
     lower_priority()
     roles.recorder(out, reach)

@@ -20,7 +20,7 @@ from zsim_deploy.inventory.enrolment import folder_of, init_command
 from zsim_deploy.inventory.inventory import SSH_PORT, Host, InventoryFile
 from zsim_deploy.inventory.processes import MODULE, ProcessFiles, access_file, command, own_programs, processes
 from zsim_deploy.launch.interrupted_run import JOURNAL
-from zsim_deploy.roles.process_control import FOLDER
+from zsim_deploy.roles.stop_channel import FOLDER
 
 ACCESS = "access.json"
 RECORD = "run.mcap"

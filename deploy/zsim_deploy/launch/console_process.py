@@ -10,7 +10,7 @@ from types import TracebackType
 from zsim.errors import printable
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.launch.supervisor import Outcome, RunProcess
-from zsim_deploy.roles.process_control import interruptible
+from zsim_deploy.roles.stop_channel import interruptible
 
 ZSIM = (sys.executable, SAFE_PATH, "-m", "zsim_deploy")
 END_S = 10.0  # wall; how long it may take to end

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from zsim_deploy.roles.process_control import CLOSED, STREAMS, is_unread, redirect_output
+from zsim_deploy.roles.closed_output import CLOSED, STREAMS, is_unread, redirect_output
 
 UNREAD = "nobody reads the output any more"  # as of `zsim run … | head`
 LOOK_S = 0.1  # between two looks at who reads the output

@@ -35,7 +35,7 @@ from zsim_deploy.launch.free_ports import DEFAULT_PORT, free_port, is_free
 from zsim_deploy.launch.interrupted_run import JOURNAL, Launch
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
-from zsim_deploy.roles.process_control import REASONS, StopChannel, handled_by
+from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 RECORDER = "recorder"
 CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand

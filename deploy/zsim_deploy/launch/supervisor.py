@@ -19,7 +19,7 @@ from zsim.scenario.scenario import Processes
 from zsim_deploy import USER_FAULT
 from zsim_deploy.launch.death_policy import SUPERSEDED, DeathPolicy
 from zsim_deploy.launch.world_watch import WorldWatch
-from zsim_deploy.roles.process_control import REASONS, TWICE_INTERRUPTED, handled_by
+from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
 POLL_S = 0.05  # how often the processes are looked at
 END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for

@@ -18,7 +18,7 @@ from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory import inventory
 from zsim_deploy.launch.end_signals import UNREAD
 from zsim_deploy.launch.supervisor import Outcome
-from zsim_deploy.roles.process_control import CLOSED
+from zsim_deploy.roles.closed_output import CLOSED
 
 SCENARIO = "name: one\nduration_s: 1\ndrones: [{name: drone1, position_m: [0, 0, 0]}]\nprocesses: {expect: []}\n"
 HOSTS = {

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from zsim_deploy.roles.process_control import NICE
+from zsim_deploy.roles.stop_channel import NICE
 
 AUTOGROUP = Path("/proc/self/autogroup")
 NICEST = 19  # of what Linux knows
 PROGRAM = """
 import os
 from pathlib import Path
-from zsim_deploy.roles.process_control import lower_priority
+from zsim_deploy.roles.stop_channel import lower_priority
 lower_priority()
 print(os.nice(0), Path("/proc/self/autogroup").read_text().split()[-1])
 """

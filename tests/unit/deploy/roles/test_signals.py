@@ -11,7 +11,7 @@ import pytest
 from refused import has_terms
 
 from zsim_deploy.launch.end_signals import UNREAD, EndSignals
-from zsim_deploy.roles.process_control import interruptible
+from zsim_deploy.roles.stop_channel import interruptible
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

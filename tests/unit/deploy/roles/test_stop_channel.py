@@ -9,13 +9,14 @@ import pytest
 from refused import has_terms
 
 from zsim.transport.tls import Identity
-from zsim_deploy.roles.process_control import CLOSED, REASONS, KeyLease, key_lease
+from zsim_deploy.roles.closed_output import CLOSED
+from zsim_deploy.roles.stop_channel import REASONS, KeyLease, key_lease
 
 ROLE = """
 import os, sys, time
 from pathlib import Path
 from zsim.transport.tls import Identity
-from zsim_deploy.roles.process_control import StopChannel
+from zsim_deploy.roles.stop_channel import StopChannel
 folder = Path(sys.argv[1])
 stop = StopChannel("run1", Identity(tls=folder))
 print("ready", flush=True)
@@ -95,7 +96,7 @@ def test_who_hangs_after_its_launcher_is_gone_is_ended_and_its_log_ends_with_why
 BY_HAND = """
 import signal, sys, time
 signal.signal(signal.SIGHUP, getattr(signal, sys.argv[1]))  # whoever runs the tests may be under nohup
-from zsim_deploy.roles.process_control import StopChannel
+from zsim_deploy.roles.stop_channel import StopChannel
 stop = StopChannel()
 print("ready", flush=True)
 while not stop.stopped():

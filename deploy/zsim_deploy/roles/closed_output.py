@@ -1,0 +1,95 @@
+"""Output that nobody reads any more, or that cannot be written: a closed terminal, a broken pipe, a full disk.
+
+It imports nothing that opens files: `renew_streams` is called before anything else.
+"""
+
+import contextlib
+import io
+import os
+import select
+import stat
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+STREAMS = 1, 2  # standard output and error
+CLOSED = "the terminal was closed"
+
+
+class _Output(io.FileIO):
+    """A standard stream that loses what its file does not take; only a broken pipe is raised."""
+
+    _lost = False
+
+    def write(self, data: Any, /) -> int | None:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            raise
+        except OSError as error:  # a full disk, a terminal that is gone
+            if not self._lost and self.fileno() != STREAMS[-1]:
+                write_error(f"standard output cannot be written ({error.strerror}); what follows is lost")
+            self._lost = True
+            return len(data)
+
+
+def write_error(text: str) -> None:
+    """Write a line to standard error without Python's stream, as from a signal handler; it may be lost."""
+    with contextlib.suppress(OSError):
+        os.write(STREAMS[-1], f"{text}\n".encode(errors="replace"))
+
+
+def renew_streams() -> None:
+    """Reopen Python's standard streams, so that nothing fails because one of them is closed, or its disk full.
+
+    To be called before any file is opened: the file would take the number of a closed stream, and receive what a
+    library prints.
+    """
+    for number in (0, *STREAMS):
+        try:
+            os.fstat(number)
+        except OSError:
+            empty = os.open(os.devnull, os.O_RDWR)
+            if empty != number:
+                os.dup2(empty, number)
+                os.close(empty)
+    encodings = [getattr(stream, "encoding", None) for stream in (sys.stdin, sys.stdout, sys.stderr)]
+    sys.stdin = os.fdopen(0, encoding=encodings[0], errors=getattr(sys.stdin, "errors", None), closefd=False)
+    out, error = (io.BufferedWriter(_Output(number, "w", closefd=False)) for number in STREAMS)
+    # a question mark for a character that the terminal's encoding lacks, rather than the end of the command
+    sys.stdout = io.TextIOWrapper(out, encodings[1], "replace", line_buffering=os.isatty(STREAMS[0]))
+    sys.stderr = io.TextIOWrapper(error, encodings[2], "replace", line_buffering=True)
+
+
+def is_unread(stream: int) -> bool:
+    """Tell whether a stream is a broken pipe."""
+    with contextlib.suppress(OSError):
+        if stat.S_ISFIFO(os.fstat(stream).st_mode) and hasattr(select, "poll"):  # not on Windows
+            poller = select.poll()
+            poller.register(stream, 0)
+            return bool(poller.poll(0))  # an error is reported whatever is asked for
+    return False
+
+
+def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
+    """Send to a file what is written from now on to a terminal or a pipe that may be gone."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+    try:
+        into = os.open(log, flags, 0o644)
+    except OSError:
+        into = os.open(os.devnull, os.O_WRONLY)
+    lost = [stream for stream in streams if not _is_file(stream)]
+    if lost:
+        write_error(f"{why}; what there is still to say is in {log}")
+    for stream in lost:
+        os.dup2(into, stream)
+    os.close(into)
+
+
+def _is_file(stream: int) -> bool:
+    """Tell whether a stream is a file already, or not open at all."""
+    try:
+        return stat.S_ISREG(os.fstat(stream).st_mode)
+    except OSError:
+        return True
