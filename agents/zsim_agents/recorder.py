@@ -87,8 +87,8 @@ class Recorder:
         path: Path,
         name: str,
         stopped: Callable[[], bool],
-        say: Callable[[str], None],
-        deserted: Callable[[], bool],
+        say: Callable[[str], None] = lambda text: None,
+        deserted: Callable[[], bool] = lambda: False,
     ) -> None:
         self._link = link
         self._info = info

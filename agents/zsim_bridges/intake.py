@@ -1,4 +1,4 @@
-"""What has passed the world, for a bridge whose work is done in an event loop."""
+"""What a bridge that works in an event loop receives: what has passed the world, and pictures."""
 
 import asyncio
 import contextlib
@@ -20,7 +20,7 @@ BACKLOG = 100  # times that something arrived, a second or two of realtime
 class TrafficIntake:
     """Messages in the order in which they passed the world; a reader that is too slow goes on with the newest.
 
-    What it has not read is left out then: what flies by old messages flies worse than what misses some.
+    Messages that it has not read by then are dropped: flying by old messages is worse than missing some.
 
     Args:
         link: an open session.
@@ -45,17 +45,17 @@ class TrafficIntake:
         self._thread.start()
 
     def close(self) -> None:
-        """Take in no more."""
+        """Receive nothing more."""
         self._traffic.close()
         self._thread.join(1.0)
 
     def arrivals(self) -> Iterator[list[ReceivedSample]]:
-        """Yield what has come until now, in the parts in which it came."""
+        """Yield what has arrived so far, in the parts in which it arrived."""
         self.news.clear()
         for _ in range(len(self._backlog)):
             try:
                 passed = self._backlog.popleft()
-            except IndexError:  # left out meanwhile
+            except IndexError:  # dropped meanwhile
                 return
             yield list(samples(passed))
 
@@ -82,7 +82,7 @@ WAITING_MAX = 10  # pictures that wait for the loop; then the oldest go
 
 
 class PictureIntake:
-    """Subscriptions that come and go with the readers.
+    """Pictures of the cameras that somebody looks at: subscriptions come and go with the readers.
 
     Args:
         link: an open session.

@@ -173,7 +173,7 @@ class Screen:
         self.console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     def hang_up(self) -> None:
-        """Show only lines from now on, since the terminal is gone; callable from a signal handler, as it draws nothing."""
+        """Show only lines from now on, as the terminal is gone; draws nothing, so a signal handler may call it."""
         self._is_live = False
         self.console.quiet = True
 

@@ -47,7 +47,7 @@ from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch, SessionTok
 from zsim.transport.session import RawSample, Session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
-from zsim_agents.hosting import agent_class, chosen, hosted, made
+from zsim_agents.hosting import agent_class, chosen, hosted, make_agents
 from zsim_deploy import USER_FAULT
 from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.stop_channel import StopChannel
@@ -138,7 +138,7 @@ def agent_of(role: str, names: Sequence[str]) -> Build:
 
     def build(info: Info, scenario: Scenario) -> Agent:
         wanted = chosen(f"{role}: {AGENTS[role].about}", names, things(role, scenario))
-        agents = made(role, info, scenario, wanted)
+        agents = make_agents(role, info, scenario, wanted)
         return agents[0] if len(agents) == 1 else AgentGroup(agents, output_hold_ns(info))
 
     return build

@@ -86,7 +86,7 @@ def formations() -> dict[str, Any]:
 
 
 def _show_compilation() -> None:
-    """Print a line whenever a function called from Python is about to be compiled, but not if it is loaded from disk."""
+    """Print a line whenever a function called from Python is compiled, but not if it is loaded from disk."""
     from numba.core import event
 
     class Shown(event.Listener):

@@ -11,7 +11,7 @@ from zsim.runtime.agent import AgentGroup
 from zsim.scenario import rights, scenario_file
 from zsim.scenario.role_table import AGENTS, Role
 from zsim.transport.tls import Identity
-from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, made
+from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, make_agents
 from zsim_deploy.roles import roles
 from zsim_world.flight.world import World
 
@@ -126,7 +126,7 @@ def test_a_plan_that_a_controller_refuses_is_refused_in_the_same_words(assignmen
     scenario = scenario_file.load(Path(__file__).parents[3] / "scenarios" / "trajectory.yaml", [path])
     info = SimpleNamespace(gate_ns=20_000_000)
     with pytest.raises(RunError) as refusal:
-        made("controller", info, scenario, ["main"])  # type: ignore[arg-type]
+        make_agents("controller", info, scenario, ["main"])  # type: ignore[arg-type]
     with pytest.raises(ScenarioError) as raised:
         check_plans(scenario, "trajectory.yaml")
     assert raised.value.faults == [f"trajectory.yaml: {refusal.value}"]

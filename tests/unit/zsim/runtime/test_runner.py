@@ -230,7 +230,7 @@ def test_garbage_in_place_of_a_gate_is_refused_and_changes_nothing():
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let what is owed be tried at every tick."""
-    monkeypatch.setattr(membership, "RETRY_S", 0.0)
+    monkeypatch.setattr(participant, "RETRY_S", 0.0)
 
 
 def answers(*given: ControlAnswer) -> Callable[[str, dict[str, Any]], ControlAnswer]:

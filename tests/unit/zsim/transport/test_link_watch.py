@@ -2,7 +2,10 @@
 
 import os
 import socket
+import struct
+import sys
 
+import pytest
 from fake_link import FakeLink
 
 from zsim.contract import keys
@@ -15,6 +18,7 @@ from zsim.transport.link_watch import (
     STALL_S,
     TOLD_S,
     Awaited,
+    LinkSockets,
     LinkWatch,
     Progress,
     SessionTokens,
@@ -174,3 +178,20 @@ def test_a_session_that_is_kept_out_is_reported_only_if_it_holds_something_back(
     case.passes(1.0)
     assert len(case.sockets.closed) == SPARED + 1
     assert list(case.watch.closed) == []
+
+
+# Connections of this process, as the kernel has them
+
+
+LINGER = struct.Struct("ii")  # socket(7): whether, and for how many seconds
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux shows a process its connections")
+def test_a_connection_that_was_seen_does_not_linger_when_it_is_closed() -> None:
+    """Whoever closes one that lingers, does nothing else for so long while the far end takes nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as near:
+        near.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.pack(1, 10))
+        host, port = near.getpeername()
+        assert f"{host}:{port}" in LinkSockets().queued()
+        lingers, _ = LINGER.unpack(near.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.size))
+        assert not lingers
