@@ -15,7 +15,6 @@ from zsim.runtime.health import HealthMeter
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import ReceivedSample
-from zsim_bridges import intake as traffic_intake
 from zsim_bridges.intake import TrafficIntake
 from zsim_bridges.ros1 import tcpros
 from zsim_bridges.ros1.node import Ros1Node
@@ -142,7 +141,7 @@ class Link:
 
 
 def test_who_is_too_slow_goes_on_with_the_newest_gates(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(traffic_intake, "BACKLOG", 3)
+    monkeypatch.setattr("zsim_bridges.intake.BACKLOG", 3)
     info: Any = type(
         "Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "own_sensors": (), "sightings": False}
     )()
