@@ -51,7 +51,6 @@ class Participant:
         slack_ns: how far the world may be ahead of what it has reported as done; 0 for a process that never gates.
         period_ns: how often an agent reports done; 0 for other processes.
         calculates: whether its results depend on its arithmetic; otherwise its join states no fingerprint.
-        next_seq: numbers the messages of each kind; by default from 0.
 
     Attributes:
         now_ns: simulated time of the newest clock received.
@@ -73,7 +72,6 @@ class Participant:
         *,
         period_ns: int = 0,
         calculates: bool = True,
-        next_seq: Callable[[str], int] | None = None,
     ) -> None:
         self.name = name
         self.now_ns = 0
@@ -95,7 +93,7 @@ class Participant:
         )
         self._process = link.host, os.getpid()
         self._seq: dict[str, int] = {}
-        self.next_seq = next_seq or self._count
+        self.next_seq: Callable[[str], int] = self._count  # the number of the next message of a kind, from 0
         self._incarnations: list[int] = []  # the newest last
         self._renew_incarnation()
         self._was_link_lost = self._has_left = False
@@ -258,7 +256,8 @@ class AgentParticipant(Participant):
         wall_s: Callable[[], float] = time.monotonic,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        super().__init__(link, info, agent.name, agent.serves, period_ns=agent.period_ns, next_seq=agent.next_seq)
+        super().__init__(link, info, agent.name, agent.serves, period_ns=agent.period_ns)
+        self.next_seq = agent.next_seq
         self._agent = agent
         self._take_in = take_in
         self._say = say
