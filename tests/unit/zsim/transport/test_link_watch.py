@@ -91,18 +91,12 @@ def test_of_two_who_are_waited_for_only_the_one_that_takes_nothing_is_stuck():
     assert case.sockets.closed == []
 
 
-def test_who_takes_something_of_little_is_left_alone():
+@pytest.mark.parametrize(("held_bytes", "closed"), [(STALL_BYTES, []), (HELD_BYTES, [READER])])
+def test_who_takes_something_is_closed_only_if_it_never_catches_up(held_bytes: int, closed: list[str]):
     case = Case()
-    case.sockets.held = {READER: STALL_BYTES}
+    case.sockets.held = {READER: held_bytes}
     case.passes(10.0, taken=1)
-    assert case.sockets.closed == []
-
-
-def test_who_never_catches_up_is_closed():
-    case = Case()
-    case.sockets.held = {READER: HELD_BYTES}
-    case.passes(2.0, taken=1)
-    assert case.sockets.closed == [READER]
+    assert case.sockets.closed == closed
 
 
 def test_a_long_way_is_given_its_time():
