@@ -82,7 +82,10 @@ class Bus:
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted, uncounted=agent.uncounted)) for agent in agents]
         self._readers = RoutingTable([agent.reads for agent in agents])
         self._routes: dict[str, _Route] = {}
-        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and who reads of it
+        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = (
+            (),
+            (),
+        )  # the keys of gates, and who reads any of them
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
         self._info: messages.Info | None = None
@@ -160,7 +163,10 @@ class Bus:
         for key, message in self._coordinator.take_outbox():
             if type(message) is GateMessages:
                 self._gate_sink(message)
-                for inbox in self._gate_readers(message.table):
+                if message.table is not self._gate_route[0]:
+                    readers = self._readers.readers_of_any(message.table)
+                    self._gate_route = (message.table, tuple(self._agents[reader][1] for reader in readers))
+                for inbox in self._gate_route[1]:
                     inbox.put(key, message)
                 continue
             self._sink(key, message)
@@ -226,10 +232,3 @@ class Bus:
             is_counted = messages.is_output(key)
             route = self._routes[key] = _Route(inboxes, is_counted, is_counted and not keys.is_command(key))
         return route
-
-    def _gate_readers(self, table: Sequence[str]) -> tuple[Inbox, ...]:
-        """Return the inboxes of those who read messages of gates with this table of keys."""
-        if table is not self._gate_route[0]:
-            readers = self._readers.readers_of_any(table)
-            self._gate_route = (table, tuple(self._agents[reader][1] for reader in readers))
-        return self._gate_route[1]

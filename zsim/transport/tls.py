@@ -156,7 +156,11 @@ def _shake(identity: Identity, plain: socket.socket, place: re.Match[str], endpo
                     link.recv(1)
             return fault
     except ssl.SSLCertVerificationError as error:
-        return _misnamed(identity, place) if error.verify_code in _MISNAMED else _unverified(error)
+        if error.verify_code in _MISNAMED:
+            return _misnamed(identity, place)
+        if error.verify_code in _UNRELATED:
+            return f"the certificate of who listens there is of another authority than ours; {MEND} and use one set"
+        return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
     except ssl.SSLError as error:
         return _words(error, endpoint)
 
@@ -177,13 +181,6 @@ def _client(identity: Identity) -> ssl.SSLContext:
     context.load_cert_chain(identity.certificate, identity.key)
     context.verify_flags |= NO_CHECK_TIME
     return context
-
-
-def _unverified(error: ssl.SSLCertVerificationError) -> str:
-    """Return in words why we refuse the certificate of the process that listens."""
-    if error.verify_code in _UNRELATED:
-        return f"the certificate of who listens there is of another authority than ours; {MEND} and use one set"
-    return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
 
 
 def _words(error: ssl.SSLError, endpoint: str) -> str | None:
