@@ -82,10 +82,7 @@ class Bus:
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted, uncounted=agent.uncounted)) for agent in agents]
         self._readers = RoutingTable([agent.reads for agent in agents])
         self._routes: dict[str, _Route] = {}
-        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = (
-            (),
-            (),
-        )  # the keys of gates, and who reads any of them
+        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and who reads any
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
         self._info: messages.Info | None = None
