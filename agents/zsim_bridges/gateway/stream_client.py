@@ -81,9 +81,7 @@ class Client:
         commanded: (source, drone) of the drones that it has commanded, outside of a lockstep session, in this run.
     """
 
-    def __init__(
-        self, gateway: GatewayApi, outbox: Outbox, source: str, authenticated: bool, limit: RateLimit
-    ) -> None:
+    def __init__(self, gateway: GatewayApi, outbox: Outbox, source: str, authenticated: bool, limit: RateLimit) -> None:
         self._gateway = gateway
         self._outbox = outbox
         self.authenticated = authenticated

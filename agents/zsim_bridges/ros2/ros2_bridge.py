@@ -128,9 +128,7 @@ class Ros2Bridge:
         wall_ns: time since 1970.
     """
 
-    def __init__(
-        self, link: Session, info: Info, observer: Participant, say: Say, wall_ns: Callable[[], int]
-    ) -> None:
+    def __init__(self, link: Session, info: Info, observer: Participant, say: Say, wall_ns: Callable[[], int]) -> None:
         self._link = link
         self._observer = observer
         self._say = say

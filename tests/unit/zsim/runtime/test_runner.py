@@ -364,28 +364,19 @@ def last_gate(before_gate: int, *lists: Faults) -> int:
     return world.gates_done()[-1]
 
 
-def test_a_kill_is_at_the_first_gate_in_which_it_acts():
-    assert last_gate(1, entries(0, 0, KILL)) == 3
-
-
 @pytest.mark.parametrize(
-    "lists", [(entries(2, 0, KILL), entries(4, 1)), (entries(4, 1), entries(2, 0, KILL))], ids=["late", "old"]
+    ("before_gate", "lists", "last"),
+    [
+        pytest.param(1, [entries(0, 0, KILL)], 3, id="at the first gate in which it acts"),
+        pytest.param(2, [entries(2, 0, KILL), entries(4, 1)], 3, id="heard of late, with the list that forgets it"),
+        pytest.param(2, [entries(4, 1), entries(2, 0, KILL)], 3, id="heard of after the list that forgets it"),
+        pytest.param(5, [entries(2, 0, KILL)], 5, id="heard of too late"),
+        pytest.param(1, [entries(0, 0, KILL), entries(1, 1)], END, id="cleared"),
+        pytest.param(1, [entries(1, 1, KILL), entries(0, 0)], 3, id="an older list comes later"),
+    ],
 )
-def test_what_was_forgotten_before_a_late_process_heard_of_it(lists: tuple[Faults, Faults]):
-    """Both lists arrive at once: one that names the kill, and the newer one, sent when it was over."""
-    assert last_gate(2, *lists) == 3
-
-
-def test_a_kill_that_is_heard_of_too_late_still_kills():
-    assert last_gate(5, entries(2, 0, KILL)) == 5
-
-
-def test_a_kill_that_is_cleared_kills_nobody():
-    assert last_gate(1, entries(0, 0, KILL), entries(1, 1)) == END
-
-
-def test_an_older_list_does_not_take_a_kill_away():
-    assert last_gate(1, entries(1, 1, KILL), entries(0, 0)) == 3
+def test_a_process_dies_of_a_kill_in_the_gate_in_which_it_acts(before_gate: int, lists: list[Faults], last: int):
+    assert last_gate(before_gate, *lists) == last
 
 
 class Second(Judge):
