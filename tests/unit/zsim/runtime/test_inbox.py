@@ -459,7 +459,7 @@ def gate_messages(*pairs: tuple[str, bytes]) -> GateMessages:
 
 
 def status_pair(drone: str) -> tuple[str, bytes]:
-    return keys.status_pair(drone), encode(Status(GATE_NS, 1, "flying", 90.0, False, None, 2))
+    return keys.status(drone), encode(Status(GATE_NS, 1, "flying", 90.0, False, None, 2))
 
 
 def baro_pair(drone: str, t_ns: int = GATE_NS) -> tuple[str, bytes]:
@@ -467,19 +467,19 @@ def baro_pair(drone: str, t_ns: int = GATE_NS) -> tuple[str, bytes]:
 
 
 def test_each_reader_gets_what_it_reads_of_a_gate_decoded_once() -> None:
-    router = GateRouter(RoutingTable([["drone/*/sensor/status_pair"], [keys.status_pair("d2")], []]))
+    router = GateRouter(RoutingTable([["drone/*/sensor/status_pair"], [keys.status("d2")], []]))
     routed = list(router.split(gate_messages(baro_pair("d1"), status_pair("d1"), baro_pair("d2"), status_pair("d2"))))
     assert [(key, readers) for readers, key, _ in routed] == [
-        (keys.status_pair("d1"), (0,)),
-        (keys.status_pair("d2"), (0, 1)),
+        (keys.status("d1"), (0,)),
+        (keys.status("d2"), (0, 1)),
     ]
     assert routed[0][2].count == 2
 
 
 def test_what_is_no_message_of_its_key_is_left_out() -> None:
     router = GateRouter(RoutingTable([["**"]]))
-    assert [key for _, key, _ in router.split(gate_messages((keys.status_pair("d1"), b"\xc1"), status_pair("d2")))] == [
-        keys.status_pair("d2")
+    assert [key for _, key, _ in router.split(gate_messages((keys.status("d1"), b"\xc1"), status_pair("d2")))] == [
+        keys.status("d2")
     ]
 
 
@@ -498,7 +498,7 @@ def test_messages_of_a_gate_come_among_the_others_in_canonical_order() -> None:
         keys.sensor("d3", "baro_pair"),
         keys.estimate("d1"),
         keys.sensor("d1", "baro_pair"),
-        keys.status_pair("d2"),
+        keys.status("d2"),
     ]
     assert [key for key, _ in router.one_by_one(inputs)] == names
     assert router.one_by_one([other]) == [other]
