@@ -463,11 +463,11 @@ def status_pair(drone: str) -> tuple[str, bytes]:
 
 
 def baro_pair(drone: str, t_ns: int = GATE_NS) -> tuple[str, bytes]:
-    return keys.sensor(drone, "baro_pair"), encode(Baro(t_ns, 1, t_ns, 101_325.0, 1.0))
+    return keys.sensor(drone, "baro"), encode(Baro(t_ns, 1, t_ns, 101_325.0, 1.0))
 
 
 def test_each_reader_gets_what_it_reads_of_a_gate_decoded_once() -> None:
-    router = GateRouter(RoutingTable([["drone/*/sensor/status_pair"], [keys.status("d2")], []]))
+    router = GateRouter(RoutingTable([["drone/*/sensor/status"], [keys.status("d2")], []]))
     routed = list(router.split(gate_messages(baro_pair("d1"), status_pair("d1"), baro_pair("d2"), status_pair("d2"))))
     assert [(key, readers) for readers, key, _ in routed] == [
         (keys.status("d1"), (0,)),
@@ -495,9 +495,9 @@ def test_messages_of_a_gate_come_among_the_others_in_canonical_order() -> None:
     router = GateRouter(RoutingTable([["**"]]))
     inputs = [(keys.GATE, gate_messages(status_pair("d2"), baro_pair("d1"), baro_pair("d3", GATE_NS - 1))), other]
     names = [
-        keys.sensor("d3", "baro_pair"),
+        keys.sensor("d3", "baro"),
         keys.estimate("d1"),
-        keys.sensor("d1", "baro_pair"),
+        keys.sensor("d1", "baro"),
         keys.status("d2"),
     ]
     assert [key for key, _ in router.one_by_one(inputs)] == names
