@@ -52,7 +52,6 @@ from zsim_deploy import USER_FAULT
 from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.stop_channel import StopChannel
 
-RECORD = "run.mcap"
 RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # an id of a run that is part of a folder's name
 PATTERN = "*?["  # signs of a pattern; fnmatch
 ANY = "*"  # in a process name, for a number
@@ -159,6 +158,7 @@ def recorder(out: Path, reach: WorldAccess) -> None:
         RecordError: the folder cannot be made, or the file cannot be written.
     """
     from zsim.record.completeness import record_completeness
+    from zsim.record.record_reader import RECORD
     from zsim_agents.recorder import record
 
     launched, who = reach.launched, reach.who._replace(process=RECORDER)

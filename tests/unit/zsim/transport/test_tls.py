@@ -7,7 +7,7 @@ from rights_table import KEYS, ROLES, SCENARIO, keys_of
 from zsim.contract import keys, messages
 from zsim.scenario import scenario_file
 from zsim.transport.tls import Act, Permissions, leaves_machine, permissions_of
-from zsim_deploy.inventory.enrolment import access_control
+from zsim_deploy.certificates import access_control
 
 
 @pytest.mark.parametrize(
