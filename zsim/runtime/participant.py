@@ -196,8 +196,9 @@ class Participant:
             event = world_events.read(payload)
         except DecodeError:
             return None  # not an event of the world
-        is_entry = event is not None and event.subject == self.name and isinstance(event.data, ProcessEntry)
-        return event.data if is_entry else None
+        if event is None or event.subject != self.name or not isinstance(event.data, ProcessEntry):
+            return None
+        return event.data
 
     def take_entry(self, entry: ProcessEntry) -> None:
         """Take the news that the world has admitted a process of this name: this one, or one that replaces it.
