@@ -304,7 +304,7 @@ def test_a_driver_whose_place_another_has_taken_does_not_land_the_aircraft():
         async with Flight(armed=True) as flight:
             flight.aircraft.state = "flying"
             await flight.aircraft.until("hold")
-            data = {"incarnation": 7, "host": flight.link.host, "pid": 1}
+            data = {"incarnation": 7, "host": flight.link.host, "pid": 1, "from_ns": 0}
             flight.link.deliver(keys.EVENT, Event(0, 0, "superseded", ME, ME, "", data))
             await asyncio.wait_for(flight.task, 30)
             assert flight.aircraft.demands[-1] == "hold"
