@@ -19,7 +19,7 @@ from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 
 class FlightObserver(Protocol):
@@ -62,7 +62,7 @@ class InProcessFlight:
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)
         for name in set(scenario.expected()) - set(agent_names(scenario)):
             if lets_drop(scenario.processes.on_overdue or {}, name):
-                self.world.losses.expired(name)  # nobody else can come here
+                self.world.expired(name)  # nobody else can come here
         self._agents = agents(self.world)
 
     def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:

@@ -22,7 +22,7 @@ from zsim.scenario.fault_check import listed
 from zsim.schema import plugin
 from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, RecordedRun, gates, open_run, recorded_agents
 from zsim_analysis.rerun_bus import RerunBus, TruthComparison
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 Say = Callable[[str], None]
 RecordState = Literal["whole", "cut", "damaged"]

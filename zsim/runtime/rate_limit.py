@@ -6,8 +6,6 @@ Its clock is a parameter: simulated time where a rerun or a resumed world must a
 import time
 from collections.abc import Callable
 
-from zsim.contract.snapshot import State
-
 SUBJECTS_MAX = 10_000  # remembered; whoever makes up names has no more than these cost
 
 
@@ -53,11 +51,3 @@ class RateLimit:
     def _counted(self, subject: str) -> float:
         spent, at = self._spent.get(subject, (0.0, 0))
         return max(0.0, spent - (self._now() - at) / self.period)
-
-    def snapshot(self) -> State:
-        """Return what each subject has spent."""
-        return {"spent": [[subject, *spent] for subject, spent in self._spent.items()]}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._spent = {subject: (count, at) for subject, count, at in state["spent"]}

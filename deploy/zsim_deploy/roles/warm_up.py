@@ -33,7 +33,7 @@ def main(extras: Collection[str]) -> None:
     if importlib.util.find_spec("numba") is None:
         return
     if WITH_WORLD & {*extras}:
-        from zsim_world.flight.world import World
+        from zsim_world.run.world import World
 
         World(scenario_file.resolve(ALONE), "lockstep", 0.0, time.monotonic_ns, None)
     if WITH_AGENTS & {*extras}:

@@ -23,13 +23,11 @@ from zsim_deploy.roles.stop_channel import StopChannel
 
 if TYPE_CHECKING:
     from zsim.record import RecordReader
-    from zsim_world.playback.playback import PlaybackRange
+    from zsim_world.run.playback import PlaybackRange
 
 SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
 HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more often
-VITAL = frozenset(
-    {"death", "doubled", "failure", "overdue", "end"}
-)  # why a run ends, which processes are lost or twice
+VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # why a run ends, and what is lost or doubled
 
 
 def world(
@@ -57,8 +55,8 @@ def world(
     """
     from zsim.math.compiled import is_kept
     from zsim_world.fleet.kernel import advance
-    from zsim_world.flight.world import World
-    from zsim_world.journal.run_journal import RunJournal, journaled_run
+    from zsim_world.run.world import World
+    from zsim_world.server.run_journal import RunJournal, journaled_run
     from zsim_world.server.world_process import run
 
     clients = {*scenario.expected(), *(expect or ())}
@@ -184,7 +182,7 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
     """
     from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run
-    from zsim_world.playback.playback import Playback
+    from zsim_world.run.playback import Playback
     from zsim_world.server.world_process import run
 
     for expression in options.choice.keys:

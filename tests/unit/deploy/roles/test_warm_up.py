@@ -21,7 +21,7 @@ def test_what_the_roles_of_a_host_run_is_compiled(
     monkeypatch: pytest.MonkeyPatch, extras: tuple[str, ...], built: list[str]
 ) -> None:
     done: list[str] = []
-    monkeypatch.setattr("zsim_world.flight.world.World", lambda *_: done.append("world"))
+    monkeypatch.setattr("zsim_world.run.world.World", lambda *_: done.append("world"))
     group = SimpleNamespace(rehearse=lambda: done.append("agents"))
     monkeypatch.setattr("zsim_agents.hosting.hosted", lambda *_: group)
     warm_up.main(extras)
@@ -29,5 +29,5 @@ def test_what_the_roles_of_a_host_run_is_compiled(
 
 
 def test_agents_of_every_kind_rehearse_without_a_world(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr("zsim_world.flight.world.World")
+    monkeypatch.delattr("zsim_world.run.world.World")
     warm_up.main(["agents"])

@@ -2,7 +2,6 @@
 
 import pytest
 
-from zsim.contract.snapshot import pack, unpack
 from zsim.runtime import rate_limit
 from zsim.runtime.rate_limit import RateLimit
 
@@ -45,14 +44,6 @@ def test_how_long_to_wait() -> None:
     spent(limit)
     clock.now += 5
     assert limit.wait() == pytest.approx(15)
-
-
-def test_what_was_spent_is_kept_in_a_snapshot() -> None:
-    clock = Clock()
-    limit, again = RateLimit(20, 3, clock), RateLimit(20, 3, clock)
-    spent(limit, "a", 2)
-    again.restore(unpack(pack(limit.snapshot())))
-    assert spent(again, "a") == 1
 
 
 def test_subjects_without_end_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
