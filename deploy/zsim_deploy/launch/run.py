@@ -21,8 +21,8 @@ from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.roles import driver_lines, expected_processes, watched_drones
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import BottomCamera, FrontCamera
-from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
+from zsim.transport.zenoh_settings import launcher_files, require_files
 from zsim_agents.hosting import agents_of
 from zsim_deploy.arguments import OTHER_OUT, changed_options, file_fault, load_scenario, pace_options
 from zsim_deploy.inventory import COMMANDS
