@@ -14,9 +14,8 @@ from zsim.contract.framing import GateMessages
 from zsim.contract.run_messages import ControlRequest
 from zsim.errors import RunError, RunFailedError
 from zsim.record import Recorded
-from zsim.runtime.agent import Agent, Output
+from zsim.runtime.agent import Agent, AgentGroup, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.group import AgentGroup
 from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
 from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Message
