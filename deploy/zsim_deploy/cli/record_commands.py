@@ -90,7 +90,7 @@ def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
 
 def _judge(record: Path) -> str:
     """Print what a flight did not do of its plan; return what `_report` returns of it."""
-    from zsim_analysis.reading.verdict import marks_of, verdict
+    from zsim_analysis.reading.shortfall import marks_of, verdict
 
     judged = verdict(record)
     for mark, _ in marks_of(judged.shortfalls):
@@ -165,11 +165,11 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
     from zsim_analysis.sweep.design import is_sweep
 
     if is_sweep(folder):
-        from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report as make
-        from zsim_analysis.sweep.report.terminal_tables import terminal_text
+        from zsim_analysis.sweep.sweep_report import make_sweep_report as make
+        from zsim_analysis.sweep.sweep_report import terminal_text
     else:
         from zsim_analysis.report.make_report import make_report as make
-        from zsim_analysis.report.tables import terminal_text
+        from zsim_analysis.report.summary import terminal_text
     with Console(stderr=True).status("reading …") as status:
         summary: Any = make(folder, lambda text: status.update(cell(text)), formats)
     PipedConsole().print(terminal_text(summary))
@@ -183,7 +183,7 @@ def _compare(directories: list[Path], out: Path | None, formats: Sequence[str]) 
 
     from zsim.record.record_reader import record_in
     from zsim.runtime.progress import cell
-    from zsim_analysis.report.make_report import compare, comparison_path
+    from zsim_analysis.report.comparison import compare, comparison_path
     from zsim_analysis.sweep.design import is_sweep
 
     for directory in directories:
@@ -319,8 +319,8 @@ def export(
 
     check_range(from_, to)
     record_at(run)
+    from zsim_analysis.export.columns import MessageSelection
     from zsim_analysis.export.make_export import export as write
-    from zsim_analysis.export.selection import MessageSelection
 
     console = Console(stderr=True)
     hidden = not console.is_terminal
