@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from zsim_world.run.world import World
+
 from zsim.contract import flight_messages, keys, run_messages
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError, UserCodeError
@@ -16,7 +18,6 @@ from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
-from zsim_world.flight.world import World
 
 
 def fly(
@@ -89,7 +90,7 @@ class InProcessFlight:
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)
         for name in set(scenario.expected()) - set(agent_names(scenario)):
             if lets_drop(scenario.processes.on_overdue or {}, name):
-                self.world.losses.expired(name)  # no other process can join
+                self.world.expired(name)  # no other process can join
         self._agents = agents(self.world)
 
     def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:

@@ -12,6 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from zsim_world.run.coordinator import FLIGHT_REQUESTS
+from zsim_world.run.world import World
+
 from zsim import __version__
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.camera_messages import Sightings
@@ -39,8 +42,6 @@ from zsim_analysis.reading.recorded_run import (
     open_run,
     recorded_agents,
 )
-from zsim_world.flight.coordinator import FLIGHT_REQUESTS
-from zsim_world.flight.world import World
 
 Say = Callable[[str], None]
 RecordState = Literal["whole", "cut", "damaged"]
@@ -439,9 +440,9 @@ class RerunBus(Bus):
                 self._world.handle(keys.process(joined[0], "join"), join, 0)
         left = event.kind == "leave" and self._world.barrier.has_farewell(event.subject)
         if (event.kind == "death" or left) and event.subject not in self._rerun:
-            self._world.losses.died(event.subject, 0)
+            self._world.died(event.subject, 0)
         elif event.kind == "overdue" and event.subject not in self._rerun:
-            self._world.losses.expired(event.subject)
+            self._world.expired(event.subject)
         elif event.kind == "control" and event.subject in FLIGHT_REQUESTS and event.data.get("ok"):
             args = event.data.get("args")
             request = ControlRequest(event.subject, args if isinstance(args, dict) else {}, event.source)

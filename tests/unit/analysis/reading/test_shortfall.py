@@ -27,7 +27,7 @@ from zsim_analysis.reading.shortfall import CRASHES, NOT_AS_PLANNED, Shortfall, 
 from zsim_analysis.report.figure_style import COLUMN_IN, PAGE_IN, VERMILION, legend_above, mark_figure, new_figure
 from zsim_analysis.report.make_report import facts, figures, judge, page
 from zsim_analysis.report.summary import table
-from zsim_deploy.cli import record_commands
+from zsim_deploy.cli import run_commands
 
 State = Callable[[float], dict[str, Any]]
 SOON: tuple[str, ...] = ("clusters.main.plan.takeoff_s=1", "report.window_s=[4, 30]")
@@ -489,7 +489,7 @@ def end_of(folder: Path, report: bool, capsys: pytest.CaptureFixture[str]) -> tu
     outcome = type("Outcome", (), {"interrupted": False, "failed": False, "reason": "over"})()
     code = 0
     try:
-        record_commands.conclude(outcome, folder, report)
+        run_commands.conclude(outcome, folder, report)
     except typer.Exit as end:
         code = end.exit_code
     out, err = capsys.readouterr()
