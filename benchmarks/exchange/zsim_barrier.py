@@ -19,7 +19,7 @@ from zsim.transport import zenoh_settings
 from zsim.transport.connection import find_world
 from zsim.transport.session import Session
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.flight import world
+from zsim_world.run import world
 from zsim_world.sensors.sampler import NONE
 from zsim_world.server import world_process
 

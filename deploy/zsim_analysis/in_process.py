@@ -5,8 +5,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from zsim_world.run.world import World
-
 from zsim.contract import flight_messages, keys, run_messages
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError, UserCodeError
@@ -18,6 +16,7 @@ from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
+from zsim_world.run.world import World
 
 
 def fly(

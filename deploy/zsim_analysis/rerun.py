@@ -12,9 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from zsim_world.run.coordinator import FLIGHT_REQUESTS
-from zsim_world.run.world import World
-
 from zsim import __version__
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.camera_messages import Sightings
@@ -42,6 +39,8 @@ from zsim_analysis.reading.recorded_run import (
     open_run,
     recorded_agents,
 )
+from zsim_world.run.coordinator import FLIGHT_REQUESTS
+from zsim_world.run.world import World
 
 Say = Callable[[str], None]
 RecordState = Literal["whole", "cut", "damaged"]

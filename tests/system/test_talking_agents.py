@@ -24,7 +24,7 @@ from zsim.runtime.inbox import output_hold_ns
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.transport.connection import find_world
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 NAMES = ("a", "b", "c")
 WAITS_FOR = {"b": "a"}  # whose state closes the gate of whom; the others only read it

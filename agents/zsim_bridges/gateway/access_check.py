@@ -10,7 +10,7 @@ from aiohttp import web
 
 from zsim.errors import DecodeError, NoWorldError, SessionError, ZsimError
 from zsim_bridges.gateway.client_messages import ForbiddenError, MethodError, TooManyError, UnknownError
-from zsim_bridges.web.loopback import is_loopback_authority
+from zsim_bridges.web import is_loopback_authority
 from zsim_bridges.web.web_server import tokens_match
 
 HTTP_RATE_HZ = 5_000.0  # requests per wall second of one address: 500 clients that ask ten times a second

@@ -41,7 +41,7 @@ def main(extras: Collection[str]) -> None:
 
 
 def _build_world() -> None:
-    from zsim_world.flight.world import World
+    from zsim_world.run.world import World
 
     World(scenario_file.resolve(ALONE), "lockstep", 0.0, time.monotonic_ns, None)
 

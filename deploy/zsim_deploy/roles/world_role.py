@@ -25,7 +25,7 @@ from zsim_deploy.roles.stop_channel import StopChannel
 
 if TYPE_CHECKING:
     from zsim.record import RecordReader
-    from zsim_world.playback.playback import PlaybackRange
+    from zsim_world.run.playback import PlaybackRange
 
 SLOW_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
 SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
@@ -56,8 +56,8 @@ def world(
         RunError: the journal is of another run.
         SessionError: an endpoint is taken, or the identity is of no use.
     """
-    from zsim_world.flight.world import World
-    from zsim_world.journal.run_journal import RunJournal, journaled_run
+    from zsim_world.run.world import World
+    from zsim_world.server.run_journal import RunJournal, journaled_run
     from zsim_world.server.world_process import run
 
     clients = {*scenario.expected(), *(expect or ())}
@@ -186,7 +186,7 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
     """
     from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run
-    from zsim_world.playback.playback import Playback
+    from zsim_world.run.playback import Playback
     from zsim_world.server.world_process import run
 
     for expression in options.choice.keys:

@@ -13,7 +13,7 @@ from zsim.scenario.role_table import AGENTS, Role
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, made
 from zsim_deploy.roles import process_identity, roles
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 STEP = scenario_file.load(Path(__file__).parents[3] / "scenarios" / "step.yaml")
 ESTIMATORS = ["estimator.drone1", "estimator.drone2", "estimator.drone3"]

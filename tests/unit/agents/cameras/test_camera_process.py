@@ -12,7 +12,7 @@ from zsim.scenario import scenario_file
 from zsim_agents.cameras.camera_process import CameraProcess
 from zsim_agents.cameras.rendering.renderer import Renderer
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 SCENARIO = scenario_file.from_text("""
 name: three

@@ -10,7 +10,6 @@ import synthetic_record
 from refused import has_terms
 from synthetic_pictures import image, info, sightings
 from synthetic_record import Flown
-from zsim_world.run.world import World
 
 from zsim import __version__
 from zsim.contract import keys, messages
@@ -30,6 +29,7 @@ from zsim_analysis.reading.recorded_run import (
 from zsim_analysis.report.comparison import ABSENT, fact_rows
 from zsim_analysis.report.comparison_figures import ComparedRun
 from zsim_analysis.report.make_report import facts, judge
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 PRINT = "f" * 16

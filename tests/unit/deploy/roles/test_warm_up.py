@@ -26,5 +26,5 @@ def test_what_the_roles_of_a_host_run_is_compiled(
 
 
 def test_agents_of_every_kind_rehearse_without_a_world(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr("zsim_world.flight.world.World")
+    monkeypatch.delattr("zsim_world.run.world.World")
     warm_up.main(["agents"])

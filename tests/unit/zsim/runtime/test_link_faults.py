@@ -18,7 +18,7 @@ from zsim.runtime.link_faults import LinkFaults, place_of, reception_probability
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import planned
 from zsim_agents.formation.controller import REQUESTS_MAX, Controller
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 ME, OTHER = "controller.main", "estimator.d1"
