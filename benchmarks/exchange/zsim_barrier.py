@@ -1,8 +1,8 @@
 """zsim's own lockstep with nothing to compute: the real world, barrier, hub and runner over Zenoh.
 
 In: WorldProcess, World, Barrier and MessageHistory, with truth, status and clock of every gate built, encoded, hashed,
-put and kept; in every agent Runner, Inbox and Membership, with status decoded and done encoded and put; joins, tokens,
-health. Out: the fleet (its truth stands still and it has no samples), and the agents' outputs.
+put and kept; in every agent Runner, Inbox and AgentParticipant, with status decoded and done encoded and put; joins,
+tokens, health. Out: the fleet (its truth stands still and it has no samples), and the agents' outputs.
 """
 
 from collections.abc import Iterator

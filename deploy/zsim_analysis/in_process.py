@@ -11,8 +11,9 @@ from zsim.errors import RunError, UserCodeError
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
-from zsim.runtime.collector import rare_collections
-from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
+from zsim.runtime.health import rare_collections
+from zsim.runtime.progress import PERIOD_S, HoldReasons, Screen, SlowStart
+from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
@@ -138,7 +139,7 @@ class _Progress:
 
     def __init__(self, scenario: Scenario, screen: Screen) -> None:
         self._screen = screen
-        self._throttle = Throttle()
+        self._throttle = RateLimit(PERIOD_S)
         self._reasons = HoldReasons()
         states = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
@@ -162,7 +163,7 @@ class _Progress:
                 self._screen.say(line)
         elif isinstance(message, run_messages.Event):
             self._screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
-        elif isinstance(message, run_messages.Clock) and self._throttle.passes():
+        elif isinstance(message, run_messages.Clock) and self._throttle.spend():
             self._start.over()
             line = {"t_s": message.t_ns / 1e9, "rate": message.rate, "state": message.state, "phase": self._phase}
             self._screen.clock({**line, "waiting_for": []})

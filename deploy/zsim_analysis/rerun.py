@@ -20,11 +20,11 @@ from zsim.contract.framing import GateMessages
 from zsim.contract.run_messages import ControlRequest
 from zsim.errors import RecordError, RunError, RunFailedError
 from zsim.record import Recorded, RecordReader
-from zsim.runtime.agent import Agent, Output
+from zsim.runtime.agent import Agent, AgentGroup, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.group import AgentGroup
 from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
-from zsim.runtime.progress import Screen, Throttle
+from zsim.runtime.progress import PERIOD_S, Screen
+from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.fault_check import listed
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
@@ -122,7 +122,7 @@ def _fly(record: RecordedRun, agents: RecordedAgents) -> RerunResult:
     bus = RerunBus(world, agents, info, scenario)
     compared = TruthComparison(world.names)
     bus.join()
-    until, due_ns, throttle, start_s = "", 0, Throttle(), time.monotonic()
+    until, due_ns, throttle, start_s = "", 0, RateLimit(PERIOD_S), time.monotonic()
     line = {"state": "world and agents" if agents.processes else "world alone", "phase": "", "waiting_for": []}
     with Screen(scenario.duration_s) as screen:
         for gate in gates(reader, world.names):
@@ -131,7 +131,7 @@ def _fly(record: RecordedRun, agents: RecordedAgents) -> RerunResult:
             bus.fly_to(gate)
             compared.add(gate.t_ns, gate.truth, bus.truth)
             due_ns += world.clock.gate_ns
-            if throttle.passes():
+            if throttle.spend():
                 rate = gate.t_ns / 1e9 / max(1e-9, time.monotonic() - start_s)
                 screen.clock({"t_s": gate.t_ns / 1e9, "rate": rate, **line})
     if agents.failure and not bus.failure:

@@ -17,9 +17,8 @@ from federation import ONE, PATIENCE_S, Federation
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState
-from zsim.runtime.agent import Agent, Output
+from zsim.runtime.agent import Agent, AgentGroup, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.group import AgentGroup
 from zsim.runtime.inbox import output_hold_ns
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file

@@ -17,11 +17,11 @@ from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo, Seen, Sightings
 from zsim.errors import DecodeError, ZsimError
 from zsim.math import rotation
+from zsim.runtime.participant import Participant
 from zsim.sensors.camera import CAMERAS
 from zsim.sensors.camera_model import Lens, pixel, undistorted
 from zsim.sensors.jpeg_header import PictureError, frame_of
 from zsim.transport.session import RawSample, Session
-from zsim_bridges.observer_process import ObserverProcess
 
 ASKED_S = 15.0  # wall; a page silent for longer sleeps: a slow one takes seconds for a picture
 MESSAGE_BYTES = 1_000  # of a picture's message beside its data, at most; chosen
@@ -79,7 +79,7 @@ class CameraFeed:
     def __init__(
         self,
         link: Session,
-        observer: ObserverProcess,
+        observer: Participant,
         drones: Iterable[str],
         hat_m: float,
         wall_s: Callable[[], float] = time.monotonic,

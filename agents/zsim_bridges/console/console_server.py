@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from zsim.contract.messages import Info
+from zsim.runtime.participant import Participant
 from zsim.transport.session import Session
 from zsim_bridges.console.control_desk import OPERATOR, VIEWER
 from zsim_bridges.console.orders import OrderRequest
@@ -17,7 +18,6 @@ from zsim_bridges.console.page_sockets import ActionSockets, CameraSockets
 from zsim_bridges.console.private_viser import PageControls, PrivateViser, is_permitted
 from zsim_bridges.console.run_condition import no_run_head
 from zsim_bridges.console.run_page import RunPage
-from zsim_bridges.observer_process import ObserverProcess
 
 REASON_S = 0.1  # wall; between two looks for a reason to end
 OFFER_S = 20.0  # wall; how long pages may take to copy what a run left behind: 100 MB over Wi-Fi of 40 Mbit/s
@@ -102,7 +102,7 @@ class Console:
         self,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         stopped: Callable[[], bool],
         say: Callable[[str], None],
     ) -> None:

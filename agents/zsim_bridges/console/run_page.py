@@ -14,6 +14,7 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
 from zsim.contract.views import EstimateView, ViewCluster
 from zsim.errors import DocumentError, RunError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.sensors.camera import Hats
 from zsim.sensors.sensor_catalogue import own_rates
@@ -34,7 +35,6 @@ from zsim_bridges.console.run_monitor import RunMonitor
 from zsim_bridges.console.scene import RunScene
 from zsim_bridges.console.time_monitor import KEPT_S, RecordPlayer, TimeMonitor
 from zsim_bridges.console.view_buffer import ViewBuffer
-from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
 STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
@@ -74,7 +74,7 @@ class RunPage:
         server: viser.ViserServer,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         camera_follow: CameraFollow,
         frustums: CameraFrustums,
         rate_hz: float | None,

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys, run_messages
 from zsim.errors import ZsimError
+from zsim.runtime.participant import Participant
 from zsim.transport.session import Session
 from zsim_bridges.console.command_client import CommandClient, PastInstant
 from zsim_bridges.console.histories import INTERVAL_S, SPAN_S
 from zsim_bridges.console.run_condition import RunCondition, run_refusals
-from zsim_bridges.observer_process import ObserverProcess
 
 POLL_S = 0.25  # wall; clock messages of every gate would cost the world time
 ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
@@ -77,7 +77,7 @@ class TimeMonitor:
     def __init__(
         self,
         link: Session,
-        observer: ObserverProcess,
+        observer: Participant,
         stamp_age_s: float = math.inf,
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:

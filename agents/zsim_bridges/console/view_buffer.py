@@ -18,9 +18,9 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
+from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
 from zsim_bridges.console.alarms import BACK, LOST, DroneCondition, Losses
-from zsim_bridges.observer_process import ObserverProcess
 
 FRESH_S = 1.0  # simulated, or wall; views come 20 times a wall second: the estimator of an older one is dead, or stuck
 FAULTS_KEPT = 8  # the last that have begun
@@ -96,7 +96,7 @@ class ViewBuffer:
         self,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         variables: Mapping[str, tuple[str, ...]],
         refused: Callable[[Event], None],
         wall_s: Callable[[], float] = time.monotonic,

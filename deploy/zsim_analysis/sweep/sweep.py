@@ -25,7 +25,8 @@ from rich.live import Live
 
 from zsim.errors import ReportError, RunError, printable
 from zsim.output_folder import no_locks, refuse_others, take_lock
-from zsim.runtime.progress import Throttle, cell
+from zsim.runtime.progress import cell
+from zsim.runtime.rate_limit import RateLimit
 from zsim_analysis.sweep.design import PLAN, SEED, Axis, Grid, SweepDesign, SweepPlan, difference, is_sweep
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
 from zsim_analysis.sweep.sweep_run import FIXED, Row, Task
@@ -134,7 +135,7 @@ class SweepScreen:
         self._unmeasured = 0
         self._now_s = now_s
         self._start_s = now_s()
-        self._throttle = Throttle(PLAIN_S)
+        self._throttle = RateLimit(PLAIN_S)
         self._live = Live(
             console=self.console, get_renderable=lambda: cell(self.line()), refresh_per_second=5, transient=True
         )
@@ -159,7 +160,7 @@ class SweepScreen:
         """Count a run."""
         self._done += 1
         self._failed += failed
-        if not self.console.is_terminal and self._done < self._total and self._throttle.passes():
+        if not self.console.is_terminal and self._done < self._total and self._throttle.spend():
             self.say(self.line())
 
     def unmeasured(self, run: int, reason: str) -> None:

@@ -128,13 +128,10 @@ class GatePublication:
         self._words = encoding.words((*firmware.MODES, None))
         self._room_beside = 0  # bytes of users' messages
         self._make_room(16 * fleet.count)
-        self._rehearse()
-
-    def _rehearse(self) -> None:
-        """Load or compile what the first gate needs."""
-        uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
+        # loads or compiles what the first gate needs, and counts nothing
+        uncounted = self._fleetwide._replace(counts=self.counts.copy())
         state = PublicationState(self._words, self._seen, uncounted, self._written)
-        publish(hold(state), *self._fleet.sampled, *self._payloads(), 0)
+        publish(hold(state), *fleet.sampled, *self._payloads(), 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the present gate; `commanders` has the commander of each drone, None for none."""

@@ -371,15 +371,14 @@ class Barrier:
         rank = {name: place for place, name in enumerate(self._expected)}
         awaited = {p.name: p for p in (*self.away(), *self.blocking(need_ns))}.values()
         late = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
-        return (*absent, *(p.waiting(wall_ns, _holders_up(p, late, feeds)) for p in late))
+        waiting = []
+        for victim in late:  # it may only wait itself for the outputs of others that are late
+            read_by = victim.served_names if victim.gating and victim.alive and not victim.away else ()
+            others = (p for p in late if p is not victim and p.gating)
+            held_by = (p.name for p in others if any(feeds(w, r) for w in p.served_names for r in read_by))
+            waiting.append(victim.waiting(wall_ns, tuple(held_by)))
+        return (*absent, *waiting)
 
 
 def _incarnation_refusal(participant: Participant, found: str) -> Refusal:
     return Refusal("incarnation", found, f"must be {participant.join.incarnation}, the newest to join")
-
-
-def _holders_up(victim: Participant, late: list[Participant], feeds: Callable[[str, str], bool]) -> tuple[str, ...]:
-    """Return the late participants whose outputs one of them may be waiting for."""
-    read_by = victim.served_names if victim.gating and victim.alive and not victim.away else ()
-    others = (p for p in late if p is not victim and p.gating)
-    return tuple(p.name for p in others if any(feeds(w, r) for w in p.served_names for r in read_by))

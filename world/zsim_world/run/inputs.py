@@ -92,11 +92,11 @@ class Run:
 
     def learn_handler(self, key: str) -> Handler:
         """Return the handler of a key's messages, and remember it: the same keys come at every gate."""
-        kind = messages.type_of(key)
+        kind, (place, name, what) = messages.type_of(key), keys.parts(key)
         if kind in messages.RELAYED or (kind in OF_CAMERAS and not keys.is_sensor(key)):
             handler = self._relay
-        elif self._is_of_driver(key):
-            handler = self._take_of_driver
+        elif place == "drone" and name in self.world.external and (what in OF_DRIVERS or what.startswith("sensor/")):
+            handler = self._take_of_driver  # and not the world's
         elif key.startswith("process/") or keys.is_command(key):
             handler = self._hand_over
         else:
@@ -105,12 +105,6 @@ class Run:
             self.handlers.clear()
         self.handlers[key] = handler
         return handler
-
-    def _is_of_driver(self, key: str) -> bool:
-        """Tell whether the driver of an external drone publishes on a key, and not the world."""
-        kind, drone, what = keys.parts(key)
-        of_driver = what in OF_DRIVERS or what.startswith("sensor/")
-        return of_driver and kind == "drone" and drone in self.world.external
 
     def _keep_foreign(self, sample: Sample, wall_ns: int) -> None:
         """Keep a message on a key outside of the contract."""

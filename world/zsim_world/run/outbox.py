@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from zsim.contract import keys, run_messages
+from zsim.runtime.rate_limit import SUBJECTS_MAX, RateLimit
 from zsim.scenario.rights import WORLD
 from zsim_world.run_state import PART, Saved
 
@@ -16,7 +17,6 @@ KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages
 CHANGES_MAX = 1000  # of a source at once, as many as there may be faults; then 50 a simulated second at gates of 20 ms
 UNJOINED = 10  # sources that have not joined may together do as much as so many that have: anybody can invent names
 STRANGERS_MAX = 100  # newcomers of all names, and other reports about strangers, at once; then one a simulated second
-SUBJECTS_MAX = 10_000  # sources and subjects
 SECOND_NS = 1_000_000_000
 EVENTS_MAX = 20  # events per source, subject and reason; further refusals are counted only
 REASONS_MAX = 10  # of a source and subject that are kept apart; all further ones count as one
@@ -156,43 +156,13 @@ class RefusalLog:
         return f"{subject}: {reason}{last}"
 
 
-class ChangeBudget:
-    """Limits what each source may change: so much at once, and one more with every period.
-
-    Args:
-        now_ns: returns the newest gate [ns].
-        period_ns: in which one more is allowed [ns].
-        most: at once.
-    """
+class ChangeBudget(RateLimit):
+    """Limits what each source may change: so much at once, and one more with every period of simulated time."""
 
     SAVED: ClassVar[Saved] = {"_spent": dict[str, tuple[float, int]]}
 
     def __init__(self, now_ns: Callable[[], int], period_ns: float, most: int = CHANGES_MAX) -> None:
-        self._now_ns = now_ns
-        self._period_ns = period_ns
-        self._most = most
-        self._spent: dict[str, tuple[float, int]] = {}  # changes that still count, and the gate of the newest [ns]
-
-    def knows(self, source: str) -> bool:
-        """Return whether a source has made a change."""
-        return source in self._spent
-
-    def allows(self, source: str) -> bool:
-        """Return whether a source may make one more change."""
-        return self._counted(source) <= self._most - 1
-
-    def spend(self, source: str) -> bool:
-        """Count a change; return False where there was none left."""
-        if not self.allows(source):
-            return False
-        if len(self._spent) > SUBJECTS_MAX:
-            self._spent.clear()
-        self._spent[source] = self._counted(source) + 1, self._now_ns()
-        return True
-
-    def _counted(self, source: str) -> float:
-        spent, at_ns = self._spent.get(source, (0.0, 0))
-        return max(0.0, spent - (self._now_ns() - at_ns) / self._period_ns)
+        super().__init__(period_ns, most, now_ns)
 
 
 class Budgets:

@@ -14,7 +14,7 @@ from zsim.contract.fingerprint import fingerprint
 from zsim.contract.run_messages import Bye, Done, Join
 from zsim.errors import RunError, RunFailedError
 from zsim.scenario import rights
-from zsim.scenario.role_table import ROLES, OnDeath, OnOverdue, agent_names, lets_drop, on_death, on_overdue
+from zsim.scenario.role_table import ROLES, OnDeath, agent_names, lets_drop, on_death, on_overdue
 from zsim.scenario.scenario import Scenario
 from zsim_world.run.barrier import Barrier, Participant
 from zsim_world.run.outbox import STRANGERS_MAX, Budgets, Refusal, RunOutbox, too_many
@@ -282,14 +282,13 @@ class Participants:
         return_s = self.scenario.processes.return_s
         if return_s is None:
             return None
-        gone = ((p.name, self._gone_since_ns(p)) for p in self.barrier.participants.values())
-        return next((name for name, since_ns in gone if since_ns and wall_ns - since_ns > return_s * 1e9), None)
-
-    def _gone_since_ns(self, participant: Participant) -> int | None:
-        """Return since when the run has waited for a process to come back, None where it does not."""
-        if not participant.alive:
-            return participant.since_wall_ns if self.may_return(participant) else None
-        return participant.silent_wall_ns if participant.is_waited_for else None
+        for participant in self.barrier.participants.values():
+            since_ns = participant.silent_wall_ns if participant.is_waited_for else None
+            if not participant.alive:
+                since_ns = participant.since_wall_ns if self.may_return(participant) else None
+            if since_ns and wall_ns - since_ns > return_s * 1e9:
+                return participant.name
+        return None
 
     def _start_timeout_s(self, name: str) -> float:
         """Return how long a run waits at its start for a process that is expected [s, wall]."""
@@ -306,7 +305,10 @@ class Participants:
         processes = self.scenario.processes
         participant = self.barrier.participants.get(name)
         if participant is not None:
-            action, (host, pid) = self._overdue_action(participant), (participant.join.host, participant.join.pid)
+            host, pid, role = participant.join.host, participant.join.pid, participant.join.role
+            action = self.on_death(participant)
+            if action not in ("drop", "end"):  # these hold for one that is silent as for one that is dead
+                action = on_overdue(processes.on_overdue or {}, name, role, processes.gating or ())
             text = f"{name} has not come back within {processes.return_s:g} s"
         elif name in self.barrier.absent():
             action, host, pid = "drop" if lets_drop(processes.on_overdue or {}, name) else "end", "", 0
@@ -318,13 +320,6 @@ class Participants:
             self._drop(name)
         else:
             self.fail(text)
-
-    def _overdue_action(self, participant: Participant) -> OnOverdue:
-        action = self.on_death(participant)
-        if action in ("drop", "end"):  # of one that is silent, as after its death
-            return action
-        processes, role = self.scenario.processes, participant.join.role
-        return on_overdue(processes.on_overdue or {}, participant.name, role, processes.gating or ())
 
     def silence_changed(self, name: str, since_wall_ns: int | None) -> None:
         """Note that a process publishes its health no longer, since its last; or does again (None)."""

@@ -6,7 +6,7 @@ and can be paused, stepped and stopped. No drone can be flown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -212,22 +212,21 @@ class Playback(Coordinator):
     def _wind(self, from_ns: int) -> None:
         self._gates = self._recorded_gates.gates(from_ns)
         self._read_next()
-        self._pending_faults = self._faults_before(from_ns) if self._plays_faults and from_ns > 0 else None
-        self._pending_infos = self._camera_infos_before(from_ns) if self._camera_infos and from_ns > 0 else []
+        # the last list of faults, and info of each camera, before: they are published only when they change
+        before = self._last_before(from_ns, {keys.FAULTS} if self._plays_faults else set())
+        self._pending_faults: Recorded | None = before[0] if before else None
+        self._pending_infos = self._last_before(from_ns, self._camera_infos)
 
     def _read_next(self) -> None:
         self._coming: Gate | None = next(self._gates, None)
         if self._coming is not None:
             self.clock.next_ns = self._coming.t_ns
 
-    def _faults_before(self, t_ns: int) -> Recorded | None:
-        """Return the last list of faults before a time: the world publishes it only when it changes."""
-        lists = self._reader.messages([keys.FAULTS], by_time=False)
-        return max((m for m in lists if m.t_ns < t_ns), key=lambda m: m.t_ns, default=None)
-
-    def _camera_infos_before(self, t_ns: int) -> list[Recorded]:
-        """Return the last info of each camera before a time: a camera may publish it only once."""
-        before = (m for m in self._reader.messages(self._camera_infos, by_time=False) if m.t_ns < t_ns)
+    def _last_before(self, t_ns: int, wanted: Collection[str]) -> list[Recorded]:
+        """Return the last message of each key before a time."""
+        if not wanted or t_ns <= 0:
+            return []
+        before = (m for m in self._reader.messages(wanted, by_time=False) if m.t_ns < t_ns)
         return list({m.key: m for m in sorted(before, key=lambda m: m.t_ns)}.values())
 
     # What is played

@@ -129,7 +129,7 @@ class RecordedGates:
 
 
 def _is_gate(payload: bytes) -> bool:
-    """Tell whether a clock is that of a gate: while a run waits for its start, none has been published."""
+    """Tell whether a clock belongs to a gate: while a run waits for its start, it does not."""
     try:
         return _decode_clock(payload).state != "waiting"
     except REFUSALS:
@@ -190,33 +190,26 @@ class PlaybackViews:
 
     def views(self, last: Mapping[str, bytes], t_ns: int, seq: int) -> Iterator[Output]:
         """Yield the views of the gate t_ns, as far as the last values go."""
-        drones = tuple(self._drone_views(last))
-        if drones:
-            wind = _read(last, keys.VIEW_DRONES)
-            wind_m_s = wind.wind_m_s if wind is not None and len(wind.wind_m_s) == len(drones) else ()
-            yield Output(keys.VIEW_DRONES, ViewDrones(t_ns, seq, drones, wind_m_s))
-        for cluster in self._clusters:
-            state = _read(last, keys.cluster_state(cluster))
-            if state is not None:
-                yield Output(keys.cluster_view(cluster), cluster_view(state, t_ns, seq))
-        for process, estimates in self._estimates(last).items():
-            yield Output(keys.estimates_view(process), ViewEstimates(t_ns, seq, tuple(estimates)))
-
-    def _drone_views(self, last: Mapping[str, bytes]) -> Iterator[DroneView]:
+        drones = []
+        estimates: defaultdict[str, list[EstimateView]] = defaultdict(list)
         for drone in self._drones:
             truth, status = _read(last, keys.truth(drone)), _read(last, keys.status(drone))
             if truth is not None and status is not None:
                 pose = (truth.position_m, truth.orientation_wxyz, truth.rotor_rad_s)
-                yield DroneView(drone, *pose, status.state, status.battery_percent, status.commander)
-
-    def _estimates(self, last: Mapping[str, bytes]) -> dict[str, list[EstimateView]]:
-        """Return the estimates by the estimator of each drone."""
-        estimates: defaultdict[str, list[EstimateView]] = defaultdict(list)
-        for drone in self._drones:
+                drones.append(DroneView(drone, *pose, status.state, status.battery_percent, status.commander))
             estimate = _read(last, keys.estimate(drone))
             if estimate is not None:
                 estimates[f"estimator.{drone}"].append(estimate_view(drone, estimate))
-        return estimates
+        if drones:
+            wind = _read(last, keys.VIEW_DRONES)
+            wind_m_s = wind.wind_m_s if wind is not None and len(wind.wind_m_s) == len(drones) else ()
+            yield Output(keys.VIEW_DRONES, ViewDrones(t_ns, seq, tuple(drones), wind_m_s))
+        for cluster in self._clusters:
+            state = _read(last, keys.cluster_state(cluster))
+            if state is not None:
+                yield Output(keys.cluster_view(cluster), cluster_view(state, t_ns, seq))
+        for process, own in estimates.items():
+            yield Output(keys.estimates_view(process), ViewEstimates(t_ns, seq, tuple(own)))
 
 
 def _read(last: Mapping[str, bytes], key: str) -> Any:

@@ -51,13 +51,10 @@ class Sampled(NamedTuple):
 
     def each(self, sensors: FleetSensors) -> list[SensorSample]:
         """Return them one by one."""
-        names, sizes = sensors.names, [_size(s, kind) for s, kind in enumerate(sensors.types)]
+        names, sizes = sensors.names, [kind.values for kind in sensors.types]
+        sizes[sensor_set.GPS] = VALUE_COLUMNS
         rows = zip(self.whose.tolist(), self.values.tolist(), strict=True)
         return [SensorSample(names[s], i, t, at, tuple(row[: sizes[s]])) for (s, i, t, at), row in rows]
-
-
-def _size(s: int, kind: SensorType) -> int:
-    return VALUE_COLUMNS if s == sensor_set.GPS else kind.values
 
 
 NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))

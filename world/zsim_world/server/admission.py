@@ -8,7 +8,7 @@ stranger without a token: somebody who joins under ever new names could stop it 
 from dataclasses import dataclass
 
 from zsim.contract.run_messages import Join
-from zsim.transport.session_tokens import Sessions, SessionTokens
+from zsim.transport.link_watch import Sessions, SessionTokens
 from zsim_world.run.barrier import Participant
 from zsim_world.run.inputs import FalselyJoined, Joined, NotShown, Run
 

@@ -13,9 +13,8 @@ import msgspec
 
 from zsim.contract import keys
 from zsim.contract.run_messages import Health, Join
-from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch
+from zsim.transport.link_watch import Awaited, ClosedLink, LinkWatch, SessionTokens
 from zsim.transport.session import Session
-from zsim.transport.session_tokens import SessionTokens
 from zsim_world.run.inputs import Died, FellSilent, ReaderClosed, Run
 
 BYE_NS = 100_000_000  # wall time by which a bye may come after the loss of its process's token

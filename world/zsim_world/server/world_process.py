@@ -15,13 +15,12 @@ from zsim.contract import keys, messages, run_messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RunError
 from zsim.runtime.agent import Output
-from zsim.runtime.collector import rare_collections
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.health import HealthMeter, rare_collections
 from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
+from zsim.transport.link_watch import SessionTokens
 from zsim.transport.session import Query, ReceivedSample, Session
-from zsim.transport.session_tokens import SessionTokens
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.run.barrier import Participant

@@ -12,13 +12,13 @@ from zsim.contract.flight_messages import LinkState
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Waiting
 from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
+from zsim.runtime.participant import Participant
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_tables import TableRows
 from zsim_bridges.console.run_condition import RunCondition, page_head
 from zsim_bridges.console.run_page import console_state
 from zsim_bridges.console.time_monitor import BEAT_S, SILENT_S, TimeMonitor
 from zsim_bridges.console.view_buffer import ReceivedEstimate, ViewBuffer
-from zsim_bridges.observer_process import ObserverProcess
 
 S = 1_000_000_000  # ns
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -66,7 +66,7 @@ class MonitoredRun:
         info: Any = SimpleNamespace(
             run_id="r1", drones=[DroneInfo(names[0], ""), DroneInfo(names[1], "", body="external")]
         )
-        self.observer = ObserverProcess(self.link, info, "console.1")
+        self.observer = Participant(self.link, info, "console.1")
         self.monitor = TimeMonitor(self.link, self.observer, stamp_age_s, lambda: self.wall_s)
         self.views = ViewBuffer(self.link, info, self.observer, {}, self.refused.append, lambda: self.wall_s)
         self.words = TableRows(self.views, {})

@@ -173,9 +173,14 @@ def test_newcomers_join_so_often_only_all_names_together(world: World, period_ns
     assert kinds(world) == {"join": 3, "leave": 1}
 
 
-def test_every_second_allows_one_newcomer_more(world: World) -> None:
+def test_every_second_allows_one_newcomer_more_and_a_continued_run_has_spent_as_much(world: World) -> None:
     for number in range(FLOOD):
         join(world, f"console.{number}")
+    events(world)
+    again = World(world.scenario, run_id="run1")
+    continue_from(world, again)
+    join(again, "late.1")
+    assert kinds(again) == {}  # not even a refusal
     for _ in range(50):
         world.advance(0)
     events(world)
@@ -197,16 +202,6 @@ def test_news_of_joins_that_nobody_is_behind_is_bounded(world: World) -> None:
         world.falsely_joined(f"x.{number}", message, "no token")
     assert kinds(world) == {"no_show": STRANGERS_MAX}
     assert world.result()["refused"] == FLOOD - STRANGERS_MAX
-
-
-def test_what_was_spent_is_in_a_snapshot(world: World) -> None:
-    for number in range(FLOOD):
-        join(world, f"console.{number}")
-    events(world)
-    again = World(world.scenario, run_id="run1")
-    continue_from(world, again)
-    join(again, "late.1")
-    assert kinds(again) == {}
 
 
 MODE = "drone/d1/cmd/mode"

@@ -50,20 +50,17 @@ def test_one_that_died_is_overdue_after_its_time_and_not_before() -> None:
     assert made.overdue(RETURN_NS + 1) is None
     assert made.overdue(RETURN_NS + 2) == ME
 
-
-def test_without_a_time_nobody_is_overdue() -> None:
-    made = world("on_death: {}")
-    made.died(ME, 1)
-    assert made.overdue(10**18) is None
-
-
-def test_then_the_run_ends() -> None:
-    made = world("return_s: 2")
-    made.died(ME, 1)
     made.expired(ME)
     assert events(made) == [("death", ME), ("overdue", ME)]
-    assert made.ended is not None
-    assert has_terms(made.ended, ME, "2")
+    assert has_terms(made.ended or "", ME, "2")
+
+
+@pytest.mark.parametrize(("processes", "changes"), [("on_death: {}", ["death"]), ("return_s: 2", ["silence", "back"])])
+def test_without_a_time_or_after_its_return_nobody_is_overdue(processes: str, changes: list[str]) -> None:
+    made = world(processes)
+    for change in changes:
+        made.died(ME, 1) if change == "death" else made.silence_changed(ME, 5 if change == "silence" else None)
+    assert made.overdue(10**18) is None
 
 
 @pytest.mark.parametrize("whose", ["estimator", ME])
@@ -97,23 +94,9 @@ def test_one_that_is_stopped_is_overdue_too_and_on_death_says_what_it_means(on_d
     assert (made.ended is not None) is ends
 
 
-def test_unless_it_goes_on_before() -> None:
-    made = world("return_s: 2")
-    made.silence_changed(ME, 5)
-    made.silence_changed(ME, None)
-    assert made.overdue(10 * RETURN_NS) is None
-
-
-@pytest.mark.parametrize(
-    ("processes", "path"),
-    [
-        ("return_s: 1, on_overdue: {estimator: wait}", "processes.on_overdue.estimator"),
-    ],
-)
-def test_what_is_refused(processes: str, path: str) -> None:
-    with pytest.raises(ScenarioError) as refused:
-        scenario_file.from_text(SCENARIO.replace("PROCESSES", processes))
-    assert path in str(refused.value)
+def test_nobody_overdue_is_waited_for() -> None:
+    with pytest.raises(ScenarioError, match=r"processes\.on_overdue\.estimator"):
+        scenario_file.from_text(SCENARIO.replace("PROCESSES", "return_s: 1, on_overdue: {estimator: wait}"))
 
 
 def test_the_journal_has_it() -> None:
@@ -252,20 +235,14 @@ def test_a_bye_without_an_incarnation_counts_when_the_token_is_gone_as_well(fail
     assert ME not in made.barrier.participants
 
 
-def test_or_when_nobody_ever_showed_a_token() -> None:
+@pytest.mark.parametrize("is_over", [False, True])
+def test_or_when_nobody_ever_showed_a_token_or_the_run_is_over(is_over: bool) -> None:
     made = world("on_death: {}")
     say_bye(made)
-    made.not_shown(ME, "has no liveliness token", 6)
-    assert events(made) == [("leave", ME)]
-
-
-def test_or_when_the_run_is_over() -> None:
-    made = world("on_death: {}")
-    say_bye(made)
-    made.publish_end()
-    assert events(made) == [("leave", ME), ("end", "world")]
+    made.publish_end() if is_over else made.not_shown(ME, "has no liveliness token", 6)
+    assert events(made) == [("leave", ME), *[("end", "world")] * is_over]
     assert not made.waiting_to_leave()
-    assert made.left_early == []
+    assert (made.left_early == []) is is_over
 
 
 def test_who_says_done_after_such_a_bye_has_not_said_it() -> None:

@@ -10,8 +10,7 @@ from zsim.contract.run_messages import Health, Join
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import WORLD
-from zsim.transport.link_watch import ClosedLink
-from zsim.transport.session_tokens import SessionTokens
+from zsim.transport.link_watch import ClosedLink, SessionTokens
 from zsim_world.run.inputs import Run
 from zsim_world.run.outbox import STRANGERS_MAX
 from zsim_world.run.world import World

@@ -1,23 +1,20 @@
-"""A process's place in a run: what the world does not answer stays owed, and is not asked for all the time."""
+"""A process's part in a run: what the world does not answer is asked for again, and who takes its place ends it."""
 
 import os
 from typing import Any
 
 import pytest
-from fake_link import UNANSWERED, FakeLink
+from fake_link import FakeLink
 from msgspec.structs import replace
-from refused import refused
 
 from zsim.contract import keys, messages
-from zsim.contract.framing import decode_batch, pairs_of
 from zsim.contract.messages import Info, Origin
-from zsim.contract.run_messages import Clock, ControlAnswer, Snapshot
+from zsim.contract.run_messages import Clock, ControlAnswer, Event, Snapshot
 from zsim.contract.snapshot import VERSION, pack
 from zsim.contract.world_events import ProcessEntry
-from zsim.errors import DecodeError, NoWorldError
-from zsim.runtime import membership
+from zsim.runtime import participant
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.membership import RETRY_S, Membership, replay
+from zsim.runtime.participant import RETRY_S, AgentParticipant, Participant
 from zsim.transport.session import ReceivedSample
 
 GATE_NS = 20_000_000
@@ -45,7 +42,7 @@ class Wall:
 
 def test_what_is_not_answered_is_asked_for_again_after_a_while():
     link, wall, came = FakeLink(), Wall(), []
-    member = Membership(link, INFO, Quiet(), came.append, lambda text: None, wall)  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), came.append, lambda text: None, wall)  # type: ignore[arg-type]
     for turns in (1, 2, 3):
         for _ in range(5):
             member.ask_again(3 * GATE_NS, "drone/d1/truth")
@@ -61,7 +58,7 @@ def test_what_is_not_answered_is_asked_for_again_after_a_while():
 
 def test_another_gate_is_asked_for_at_once():
     link = FakeLink()
-    member = Membership(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     for gate in (3, 4):
         member.ask_again(gate * GATE_NS, "drone/d1/truth")
     assert [args["from_ns"] // GATE_NS for _, args in link.requests] == [2, 3]
@@ -73,7 +70,7 @@ def test_what_an_inbox_holds_back_is_asked_for_where_there_is_such_a_hold(mode: 
     link, agent = FakeLink(), Quiet()
     agent.reads = (*Quiet.reads, "drone/d2/estimate")
     info = replace(INFO, mode=mode)
-    member = Membership(link, info, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    member = AgentParticipant(link, info, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     member.ask_again(3 * GATE_NS, "drone/d1/truth")
     assert [args["from_ns"] // GATE_NS for _, args in link.requests] == [from_gate]
 
@@ -81,13 +78,15 @@ def test_what_an_inbox_holds_back_is_asked_for_where_there_is_such_a_hold(mode: 
 def test_who_did_not_join_as_the_news_of_its_own_process_say_joins_again():
     link = FakeLink()
     link.last = {keys.INFO: messages.encode(INFO)}
-    member = Membership(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     member.enter()
-    member.taken_in(ProcessEntry(7, link.host, os.getpid(), 0, former_pid=os.getpid()))
+    (own,) = link.published_on("process/*/join")
+    for incarnation in (own.incarnation, 7):
+        member.take_entry(ProcessEntry(incarnation, link.host, os.getpid(), 0, former_pid=os.getpid()))
     first, second = link.published_on("process/*/join")
     assert second.incarnation not in {first.incarnation, 7}
     for own in (first, second):
-        member.taken_in(ProcessEntry(own.incarnation, link.host, os.getpid(), 0, former_pid=os.getpid()))
+        member.take_entry(ProcessEntry(own.incarnation, link.host, os.getpid(), 0, former_pid=os.getpid()))
     assert len(link.published_on("process/*/join")) == 2
     assert member.failure is None
 
@@ -98,7 +97,7 @@ def test_who_did_not_join_as_the_news_of_its_own_process_say_joins_again():
 def test_a_join_is_repeated_until_the_world_has_taken_it_in():
     link, wall = FakeLink(), Wall()
     link.admits, link.last = False, {keys.INFO: messages.encode(INFO)}
-    member = Membership(link, INFO, Quiet(), lambda sample: None, lambda text: None, wall)  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), lambda sample: None, lambda text: None, wall)  # type: ignore[arg-type]
     member.enter()
     for _ in range(3):
         wall.now_s += RETRY_S
@@ -107,7 +106,7 @@ def test_a_join_is_repeated_until_the_world_has_taken_it_in():
     assert len(joins) == 4
     assert len({join.incarnation for join in joins}) == 1
     assert member.awaited
-    member.taken_in(ProcessEntry(joins[0].incarnation, link.host, os.getpid(), 0))
+    member.take_entry(ProcessEntry(joins[0].incarnation, link.host, os.getpid(), 0))
     wall.now_s += RETRY_S
     member.settle()
     assert (member.awaited, len(link.published_on("process/*/join"))) == (False, 4)
@@ -126,53 +125,90 @@ def test_a_snapshot_is_asked_for_until_a_world_answers(monkeypatch: pytest.Monke
         keys.CLOCK: messages.encode(Clock(2 * GATE_NS, 0, "r", 2, "running", 1.0)),
         keys.INFO: messages.encode(INFO),
     }
-    monkeypatch.setattr(membership.time, "sleep", lambda wall_s: link.last.update(kept))  # it is there when asked again
-    member = Membership(link, INFO, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    monkeypatch.setattr(
+        participant.time, "sleep", lambda wall_s: link.last.update(kept)
+    )  # it is there when asked again
+    member = AgentParticipant(link, INFO, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     assert (member.resume(), states) == (GATE_NS, [{"count": 3}])
 
 
 def test_whoever_is_to_end_waits_for_no_world():
     link = FakeLink()
     settings = (lambda sample: None, lambda text: None, Wall(), lambda: True)
-    member = Membership(link, INFO, Quiet(), *settings)  # type: ignore[arg-type]
+    member = AgentParticipant(link, INFO, Quiet(), *settings)  # type: ignore[arg-type]
     assert member.resume() is None
 
 
-# The pages of a replay
+# A process that shows, and never gates
 
 
-def pages(link: FakeLink, *answers: ControlAnswer) -> list[tuple[str, bytes]]:
-    left = iter(answers)
-    link.on_request = lambda key, args: next(left)
-    return list(replay(link, "quiet.one", 7, ["**"], 1.0))  # type: ignore[arg-type]
+ME = "console.1"
 
 
-def test_a_replay_goes_on_until_the_last_page():
+def console(link: FakeLink) -> Participant:
+    """Return a participant that is admitted, by the answer of the fake link."""
+    participant = Participant(link, INFO, ME)  # type: ignore[arg-type]
+    participant.announce()
+    assert participant.admitted
+    return participant
+
+
+def tell(link: FakeLink, kind: str, incarnation: int, pid: int) -> None:
+    data = {"incarnation": incarnation, "host": link.host, "pid": pid, "from_ns": 0}
+    link.deliver(keys.EVENT, Event(0, 0, kind, ME, ME, "", data))
+
+
+@pytest.mark.parametrize("kind", ["join", "restart", "superseded"])
+def test_another_process_of_its_name_ends_it(kind: str):
     link = FakeLink()
-    first, second = ControlAnswer(True, result=[["a", b"1"]], more=41), ControlAnswer(True, result=[["b", b"2"]])
-    assert pages(link, first, second) == [("a", b"1"), ("b", b"2")]
-    assert link.requests == [
-        (keys.replay("quiet.one"), {"from_ns": 7, "keys": ["**"], "page": page}) for page in (0, 41)
-    ]
+    shown = console(link)
+    tell(link, kind, 7, os.getpid() + 1)
+    assert shown.superseded
+    shown.leave("closed")
+    assert not link.published_on("process/*/bye")  # which would be that of the other one
 
 
-NO_PAIRS = [None, 7, "text", [1], [["a"]], [["a", "dGV4dA=="]], [["a", b"1", b"2"]], {"a": b"1"}, [[b"a", b"1"]]]
+def test_who_is_not_admitted_yet_replaces_whoever_was_before():
+    link = FakeLink()
+    link.admits = False
+    shown = Participant(link, INFO, ME)  # type: ignore[arg-type]
+    shown.announce()
+    tell(link, "superseded", 7, os.getpid() + 1)
+    assert not shown.superseded
 
 
-@pytest.mark.parametrize("result", NO_PAIRS)
-def test_a_result_that_is_no_list_of_pairs_is_none(result: Any):
-    with refused(DecodeError, "list", "[key, payload]"):
-        pairs_of(result)
-    with refused(NoWorldError, "replay"):
-        pages(FakeLink(), ControlAnswer(True, result=result))
+def test_a_join_of_its_own_process_that_it_did_not_publish_is_answered_by_a_newer_one():
+    link = FakeLink()
+    shown = console(link)
+    tell(link, "superseded", 7, os.getpid())
+    shown.tick()
+    first, second = link.published_on("process/*/join")
+    assert not shown.superseded
+    assert second.incarnation not in {first.incarnation, 7}
 
 
-def test_no_answer_is_said():
-    with pytest.raises(NoWorldError, match="nobody answered"):
-        pages(FakeLink(), UNANSWERED)
+@pytest.mark.parametrize("slack_ns", [0, GATE_NS])
+def test_after_a_lost_link_it_joins_anew_and_says_again_what_it_has_done(slack_ns: int):
+    link = FakeLink()
+    shown = Participant(link, INFO, ME, slack_ns=slack_ns)  # type: ignore[arg-type]
+    shown.announce()
+    shown.done(3)
+    link.cut(True)
+    shown.tick()
+    link.cut(False)
+    link.cut(True)
+    shown.tick()
+    first, second = link.published_on("process/*/join")
+    assert (first.seq, second.seq) == (0, 1)
+    dones = link.published_on("process/*/done")
+    assert [(done.done_ns, done.incarnation) for done in dones] == (
+        [(3, first.incarnation), (3, second.incarnation)] if slack_ns else []
+    )
 
 
-@pytest.mark.parametrize("payload", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1", b""])
-def test_a_batch_that_is_none_is_refused(payload: bytes):
-    with refused(DecodeError, "@batch", "list"):
-        decode_batch(payload)
+def test_it_leaves_once():
+    link = FakeLink()
+    shown = console(link)
+    for _ in range(2):
+        shown.leave("closed")
+    assert len(link.published_on("process/*/bye")) == 1

@@ -12,8 +12,7 @@ from zsim.contract.messages import Info, Origin
 from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest
 from zsim.contract.snapshot import pack, unpack
 from zsim.errors import RunError
-from zsim.runtime.agent import Agent, Output
-from zsim.runtime.group import AgentGroup
+from zsim.runtime.agent import Agent, AgentGroup, Output
 
 GATE_NS = 20_000_000
 HOLD_NS = 2 * GATE_NS  # with a command delay of a gate

@@ -4,38 +4,12 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from refused import has_terms
 
 from zsim_deploy.launch.supervisor import UNREAD, EndSignals
-from zsim_deploy.roles.stop_channel import interruptible
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_interrupts(number: signal.Signals) -> None:
-    former = signal.getsignal(number)
-    with pytest.raises(KeyboardInterrupt), interruptible():
-        signal.raise_signal(number)
-    assert signal.getsignal(number) is former
-
-
-def test_what_a_library_makes_of_it_is_an_interrupt_still() -> None:
-    def lose() -> None:
-        with suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        raise SystemError("returned NULL without setting an exception")
-
-    with pytest.raises(KeyboardInterrupt), interruptible():
-        lose()
-
-
-def test_other_errors_are_what_they_are() -> None:
-    with pytest.raises(SystemError), interruptible():
-        raise SystemError("returned NULL without setting an exception")
-
 
 TALKS = """
 import signal, sys

@@ -7,8 +7,8 @@ import pytest
 from refused import refused
 
 from zsim.errors import SessionError
-from zsim.transport import open_files
-from zsim.transport.open_files import allow_files, hub_files, launcher_files, require_files
+from zsim.transport import zenoh_settings
+from zsim.transport.zenoh_settings import allow_files, hub_files, launcher_files, require_files
 
 Limits = Callable[[int, int], list[int]]
 
@@ -50,7 +50,7 @@ def test_what_is_only_wanted_is_raised_as_far_as_it_goes(limits: Limits) -> None
 
 @pytest.mark.parametrize(("clients", "measured"), [(2, 26), (4, 31), (11, 48), (31, 92)])
 def test_a_hub_needs_what_was_measured_and_room(clients: int, measured: int) -> None:
-    assert measured < hub_files(clients) < 2 * measured + open_files.SESSION_FILES
+    assert measured < hub_files(clients) < 2 * measured + zenoh_settings.SESSION_FILES
     assert launcher_files(clients + 1, clients) >= hub_files(clients)
 
 
