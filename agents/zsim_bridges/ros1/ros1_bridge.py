@@ -17,7 +17,7 @@ from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics, ros1_name
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.traffic_intake import TrafficIntake
-from zsim_bridges.vehicle_links import onboard_state
+from zsim_bridges.vehicle_links import drone_link as onboard_state
 
 POLL_S = 0.1  # how often a stop is looked for
 REPORTED_MAX = 1000  # texts remembered, so that each is printed once

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from zsim_bridges.ardrone.server.addresses import FIRST_ADDRESS
 from zsim_deploy.arguments import WorldAccess, participant_options, positive
+
+FIRST_ADDRESS = "127.0.0.2"  # of the first drone; 127.0.0.1 is where programs on this host send from
 
 ardrone = typer.Typer(name="ardrone", help="Programs for the AR.Drone fly drones of a run.", no_args_is_help=True)
 
@@ -30,11 +31,10 @@ def serve(
     name: Annotated[str, typer.Option(help="Process name (default ardrone.main, or the certificate's).")] = "",
 ) -> None:
     """Offer each drone as an AR.Drone 2.0 on an address of its own."""
-    from zsim_bridges.ardrone.server.addresses import peer_addresses
-    from zsim_bridges.ardrone.server.ardrone_server import ArdroneOptions
-    from zsim_bridges.ardrone.server.ardrone_server import serve as serve_run
+    from zsim_bridges.ardrone.ardrone_server import ArdroneOptions, ArdroneServer
+    from zsim_bridges.ardrone.ports import peer_addresses
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import serve_runs
 
     options = ArdroneOptions(addresses, peer_addresses(peer or ()), rate)
-    serve_runs(process_name("ardrone", name, reach.who), partial(serve_run, options=options), reach)
+    serve_runs(process_name("ardrone", name, reach.who), partial(ArdroneServer.serve, options=options), reach)

@@ -11,8 +11,8 @@ from zsim_deploy.arguments import WorldAccess, finite, participant_options, posi
 from zsim_deploy.cli.mavlink_commands import read_key
 
 if TYPE_CHECKING:
+    from zsim_bridges.vehicle_links.driver import SessionMaker
     from zsim_bridges.vehicle_links.driver_options import DriverOptions
-    from zsim_deploy.roles.roles import Serve
 
 DroneName = Annotated[str, typer.Argument(help="The drone of the run that it is; `body: external` in the scenario.")]
 Armed = Annotated[bool, typer.Option("--armed", help="Obey from the start; else an operator asks `arm` first.")]
@@ -42,14 +42,15 @@ def drive_mavlink(
     ceiling: Ceiling = None,
 ) -> None:
     """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
-    from zsim_bridges.mavlink.mavlink_driver import drive
+    from zsim_bridges.mavlink.autopilot_session import AutopilotSession
     from zsim_bridges.vehicle_links.driver_options import check_host, udp_channel
 
     options = _options(drone, (speed, climb), (radius, ceiling), armed, origin, None)
     channel = udp_channel(address, local_port)
     check_host(channel.host)
     key = read_key(signing_key) if signing_key else None
-    _serve(partial(drive, options=options, channel=channel, system=system, key=key), reach, drone)
+    make_session = partial(AutopilotSession.of_run, channel=channel, system=system, key=key)
+    _serve(make_session, options, reach)
 
 
 @participant_options
@@ -74,14 +75,14 @@ def drive_ardrone(
     ceiling: Ceiling = None,
 ) -> None:
     """Let an AR.Drone 2.0 fly as a drone of the run."""
-    from zsim_bridges.ardrone.ardrone_driver import drive
-    from zsim_bridges.ardrone.drive.aircraft_session import AircraftSettings
+
+    from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings
     from zsim_bridges.vehicle_links.driver_options import aircraft_host, check_host
 
     options = _options(drone, (speed, climb), (radius, ceiling), armed, origin, yaw)
     check_host(aircraft_host(address))
     settings = AircraftSettings(ultrasound=ultrasound)
-    _serve(partial(drive, options=options, address=address, settings=settings), reach, drone)
+    _serve(partial(AircraftSession.of_run, host=address, settings=settings), options, reach)
 
 
 def _options(
@@ -93,7 +94,7 @@ def _options(
     yaw_deg: float | None,
 ) -> "DriverOptions":
     from zsim_bridges.vehicle_links.driver_options import DriverOptions, position
-    from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+    from zsim_bridges.vehicle_links.failsafe import FlightLimits
 
     speed, climb = speeds
     radius, ceiling = (math.inf if limit is None else limit for limit in fence)
@@ -101,8 +102,10 @@ def _options(
     return DriverOptions(drone, limits, armed, position(origin) if origin else None, yaw_deg)
 
 
-def _serve(drive: "Serve", reach: WorldAccess, drone: str) -> None:
+def _serve(make_session: "SessionMaker", options: "DriverOptions", reach: WorldAccess) -> None:
+    from zsim_bridges.vehicle_links.driver import drive
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import serve_runs
 
-    serve_runs(process_name("driver", "", reach.who, drone), drive, reach)
+    name = process_name("driver", "", reach.who, options.drone)
+    serve_runs(name, partial(drive, options=options, make_session=make_session), reach)

@@ -62,8 +62,7 @@ def serve(
     name: Annotated[str, typer.Option(help="Process name (default mavlink.main, or the certificate's).")] = "",
 ) -> None:
     """Offer each drone as a vehicle: QGroundControl, MAVSDK, DroneKit, MAVProxy fly it."""
-    from zsim_bridges.mavlink.serve.mavlink_server import MavlinkOptions
-    from zsim_bridges.mavlink.serve.mavlink_server import serve as serve_vehicles
+    from zsim_bridges.mavlink.mavlink_server import MavlinkOptions, MavlinkServer
     from zsim_deploy.roles.process_identity import process_name
     from zsim_deploy.roles.roles import serve_runs
 
@@ -83,7 +82,7 @@ def serve(
     )
     if options.key and options.version == 1:
         raise typer.BadParameter("--signing-key needs MAVLink 2; leave out --protocol 1")
-    serve_runs(process_name("mavlink", name, reach.who), partial(serve_vehicles, options=options), reach)
+    serve_runs(process_name("mavlink", name, reach.who), partial(MavlinkServer.serve, options=options), reach)
 
 
 def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:

@@ -11,9 +11,9 @@ from mavlink_drone import FlownDrone
 from zsim.contract.flight_messages import Mode as ModeCommand
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Event
-from zsim_bridges.mavlink.autopilot.enums import FENCE, FORCE, Cmd, MavFrame, MissionResult, Result, TypeMask
-from zsim_bridges.mavlink.autopilot.personality import COPTER_MODES, PX4_MODES, FlightMode
-from zsim_bridges.mavlink.wire import dialect
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.enums import FENCE, FORCE, Cmd, MavFrame, MissionResult, Result, TypeMask
+from zsim_bridges.mavlink.personality import COPTER_MODES, PX4_MODES, FlightMode
 
 NAN = math.nan
 VELOCITY_ONLY = TypeMask.X | TypeMask.Y | TypeMask.Z | TypeMask.AX | TypeMask.AY | TypeMask.AZ | TypeMask.YAW
@@ -37,7 +37,7 @@ def flying(autopilot: str = "px4", altitude_m: float = 3.0) -> FlownDrone:
 
 
 def set_mode(drone: FlownDrone, custom: int) -> int:
-    if drone.vehicle._options.personality.name == "px4":
+    if drone.vehicle._options.personality.is_px4:
         return drone.command(Cmd.DO_SET_MODE, 1, custom >> 16 & 0xFF, custom >> 24)
     return drone.command(Cmd.DO_SET_MODE, 1, custom)
 
