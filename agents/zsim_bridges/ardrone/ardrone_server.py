@@ -14,13 +14,13 @@ from zsim.extras import install_command
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone
 from zsim.transport.session import Session
-from zsim_bridges.ardrone import at_commands, configuration, file_server, navdata, video
+from zsim_bridges.ardrone import at_commands, configuration, navdata, ports, video
 from zsim_bridges.ardrone.aircraft import Aircraft, Outlets
-from zsim_bridges.ardrone.file_server import FileServer
 from zsim_bridges.ardrone.ports import (
     Address,
     AllowedHosts,
     DatagramPort,
+    FileServer,
     StreamPort,
     drone_addresses,
     read_until_end,
@@ -153,7 +153,7 @@ class DroneServer:
         outlets = Outlets(server.link.put, self._navdata.send, self._control.broadcast, server.refuse)
         self.aircraft = Aircraft(drone, server.observer.name, server.info.gate_ns, outlets)
         self.video = VideoServer(peers, self._refuse)
-        version = FileServer(address, peers, file_server.VERSION_FILES, self._refuse)
+        version = FileServer(address, peers, ports.VERSION_FILES, self._refuse)
         self._files = FileServer(address, peers, {}, self._refuse).port
         self._ports: tuple[tuple[DatagramPort | StreamPort, str, int], ...] = (
             (self._navdata, "UDP", navdata.PORT),
@@ -161,7 +161,7 @@ class DroneServer:
             (self._authentication, "UDP", AUTHENTICATION_PORT),
             (self._control, "TCP", configuration.PORT),
             (self.video.port, "TCP", video.PORT),
-            (version.port, "TCP", file_server.VERSION_PORT),
+            (version.port, "TCP", ports.VERSION_PORT),
         )
 
     async def open(self) -> list[str]:
@@ -180,10 +180,10 @@ class DroneServer:
                 }.get(error.errno or 0, error.strerror or str(error))
                 raise RunError(f"{self._name}: {kind} port {port} of {self.address} cannot be had: {why}") from error
         try:  # few programs use it, and it needs a privilege
-            await self._files.open(self.address, file_server.FILES_PORT)
+            await self._files.open(self.address, ports.FILES_PORT)
         except OSError as error:
             why = "needs a privilege" if error.errno in NOT_PERMITTED else error.strerror
-            return [f"{self._name}: TCP port {file_server.FILES_PORT} is left out ({why}); ps_drone looks there"]
+            return [f"{self._name}: TCP port {ports.FILES_PORT} is left out ({why}); ps_drone looks there"]
         return []
 
     async def close(self) -> None:

@@ -2,8 +2,8 @@
 
 A packet is a header (magic, state bits, sequence number, vision flag; uint32 each), options, and last the checksum
 option, the sum of all bytes before it. An option begins with its tag and its size in bytes, both uint16, these four
-bytes included. All is little-endian and packed. The table is written as `wire_table` says: angles are in millidegrees
-where a name says so, theta nose up, phi to the right, psi clockwise; axes x forward, y right, z down.
+bytes included. All is little-endian and packed. The table has the form that `wire_table` describes: angles are in
+millidegrees where a name says so, theta nose up, phi to the right, psi clockwise; axes x forward, y right, z down.
 
 Source: AR.Drone Developer Guide SDK 2.0, chapter 7; ARDroneLib (SDK 2.0.1), navdata_common.h and config.h; the GPS
 option of firmware 2.4 and later: its branch `gps`.
@@ -117,56 +117,23 @@ FULL_TAGS = tuple(tag for tag in LAYOUTS if tag < GPS_TAG)
 its tag means."""
 
 
-class StateBit(IntFlag):
-    """The state word of a packet (ARDroneLib, config.h)."""
-
-    FLYING = 1 << 0
-    VIDEO = 1 << 1
-    VISION = 1 << 2
-    ANGULAR_SPEED_CONTROL = 1 << 3
-    ALTITUDE_CONTROL = 1 << 4
-    USER_FEEDBACK = 1 << 5
-    COMMAND_ACK = 1 << 6
-    CAMERA_READY = 1 << 7
-    TRAVELLING = 1 << 8
-    USB_READY = 1 << 9
-    NAVDATA_DEMO = 1 << 10
-    NAVDATA_BOOTSTRAP = 1 << 11
-    MOTORS_FAULT = 1 << 12
-    COM_LOST = 1 << 13
-    SOFTWARE_FAULT = 1 << 14
-    BATTERY_LOW = 1 << 15
-    USER_EMERGENCY = 1 << 16
-    TIMER_ELAPSED = 1 << 17
-    MAGNETO_NEEDS_CALIBRATION = 1 << 18
-    ANGLES_OUT_OF_RANGE = 1 << 19
-    TOO_MUCH_WIND = 1 << 20
-    ULTRASOUND_DEAF = 1 << 21
-    CUTOUT = 1 << 22
-    PIC_VERSION_OK = 1 << 23
-    AT_THREAD = 1 << 24
-    NAVDATA_THREAD = 1 << 25
-    VIDEO_THREAD = 1 << 26
-    ACQUISITION_THREAD = 1 << 27
-    CONTROL_WATCHDOG = 1 << 28
-    ADC_WATCHDOG = 1 << 29
-    COM_WATCHDOG = 1 << 30
-    EMERGENCY = 1 << 31
+StateBit = IntFlag(
+    "StateBit",
+    "FLYING VIDEO VISION ANGULAR_SPEED_CONTROL ALTITUDE_CONTROL USER_FEEDBACK COMMAND_ACK CAMERA_READY "
+    "TRAVELLING USB_READY NAVDATA_DEMO NAVDATA_BOOTSTRAP MOTORS_FAULT COM_LOST SOFTWARE_FAULT BATTERY_LOW "
+    "USER_EMERGENCY TIMER_ELAPSED MAGNETO_NEEDS_CALIBRATION ANGLES_OUT_OF_RANGE TOO_MUCH_WIND "
+    "ULTRASOUND_DEAF CUTOUT PIC_VERSION_OK AT_THREAD NAVDATA_THREAD VIDEO_THREAD ACQUISITION_THREAD "
+    "CONTROL_WATCHDOG ADC_WATCHDOG COM_WATCHDOG EMERGENCY",
+)
+"""The state word of a packet (ARDroneLib, config.h)."""
 
 
-class ControlState(IntEnum):
-    """The upper half of demo's ctrl_state (ARDroneLib, control_states.h)."""
-
-    DEFAULT = 0
-    INIT = 1
-    LANDED = 2
-    FLYING = 3
-    HOVERING = 4
-    TEST = 5
-    TAKING_OFF = 6
-    GO_TO_FIX = 7
-    LANDING = 8
-    LOOPING = 9
+ControlState = IntEnum(
+    "ControlState",
+    "DEFAULT INIT LANDED FLYING HOVERING TEST TAKING_OFF GO_TO_FIX LANDING LOOPING",
+    start=0,
+)
+"""The upper half of demo's ctrl_state (ARDroneLib, control_states.h)."""
 
 
 class Hovering(IntEnum):

@@ -1,21 +1,30 @@
 """MAVLink's messages, of the dialects common and ardupilotmega, as far as vehicles and their clients use them.
 
-`dialect.Heartbeat(type=2)` is a HEARTBEAT, a record with the fields of its definition. The table is written as
-`wire_table` says, with the units of the definitions; axes are north, east, down, and forward, right, down. A default is
-what the definition has for a value that is not known.
+`dialect.Heartbeat(type=2)` is a HEARTBEAT, a record with the fields of its definition. The table has the form that
+`wire_table` describes, and the units of the definitions; a default is the definition's value for "not known". At the
+end are the conversions between axes: W is east, north, up and B forward, left, up; MAVLink's are north, east, down and
+forward, right, down.
 
-Sources: https://mavlink.io/en/messages/common.html and ardupilotmega.html for the definitions;
-https://mavlink.io/en/guide/serialization.html for the order of the bytes, CRC_EXTRA and the checksum.
+Sources: https://mavlink.io/en/messages/common.html and ardupilotmega.html for the definitions and frames;
+https://mavlink.io/en/guide/serialization.html for the order of the bytes, CRC_EXTRA and the checksum;
+https://mavlink.io/en/services/mission.html#mission_item_int for whole numbers.
 """
 
+import math
 from binascii import crc_hqx
 from operator import attrgetter
+from struct import calcsize
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from zsim.math.rotation import Quaternion, Vector
 from zsim_bridges.vehicle_links.wire_table import Entry, WireLayout, read_table
 
+DEGREES, LOCAL_M = 1e-7, 1e-4  # unit of x and y in messages that have them as whole numbers
+INT32_UNKNOWN = 2**31 - 1  # INT32_MAX: NaN among whole numbers of 32 bits
+UINT16_UNKNOWN = 65535  # likewise of 16 bits
+_S = math.sqrt(0.5)
 _TARGET = "target_system,target_component:B"
 _GOAL = "vx,vy,vz:f[m/s] afx,afy,afz:f[m/s/s] yaw:f[rad] yaw_rate:f[rad/s]"
 _IMU = "xacc,yacc,zacc:h[mG] xgyro,ygyro,zgyro:h[mrad/s] xmag,ymag,zmag:h[mgauss]"
@@ -159,7 +168,6 @@ _C_TYPES = {
     "c": "char", "s": "uint8_t", "B": "uint8_t", "b": "int8_t", "H": "uint16_t", "h": "int16_t", "I": "uint32_t",
     "i": "int32_t", "Q": "uint64_t", "q": "int64_t", "f": "float", "d": "double",
 }  # fmt: skip
-_SIZES = {"c": 1, "s": 1, "B": 1, "b": 1, "H": 2, "h": 2, "I": 4, "i": 4, "f": 4, "Q": 8, "q": 8, "d": 8}
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
@@ -189,7 +197,7 @@ class MessageLayout(WireLayout):
     """
 
     def __init__(self, entry: Entry) -> None:
-        base = sorted(entry.fields, key=lambda field: -_SIZES[field.code])
+        base = sorted(entry.fields, key=lambda field: -calcsize(f"<{field.code}"))
         super().__init__([*entry.fields, *entry.extensions], [*base, *entry.extensions])
         self.id, self.name = entry.number, entry.name
         self.size, self.base_size = self.codec.size, WireLayout(base).codec.size
@@ -231,3 +239,54 @@ globals().update({kind.__name__: kind for kind in LAYOUTS})
 if TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any: ...
+
+
+def ned(v_W: Vector) -> Vector:
+    """Return a vector of W in north, east, down; its own inverse."""
+    return v_W[1], v_W[0], -v_W[2]
+
+
+def frd(v_B: Vector) -> Vector:
+    """Return a vector of B in forward, right, down; its own inverse."""
+    return v_B[0], -v_B[1], -v_B[2]
+
+
+def attitude_ned(q_WB: Quaternion) -> Quaternion:
+    """Return the attitude forward-right-down to north-east-down, w first and not negative; its own inverse.
+
+    W to NED is half a turn about (1, 1, 0), FRD to B half a turn about x.
+    """
+    w, x, y, z = q_WB
+    w, x, y, z = -x, w, z, -y
+    q = -_S * (x + y), _S * (w + z), _S * (w - z), _S * (y - x)
+    return q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
+
+
+def wrapped(angle_rad: float) -> float:
+    """Return an angle in [-pi, pi]."""
+    return math.remainder(angle_rad, math.tau)
+
+
+def yaw_ned(yaw_W: float) -> float:
+    """Return a yaw counter-clockwise from east as one clockwise from north [rad]; its own inverse."""
+    return wrapped(0.5 * math.pi - yaw_W)
+
+
+def from_int(value: int, unit: float) -> float:
+    """Return a whole number in a unit; NaN where it is not known."""
+    return math.nan if value == INT32_UNKNOWN else unit * value
+
+
+def to_int(value: float, unit: float) -> int:
+    """Return a value as a whole number in a unit."""
+    return round(value / unit) if math.isfinite(value) else INT32_UNKNOWN
+
+
+def global_ints(place: Vector) -> tuple[int, int, int]:
+    """Return latitude [deg], longitude [deg] and height [m] as whole numbers [1e-7 deg, 1e-7 deg, mm]."""
+    return round(1e7 * place[0]), round(1e7 * place[1]), round(1000 * place[2])
+
+
+def int16(value: float) -> int:
+    """Return the nearest whole number of 16 bits, within 32767 either way."""
+    return max(-32767, min(32767, round(value)))

@@ -21,10 +21,8 @@ class Cmd(IntEnum):
     DO_FLIGHTTERMINATION = 185
     DO_REPOSITION = 192
     DO_PAUSE_CONTINUE = 193
-    DO_SET_ROI_NONE = 197
     DO_FENCE_ENABLE = 207
     DO_SET_MISSION_CURRENT = 224
-    PREFLIGHT_CALIBRATION = 241
     PREFLIGHT_REBOOT_SHUTDOWN = 246
     MISSION_START = 300
     COMPONENT_ARM_DISARM = 400
@@ -32,7 +30,6 @@ class Cmd(IntEnum):
     GET_MESSAGE_INTERVAL = 510
     SET_MESSAGE_INTERVAL = 511
     REQUEST_MESSAGE = 512
-    REQUEST_PROTOCOL_VERSION = 519
     REQUEST_AUTOPILOT_CAPABILITIES = 520
     FENCE_RETURN_POINT = 5000
     FENCE_POLYGON_INCLUSION = 5001
@@ -41,59 +38,33 @@ class Cmd(IntEnum):
     FENCE_CIRCLE_EXCLUSION = 5004
 
 
-class Result(IntEnum):
-    """MAV_RESULT."""
-
-    ACCEPTED = 0
-    TEMPORARILY_REJECTED = 1
-    DENIED = 2
-    UNSUPPORTED = 3
-    FAILED = 4
-    IN_PROGRESS = 5
+Result = IntEnum("Result", "ACCEPTED TEMPORARILY_REJECTED DENIED UNSUPPORTED FAILED IN_PROGRESS", start=0)
+"""MAV_RESULT."""
 
 
-class Severity(IntEnum):
-    """MAV_SEVERITY."""
-
-    EMERGENCY = 0
-    ALERT = 1
-    CRITICAL = 2
-    ERROR = 3
-    WARNING = 4
-    NOTICE = 5
-    INFO = 6
+Severity = IntEnum("Severity", "EMERGENCY ALERT CRITICAL ERROR WARNING NOTICE INFO", start=0)
+"""MAV_SEVERITY."""
 
 
 class MissionResult(IntEnum):
     """MAV_MISSION_RESULT."""
 
     ACCEPTED = 0
-    ERROR = 1
     UNSUPPORTED_FRAME = 2
     UNSUPPORTED = 3
     NO_SPACE = 4
     INVALID = 5
     INVALID_SEQUENCE = 13
-    DENIED = 14
     OPERATION_CANCELLED = 15
 
 
-class MavFrame(IntEnum):
-    """MAV_FRAME."""
-
-    GLOBAL = 0
-    LOCAL_NED = 1
-    MISSION = 2
-    GLOBAL_RELATIVE_ALT = 3
-    LOCAL_ENU = 4
-    GLOBAL_INT = 5
-    GLOBAL_RELATIVE_ALT_INT = 6
-    LOCAL_OFFSET_NED = 7
-    BODY_NED = 8
-    BODY_OFFSET_NED = 9
-    GLOBAL_TERRAIN_ALT = 10
-    GLOBAL_TERRAIN_ALT_INT = 11
-    BODY_FRD = 12
+MavFrame = IntEnum(
+    "MavFrame",
+    "GLOBAL LOCAL_NED MISSION GLOBAL_RELATIVE_ALT LOCAL_ENU GLOBAL_INT GLOBAL_RELATIVE_ALT_INT "
+    "LOCAL_OFFSET_NED BODY_NED BODY_OFFSET_NED GLOBAL_TERRAIN_ALT GLOBAL_TERRAIN_ALT_INT BODY_FRD",
+    start=0,
+)
+"""MAV_FRAME."""
 
 
 class Autopilot(IntEnum):
@@ -125,14 +96,8 @@ class SystemStatus(IntEnum):
     TERMINATED = 8
 
 
-class LandedState(IntEnum):
-    """MAV_LANDED_STATE."""
-
-    UNDEFINED = 0
-    ON_GROUND = 1
-    IN_AIR = 2
-    TAKEOFF = 3
-    LANDING = 4
+LandedState = IntEnum("LandedState", "UNDEFINED ON_GROUND IN_AIR TAKEOFF LANDING", start=0)
+"""MAV_LANDED_STATE."""
 
 
 class SensorBit(IntFlag):
@@ -173,21 +138,8 @@ class Capability(IntFlag):
     MISSION_FENCE = 16384
 
 
-class TypeMask(IntFlag):
-    """POSITION_TARGET_TYPEMASK: the ignored parts of a setpoint."""
-
-    X = 1
-    Y = 2
-    Z = 4
-    VX = 8
-    VY = 16
-    VZ = 32
-    AX = 64
-    AY = 128
-    AZ = 256
-    FORCE = 512
-    YAW = 1024
-    YAW_RATE = 2048
+TypeMask = IntFlag("TypeMask", "X Y Z VX VY VZ AX AY AZ FORCE YAW YAW_RATE")
+"""POSITION_TARGET_TYPEMASK: the ignored parts of a setpoint."""
 
 
 class AttitudeMask(IntFlag):
@@ -235,9 +187,7 @@ class ParamType(IntEnum):
 
 
 FORCE = 21196.0  # param2 of COMPONENT_ARM_DISARM: without checks, also in flight
-TYPE_QUADROTOR = 2  # MAV_TYPE
-TYPE_GCS = 6  # MAV_TYPE
-TYPE_ONBOARD_CONTROLLER = 18  # MAV_TYPE
+TYPE_QUADROTOR, TYPE_ONBOARD_CONTROLLER = 2, 18  # MAV_TYPE
 COMPONENT_AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
-MISSION, FENCE, RALLY = 0, 1, 2  # MAV_MISSION_TYPE
+MISSION, FENCE = 0, 1  # MAV_MISSION_TYPE
 ALL_MISSION_TYPES = 255

@@ -7,7 +7,7 @@ import math
 from typing import Literal, NamedTuple
 
 from zsim.math.rotation import Quaternion, Vector
-from zsim_bridges.mavlink.conversions import wrapped
+from zsim_bridges.mavlink.dialect import wrapped
 from zsim_bridges.mavlink.personality import Parameters, SpeedLimits
 from zsim_bridges.mavlink.vehicle_state import VehicleState
 from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName

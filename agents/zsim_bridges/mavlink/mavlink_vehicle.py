@@ -10,15 +10,14 @@ from zsim.contract.run_messages import Event
 from zsim.errors import without_figures
 from zsim.scenario.scenario import Drone
 from zsim.schema.quantities import G_M_S2
-from zsim_bridges.mavlink import dialect, setpoints
+from zsim_bridges.mavlink import commands, dialect
 from zsim_bridges.mavlink.commands import Request, VehicleParts, carry_out, put_custom_mode
 from zsim_bridges.mavlink.dialect import WireMessage
 from zsim_bridges.mavlink.drone_watch import DroneWatch
 from zsim_bridges.mavlink.enums import COMPONENT_AUTOPILOT, FENCE, MISSION, Capability, Result, Severity
 from zsim_bridges.mavlink.flight_control import Target
 from zsim_bridges.mavlink.frame import Received
-from zsim_bridges.mavlink.mission import PlanItem, place_of
-from zsim_bridges.mavlink.mission_protocol import Address, MissionProtocol, home_item, item_fault, item_of
+from zsim_bridges.mavlink.mission import Address, MissionProtocol, PlanItem, home_item, item_fault, item_of, place_of
 from zsim_bridges.mavlink.personality import Parameters, Personality
 from zsim_bridges.mavlink.telemetry import Level, Telemetry, TelemetrySource, heartbeat, mission_current
 from zsim_bridges.mavlink.vehicle_flight import Flight
@@ -140,11 +139,11 @@ class MavlinkVehicle:
                 if result is not Result.UNSUPPORTED:
                     self._deny(reason)
             case dialect.SetPositionTargetLocalNed():
-                self._set_point(setpoints.from_local(message, self.state))
+                self._set_point(commands.from_local(message, self.state))
             case dialect.SetPositionTargetGlobalInt():
-                self._set_point(setpoints.from_global(message, self.state))
+                self._set_point(commands.from_global(message, self.state))
             case dialect.SetAttitudeTarget():
-                self._set_point(setpoints.from_attitude(message, self._weight_n))
+                self._set_point(commands.from_attitude(message, self._weight_n))
             case dialect.ManualControl(target=target) if target in (0, self._options.system_id):
                 self._steer(message)
             case dialect.SetMode():
@@ -184,8 +183,8 @@ class MavlinkVehicle:
         if reason:
             self.report(Severity.WARNING, f"Denied: {reason}")
 
-    def _set_point(self, setpoint: setpoints.Setpoint | setpoints.SetpointRefusal) -> None:
-        reason = setpoint.reason if isinstance(setpoint, setpoints.SetpointRefusal) else self.flight.set_point(setpoint)
+    def _set_point(self, setpoint: commands.Setpoint | commands.SetpointRefusal) -> None:
+        reason = setpoint.reason if isinstance(setpoint, commands.SetpointRefusal) else self.flight.set_point(setpoint)
         if reason and without_figures(reason) not in self._refused and len(self._refused) < REFUSED_MAX:
             self._refused.add(without_figures(reason))  # a stream would fill the operator's screen
             self._deny(reason)

@@ -19,19 +19,8 @@ CM = 0.01  # m; unit of ArduPilot's parameters of places and speeds
 ID_MAX = 16  # characters of a parameter's name
 
 
-class FlightMode(Enum):
-    """The modes of both autopilots under common names."""
-
-    MANUAL = "MANUAL"
-    ALTITUDE = "ALTITUDE"
-    POSITION = "POSITION"
-    HOLD = "HOLD"
-    BRAKE = "BRAKE"
-    TAKEOFF = "TAKEOFF"
-    LAND = "LAND"
-    RETURN = "RETURN"
-    MISSION = "MISSION"
-    OFFBOARD = "OFFBOARD"
+FlightMode = Enum("FlightMode", "MANUAL ALTITUDE POSITION HOLD BRAKE TAKEOFF LAND RETURN MISSION OFFBOARD")
+"""The modes of both autopilots under common names."""
 
 
 BY_STICKS = (FlightMode.MANUAL, FlightMode.ALTITUDE, FlightMode.POSITION)
@@ -67,14 +56,8 @@ COPTER_MODES = {
 }
 
 
-class FenceAction(Enum):
-    """What a vehicle does outside its fence."""
-
-    NONE = 0
-    WARN = 1
-    HOLD = 2
-    RETURN = 3
-    LAND = 5
+FenceAction = Enum("FenceAction", "NONE WARN HOLD RETURN LAND")
+"""What a vehicle does outside its fence."""
 
 
 PX4_FENCE = {  # GF_ACTION

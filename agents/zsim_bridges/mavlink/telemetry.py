@@ -16,8 +16,17 @@ from zsim.scenario.scenario import Drone
 from zsim.schema.quantities import G_M_S2
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_bridges.mavlink import dialect
-from zsim_bridges.mavlink.conversions import UINT16_UNKNOWN, attitude_ned, frd, global_ints, int16, ned, yaw_ned
-from zsim_bridges.mavlink.dialect import LAYOUTS, WireMessage
+from zsim_bridges.mavlink.dialect import (
+    LAYOUTS,
+    UINT16_UNKNOWN,
+    WireMessage,
+    attitude_ned,
+    frd,
+    global_ints,
+    int16,
+    ned,
+    yaw_ned,
+)
 from zsim_bridges.mavlink.enums import (
     TYPE_QUADROTOR,
     BaseMode,

@@ -11,7 +11,7 @@ from zsim.math import frames
 from zsim.math.geodetic import anchor, geodetic
 from zsim.math.rotation import LEVEL, Vector
 from zsim.scenario.scenario import Drone
-from zsim_bridges.mavlink import conversions
+from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.enums import SensorBit
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an older estimate is not used
@@ -186,5 +186,5 @@ class VehicleState:
     @property
     def rpy_ned_rad(self) -> Vector:
         """Roll, pitch and yaw in MAVLink's axes."""
-        roll, pitch, yaw = frames.rpy_from_quaternion(conversions.attitude_ned(self.q_WB)).tolist()
+        roll, pitch, yaw = frames.rpy_from_quaternion(dialect.attitude_ned(self.q_WB)).tolist()
         return roll, pitch, yaw

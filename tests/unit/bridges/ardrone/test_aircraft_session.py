@@ -7,8 +7,7 @@ import pytest
 from fake_aircraft import FIELD_UT, STEP_NS, FakeAircraft
 
 from zsim.math.frames import heading
-from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings
-from zsim_bridges.ardrone.navdata_readings import NavdataReadings
+from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings, NavdataReadings
 from zsim_bridges.vehicle_links.aircraft_readings import AircraftPose
 from zsim_bridges.vehicle_links.vehicle_session import Demand
 

@@ -11,10 +11,9 @@ from fake_autopilot import ARDUPILOT, HOLD, IN_AIR, LAND, LANDING, PX4, STEP_NS,
 from scipy.spatial.transform import Rotation
 
 from zsim.math.frames import heading
-from zsim_bridges.mavlink import conversions, dialect
-from zsim_bridges.mavlink.autopilot_session import AutopilotSession
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.autopilot_session import AutopilotSession, TelemetryReadings
 from zsim_bridges.mavlink.frame import Link, Parser, Signing
-from zsim_bridges.mavlink.telemetry_readings import TelemetryReadings
 from zsim_bridges.vehicle_links.aircraft_readings import AircraftPose
 from zsim_bridges.vehicle_links.vehicle_session import Demand, UdpChannel
 
@@ -263,17 +262,17 @@ def test_attitudes_agree_with_scipys_rotations(seed: int):
         Rotation.from_matrix(np.diag([1, -1, -1])),
     )
     expected = (ned_to_enu * q_NF * flu_to_frd).as_matrix()
-    turned = conversions.attitude_ned((w, x, y, z))
+    turned = dialect.attitude_ned((w, x, y, z))
     found = Rotation.from_quat([*turned[1:], turned[0]]).as_matrix()
     assert found == pytest.approx(expected, abs=1e-12)
-    assert np.abs(conversions.attitude_ned(turned)) == pytest.approx(np.abs([w, x, y, z]), abs=1e-12)
+    assert np.abs(dialect.attitude_ned(turned)) == pytest.approx(np.abs([w, x, y, z]), abs=1e-12)
 
 
 def test_vectors_and_headings():
-    assert conversions.ned((1, 2, 3)) == (2, 1, -3)
-    assert conversions.frd((1, 2, 3)) == (1, -2, -3)
-    assert conversions.yaw_ned(math.pi / 2) == pytest.approx(0.0)
-    assert conversions.yaw_ned(conversions.yaw_ned(0.7)) == pytest.approx(0.7)
+    assert dialect.ned((1, 2, 3)) == (2, 1, -3)
+    assert dialect.frd((1, 2, 3)) == (1, -2, -3)
+    assert dialect.yaw_ned(math.pi / 2) == pytest.approx(0.0)
+    assert dialect.yaw_ned(dialect.yaw_ned(0.7)) == pytest.approx(0.7)
 
 
 def test_a_pose_stands_in_w_where_the_vehicles_own_origin_is():
