@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +24,7 @@ from zsim_bridges.mavlink.mavlink_server import (
     MavlinkOptions,
     MavlinkServer,
     Peers,
+    Served,
     VehiclePort,
     VehiclePorts,
 )
@@ -52,84 +54,62 @@ def test_programs_on_this_machine_become_peers_until_they_are_silent() -> None:
     assert peers.addresses(SILENT_S + 1.0) == [GCS, ("127.0.0.1", 5000)]
 
 
-class OpenPort:
-    """A vehicle's port, and a program that has spoken to it."""
+@pytest.fixture
+def program() -> Iterator[socket.socket]:
+    """A program that has a port of its own."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.0.1", 0))
+        opened.settimeout(10.0)
+        yield opened
 
-    def __init__(self) -> None:
-        self.received: list[Received] = []
-        self.program = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.program.bind(("127.0.0.1", 0))
-        self.program.settimeout(10.0)
-        self.port = VehiclePort(("127.0.0.1", 0), self.program.getsockname(), None, self.received.append)
-        self.ports = VehiclePorts([self.port], Link(1, 1))
 
-    def close(self) -> None:
-        self.port.close(asyncio.get_running_loop())
-        self.program.close()
+def vehicle_ports(program: socket.socket, received: list[Received]) -> VehiclePorts:
+    port = VehiclePort(("127.0.0.1", 0), program.getsockname(), None, received.append)
+    ports = VehiclePorts([port], Link(1, 1))
+    ports.open(asyncio.get_running_loop(), time.monotonic)
+    return ports
 
 
 @pytest.mark.parametrize("is_taken", [True, False])
-def test_a_port_that_cannot_be_had_is_refused_with_the_option_to_change(is_taken: bool) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
-        local = ("127.0.0.1" if is_taken else "nowhere.invalid", other.getsockname()[1])
-        with pytest.raises(RunError, match=f"{local[0]}.*{'--api-local' if is_taken else '--listen'}"):
-            VehiclePort(local, GCS, None, print)
+def test_a_port_that_cannot_be_had_is_refused_with_the_option_to_change(program: socket.socket, is_taken: bool) -> None:
+    local = ("127.0.0.1" if is_taken else "nowhere.invalid", program.getsockname()[1])
+    with pytest.raises(RunError, match=f"{local[0]}:{local[1]}.*{'--api-local' if is_taken else '--listen'}"):
+        VehiclePort(local, GCS, None, print)
 
 
-def test_messages_go_together_in_datagrams_of_a_frame_of_ethernet() -> None:
+def test_messages_go_together_in_datagrams_and_those_out_of_range_are_counted(program: socket.socket) -> None:
+    many = [dialect.Statustext(6, f"{i:050}") for i in range(50)]
+
     async def send() -> None:
-        opened = OpenPort()
-        opened.ports.open(asyncio.get_running_loop(), time.monotonic)
-        many = [dialect.Statustext(6, f"{i:050}") for i in range(50)]
-        opened.ports.send(many)
-        parser, read = Parser(), []
-        while len(read) < len(many):
-            data = opened.program.recv(65_536)
-            assert len(data) <= DATAGRAM_MAX
-            read += [each.message for each in parser.feed(data)]
-        assert read == many
-        opened.close()
+        ports = vehicle_ports(program, [])
+        ports.send([*many[:25], dialect.Heartbeat(type=300), *many[25:]])
+        assert ports.refused()["unsent"] == 1
+        ports.close(asyncio.get_running_loop())
 
     asyncio.run(send())
+    parser, read = Parser(), []
+    while len(read) < len(many):
+        data = program.recv(65_536)
+        assert len(data) <= DATAGRAM_MAX
+        read += [each.message for each in parser.feed(data)]
+    assert read == many
 
 
-def test_a_message_that_cannot_be_packed_is_counted_and_the_others_are_sent() -> None:
-    async def send() -> None:
-        opened = OpenPort()
-        opened.ports.open(asyncio.get_running_loop(), time.monotonic)
-        opened.ports.send([dialect.Heartbeat(type=300), dialect.Heartbeat(type=2)])
-        assert [each.message for each in Parser().feed(opened.program.recv(65_536))] == [dialect.Heartbeat(type=2)]
-        assert opened.ports.refused()["unsent"] == 1
-        opened.close()
-
-    asyncio.run(send())
-
-
-def test_what_a_program_sends_is_read_and_what_is_damaged_is_counted() -> None:
+def test_what_a_program_sends_is_read_and_what_is_damaged_is_counted(program: socket.socket) -> None:
     async def receive() -> None:
-        opened = OpenPort()
-        opened.ports.open(asyncio.get_running_loop(), time.monotonic)
-        local = opened.port._socket.getsockname()
+        received: list[Received] = []
+        ports = vehicle_ports(program, received)
         good = Link(255, 190).pack(dialect.Heartbeat(type=6))
-        opened.program.sendto(good[:-1] + bytes([good[-1] ^ 1]), local)
-        opened.program.sendto(good, local)
+        for data in (good[:-1] + bytes([good[-1] ^ 1]), good):
+            program.sendto(data, ports._ports[0]._socket.getsockname())
         async with asyncio.timeout(10.0):
-            while not opened.received:
+            while not received:
                 await asyncio.sleep(0)
-        assert opened.received == [Received(dialect.Heartbeat(type=6), 255, 190, 0, False)]
-        assert opened.ports.refused()["bad_crc"] == 1
-        opened.close()
+        assert received == [Received(dialect.Heartbeat(type=6), 255, 190, 0, False)]
+        assert ports.refused()["bad_crc"] == 1
+        ports.close(asyncio.get_running_loop())
 
     asyncio.run(receive())
-
-
-def test_a_port_that_is_taken_is_told() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
-        port = other.getsockname()[1]
-        with pytest.raises(RunError, match=f"127.0.0.1:{port}"):
-            VehiclePort(("127.0.0.1", port), GCS, None, lambda _: None)
 
 
 def server_of(link: Any, first_system_id: int = 1, run_id: str = "r") -> MavlinkServer:
@@ -137,6 +117,11 @@ def server_of(link: Any, first_system_id: int = 1, run_id: str = "r") -> Mavlink
     options = MavlinkOptions("px4", "normal", "127.0.0.1", GCS, 0, GCS, 0, None, 2, None, first_system_id)
     observer: Any = SimpleNamespace(name="mavlink.main")
     return MavlinkServer(link, info, observer, lambda _: None, options)
+
+
+def close(served: Served) -> None:
+    for port in served.ports._ports:
+        port._socket.close()
 
 
 def test_vehicles_of_two_simulations_are_told_apart_by_one_ground_station() -> None:
@@ -149,8 +134,7 @@ def test_vehicles_of_two_simulations_are_told_apart_by_one_ground_station() -> N
         assert vehicle._parameters.values["MAV_SYS_ID"] == first
         version: Any = vehicle._version()
         unique_ids.add(version.uid)
-        for port in served.ports._ports:
-            port._socket.close()
+        close(served)
     assert addresses == {1, 11}
     assert len(unique_ids) == 2
     with pytest.raises(RunError, match=r"254.*--first-system-id.*255"):
@@ -166,39 +150,31 @@ def test_how_far_a_mission_was_flown_is_reported_to_the_world_in_order() -> None
     served.vehicle.flight.mission.reports += reports
     server._report_mission(served)
     server._requests.shutdown()
-    for port in served.ports._ports:
-        port._socket.close()
+    close(served)
     assert [(key, op, source) for key, op, source, *_ in asked] == [("world/control", "mission", "mavlink.main")] * 2
     assert [args for *_, args, _ in asked] == [{"drone": "drone1", **each._asdict()} for each in reports]
     assert served.vehicle.flight.mission.reports == []
 
 
-def run(mode: str, rate: float) -> Any:
-    return SimpleNamespace(run_id="r", mode=mode, rate=rate)
-
-
-def world(ok: bool, asked: list[Any]) -> Any:
-    def request(key: str, op: str, source: str, args: dict[str, Any]) -> ControlAnswer:
-        asked.append((op, source, args))
-        return ControlAnswer(ok=ok, error="" if ok else "not now")
-
-    return SimpleNamespace(request=request)
-
-
 def test_a_run_without_a_pace_is_refused_unless_one_is_set() -> None:
     asked: list[Any] = []
+
+    def ask(mode: str, own: float, rate: float | None, answer: Any = ControlAnswer(ok=True)) -> None:  # noqa: B008
+        info: Any = SimpleNamespace(run_id="r", mode=mode, rate=own)
+        link: Any = SimpleNamespace(request=lambda _, *arguments: asked.append(arguments) or answer)
+        set_pace(link, info, "mavlink.main", rate)
+
     with pytest.raises(RunError, match="--rate"):
-        set_pace(world(True, asked), run("lockstep", 0.0), "mavlink.main", None)
-    for mode, rate in (("lockstep", 2.0), ("realtime", 1.0)):
-        set_pace(world(True, asked), run(mode, rate), "mavlink.main", None)
+        ask("lockstep", 0.0, None)
+    ask("lockstep", 2.0, None)
+    ask("realtime", 1.0, None)
     assert asked == []
-    set_pace(world(True, asked), run("lockstep", 0.0), "mavlink.main", 3.0)
+    ask("lockstep", 0.0, 3.0)
     assert asked == [("rate", "mavlink.main", {"value": 3.0})]
     with pytest.raises(RunError, match="not now"):
-        set_pace(world(False, asked), run("lockstep", 0.0), "mavlink.main", 3.0)
-    gone: Any = SimpleNamespace(request=lambda *_: Unanswered(ok=False, error="nobody answers there"))
+        ask("lockstep", 0.0, 3.0, ControlAnswer(ok=False, error="not now"))
     with pytest.raises(NoWorldError, match="nobody answers there"):
-        set_pace(gone, run("lockstep", 0.0), "mavlink.main", 3.0)
+        ask("lockstep", 0.0, 3.0, Unanswered(ok=False, error="nobody answers there"))
 
 
 def test_endpoints_are_hosts_and_ports_that_can_be_reached() -> None:
