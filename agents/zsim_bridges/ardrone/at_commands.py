@@ -260,6 +260,7 @@ def format_command(command: Command) -> bytes:
         return f"AT*{command.name}={command.sequence}\r".encode("ascii")
     sequence, *values = command
     texts = [str(sequence)]
+    value: Any
     for type_, value in zip(_argument_types(type(command)), values, strict=True):
         texts.append(f'"{value}"' if type_ is str else str(bits_of_float(value) if type_ is float else value))
     return f"AT*{_NAME_OF[type(command)]}={','.join(texts)}\r".encode("ascii")

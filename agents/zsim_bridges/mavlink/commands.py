@@ -51,6 +51,7 @@ class Request(NamedTuple):
     def of(cls, message: dialect.CommandLong | dialect.CommandInt) -> "Request":
         """Return the command in a message."""
         m, frame = message, 0
+        place: tuple[float, float, float]
         if isinstance(m, dialect.CommandLong):
             place = m.param5, m.param6, m.param7
         else:

@@ -211,7 +211,8 @@ class MessageLayout(WireLayout):
         self._wire_values = attrgetter(*self.wire_order) if len(self.wire_order) > 1 else self._only_value
         name = self.name.replace("_", " ").title().replace(" ", "")
         fields = [(field.name, type(field.default_value), field.default_value) for field in self.fields]
-        self.kind = msgspec.defstruct(name, fields, bases=(WireMessage,), gc=False, module=__name__)
+        kind: Any = msgspec.defstruct(name, fields, bases=(WireMessage,), gc=False, module=__name__)
+        self.kind: type[WireMessage] = kind
 
     def _only_value(self, message: WireMessage) -> tuple[Any]:
         return (getattr(message, self.wire_order[0]),)

@@ -8,7 +8,7 @@ builders here.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from zsim.math import frames
 from zsim.math.rotation import Vector
@@ -126,6 +126,7 @@ class TelemetrySource:
 
 
 Builder = Callable[[TelemetrySource], WireMessage | None]
+BuilderT = TypeVar("BuilderT", bound=Builder)
 Rates = tuple[float, float]
 """At the levels normal and full [Hz of simulated time]."""
 
@@ -148,10 +149,10 @@ def builds(
     px4: Rates | None = None,
     ardupilot: Rates | None = None,
     sensor: str | None = None,
-) -> Callable[[Builder], Builder]:
+) -> Callable[[BuilderT], BuilderT]:
     """Return a decorator that registers a builder; without rates its message is sent on request alone."""
 
-    def register(build: Builder) -> Builder:
+    def register(build: BuilderT) -> BuilderT:
         ROWS[kind] = Row(build, px4 or both, ardupilot or both, sensor)
         return build
 

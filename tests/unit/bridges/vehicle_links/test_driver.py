@@ -47,7 +47,7 @@ def info(mode: Any = "realtime") -> Info:
 class Session(VehicleSession):
     """Sends its demands by name, and takes what arrives for the state that it then has."""
 
-    state = AircraftState()
+    state: AircraftState = AircraftState()  # type: ignore[assignment]
 
     def __init__(self, port: int) -> None:
         super().__init__((UdpChannel("127.0.0.1", port),), AircraftReadings((0.0, 0.0, 0.0)), 256)
