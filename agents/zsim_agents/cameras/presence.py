@@ -11,7 +11,7 @@ TICK_S = 0.1  # how often a stop is looked for while nothing arrives
 
 
 class Presence(Protocol):
-    """The process in one run; zsim_bridges.observer_process has it."""
+    """The process in one run; zsim.runtime.participant has it."""
 
     name: str
     now_ns: int

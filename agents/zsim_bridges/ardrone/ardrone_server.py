@@ -11,6 +11,7 @@ from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.errors import RunError
 from zsim.extras import install_command
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone
 from zsim.transport.session import Session
@@ -26,9 +27,7 @@ from zsim_bridges.ardrone.ports import (
     read_until_end,
 )
 from zsim_bridges.ardrone.video import VideoServer
-from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.picture_intake import PictureIntake
-from zsim_bridges.traffic_intake import TrafficIntake
+from zsim_bridges.intake import PictureIntake, TrafficIntake
 from zsim_bridges.vehicle_links import drone_link
 from zsim_bridges.vehicle_links.server import Say, VehicleServer
 
@@ -60,7 +59,7 @@ class ArdroneServer(VehicleServer):
 
     options: ArdroneOptions
 
-    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: ArdroneOptions) -> None:
+    def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: ArdroneOptions) -> None:
         super().__init__(link, info, observer, say, options)
         addresses = drone_addresses(options.addresses, [drone.name for drone in info.drones])
         drones = {drone.name: drone for drone in scenario_file.from_text(info.scenario).drones}

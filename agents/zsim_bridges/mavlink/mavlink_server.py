@@ -20,20 +20,20 @@ from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
 from zsim.errors import RunError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone
 from zsim.transport.session import Session
+from zsim_bridges.intake import TrafficIntake
 from zsim_bridges.mavlink.dialect import WireMessage
 from zsim_bridges.mavlink.enums import COMPONENT_AUTOPILOT
 from zsim_bridges.mavlink.frame import Link, Parser, Received, Signing, Version
 from zsim_bridges.mavlink.mavlink_vehicle import MavlinkVehicle, Options
 from zsim_bridges.mavlink.personality import PERSONALITIES
 from zsim_bridges.mavlink.telemetry import Level
-from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.traffic_intake import TrafficIntake
 from zsim_bridges.vehicle_links.drone_link import CommandSender
 from zsim_bridges.vehicle_links.server import Say, VehicleServer
-from zsim_bridges.web.loopback import is_loopback
+from zsim_bridges.web import is_loopback
 
 ANSWER_S = 1.0  # wall time for which an answer of the world is waited for, aside from the traffic
 TICK_S = 0.1  # wall time between two looks at what is due by wall time
@@ -107,7 +107,7 @@ class MavlinkServer(VehicleServer):
 
     options: MavlinkOptions
 
-    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: MavlinkOptions) -> None:
+    def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: MavlinkOptions) -> None:
         super().__init__(link, info, observer, say, options)
         self._signing = Signing(options.key) if options.key else None
         self._counted: Counter[str] = Counter()

@@ -19,12 +19,12 @@ from zsim.contract.flight_messages import Connection
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED, ControlAnswer
 from zsim.errors import DecodeError, RunError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.transport.session import Query, RawSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
-from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.aircraft_readings import STILL, AircraftPose, ClockOffset, Reading
 from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_run
 from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe
@@ -45,7 +45,7 @@ SessionMaker = Callable[[Info, Scenario, DriverOptions], VehicleSession]
 def drive(
     link: Session,
     info: Info,
-    observer: ObserverProcess,
+    observer: Participant,
     stopped: Callable[[], bool],
     say: Say,
     options: DriverOptions,
@@ -86,7 +86,7 @@ class DriverProcess:
         self,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         options: DriverOptions,
         session: VehicleSession,
         say: Say,

@@ -9,9 +9,9 @@ from typing import Any
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError, NoWorldError, RunError, without_figures
+from zsim.runtime.participant import Participant
 from zsim.transport.session import Session, Unanswered
-from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.traffic_intake import TrafficIntake
+from zsim_bridges.intake import TrafficIntake
 
 POLL_S = 0.1  # how often a stop is looked for
 REPORTED_MAX = 1000  # texts remembered, so that each is printed once
@@ -29,7 +29,7 @@ class VehicleServer(ABC):
         options: of the wire; `rate` is the pace that is asked of the world, None for the run's own.
     """
 
-    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: Any) -> None:
+    def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: Any) -> None:
         self.link = link
         self.info = info
         self.observer = observer
@@ -39,7 +39,7 @@ class VehicleServer(ABC):
 
     @classmethod
     def serve(
-        cls, link: Session, info: Info, observer: ObserverProcess, stopped: Callable[[], bool], say: Say, options: Any
+        cls, link: Session, info: Info, observer: Participant, stopped: Callable[[], bool], say: Say, options: Any
     ) -> None:
         """Serve one run until it is over.
 

@@ -1,6 +1,6 @@
 """Drones in the picture: hull, arms, motors, nose, lens, and rotors as their blades sweep during the exposure. Pure.
 
-They look like the console's (zsim_bridges.console.scene.airframe); lengths are the AR.Drone's, scaled by the arms.
+They look like the console's (zsim_bridges.console.airframe); lengths are the AR.Drone's, scaled by the arms.
 """
 
 import math

@@ -10,7 +10,7 @@ from zsim.math.compiled import COMPILES
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.estimator import Estimator
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 DRONES = ("d1", "d2", "d3")
 
