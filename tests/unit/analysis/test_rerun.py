@@ -6,7 +6,6 @@ from typing import Any
 import msgspec
 import pytest
 from refused import has_terms
-from zsim_world.run.world import World
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Mode, Truth
@@ -16,6 +15,7 @@ from zsim.scenario import scenario_file
 from zsim.schema.message import Message
 from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents
 from zsim_analysis.rerun import OutputComparison, RerunBus, TruthComparison, difference
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 VISITOR = "tester.one"
