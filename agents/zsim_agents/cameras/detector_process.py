@@ -15,10 +15,9 @@ from zsim.sensors.camera import CAMERAS
 from zsim.sensors.camera_model import CameraPose, Lens, folds
 from zsim.sensors.jpeg_header import PictureError
 from zsim.transport.session import RawSample, Session
-from zsim_agents.cameras import hat_outline
-from zsim_agents.cameras.detector import HatDetector
-from zsim_agents.cameras.jpeg import PIXELS_MAX, decoded
-from zsim_agents.cameras.presence import Bell, Presence
+from zsim_agents.cameras import detector as hat_outline
+from zsim_agents.cameras.detector import PIXELS_MAX, HatDetector, decoded
+from zsim_agents.cameras.process import Bell, Presence
 
 ASK_S = 2.0  # wall; how often a camera is asked what its pixels mean, while pictures come of which that is not known
 REPORTS_MAX = 5  # lines about pictures that are refused; the count is in the health

@@ -17,7 +17,7 @@ from zsim.runtime.routing import Input
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import EstimatorSet, estimator_class
 from zsim_agents.estimation.estimator_bank import EstimatorBank
-from zsim_agents.estimation.joint.cluster_banks import ClusterBanks
+from zsim_agents.estimation.joint_filter import ClusterBanks
 
 
 class Estimator(Agent):

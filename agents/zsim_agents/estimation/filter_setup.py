@@ -19,7 +19,7 @@ from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim.sensors.imu import ImuConfig
 from zsim.sensors.sensor import ErrorModel, Sensor, scaled
 from zsim.sensors.sensor_catalogue import Sensors
-from zsim_agents.estimation.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
+from zsim_agents.estimation.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY, beta_for, levelling_time_s
 from zsim_agents.estimation.filter_state import (
     BIAS,
     CHANNELS,
@@ -36,7 +36,6 @@ from zsim_agents.estimation.filter_state import (
     Rows,
 )
 from zsim_agents.estimation.kalman_update import DOF_MAX
-from zsim_agents.estimation.madgwick import beta_for, levelling_time_s
 from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, SET_DOWN_SIGMA_RAD
 from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, MANOEUVRE_S, ZERO
 

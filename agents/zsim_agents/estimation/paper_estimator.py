@@ -23,8 +23,8 @@ from zsim.math import frames
 from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim.sensors.sensor import ErrorModel, noise_sigma
+from zsim_agents.estimation.dead_reckoning import madgwick_step
 from zsim_agents.estimation.drone_estimator import StateEstimate
-from zsim_agents.estimation.madgwick import madgwick_step
 
 YAW = 3  # place in the state
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field

@@ -12,7 +12,14 @@ import numpy as np
 
 from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import Vector, about_z, add, axpy, multiply, normalised, product, scaled, subtract
-from zsim_agents.estimation.dead_reckoning import acceleration, arm_acceleration, corrected, reckon, write_prediction
+from zsim_agents.estimation.dead_reckoning import (
+    acceleration,
+    arm_acceleration,
+    corrected,
+    reckon,
+    rotation_vector_quaternion,
+    write_prediction,
+)
 from zsim_agents.estimation.filter_state import (
     CLONE,
     CLONED,
@@ -36,7 +43,6 @@ from zsim_agents.estimation.filter_state import (
     vector,
 )
 from zsim_agents.estimation.kalman_update import predict_jointly, predicted_covariance
-from zsim_agents.estimation.madgwick import rotation_vector_quaternion
 
 ZERO: Vector = (0.0, 0.0, 0.0)
 ACCEL_MAX_M_S2 = 500.0  # m/s^2, 50 g: no MEMS accelerometer of a drone reads more

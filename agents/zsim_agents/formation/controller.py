@@ -20,7 +20,7 @@ from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.engagement_setup import engagement_of
-from zsim_agents.formation.flight_data import GateInput, GateOutput
+from zsim_agents.formation.flight_check import GateInput, GateOutput
 from zsim_agents.formation.flight_plan import RequestError, read_request
 
 REQUESTS_MAX = 1000  # between two gates, as in a run that is paused; the next gate publishes them

@@ -12,9 +12,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from zsim.contract.snapshot import State
-from zsim_agents.formation.control_law import ControlLaw, FormationCommand, FormationGains, ProportionalLaw
-from zsim_agents.formation.flight_check import FlightCheck, place_fault, shape_fault
-from zsim_agents.formation.flight_data import (
+from zsim_agents.formation.control_law import (
+    ControlLaw,
+    FormationCommand,
+    FormationGains,
+    Pairs,
+    ProportionalLaw,
+    RobotLimits,
+    guard,
+)
+from zsim_agents.formation.flight_check import (
     AIRBORNE,
     DOWN,
     GUARD_PARTS,
@@ -23,11 +30,14 @@ from zsim_agents.formation.flight_data import (
     REJOINING,
     TOO_NEAR,
     EngagementLimits,
+    FlightCheck,
     GateInput,
     GateOutput,
     ModeCommand,
     ModeSender,
+    place_fault,
     setpoints,
+    shape_fault,
 )
 from zsim_agents.formation.flight_plan import (
     REFUSALS,
@@ -45,7 +55,6 @@ from zsim_agents.formation.flight_plan import (
     refuse,
 )
 from zsim_agents.formation.guidance import IN_PLACE_M, Guidance, Places
-from zsim_agents.formation.robot_limits import Pairs, RobotLimits, guard
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
 DT_MAX_S = 0.1  # longest step of the integral, after a gap

@@ -19,9 +19,10 @@ from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, Sing
 from zsim_agents.formation.trajectory import (
     ExpressionTrajectory,
     Reference,
+    TrajectoryError,
     WaypointTrajectory,
+    named_values,
 )
-from zsim_agents.formation.variable_values import TrajectoryError, named_values
 
 RETRY_S = 0.5  # between two tries of a request that was refused
 WAITS = " of the plan waits: "  # in the note of a plan, between the step and the reason

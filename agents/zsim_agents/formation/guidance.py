@@ -11,11 +11,9 @@ import math
 import numpy as np
 
 from zsim.contract.snapshot import State
-from zsim_agents.formation.control_law import FormationGains
-from zsim_agents.formation.flight_check import place_fault, shape_fault
-from zsim_agents.formation.flight_data import ShapeLimits
+from zsim_agents.formation.control_law import FormationGains, RobotLimits, load
+from zsim_agents.formation.flight_check import ShapeLimits, place_fault, shape_fault
 from zsim_agents.formation.flight_plan import Follow, MoveTo
-from zsim_agents.formation.robot_limits import RobotLimits, load
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, robot_rates
 from zsim_agents.formation.trajectory import (
     Hold,

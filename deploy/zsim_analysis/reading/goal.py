@@ -9,7 +9,7 @@ from zsim.scenario.scenario import ClusterPlan, Scenario
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_agents.formation.variable_values import TrajectoryError, named_values
+from zsim_agents.formation.trajectory import TrajectoryError, named_values
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import Array
 

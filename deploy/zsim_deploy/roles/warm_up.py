@@ -54,9 +54,9 @@ def _rehearse_agents() -> None:
 
 
 def _rehearse_detector() -> None:
-    from zsim_agents.cameras import hat_outline
+    from zsim_agents.cameras import detector
 
-    hat_outline.rehearse()
+    detector.rehearse()
 
 
 def _info(scenario: Scenario) -> Info:

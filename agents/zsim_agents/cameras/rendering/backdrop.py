@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim_agents.cameras.rendering.view import CameraMotion, View
+from zsim_agents.cameras.rendering.scene import CameraMotion, View
 
 Grey = NDArray[np.uint8]
 Array = NDArray[np.float64]

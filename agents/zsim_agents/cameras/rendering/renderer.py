@@ -1,6 +1,7 @@
 """Draws what a drone's camera sees, from the true poses of all drones. Pure: the same inputs give the same bits."""
 
 import math
+import zlib
 from functools import cache
 from typing import NamedTuple
 
@@ -9,16 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.frames import rotation_matrix
+from zsim.math.random_streams import stream
 from zsim.scenario.obstacle import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
-from zsim_agents.cameras.rendering import film
 from zsim_agents.cameras.rendering.backdrop import Backdrop, Ground, colour_map, field
-from zsim_agents.cameras.rendering.drone_images import SEEN_M, DroneImager, DroneImages, hat_images
-from zsim_agents.cameras.rendering.drones import draw_drone
-from zsim_agents.cameras.rendering.faces import draw_obstacle
-from zsim_agents.cameras.rendering.scene import SUN_W, DroneStates, Scene
-from zsim_agents.cameras.rendering.view import CameraMotion, View, camera_motion
+from zsim_agents.cameras.rendering.drones import SEEN_M, DroneImager, DroneImages, draw_drone, hat_images
+from zsim_agents.cameras.rendering.scene import SUN_W, CameraMotion, DroneStates, Scene, View, camera_motion
+from zsim_agents.cameras.rendering.shapes import draw_obstacle
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -49,7 +48,7 @@ class Renderer:
     def __init__(
         self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
     ) -> None:
-        gain = film.gain(scene.light)
+        gain = gain(scene.light)
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)
@@ -60,7 +59,7 @@ class Renderer:
         self._noise = None
         if camera.noise > 0:
             shape = self._view.lens.height, self._view.lens.width
-            self._noise = film.Noise(seed, f"{name}/noise", shape, camera.noise * gain)
+            self._noise = Noise(seed, f"{name}/noise", shape, camera.noise * gain)
         self._bend: tuple[Picture, Picture] | None = None
         flat = self._view
         if self._view.distorts:
@@ -85,14 +84,14 @@ class Renderer:
         images = self._imager.images(motion, t_s, bodies, R_WB)
         for seen in sorted(self._order(motion, images), reverse=True):
             self._draw(picture, seen, motion, images)
-        film.lens_blur(picture, self._camera.blur_px)
+        lens_blur(picture, self._camera.blur_px)
         if self._noise is not None:
             self._noise.add(picture, number)
         return picture
 
     def jpeg(self, number: int, t_s: float, bodies: DroneStates) -> bytes:
         """Return the picture of an exposure as JPEG; see `picture`."""
-        return film.jpeg(self.picture(number, t_s, bodies), self._camera.jpeg_quality)
+        return jpeg(self.picture(number, t_s, bodies), self._camera.jpeg_quality)
 
     def _sweep(self, grey: Picture, motion: CameraMotion) -> None:
         """Blur the ground by the motion of the middle of the picture's lower half over the exposure.
@@ -105,7 +104,7 @@ class Renderer:
         way_px = self._view.flow_px(point_K, motion.rates_K(point_K, np.zeros(3))) * self._exposure_s
         if np.hypot(*way_px) < SWEPT_PX:
             return
-        kernel = film.sweep_kernels(way_px[None])[0]
+        kernel = sweep_kernels(way_px[None])[0]
         part = grey[self._backdrop.ground_rows(motion, len(kernel))]
         if len(part):
             cv2.filter2D(part, -1, kernel, dst=part, borderType=cv2.BORDER_REPLICATE)
@@ -173,3 +172,75 @@ def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
     flat = Lens(lens.fx, lens.fy, (width - 1) / 2, (height - 1) / 2, 0, 0, 0, 0, 0, width, height)
     at = (view.plane * (lens.fx, lens.fy) + (flat.cx, flat.cy)).astype(np.float32)
     return _view(flat), cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)  # type: ignore[return-value]
+
+
+MARGIN = 64  # px, by which the noise is larger than the picture
+NOISE_MAX = 48.0  # grey levels, standard deviation: the most that the gain makes of the noise
+SWEEP_MAX_PX = 24.0  # px; a longer way is blurred as this
+SAMPLES_PER_PX = 8
+FULL_COLOUR = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444  # hats are a few pixels wide
+MIX = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio, whose multiples spread (Knuth, TAOCP 3, 6.4)
+
+
+def gain(light: float) -> float:
+    """Return the sensor's gain, which makes up for half of the stops that the light lacks of a clear day; chosen."""
+    return 1.0 / math.sqrt(light)
+
+
+def sweep_kernels(ways_px: Array) -> list[NDArray[np.float32]]:
+    """Return the kernels of motions by ways (N, 2) [px] over the picture: how long each pixel has had the light."""
+    lengths = np.hypot(*ways_px.T)
+    ways = ways_px * np.minimum(1.0, SWEEP_MAX_PX / np.maximum(lengths, 1e-9))[:, None]
+    count = max(2, math.ceil(min(lengths.max(), SWEEP_MAX_PX) * SAMPLES_PER_PX))
+    at = ways[:, :, None] * ((np.arange(count) + 0.5) / count - 0.5)  # (N, 2, count)
+    halves = [math.ceil(way / 2) + 1 for way in np.abs(ways).max(axis=1).tolist()]
+    most = max(halves)
+    shares = np.maximum(1 - np.abs(np.arange(-most, most + 1) - at[..., None]), 0)  # of a point, in a column or row
+    kernels = (shares[:, 1].transpose(0, 2, 1) @ shares[:, 0] / count).astype(np.float32)
+    inner = [slice(most - half, most + half + 1) for half in halves]
+    return [kernel[part, part] for kernel, part in zip(kernels, inner, strict=True)]
+
+
+class Noise:
+    """The noise of a sensor, made once, laid over each picture at another place.
+
+    Args:
+        seed, name: of the random stream; the same give the same noise.
+        shape: of the picture, (height, width).
+        sigma: grey levels, standard deviation.
+    """
+
+    def __init__(self, seed: int, name: str, shape: tuple[int, int], sigma: float) -> None:
+        height, width = shape
+        drawn = stream(seed, name).standard_normal((height + MARGIN, width + MARGIN, 3), np.float32)
+        levels = np.rint(min(sigma, NOISE_MAX) * drawn)
+        self._shape = shape
+        self._key = zlib.crc32(name.encode()) ^ (seed & 0xFFFFFFFF)
+        self._over = np.clip(levels, 0, 255).astype(np.uint8)
+        self._under = np.clip(-levels, 0, 255).astype(np.uint8)
+
+    def add(self, picture: Picture, number: int) -> None:
+        """Add it to the picture of a number."""
+        bits = ((number * 4 + 1) * MIX ^ self._key * MIX >> 7) & (2**64 - 1)
+        v, u = bits >> 40 & (MARGIN - 1), bits >> 52 & (MARGIN - 1)
+        height, width = self._shape
+        over, under = self._over[v : v + height, u : u + width], self._under[v : v + height, u : u + width]
+        if bits >> 60 & 1:
+            over, under = under, over
+        cv2.add(picture, over, dst=picture)
+        cv2.subtract(picture, under, dst=picture)
+
+
+def lens_blur(picture: Picture, sigma_px: float) -> None:
+    """Blur a picture as the lens does."""
+    if sigma_px < 0.2:
+        return  # less than a pixel's own width
+    side = 3 if sigma_px <= 0.7 else 2 * math.ceil(2.5 * sigma_px) + 1
+    kernel = cv2.getGaussianKernel(side, sigma_px)
+    cv2.sepFilter2D(picture, -1, kernel, kernel, dst=picture, borderType=cv2.BORDER_REPLICATE)
+
+
+def jpeg(picture: Picture, quality: int) -> bytes:
+    """Return a picture as JPEG."""
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality, *FULL_COLOUR])
+    return data.tobytes()

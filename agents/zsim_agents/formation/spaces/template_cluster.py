@@ -22,24 +22,22 @@ from numpy.typing import ArrayLike
 
 from zsim.math.compiled import portable
 from zsim.math.rotation import matrix
-from zsim_agents.formation.spaces.cluster_frame import (
+from zsim_agents.formation.spaces.cluster_space import (
+    CONDITION_LENGTH_M,
     LENGTH_MIN_M,
+    TAU,
+    Array,
+    ClusterSpace,
+    SingularClusterError,
     array_of,
     euler_angles,
     euler_axes_of,
     euler_rates,
     inertia,
+    numbered,
     rotation_of,
     row,
     skew,
-)
-from zsim_agents.formation.spaces.cluster_space import (
-    CONDITION_LENGTH_M,
-    TAU,
-    Array,
-    ClusterSpace,
-    SingularClusterError,
-    numbered,
 )
 
 INDEPENDENT_MIN = 1e-6  # share of a direction that must be new; rounding leaves 1e-15

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from zsim_agents.formation.flight_data import EngagementLimits
+from zsim_agents.formation.flight_check import EngagementLimits
 from zsim_bridges.console.monitoring.alarms import (
     BATTERY_EMPTY_PERCENT,
     BATTERY_LOW_PERCENT,

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from zsim.contract.state_rules import state_refusal
-from zsim_agents.formation.flight_data import (
+from zsim_agents.formation.flight_check import (
     AIRBORNE,
     DOWN,
     GUARD_PARTS,

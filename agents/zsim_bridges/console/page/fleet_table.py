@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import viser
 
-from zsim_agents.formation.flight_data import DOWN
+from zsim_agents.formation.flight_check import DOWN
 from zsim_bridges.console.console_tables import DroneRow, drone_table
 from zsim_bridges.console.monitoring.alarms import BATTERY_LOW_PERCENT
 from zsim_bridges.console.monitoring.flight_figures import FlightFigures

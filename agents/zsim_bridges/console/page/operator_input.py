@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from zsim.scenario.fault_kinds import FaultKind, expected, typed_rest, unstated
 from zsim.scenario.scenario import Cluster, Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
-from zsim_agents.formation.variable_values import DEGREES
+from zsim_agents.formation.trajectory import DEGREES
 
 SIDEWAYS_M = 50.0  # of the drones' starts, sideways; chosen: as far as a page shows a formation well
 HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and within sight

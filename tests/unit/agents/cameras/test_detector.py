@@ -10,10 +10,9 @@ from pictures import BOTTOM, FRONT, HATS, bodies, hat_K, looks, renderer, scene
 
 from zsim.sensors.camera import Camera, FrontCamera
 from zsim.sensors.camera_model import camera_pose, lens_of, pixel
-from zsim_agents.cameras.detector import HatDetector
-from zsim_agents.cameras.jpeg import decoded
-from zsim_agents.cameras.rendering.balls import AMBIENT, Ball, draw_ball
-from zsim_agents.cameras.rendering.view import View
+from zsim_agents.cameras.detector import HatDetector, decoded
+from zsim_agents.cameras.rendering.scene import View
+from zsim_agents.cameras.rendering.shapes import AMBIENT, Ball, draw_ball
 
 ASSOCIATED_RAD = 0.03  # rad, within which a sighting is that of the hat
 

@@ -6,7 +6,7 @@ import pytest
 from refused import has_terms
 
 from zsim.sensors.jpeg_header import PictureError, frame_of
-from zsim_agents.cameras.jpeg import decoded
+from zsim_agents.cameras.detector import decoded
 
 PICTURE = np.random.default_rng(1).integers(0, 255, (48, 64, 3), dtype=np.uint8)
 

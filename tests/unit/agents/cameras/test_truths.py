@@ -4,7 +4,7 @@ from msgspec.structs import replace
 
 from zsim.contract.flight_messages import Truth
 from zsim.scenario.scenario_file import resolve
-from zsim_agents.cameras.truths import PENDING_MAX, TruthHistory, standing
+from zsim_agents.cameras.camera_process import PENDING_MAX, TruthHistory, standing
 
 GATE_NS = 20_000_000
 

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from synthetic_flight import GATE_S, Flight, OneDrone, Reading, estimator, fly, readings, scenario
 
+from zsim_agents.estimation.dead_reckoning import levelling_time_s
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.filter_setup import LEVELLING_S, madgwick_beta
 from zsim_agents.estimation.filter_state import Rows
-from zsim_agents.estimation.madgwick import levelling_time_s
 
 NAN, INF = math.nan, math.inf
 AIDING = ("gps", "mag", "baro", "sonar", "flow")

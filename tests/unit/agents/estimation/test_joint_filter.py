@@ -15,9 +15,7 @@ from zsim.scenario import scenario_file
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank
 from zsim_agents.estimation.filter_state import Moment
-from zsim_agents.estimation.joint.cluster_banks import ClusterBanks
-from zsim_agents.estimation.joint.joint_bank import JointBank
-from zsim_agents.estimation.joint.sighting_update import across, expected, write_rows
+from zsim_agents.estimation.joint_filter import ClusterBanks, JointBank, across, expected, write_rows
 
 EYES = scenario_file.load(Path(__file__).parents[4] / "scenarios" / "eyes.yaml")
 GATE_S, GATE_NS = 0.02, 20_000_000

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from zsim.math.rotation import LEVEL, Quaternion, Vector, heading
-from zsim_agents.estimation import madgwick
+from zsim_agents.estimation import dead_reckoning
 
 G = 9.80665  # m/s^2
 DT = 0.005  # s, 200 Hz
@@ -41,14 +41,14 @@ def test_a_constant_rate_turns_by_rate_times_time(axis):
     q = LEVEL
     w = (rate * axis[0], rate * axis[1], rate * axis[2])
     for _ in range(steps):
-        q = madgwick.madgwick_step(q, w, (0.0, 0.0, 0.0), 0.1, DT)
+        q = dead_reckoning.madgwick_step(q, w, (0.0, 0.0, 0.0), 0.1, DT)
     expected = Rotation.from_rotvec(np.array(axis) * rate * steps * DT)
     assert (as_rotation(q) * expected.inv()).magnitude() < 1e-9
 
 
 def test_body_rates_multiply_on_the_right():
     start = Rotation.from_euler("ZYX", [100.0, 20.0, -30.0], degrees=True)
-    q = madgwick.madgwick_step(quaternion(start), (10.0, -20.0, 30.0), (0.0, 0.0, 0.0), 0.0, DT)
+    q = dead_reckoning.madgwick_step(quaternion(start), (10.0, -20.0, 30.0), (0.0, 0.0, 0.0), 0.0, DT)
     expected = start * Rotation.from_rotvec(np.array([10.0, -20.0, 30.0]) * DT)
     assert (as_rotation(q) * expected.inv()).magnitude() < 1e-12
 
@@ -66,7 +66,7 @@ def test_the_gradient_is_the_derivative_of_the_objective():
         q /= np.linalg.norm(q)
         h = 1e-6
         numeric = [(objective(q + h * e, f) - objective(q - h * e, f)) / (2 * h) for e in np.eye(4)]
-        assert madgwick.gravity_gradient(tuple(q), tuple(f)) == pytest.approx(numeric, abs=1e-8)
+        assert dead_reckoning.gravity_gradient(tuple(q), tuple(f)) == pytest.approx(numeric, abs=1e-8)
 
 
 def test_the_accelerometer_levels_by_two_beta_and_keeps_the_heading():
@@ -75,7 +75,7 @@ def test_the_accelerometer_levels_by_two_beta_and_keeps_the_heading():
     start = Rotation.from_rotvec([0.2, 0.1, 0.0]) * true
     q = quaternion(start)
     for _ in range(steps):
-        q = madgwick.madgwick_step(q, (0.0, 0.0, 0.0), at_rest(true), beta, DT)
+        q = dead_reckoning.madgwick_step(q, (0.0, 0.0, 0.0), at_rest(true), beta, DT)
     lost = tilt(quaternion(start)) - tilt(q)
     assert lost == pytest.approx(2.0 * beta * steps * DT, rel=0.02)  # a little of the step is along q itself
     assert heading(q) == pytest.approx(start.as_euler("ZYX")[0], abs=0.005)
@@ -83,30 +83,30 @@ def test_the_accelerometer_levels_by_two_beta_and_keeps_the_heading():
 
 def test_under_noise_the_tilt_decays_with_the_levelling_time():
     sigma, levelling = 0.35 / G, 2.0  # rad, s
-    beta = madgwick.beta_for(levelling, sigma)
-    assert madgwick.levelling_time_s(beta, sigma) == pytest.approx(levelling)
+    beta = dead_reckoning.beta_for(levelling, sigma)
+    assert dead_reckoning.levelling_time_s(beta, sigma) == pytest.approx(levelling)
     rng = np.random.default_rng(3)
     left = []
     for _ in range(40):
         q = quaternion(Rotation.from_rotvec([0.02, 0.0, 0.0]))  # rad, within the noise
         for noise in rng.normal(scale=0.35, size=(round(levelling / DT), 3)):
-            q = madgwick.madgwick_step(q, (0.0, 0.0, 0.0), (noise[0], noise[1], noise[2] + G), beta, DT)
+            q = dead_reckoning.madgwick_step(q, (0.0, 0.0, 0.0), (noise[0], noise[1], noise[2] + G), beta, DT)
         left.append(as_rotation(q).as_rotvec()[0])
     assert np.mean(left) == pytest.approx(0.02 * math.exp(-1.0), rel=0.15)
 
 
 def test_without_gain_or_force_only_the_gyroscope_counts():
     q = quaternion(Rotation.from_rotvec([0.3, 0.0, 0.0]))
-    by_gyro = madgwick.madgwick_step(q, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 0.5, DT)
-    assert madgwick.madgwick_step(q, (0.0, 0.0, 1.0), (1.0, 2.0, 9.0), 0.0, DT) == by_gyro
-    assert madgwick.levelling_time_s(0.0, 0.03) == math.inf
+    by_gyro = dead_reckoning.madgwick_step(q, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 0.5, DT)
+    assert dead_reckoning.madgwick_step(q, (0.0, 0.0, 1.0), (1.0, 2.0, 9.0), 0.0, DT) == by_gyro
+    assert dead_reckoning.levelling_time_s(0.0, 0.03) == math.inf
 
 
 def test_the_length_stays_one_over_many_steps():
     rng = np.random.default_rng(4)
     q = LEVEL
     for w, f in zip(rng.normal(size=(5000, 3)), rng.normal(size=(5000, 3)), strict=True):
-        q = madgwick.madgwick_step(q, tuple(w), tuple(f), 0.2, DT)
+        q = dead_reckoning.madgwick_step(q, tuple(w), tuple(f), 0.2, DT)
     assert math.fsum(x * x for x in q) == pytest.approx(1.0, abs=1e-14)
 
 

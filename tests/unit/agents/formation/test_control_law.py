@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim_agents.formation.control_law import FormationGains, ProportionalLaw
-from zsim_agents.formation.robot_limits import guard, load, near_pairs
+from zsim_agents.formation.control_law import FormationGains, ProportionalLaw, guard, load, near_pairs
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 SPACE = cluster_space(3)

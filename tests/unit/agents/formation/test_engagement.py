@@ -14,7 +14,7 @@ from zsim.contract.snapshot import pack, unpack
 from zsim_agents.formation import guidance
 from zsim_agents.formation.control_law import ProportionalLaw
 from zsim_agents.formation.engagement import Engagement
-from zsim_agents.formation.flight_data import EngagementLimits, GateInput, GateOutput
+from zsim_agents.formation.flight_check import EngagementLimits, GateInput, GateOutput
 from zsim_agents.formation.flight_plan import (
     Engage,
     Follow,

@@ -11,19 +11,20 @@ from refused import has_terms, refused
 from zsim.contract.snapshot import pack, unpack
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.expression import Expression, ExpressionError
-from zsim_agents.formation.flight_data import ShapeLimits
+from zsim_agents.formation.flight_check import ShapeLimits
 from zsim_agents.formation.guidance import RampPlanner
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import (
     ExpressionTrajectory,
     Hold,
     Shifted,
+    TrajectoryError,
     WaypointTrajectory,
+    named_values,
     ramp_onto,
     reference_of,
     state_of,
 )
-from zsim_agents.formation.variable_values import TrajectoryError, named_values
 
 SPACE = cluster_space(3)
 ZERO = np.zeros(12)

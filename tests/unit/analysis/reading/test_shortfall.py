@@ -18,7 +18,7 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState, Truth
 from zsim.contract.run_messages import Clock, ClusterRequest, Event
 from zsim.record import RecordWriter
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST
+from zsim_agents.formation.flight_check import HELD_ON_REQUEST
 from zsim_agents.formation.flight_plan import WAITS, waiting_step
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import WaypointTrajectory

@@ -243,10 +243,10 @@ import numpy as np
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.engagement_setup import rehearse
 from zsim_agents.formation.engagement import Engagement
-from zsim_agents.formation.flight_data import GateInput
+from zsim_agents.formation.flight_check import GateInput
 from zsim_agents.formation.flight_plan import MoveTo
 from zsim_agents.formation.control_law import FormationGains
-from zsim_agents.formation.spaces.nested_cluster import NestedCluster
+from zsim_agents.formation.spaces.scenario_space import NestedCluster
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 
 def compiled():

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError
-from zsim_agents.formation.spaces.nested_cluster import NestedCluster
-from zsim_agents.formation.spaces.scenario_space import cluster_space
+from zsim_agents.formation.spaces.scenario_space import NestedCluster, cluster_space
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 
 SQUARE = np.array([(2.0, 2.0, 0.0), (-2.0, 2.0, 0.0), (-2.0, -2.0, 0.0), (2.0, -2.0, 0.0)])

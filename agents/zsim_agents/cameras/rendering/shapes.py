@@ -5,12 +5,15 @@ and smooth over one pixel at the edge, so that the centre of what is drawn is th
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim_agents.cameras.rendering.view import View, has_pixels
+from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, SPHERE
+from zsim_agents.cameras.rendering.scene import SUN_W, CameraMotion, View, has_pixels
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -18,7 +21,7 @@ Field = NDArray[np.float32]
 AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun; chosen: matt foam outdoors
 STEPS_MAX = 6  # instants of an exposure that are drawn of what moves over the picture
 STEP_PX = 0.8  # px between two of them
-HALF = np.float32(0.5)
+ROUNDING = np.float32(0.5)
 AXIS = np.array([0.0, 0.0, 1.0])
 NEAR_M = 0.05  # nothing nearer is drawn
 
@@ -97,7 +100,7 @@ def ball_images(view: View, balls: Balls, sun_K: Array) -> dict[int, BallImage]:
     steps = min(STEPS_MAX, max(1, math.ceil(balls.ways_px[shown].max() / STEP_PX)))
     covered = _covered(pixels, centres, ways, radius, view.lens.fx, steps)
     shade = _shade(pixels, centres, radius, sun_K)
-    light = (covered * shade)[:, None] * balls.colour.astype(np.float32) + HALF
+    light = (covered * shade)[:, None] * balls.colour.astype(np.float32) + ROUNDING
     return _split(boxes, light, (1 - covered)[:, None])
 
 
@@ -157,7 +160,7 @@ def _covered(pixels: _Pixels, centres: Array, ways: Array, radius: float, focal_
     px_per_m = pixels.of_ball(focal_px / np.sqrt((centres * centres).sum(axis=-1)))
     px_per_m /= pixels.to_axis * np.sqrt(pixels.to_axis)  # mean of both directions
     within = (np.float32(radius) - np.sqrt(np.maximum(beside2, 0))) * px_per_m
-    return np.minimum(np.maximum(within + HALF, 0), 1).mean(axis=0)
+    return np.minimum(np.maximum(within + ROUNDING, 0), 1).mean(axis=0)
 
 
 def _shade(pixels: _Pixels, centres: Array, radius: float, sun_K: Array) -> Field:
@@ -166,3 +169,90 @@ def _shade(pixels: _Pixels, centres: Array, radius: float, sun_K: Array) -> Fiel
     meets = pixels.along - np.sqrt(np.maximum(pixels.along * pixels.along + rest, 0))
     cosine = (meets * pixels.to_sun - pixels.of_ball(centres @ sun_K)) * np.float32(DIFFUSE / radius)
     return np.float32(AMBIENT) + np.minimum(np.maximum(cosine, 0), np.float32(DIFFUSE))
+
+
+SHIFT = 4  # fractional bits of OpenCV's coordinates: sixteenths of a pixel
+FAR_PX = 16_000.0  # px, beyond which coordinates are cut: they are 32 bits with the fraction, and lines have to end
+SIDES = 24  # of a cylinder
+STILL = np.zeros(3)
+PIECES = 8  # of an edge that a lens bends
+OBSTACLE = np.array([92.0, 118.0, 146.0])  # B, G, R, chosen: weathered wood; never magenta
+
+
+def draw_obstacle(
+    picture: Picture, view: View, row: tuple[float, ...], motion: CameraMotion, brightness: float
+) -> None:
+    """Draw an obstacle, a row of zsim.scenario.obstacle."""
+    if row[SHAPE] == SPHERE:
+        centre = motion.points_K(np.array(row[CENTRE : CENTRE + 3]))
+        if centre[2] > 0:
+            ball = Ball(centre, STILL, view.pixels(centre), 0.0, row[HALF], brightness * OBSTACLE)
+            draw_ball(picture, view, ball, SUN_W @ motion.R_WK)
+        return
+    for corners, normal in _faces(row):
+        if normal @ (motion.p_WK - corners[0]) > 0:
+            shade = brightness * (AMBIENT - 0.15 + (DIFFUSE + 0.15) * max(0.0, float(normal @ SUN_W)))
+            fill(picture, view, motion.points_K(corners), shade * OBSTACLE)
+
+
+@lru_cache(maxsize=1000)
+def _faces(row: tuple[float, ...]) -> tuple[tuple[Array, Array], ...]:
+    """Return the upright faces and the top of a box or cylinder: corners (M, 3) and the normal (3,), in W."""
+    if row[SHAPE] == BOX:
+        outline = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]) * row[HALF : HALF + 2]
+    else:
+        angles = 2 * math.pi * np.arange(SIDES) / SIDES
+        outline = row[HALF] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    c, s = row[COSINE], row[SINE]
+    foot = outline @ np.array([[c, s], [-s, c]]) + row[CENTRE : CENTRE + 2]
+    low, high = row[CENTRE + 2] - row[HALF + 2], row[CENTRE + 2] + row[HALF + 2]
+    faces = [(np.column_stack([foot, np.full(len(foot), high)]), np.array([0.0, 0.0, 1.0]))]
+    for a, b in zip(foot, np.roll(foot, -1, axis=0), strict=True):
+        corners = np.array([(*a, low), (*b, low), (*b, high), (*a, high)])
+        dx, dy = b - a
+        faces.append((corners, np.array([dy, -dx, 0.0]) / math.hypot(dx, dy)))
+    return tuple(faces)
+
+
+def fill(picture: Picture, view: View, corners_K: Array, colour: Array) -> None:
+    """Fill a convex face, given by its corners (M, 3) [m; K], with a colour (B, G, R)."""
+    seen = in_front(corners_K)
+    if len(seen) < 3:
+        return
+    outline = view.pixels(_in_pieces(seen) if view.distorts else seen)
+    lowest, highest = outline.min(axis=0), outline.max(axis=0)
+    if (highest < 0).any() or lowest[0] > view.lens.width or lowest[1] > view.lens.height:
+        return
+    cv2.fillPoly(picture, [fixed(outline)], bgr(colour), cv2.LINE_AA, SHIFT)
+
+
+def in_front(corners: Array) -> Array:
+    """Return the part of a convex face in front of the camera, as corners (M, 3) [m; K]."""
+    depth = corners[:, 2] - NEAR_M
+    if (depth > 0).all():
+        return corners
+    kept: list[Array] = []
+    for i, here in enumerate(depth):
+        j = (i + 1) % len(corners)
+        if here > 0:
+            kept.append(corners[i])
+        if (here > 0) != (depth[j] > 0):
+            kept.append(corners[i] + (corners[j] - corners[i]) * (here / (here - depth[j])))
+    return np.array(kept).reshape(-1, 3)
+
+
+def fixed(pixels: Array) -> NDArray[np.int32]:
+    """Return pixels as OpenCV takes them, with SHIFT fractional bits."""
+    return np.rint(np.clip(pixels, -FAR_PX, FAR_PX) * (1 << SHIFT)).astype(np.int32)
+
+
+def bgr(colour: Array) -> tuple[float, float, float]:
+    """Return a colour as OpenCV takes it."""
+    b, g, r = colour.tolist()
+    return round(b), round(g), round(r)
+
+
+def _in_pieces(corners: Array) -> Array:
+    ends = np.roll(corners, -1, axis=0)
+    shares = np.arange(PIECES)[:, None] / PIECES
+    return (corners[:, None] + shares * (ends - corners)[:, None]).reshape(-1, 3)
