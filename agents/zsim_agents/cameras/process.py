@@ -1,4 +1,4 @@
-"""What a process of cameras needs of its place in a run."""
+"""What the processes of cameras and of detectors share: their place in a run, and waiting for messages."""
 
 import threading
 from typing import Protocol
@@ -10,8 +10,8 @@ from zsim.transport.session import RawSample, Session
 TICK_S = 0.1  # how often a stop is looked for while nothing arrives
 
 
-class Presence(Protocol):
-    """The process in one run; zsim_bridges.observer_process has it."""
+class Participant(Protocol):
+    """The process in one run; see zsim_bridges.observer_process."""
 
     name: str
     now_ns: int
@@ -26,38 +26,37 @@ class Presence(Protocol):
     def done(self, t_ns: int) -> None: ...
 
 
-class Bell:
-    """Rung by Zenoh's threads when something has arrived; also after the link was lost and is back.
+class RunProcess:
+    """A process that waits for messages, which arrive in Zenoh's threads.
 
-    Args:
-        link: an open session.
-        presence: of the process; it follows the clock.
+    Attributes:
+        is_back: whether the link was lost and is back.
     """
 
-    def __init__(self, link: Session, presence: Presence) -> None:
-        self._presence = presence
-        self._rung = threading.Event()
+    def __init__(self, link: Session, participant: Participant) -> None:
+        self._link, self._participant = link, participant
+        self._wake_event = threading.Event()
         self._was_lost = False
         self.is_back = False
         link.declare_subscriber(keys.CLOCK, self._on_clock)
         link.on_link(self._on_link)
 
-    def ring(self) -> None:
+    def wake(self) -> None:
         """Let a waiting `wait` return."""
-        self._rung.set()
+        self._wake_event.set()
 
     def wait(self) -> None:
         """Return when something has arrived, or after a tick."""
-        self._rung.wait(TICK_S)
-        self._rung.clear()
-        self._presence.tick()
+        self._wake_event.wait(TICK_S)
+        self._wake_event.clear()
+        self._participant.tick()
 
     def _on_clock(self, sample: RawSample) -> None:
-        self._presence.update_clock(sample.payload)
-        if self._presence.end_reason:
-            self.ring()
+        self._participant.update_clock(sample.payload)
+        if self._participant.end_reason:
+            self.wake()
 
     def _on_link(self, up: bool) -> None:
         self.is_back = self.is_back or (up and self._was_lost)
         self._was_lost = not up
-        self.ring()
+        self.wake()

@@ -9,10 +9,10 @@ from msgspec.structs import replace
 from pictures import BOTTOM, FRONT, HATS, bodies, hat_K, looks, renderer, scene
 
 from zsim.sensors.camera import Camera, FrontCamera
-from zsim.sensors.camera_model import camera_pose, lens_of, pixel
+from zsim.sensors.camera_model import camera_pose, lens_of
 from zsim_agents.cameras.detector import HatDetector, decoded
 from zsim_agents.cameras.rendering.scene import View
-from zsim_agents.cameras.rendering.shapes import AMBIENT, Ball, draw_ball
+from zsim_agents.cameras.rendering.shapes import AMBIENT, ball_images
 
 ASSOCIATED_RAD = 0.03  # rad, within which a sighting is that of the hat
 
@@ -77,10 +77,9 @@ def test_a_ball_anywhere_in_the_picture_has_its_range_and_direction(place: Any) 
     lens, distance = lens_of(FRONT), 2.0
     direction_K = np.array([*place, 1.0]) / np.linalg.norm([*place, 1.0])
     picture = np.full((lens.height, lens.width, 3), 90, np.uint8)
-    centre = direction_K * distance
-    at = np.array(pixel(lens, *centre.tolist()))
     colour = np.array([134.0, 0.0, 226.0]) / AMBIENT  # in the shade everywhere, so that nothing but geometry counts
-    draw_ball(picture, View(lens), Ball(centre, np.zeros(3), at, 0.0, HATS.diameter_m / 2, colour), direction_K)
+    centres, radius_m = (direction_K * distance)[None], HATS.diameter_m / 2
+    ball_images(View(lens), centres, np.zeros((1, 3)), radius_m, colour, direction_K)[0].draw(picture)
     (seen,) = detector().seen(picture)
     off = np.array(seen.direction_B) - camera_pose(FRONT).R_BK @ direction_K
     assert np.linalg.norm(off) < 5e-4  # 0.2 px
