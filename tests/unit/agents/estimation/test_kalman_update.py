@@ -10,7 +10,7 @@ from synthetic_flight import GATE_S, Flight, estimator, readings, scenario
 
 from zsim.math.compiled import COMPILES
 from zsim.math.rotation import matrix
-from zsim_agents.estimation import kalman_update
+from zsim_agents.estimation import measurement_update
 from zsim_agents.estimation.dead_reckoning import corrected
 from zsim_agents.estimation.filter_setup import innovation_limits
 from zsim_agents.estimation.filter_state import NOMINAL, SETTING, Rows, reckoning
@@ -146,16 +146,16 @@ def test_a_gate_in_flight_is_filterpys_update():
 
 
 def _gps(H, i, p, v, q, w, setting):
-    return kalman_update.write_gps(H, i, p, v, matrix(q), w, ZERO, 0.0)
+    return measurement_update.write_gps(H, i, p, v, matrix(q), w, ZERO, 0.0)
 
 
 def _mag(H, i, p, v, q, w, setting):
     field = tuple(setting[SETTING.field_W : SETTING.field_W + 3].tolist())
-    return kalman_update.write_mag(H, i, matrix(q), matrix((1.0, 0.0, 0.0, 0.0)), field)
+    return measurement_update.write_mag(H, i, matrix(q), matrix((1.0, 0.0, 0.0, 0.0)), field)
 
 
 def _baro(H, i, p, v, q, w, setting):
-    return (kalman_update.write_baro(H, i, p, matrix(q), ZERO, 0.0),)
+    return (measurement_update.write_baro(H, i, p, matrix(q), ZERO, 0.0),)
 
 
 MODELS = {"gps": (_gps, [2.0] * 3 + [0.43] * 3), "mag": (_mag, [0.94] * 3), "baro": (_baro, [0.1])}

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from zsim.math.rotation import LEVEL, matrix
-from zsim_agents.estimation import kalman_update
+from zsim_agents.estimation import measurement_update
 
 ZERO = (0.0, 0.0, 0.0)
 ARM, W = (0.11, -0.07, 0.05), (3.7, -2.0, 1.5)  # m, rad/s
@@ -29,23 +29,23 @@ def flat(turned: Rotation):
 
 
 def gps(H, p, v, R):
-    return kalman_update.write_gps(H, 1, p, v, R, W, ARM, LAG)
+    return measurement_update.write_gps(H, 1, p, v, R, W, ARM, LAG)
 
 
 def mag(H, p, v, R):
-    return kalman_update.write_mag(H, 1, R, flat(MOUNT), FIELD)
+    return measurement_update.write_mag(H, 1, R, flat(MOUNT), FIELD)
 
 
 def baro(H, p, v, R):
-    return (kalman_update.write_baro(H, 1, p, R, ARM, LAG),)
+    return (measurement_update.write_baro(H, 1, p, R, ARM, LAG),)
 
 
 def sonar(H, p, v, R):
-    return (kalman_update.write_sonar(H, 1, p, R, ARM, triple(-MOUNT.as_matrix()[:, 2]), LAG),)
+    return (measurement_update.write_sonar(H, 1, p, R, ARM, triple(-MOUNT.as_matrix()[:, 2]), LAG),)
 
 
 def flow(H, p, v, R):
-    return kalman_update.write_flow(H, 1, v, R, W, ARM)
+    return measurement_update.write_flow(H, 1, v, R, W, ARM)
 
 
 @pytest.mark.parametrize("model", [gps, mag, baro, sonar, flow])
@@ -84,5 +84,5 @@ def test_predictions_are_what_the_geometry_says():
 def test_a_sonar_that_looks_up_says_nothing():
     H = np.zeros((1, 12))
     up = (0.0, 0.0, 1.0)
-    assert kalman_update.write_sonar(H, 0, (0.0, 0.0, 3.0), matrix(LEVEL), ZERO, up, 0.0) == 0.0
+    assert measurement_update.write_sonar(H, 0, (0.0, 0.0, 3.0), matrix(LEVEL), ZERO, up, 0.0) == 0.0
     assert not H.any()
