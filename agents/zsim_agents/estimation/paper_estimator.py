@@ -125,7 +125,7 @@ class PaperEstimator:
         return (self._speed_sigma if self._velocity else SPEED_SIGMA_M_S) ** 2
 
     def _process_noise(self, dt: float) -> NDArray[np.float64]:
-        """Return the process noise of an interval, (4, 4): each velocity has an independent error, held for its period."""
+        """Return the process noise of an interval, (4, 4): velocities err independently, each held for its period."""
         position = self._velocity_variance() * self._flow_period_s * dt
         yaw = (self._gyro_sigma**2 * self._imu_period_s + self._gyro_bias**2 * DRIFT_S) * dt
         return np.diag([position, position, position, yaw])

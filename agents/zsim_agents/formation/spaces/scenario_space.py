@@ -1,4 +1,9 @@
-"""The cluster space that a scenario asks for: the stock ones by their names, clusters of clusters by their groups."""
+"""The cluster space that a scenario asks for: a stock one or a user's class, or a cluster of clusters by its groups.
+
+A group k has the cluster c_k of its own robots. Its (x_c, y_c, z_c, yaw) are the place and heading of robot k of the
+parent; the rest of c_k, its tilts, headings and shape, is added to the parent's variables. 4m variables of the parent
+and 4n_k - 4 of each group make 4n. The groups may be clusters of clusters themselves.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +21,17 @@ from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, chec
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 from zsim_agents.formation.spaces.triad_cluster import PairCluster, TriadCluster
 
+Places = NDArray[np.intp]
+BODY = ("x_c", "y_c", "z_c", "yaw")  # of a group: variables of a robot of the parent
+
 
 def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     """Return the cluster space of one of a scenario's clusters.
 
     Raises:
-        ValueError: there is none: a template in one line.
-        DocumentError: it is a class of the user's own that cannot be loaded; the line names its module.
-        UserCodeError: it is a class of the user's own that cannot be made.
+        ValueError: the template is in one line.
+        DocumentError: a user's class cannot be loaded; the line names its module.
+        UserCodeError: a user's class cannot be made.
     """
     starts = _starts(scenario, cluster.drones)
     if not cluster.groups:
@@ -37,8 +45,29 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     return NestedCluster(_space(cluster, np.array(centres)), groups)
 
 
+def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
+    places_m = np.array(spec.template_m or starts, dtype=float)
+    name = space_name(spec.space, len(places_m), bool(spec.template_m))
+    if name in STOCK:
+        return STOCK[name](places_m)
+    own: Any = plugin.load(name, "space", ClusterSpace)
+    try:
+        return checked(own.for_places(places_m))
+    except TypeError as error:  # also of a call with wrong arguments, which has no frame of the user's
+        failure = plugin.user_code_error(error, "")
+        raise failure or UserCodeError(f"{name}.for_places raised TypeError: {error}") from error
+
+
+def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
+    """Return where drones start (n, 3) [m]: x ahead and y left of the first of them, z up."""
+    by_name = {drone.name: drone for drone in scenario.drones}
+    yaw = math.radians(by_name[drones[0]].yaw_deg)
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([by_name[name].position_m for name in drones]) @ np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)])
+
+
 def cluster_space(n: int) -> ClusterSpace:
-    """Return the space of n robots called triad: the paper's at n = 3, its generalisation elsewhere.
+    """Return the space of n robots called triad: the paper's at n = 3, its generalisation otherwise.
 
     Raises:
         ValueError: n is not from 2 to 64.
@@ -54,33 +83,6 @@ STOCK: dict[str, Callable[[Array], ClusterSpace]] = {
 }
 
 
-def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
-    """Return the space of as many robots as there are starting places (n, 3)."""
-    places_m = np.array(spec.template_m or starts, dtype=float)
-    name = space_name(spec.space, len(places_m), bool(spec.template_m))
-    if name in STOCK:
-        return STOCK[name](places_m)
-    own: Any = plugin.load(name, "space", ClusterSpace)
-    try:
-        return checked(own.for_places(places_m))
-    except TypeError as error:  # also of a constructor that cannot be called like this, in which no frame is the user's
-        failure = plugin.user_code_error(error, "")
-        raise failure or UserCodeError(f"{name}.for_places raised TypeError: {error}") from error
-
-
-def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
-    """Return where drones start (n, 3) [m]: x ahead and y left of the first of them, z up."""
-    by_name = {drone.name: drone for drone in scenario.drones}
-    yaw = math.radians(by_name[drones[0]].yaw_deg)
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([by_name[name].position_m for name in drones]) @ np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)])
-
-
-Places = NDArray[np.intp]
-
-BODY = ("x_c", "y_c", "z_c", "yaw")  # of a group: what a robot of the parent has
-
-
 class _Group(NamedTuple):
     """Where a group stands in the whole.
 
@@ -89,7 +91,7 @@ class _Group(NamedTuple):
         rows: their 4n_k entries in r, four each.
         body, rest: places of BODY and of all else in its own c.
         own: places of the rest in the c of the whole.
-        at: places of its body in what the robots of the parent have, four each.
+        at: places of its body in the r of the parent, four each.
     """
 
     space: ClusterSpace
@@ -104,8 +106,8 @@ class _Group(NamedTuple):
 class NestedCluster(ClusterSpace):
     """c = (variables of the parent, then of each group all but x_c, y_c, z_c, yaw, as NAME.roll, NAME.pitch, ...).
 
-    phi_k of the parent is the yaw of group k against that of the parent, NAME.phi_i the heading of a robot against the
-    yaw of its group. The origin is the mean of the groups' centroids. The chain rule gives both Jacobians.
+    phi_k of the parent is the yaw of group k relative to that of the parent, NAME.phi_i the heading of a robot relative
+    to the yaw of its group. The origin is the mean of the groups' centroids. The chain rule gives both Jacobians.
 
     Args:
         parent: cluster space of m robots.
@@ -201,7 +203,6 @@ class NestedCluster(ClusterSpace):
         return parts
 
     def spread(self, c: Array) -> float:
-        """Return the least spread of the parent and of the groups [m]."""
         return min(space.spread(part) for space, part in self._pairs(c))
 
     def measures(self, c: Array) -> tuple[float, float]:
@@ -212,7 +213,7 @@ class NestedCluster(ClusterSpace):
     def condition(self, c: Array) -> float:
         """Return the greatest condition number of the parent and of the groups, each in its own measure.
 
-        J^-1 of the whole is a product of theirs, so that none of them being large keeps it from being large.
+        J^-1 of the whole is a product of theirs: where none is large, neither is the whole.
         """
         return max(space.condition(part) for space, part in self._pairs(c))
 

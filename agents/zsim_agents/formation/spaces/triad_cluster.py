@@ -1,9 +1,10 @@
-"""The cluster of three robots of the paper, and its generalisation to more of them.
+"""The clusters of two, of three (the paper's) and of more robots, whose frame is given by robots 1, 2 and 3.
 
-Robots 1, 2, 3 give the frame C and the triangle (p, q, beta); each further robot k adds its distance rho,
-azimuth and elevation, seen from robot 1 in C. The origin is the centroid of all robots.
+Robots 1, 2, 3 give the frame C and the triangle (p, q, beta); each further robot k adds its distance rho, azimuth and
+elevation, seen from robot 1 in C. The origin is the centroid of all robots. Two robots are a rod with a direction and
+a length, without roll.
 
-Order of this file: the space, the compiled mathematics from robots to c and back and of J^-1, the rows of J.
+Order of this file: the triad, its compiled mathematics from robots to c and back and of J^-1, the rows of J, the pair.
 """
 
 from __future__ import annotations
@@ -13,7 +14,19 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
-from zsim.math.rotation import Matrix, Vector, column, cross, dot, matrix_from_rpy, norm, product, scaled, subtract
+from zsim.math.rotation import (
+    Matrix,
+    Vector,
+    add,
+    column,
+    cross,
+    dot,
+    matrix_from_rpy,
+    norm,
+    product,
+    scaled,
+    subtract,
+)
 from zsim_agents.formation.spaces.cluster_space import (
     LENGTH_MIN_M,
     Array,
@@ -26,7 +39,6 @@ from zsim_agents.formation.spaces.cluster_space import (
     pitch_yaw,
     put,
     row,
-    triad_axes,
     wrap_angle,
 )
 
@@ -136,8 +148,8 @@ def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
 def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
     """Write J^-1 (4n, 4n) into zeros; return whether the shape has an extent, without which nothing is written.
 
-    Robot i moves at v_c + R_WC (w_WC_C x place_i + its place's derivatives by the shape times their rates),
-    and turns at yaw' + phi_i'.
+    Robot i moves at v_c + R_WC (w_WC_C x place_i + derivatives of its place by the shape times their rates), and turns
+    at yaw' + phi_i'.
     """
     n = c.size // 4
     if not has_direction(c):
@@ -189,6 +201,24 @@ def triad_spread(c: Array) -> float:
     for first in range(at + 3, c.size, 3):
         least = min(least, c[first] * math.cos(c[first + 2]))
     return least
+
+
+@portable
+def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, float]:
+    """Return the axes x, y, z of C in W, h = |d2 + d3| [m] and the area |d2 x d3| [m^2] of d2 = P2 - P1, d3 = P3 - P1.
+
+    x_C points from the middle of robots 2 and 3 to robot 1, z_C along d2 x d3; robot 2 is on the left. All is zero
+    where the three robots are in line or in one place.
+    """
+    m = add(d2, d3)
+    normal = cross(d2, d3)
+    h, area = norm(m), norm(normal)
+    if not (h > LENGTH_MIN_M and area > LENGTH_MIN_M * h):  # also true for NaN
+        none = (0.0, 0.0, 0.0)
+        return none, none, none, 0.0, 0.0
+    x = (-m[0] / h, -m[1] / h, -m[2] / h)
+    z = (normal[0] / area, normal[1] / area, normal[2] / area)
+    return x, cross(z, x), z, h, area
 
 
 @portable
@@ -341,7 +371,7 @@ class PairCluster(ClusterSpace):
 
 @portable
 def pair_forward(p_W: Array, yaw: Array, c: Array) -> None:
-    """Write c (8,); only its length p is right where that is zero."""
+    """Write c (8,); only its length p is valid where that is zero."""
     d_W = subtract(row(p_W, 0), row(p_W, 1))
     c[0], c[1], c[2] = centroid(p_W)
     c[3], c[4] = pitch_yaw(d_W)
