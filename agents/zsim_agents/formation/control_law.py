@@ -1,7 +1,7 @@
 """Control laws of a formation, from the estimated robots and a reference to velocity commands.
 
-Order of this file: gains and command, what all laws share (`law:` of a cluster may name a subclass of one's own), the
-stock law.
+Order of this file: gains and command, what all laws share (`law:` of a cluster may name a subclass of your own), the
+stock law, and compiled: the saturation of the robots' velocities, and the guard of the distances between them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,15 @@ from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace, row
 
+Pairs = tuple[tuple[int, int], ...]
+Order = NDArray[np.int64]
+PairTable = NDArray[np.int64]
+
 RATES = ("vx", "vy", "vz", "yaw rate")  # of a robot, in the order of r_dot
+NEAR_M = 1e-6  # robots that are nearer have no direction from one to the other
+SETTLED_M_S = 1e-9  # a rate that lacks less is reached
+LOAD_MIN = 1e-9  # against division by zero
+GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three robots in a corner need a few
 
 
 @dataclass(frozen=True)
@@ -34,7 +42,7 @@ class FormationGains:
 
     Attributes:
         k_1_s: proportional gain [1/s]; 0.5 to 0.8 is good, unstable from about 2 on a drone's velocity loop.
-        integral_1_s2: integral gain [1/s^2]; takes out the offset that wind leaves, 0 switches it off.
+        integral_1_s2: integral gain [1/s^2]; removes the offset that wind causes, 0 switches it off.
         integral_max_m_s, integral_max_rad_s: clamp of the integral term for lengths and for angles.
         separation_min_m: least distance between two robots of a reference, and where the guard acts.
         all others: see `RobotLimits`.
@@ -54,12 +62,11 @@ class FormationGains:
 
     @cached_property
     def limits(self) -> RobotLimits:
-        """Return what the saturation and the guard keep."""
         return RobotLimits(*(float(getattr(self, name)) for name in RobotLimits._fields))
 
 
 class FormationCommand(Struct, eq=False):
-    """What the law asks of the robots.
+    """The commands of the law to the robots.
 
     Attributes:
         v_W: velocities (n, 3) [m/s, W]; yaw_rate: (n,) [rad/s].
@@ -76,17 +83,17 @@ class FormationCommand(Struct, eq=False):
 
 
 class ControlLaw(ABC):
-    """A law: what it asks of the robots is saturated and guarded here, for all laws alike.
+    """A control law, whose demands are saturated and guarded here, for all laws alike.
 
-    One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A law of one's
-    own has `rates`, and where it has a state `reset`, `followed`, `snapshot` and `restore`.
+    One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A law of your own
+    has `rates`, and where it has a state `reset`, `followed`, `snapshot` and `restore`.
 
     Args:
         space: cluster space of n robots.
-        gains: of the scenario; a law takes those that it knows.
+        gains: of the scenario; a law uses those that it needs.
 
     Attributes:
-        robots: what they are called in messages, in their order.
+        robots: their names in messages, in order.
     """
 
     def __init__(self, space: ClusterSpace, gains: FormationGains | None = None) -> None:
@@ -98,7 +105,7 @@ class ControlLaw(ABC):
 
     @abstractmethod
     def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
-        """Return r_dot (4n,) that the robots shall have: (vx, vy, vz [m/s], yaw rate [rad/s]) robot by robot, W.
+        """Return the desired r_dot (4n,): (vx, vy, vz [m/s], yaw rate [rad/s]) robot by robot, W.
 
         Args:
             c: (4n,) cluster of the estimates; p_W, v_W: the estimates, (n, 3) [m, m/s; W].
@@ -109,17 +116,17 @@ class ControlLaw(ABC):
         """Forget all state: the formation is engaged, or goes on after it was held."""
 
     def followed(self, dt_s: float) -> None:  # noqa: B027
-        """Go on by dt_s [s]: the robots get what `rates` returned, neither saturated nor held apart.
+        """Advance by dt_s [s]: the robots get what `rates` returned, neither saturated nor held apart.
 
-        It is not called otherwise, so that an integral that grows here does not wind up.
+        Otherwise it is not called, so that an integral that grows here does not wind up.
         """
 
     def snapshot(self) -> State | None:
-        """Return all state as plain values and arrays, {} where there is none; None: it cannot be handed over."""
+        """Return all state as plain values and arrays, {} where there is none, None where it cannot be transferred."""
         return {} if type(self).reset is ControlLaw.reset and type(self).followed is ControlLaw.followed else None
 
     def restore(self, state: State) -> None:  # noqa: B027
-        """Take over what the law of another process returned by `snapshot`, to go on to the same bits."""
+        """Take over the `snapshot` of the law of another process, to continue with the same bits."""
 
     def command(
         self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array, dt_s: float
@@ -141,7 +148,7 @@ class ControlLaw(ABC):
         return FormationCommand(v_cmd_W, yaw_rate, factor, guarded, alarmed)
 
     def _checked(self, r_dot: Any) -> Array:
-        """Return what `rates` of a user's law returned as an array (4n,) of finite numbers."""
+        """Return the result of a user's `rates` as an array (4n,) of finite numbers."""
         what = f"{plugin.full_name(type(self))}.rates returns"
         size = self.space.size
         try:
@@ -190,8 +197,7 @@ class ProportionalLaw(ControlLaw):
         grow(self.integral, self._error, self.gains.integral_1_s2 * dt_s, self._clamp)
 
 
-LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}
-"""The stock laws by the names that a scenario gives them."""
+LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}  # stock laws by their names in a scenario
 
 
 @portable
@@ -212,25 +218,15 @@ def grow(integral: Array, error: Array, rate: float, clamp: Array) -> None:
         integral[k] = min(max(integral[k] + rate * error[k], -clamp[k]), clamp[k])
 
 
-Pairs = tuple[tuple[int, int], ...]
-Order = NDArray[np.int64]
-PairTable = NDArray[np.int64]
-
-NEAR_M = 1e-6  # robots that are nearer have no direction from one to the other
-SETTLED_M_S = 1e-9  # a rate that lacks less is reached
-LOAD_MIN = 1e-9  # against division by zero
-GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three robots in a corner need a few
-
-
 class RobotLimits(NamedTuple):
-    """What the saturation and the guard keep, for compiled code.
+    """Limits of the saturation and of the guard, for compiled code.
 
     Attributes:
         speed_max_m_s, climb_max_m_s, yaw_rate_max_rad_s: limits of each robot.
         separation_min_m: least distance between two robots.
         separation_alarm_m: below it two robots are reported.
         guard_horizon_s: how far ahead the guard looks.
-        response_s: lag of a drone's velocity loop, over which the guard expects it to keep its velocity.
+        response_s: lag of a drone's velocity loop, during which the guard expects it to keep its velocity.
     """
 
     speed_max_m_s: float
@@ -243,13 +239,12 @@ class RobotLimits(NamedTuple):
 
 
 def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[Array, Pairs, Pairs]:
-    """Return the velocities with dangerous approaches taken out, the pairs concerned, and the pairs in alarm.
+    """Return the velocities without dangerous approaches, the pairs concerned, and the pairs in alarm.
 
-    Two robots at distance d, d' = rate of the command along their line, are held to
-    d' >= -(d_near - separation_min) / guard_horizon: the distance predicted over the horizon stays above the
-    minimum, and below it the approach is reversed. d_near allows for the velocities that the robots have,
-    which last for their response time. Each robot of a pair takes half of the change;
-    a few sweeps settle several pairs.
+    Two robots at distance d, d' = rate of the command along their line, are held to d' >= -(d_near - separation_min) /
+    guard_horizon: the distance predicted over the horizon stays above the minimum, and below it the approach is
+    reversed. d_near allows for the present velocities, which last for the response time. Each robot of a pair takes
+    half of the change; a few sweeps settle several pairs.
     """
     parted_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
     guards, alarms = hold_apart(p_W, v_W, parted_W, order, *limits)
@@ -274,8 +269,8 @@ def limited(
 ) -> tuple[float, int, int]:
     """Write velocities (n, 3) and yaw rates (n,) of r_dot (4n,), saturated and guarded.
 
-    Returns the factor of the saturation, then what `hold_apart` does; limits_of are the fields of RobotLimits: a tuple
-    takes longer to hand over to compiled code than all else here.
+    Returns the factor of the saturation, then the result of `hold_apart`; limits_of are the fields of RobotLimits:
+    passing a tuple to compiled code takes longer than all else here.
     """
     limits = RobotLimits(*limits_of)
     for i in range(yaw_rate.size):
@@ -303,7 +298,6 @@ def load(v_W: Array, yaw_rate: Array, limits: RobotLimits) -> float:
 
 @portable
 def scale(v_W: Array, yaw_rate: Array, factor: float) -> None:
-    """Multiply velocities and yaw rates in place."""
     for i in range(yaw_rate.size):
         for k in range(3):
             v_W[i, k] *= factor
@@ -328,8 +322,8 @@ def near_pairs(p_W: Array, within_m: float) -> PairTable:
 def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of: float) -> tuple[int, int]:
     """Change commands in place until every pair separates at its least rate (see `guard`).
 
-    Returns how many pairs were changed and how many are nearer than the alarm threshold; writes into order (n, n)
-    the numbers of the former, from 1 on, above the diagonal and of the latter below it, all else zero.
+    Returns how many pairs were changed and how many are nearer than the alarm threshold; writes into order (n, n) the
+    numbers of the former, from 1 on, above the diagonal and of the latter below it, all else zero.
     """
     limits = RobotLimits(*limits_of)
     order[:] = 0
@@ -352,7 +346,7 @@ def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of:
 
 @portable
 def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: Order) -> int:
-    """Number those of the near pairs that are nearer than the alarm threshold, below the diagonal; return how many."""
+    """Number the near pairs below the alarm threshold, below the diagonal; return how many there are."""
     alarms = 0
     for k in range(near.shape[0]):
         i, j = near[k, 0], near[k, 1]

@@ -1,8 +1,14 @@
-"""The engagement that a scenario's cluster asks for: its space, gains, law and plan, rehearsed before the flight."""
+"""The engagement that a scenario's cluster asks for: its space, gains, law and plan, rehearsed before the flight.
+
+A plan is judged before the flight from where the drones stand. In flight the guidance refuses what is beyond the
+limits, twice a second anew, and the formation hovers meanwhile. A plan that is certain to be refused to its end, or is
+over before any formation could begin it, is refused here, with the factor by which its time has to be stretched. Limits
+are a little wider than in flight, as the formation is never exactly where it was set down: cases between the two are
+left to the flight.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,7 +24,6 @@ from zsim_agents.formation.control_law import (
     LAWS,
     ControlLaw,
     FormationGains,
-    ProportionalLaw,
     RobotLimits,
     guard,
     load,
@@ -27,9 +32,8 @@ from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_check import (
     EngagementLimits,
     GateInput,
-    ShapeLimits,
     all_near,
-    place_fault,
+    formation_fault,
     shape_fault,
 )
 from zsim_agents.formation.flight_plan import REFUSALS, FlightPlan, Follow, MoveTo, PlanError, plan_of
@@ -45,6 +49,11 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, Reference, Shifted, ramp_onto
 
 APART_M = 2.0  # of robots in a rehearsal, any distance well above zero
+READY_S = 3.0  # least from the order to take off to the engagement: a take-off to the hover; AR.Drones take 4 to 12 s
+ROOM = 1.05  # chosen: of the limits of speed, as a drone's place in the formation differs by some centimetres
+WAY_ROOM = 1.25  # chosen: of a way from the start, whose length differs by what the drones drift in their climb
+NEAR_ROOM = 0.9  # chosen: of the least separation and height
+STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # of a reference that is sampled
 
 
 def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
@@ -54,10 +63,16 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         RunError: the plan can never be flown, with the reason.
     """
     with _refusals_of(scenario, cluster):
-        space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
-        rehearse(space, gains, law)
-        engagement = Engagement(space, cluster.drones, gains, limits_of(cluster.gains), plan_of(cluster), law)
-        check_flyable(scenario, cluster, space, gains)
+        space, gains, law_name = scenario_space(scenario, cluster), gains_of(cluster.gains), cluster.law or "proportional"
+        law = LAWS.get(law_name) or plugin.load(law_name, "law", ControlLaw, is_constructed=True)
+        _rehearse(space, gains, law)
+        limits = EngagementLimits()
+        if cluster.gains.sigma_max_m is not UNSET:
+            limits = replace(limits, sigma_max_m=cluster.gains.sigma_max_m)
+        if cluster.gains.heading_sigma_max_deg is not UNSET:
+            limits = replace(limits, yaw_sigma_max_rad=math.radians(cluster.gains.heading_sigma_max_deg))
+        engagement = Engagement(space, cluster.drones, gains, limits, plan_of(cluster), law)
+        _check_flyable(scenario, cluster, space, gains)
         return engagement
 
 
@@ -70,12 +85,12 @@ def check_plan(scenario: Scenario, cluster: Cluster) -> None:
     with _refusals_of(scenario, cluster):
         space = scenario_space(scenario, cluster)
         FlightPlan(space, plan_of(cluster))
-        check_flyable(scenario, cluster, space, gains_of(cluster.gains))
+        _check_flyable(scenario, cluster, space, gains_of(cluster.gains))
 
 
 @contextmanager
 def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
-    """Raise what is wrong with a cluster as a RunError that names it, in its plan with the path in the scenario."""
+    """Raise every fault of a cluster as a RunError that names it, a fault of its plan with the path in the scenario."""
     try:
         yield
     except PlanError as error:
@@ -93,22 +108,10 @@ def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
         raise
 
 
-def law_of(cluster: Cluster) -> Callable[[ClusterSpace, FormationGains], ControlLaw]:
-    """Return the class of the control law that a cluster names.
-
-    Raises:
-        DocumentError: a class of the user's own that cannot be loaded.
-    """
-    name = cluster.law or "proportional"
-    return LAWS.get(name) or plugin.load(name, "law", ControlLaw, is_constructed=True)
-
-
-def rehearse(
-    space: ClusterSpace,
-    gains: FormationGains,
-    law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
+def _rehearse(
+    space: ClusterSpace, gains: FormationGains, law: Callable[[ClusterSpace, FormationGains], ControlLaw]
 ) -> None:
-    """Fly a gate of a formation of its own: code is compiled, or loaded, here and not in flight."""
+    """Fly a gate of another formation: code is compiled, or loaded, here and not in flight."""
     c = space.specimen(max(gains.separation_min_m, APART_M))
     p_W, yaw = space.inverse(c)
     c = space.forward(p_W, yaw)
@@ -124,16 +127,6 @@ def rehearse(
     load(*robot_rates(space, c, c), gains.limits)
 
 
-def limits_of(gains: Gains) -> EngagementLimits:
-    """Return the limits of the phase machine, those of certainty as the scenario has them."""
-    limits = EngagementLimits()
-    if gains.sigma_max_m is not UNSET:
-        limits = replace(limits, sigma_max_m=gains.sigma_max_m)
-    if gains.heading_sigma_max_deg is not UNSET:
-        limits = replace(limits, yaw_sigma_max_rad=math.radians(gains.heading_sigma_max_deg))
-    return limits
-
-
 def gains_of(gains: Gains) -> FormationGains:
     """Return the control law's gains in SI units."""
     return FormationGains(
@@ -147,24 +140,21 @@ def gains_of(gains: Gains) -> FormationGains:
     )
 
 
-READY_S = 3.0  # least from the order to take off to the engagement: a take-off to the hover; AR.Drones take 4 to 12 s
-ROOM = 1.05  # chosen: of the limits of speed, as a drone's place in the formation differs by some centimetres
-WAY_ROOM = 1.25  # chosen: of a way from the start, whose length differs by what the drones drift in their climb
-NEAR_ROOM = 0.9  # chosen: of the least separation and height
-STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # of a reference that is sampled
-
-
-def check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
-    """Refuse a plan that no formation of these drones can fly; one whose drones make no formation yet is not judged.
+def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
+    """Refuse a plan that these drones cannot fly; without a valid formation at the start it is not judged.
 
     Raises:
-        PlanError: names the step, what it asks for, and what is possible.
+        PlanError: names the step, its demand, and what is possible.
     """
     plan = cluster.plan
     if plan.takeoff_s is None or not (plan.target or plan.trajectory):
         return
     ready_s = plan.takeoff_s + READY_S
-    _check_landing(cluster, ready_s)
+    begins_s = max(ready_s, plan.trajectory.start_s) if plan.trajectory else ready_s
+    if plan.land_s is not None and plan.land_s < begins_s:
+        what = "trajectory" if plan.trajectory else "target"
+        reason = f"the {what} of the plan begins at {begins_s:g} s at the earliest"
+        raise PlanError(f"plan.land_s is {plan.land_s:g}; must be later: {reason}")
     start = _formation_at_start(scenario, cluster, space)
     if start is None:
         return
@@ -184,18 +174,8 @@ def check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gai
             raise PlanError(f"{step.path}: {error}") from None
 
 
-def _check_landing(cluster: Cluster, ready_s: float) -> None:
-    """Refuse a landing before which nothing else of the plan can begin."""
-    plan = cluster.plan
-    begins_s = max(ready_s, plan.trajectory.start_s) if plan.trajectory else ready_s
-    if plan.land_s is not None and plan.land_s < begins_s:
-        what = "trajectory" if plan.trajectory else "target"
-        reason = f"the {what} of the plan begins at {begins_s:g} s at the earliest"
-        raise PlanError(f"plan.land_s is {plan.land_s:g}; must be later: {reason}")
-
-
 def _formation_at_start(scenario: Scenario, cluster: Cluster, space: ClusterSpace) -> Array | None:
-    """Return the variables (4n,) of the drones over the places where they start; None where they make no formation."""
+    """Return the variables (4n,) of the drones above their starting places; None where they form none."""
     drones = [scenario.drone(name) for name in cluster.drones]
     p_W = np.array([drone.position_m for drone in drones], float)
     p_W[:, 2] += EngagementLimits().assembly_height_m
@@ -207,7 +187,7 @@ def _formation_at_start(scenario: Scenario, cluster: Cluster, space: ClusterSpac
 
 
 class _Rehearsal:
-    """The ways of a plan against the limits of a formation, of its controller's and of its drones' own."""
+    """Checks the ways of a plan against the limits of formation, controller and drones."""
 
     def __init__(self, scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
         limits = EngagementLimits()
@@ -222,13 +202,13 @@ class _Rehearsal:
             yaw_rate_max_rad_s=min(asked.yaw_rate_max_rad_s, *(math.radians(each.yaw_rate_deg_s) for each in own)),
         )
         in_flight = limits.shape_in_flight
-        wide = dataclasses.replace(gains, separation_min_m=NEAR_ROOM * gains.separation_min_m)
-        self._wide = wide, dataclasses.replace(in_flight, height_min_m=NEAR_ROOM * in_flight.height_min_m)
+        wide = replace(gains, separation_min_m=NEAR_ROOM * gains.separation_min_m)
+        self._wide = wide, replace(in_flight, height_min_m=NEAR_ROOM * in_flight.height_min_m)
         self._exact = gains, limits.shape
         self._planner = RampPlanner(space, gains, limits.shape)
 
     def check_target(self, start: Array, goal: Array, over_s: float | None) -> None:
-        """Refuse a target that is no place for the formation, or is too far for its time.
+        """Refuse a target that is not allowed, or too far for its time.
 
         Raises:
             PlanError: with the factor; TrajectoryError: it is out of reach.
@@ -270,33 +250,28 @@ class _Rehearsal:
         for t_s in _instants(from_s, to_s):
             if fault := self._fault_at(trajectory.value(t_s)[0]):
                 raise PlanError(f"plan.trajectory: {t_s:.1f} s after its start {fault}")
-        there_s = (
-            ready_s + self._planner.fastest((start, np.zeros_like(start)), Shifted(trajectory, start_s), ready_s).over_s
-        )
+        ramp = self._planner.fastest((start, np.zeros_like(start)), Shifted(trajectory, start_s), ready_s)
+        there_s = ready_s + ramp.over_s
         if end_s < math.inf and there_s > ready_s + WAY_ROOM * (end_s - ready_s):
             reason = f"the way to it takes the formation until {there_s:.0f} s"
             raise PlanError(f"plan.trajectory is over at {end_s:g} s; must start later: {reason}")
 
     def _peak(self, reference: Reference, from_s: float, to_s: float) -> tuple[float, float]:
         """Return the greatest share of its limits at which a robot moves along a reference, and when [s]."""
-        loads = [
+        return max(
             (load(*robot_rates(self._space, *reference.value(t_s)), self._limits), t_s)
             for t_s in _instants(from_s, to_s)
-        ]
-        return max(loads)
+        )
 
     def _fault_at(self, c: Array) -> str | None:
         space = self._space
-        if self._place_fault(c, *self._wide):
-            return self._place_fault(c, *self._exact)
+        if formation_fault(space, c, *self._wide):
+            return formation_fault(space, c, *self._exact)
         heights_m = space.inverse(c)[0][:, 2].tolist()
         for (name, limits), height_m in zip(self._drones, heights_m, strict=True):
             if height_m > limits.altitude_m:
                 return f"{name} is at z = {height_m:.1f} m; allowed: {limits.altitude_m:g} m, its limits.altitude_m"
         return None
-
-    def _place_fault(self, c: Array, gains: FormationGains, shape: ShapeLimits) -> str | None:
-        return shape_fault(self._space, c, shape) or place_fault(self._space, c, gains, shape)
 
 
 def _instants(from_s: float, to_s: float) -> list[float]:

@@ -1,4 +1,8 @@
-"""Whether a formation may take off, be engaged, and be flown on, and where it may be: every fault in words."""
+"""Whether a formation may take off, be engaged, flown on, and where it may be led: every fault in words.
+
+Order of this file: limits, input and output of the phase machine at a gate, checks of a gate, checks of a reference.
+The data of a gate are Structs, which take a fifth of the time of a named tuple or dataclass.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +19,12 @@ from zsim.math.compiled import portable
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
 
+FAR = 1e6  # m or rad: beyond it a value is a mistake
+ROUNDING_M = 1e-9  # of a place computed from variables (1e-14 at 50 m): the limit itself is allowed
+VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # state of an estimate
 AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
 DOWN = frozenset({"landed", "emergency"})  # states of a drone that is on the ground, or falls to it
-HELD_ON_REQUEST = "held on request"  # reasons of a formation; a display reads from them what may be asked for
+HELD_ON_REQUEST = "held on request"  # reasons of a formation, from which a display derives the possible requests
 READY_TO_ENGAGE = "ready to engage"
 GUARD_PARTS = "the guard parts"
 TOO_NEAR = "ALARM"
@@ -49,16 +56,14 @@ class EngagementLimits:
 
     Attributes:
         shape: where a formation may be engaged and led.
-        flight_slack: in flight the spread may fall to its limit over this, the tilt grow to its limit times
-            this.
-        assembly_height_m: height to which drones climb straight up before engagement, within
-            assembly_within_m.
+        flight_slack: in flight the spread may fall to its limit over this, the tilt grow to its limit times this.
+        assembly_height_m: height to which drones climb straight up before engagement, within assembly_within_m.
         assembly_climb_m_s: greatest speed of that climb.
         age_max_s: oldest estimate that is flown on.
         sigma_max_m, yaw_sigma_max_rad: greatest sigma of position and heading for take-off and engagement.
         in_flight_factor: by which both may be greater in flight.
-        heal_s: how long everything must be well before a held formation goes on.
-        resend_s: after it a mode command without effect is sent again.
+        heal_s: time without fault after which a held formation goes on.
+        resend_s: time after which a mode command without effect is sent again.
     """
 
     shape: ShapeLimits = field(default_factory=ShapeLimits)
@@ -75,7 +80,7 @@ class EngagementLimits:
 
     @property
     def shape_in_flight(self) -> ShapeLimits:
-        """Return the wider limits beyond which a formation in flight is held."""
+        """Wider limits beyond which a formation in flight is held."""
         return dataclasses.replace(
             self.shape,
             spread_min_m=self.shape.spread_min_m / self.flight_slack,
@@ -85,7 +90,7 @@ class EngagementLimits:
 
 
 class GateInput(Struct, eq=False):
-    """The newest estimates of n drones at a gate; its arrays may be filled anew for the next.
+    """The newest estimates of n drones at a gate; its arrays may be overwritten for the next.
 
     Attributes:
         t_s: simulated time.
@@ -106,7 +111,7 @@ class GateInput(Struct, eq=False):
 
     @property
     def down(self) -> bool:
-        """Return whether no drone is in the air."""
+        """Whether no drone is in the air."""
         return DOWN.issuperset(self.states)
 
 
@@ -115,32 +120,6 @@ class ModeCommand(NamedTuple):
 
     drone: str
     mode: str
-
-
-class ModeSender:
-    """Sends a mode to each drone that is still in a state from which it is to go, once per resend_s.
-
-    Attributes:
-        sent_s: when, by drone.
-    """
-
-    def __init__(self, drones: tuple[str, ...], resend_s: float) -> None:
-        self._drones = drones
-        self._resend_s = resend_s
-        self.sent_s: dict[str, float] = {}
-
-    def restart(self) -> None:
-        """Begin anew: the next commands are sent at once."""
-        self.sent_s.clear()
-
-    def commands(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
-        """Return the commands of this gate for the drones that are in one of the states."""
-        due = []
-        for drone, state in zip(self._drones, gate.states, strict=True):
-            if state in states and gate.t_s - self.sent_s.get(drone, -math.inf) >= self._resend_s:
-                self.sent_s[drone] = gate.t_s
-                due.append(ModeCommand(drone, mode))
-        return tuple(due)
 
 
 class Setpoint(Struct, eq=False):
@@ -163,12 +142,11 @@ class GateOutput(Struct, eq=False):
 
     Attributes:
         modes: mode commands to send.
-        setpoints: (n,) what each drone is to do, None for no command.
-        phase, value, desired, desired_rate, trajectory_t_s, margin, reason: as in the message; value and
+        setpoints: (n,) velocity commands, None for no command.
+        phase, value, desired, desired_rate, trajectory_t_s, margin, reason, plan_step: as in the message; value and
             desired with wrapped angles.
         factor: common factor of the saturation, 1 where nothing is saturated.
         alarmed: pairs of drone indices that are nearer than the alarm threshold.
-        plan_step: as in the message.
     """
 
     modes: tuple[ModeCommand, ...]
@@ -185,13 +163,8 @@ class GateOutput(Struct, eq=False):
     plan_step: int
 
 
-FAR = 1e6  # m or rad: beyond it a value is a slip
-ROUNDING_M = 1e-9  # of a place that is computed from variables: 1e-14 at 50 m; a limit itself is allowed
-VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # state of an estimate
-
-
 class FlightCheck:
-    """Checks the estimates and states of a gate; each check returns the fault, or None where all is well.
+    """Checks the estimates and states of a gate; each check returns the fault, or None.
 
     Attributes:
         value: (4n,) cluster of the newest estimates that had a frame, zero before any.
@@ -199,16 +172,9 @@ class FlightCheck:
     """
 
     def __init__(
-        self,
-        space: ClusterSpace,
-        drones: tuple[str, ...],
-        gains: FormationGains,
-        limits: EngagementLimits,
+        self, space: ClusterSpace, drones: tuple[str, ...], gains: FormationGains, limits: EngagementLimits
     ) -> None:
-        self.space = space
-        self.drones = drones
-        self.gains = gains
-        self.limits = limits
+        self.space, self.drones, self.gains, self.limits = space, drones, gains, limits
         self._shape_in_flight = limits.shape_in_flight
         self._bounds_in_flight = bounds_of(space, self._shape_in_flight)
         self.value: Array = np.zeros(space.size)
@@ -221,7 +187,6 @@ class FlightCheck:
         self._in_flight = (limits.age_max_s, *(limits.in_flight_factor * sigma for sigma in sigmas))
 
     def observe(self, gate: GateInput) -> None:
-        """Take over the estimates of a gate."""
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
         self._flaw = _first_flaw(gate, *self._in_flight)
         if self._flaw[0] != VALID and not all_near(gate.p_W, gate.yaw):
@@ -239,7 +204,6 @@ class FlightCheck:
         return fault or (self.formation_fault(gate) if "landed" in gate.states else None)
 
     def engagement_fault(self, gate: GateInput) -> str | None:
-        """Return why the formation cannot be engaged."""
         fault = self.state_fault(gate, AIRBORNE) or self._start_fault(gate)
         if fault:
             return fault
@@ -258,7 +222,7 @@ class FlightCheck:
         return shape_fault(self.space, self.value, shape, self._spread)
 
     def formation_fault(self, gate: GateInput) -> str | None:
-        """Return why the robots, where they are, make no formation to start from."""
+        """Return why the robots, where they are, are no formation to start from."""
         fault = self._no_frame or shape_fault(self.space, self.value, self.limits.shape, self._spread)
         if fault:
             return fault
@@ -269,7 +233,7 @@ class FlightCheck:
         return f"{pair} are {distance:.2f} m apart; allowed: {self.gains.separation_min_m:g} m or more"
 
     def estimate_fault(self, gate: GateInput) -> str | None:
-        """Return why the estimates of drones in flight cannot be flown on, those of the gate that was observed."""
+        """Return why the estimates of drones in flight, at the observed gate, cannot be flown on."""
         return self._flaw_text(gate, self._flaw, self.limits.in_flight_factor)
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
@@ -330,9 +294,9 @@ def estimate_flaw(
     sigma_max_m: float,
     yaw_sigma_max: float,
 ) -> tuple[int, int]:
-    """Return what the first estimate that is not well is (STALE, NOT_FINITE, UNCERTAIN, TURNED), and whose; else VALID.
+    """Return the flaw of the first unusable estimate (STALE, NOT_FINITE, UNCERTAIN, TURNED), and its drone; else VALID.
 
-    UNCERTAIN: where the drone is; TURNED: its heading.
+    UNCERTAIN: of the position; TURNED: of the heading.
     """
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:
@@ -348,14 +312,16 @@ def estimate_flaw(
 
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
-    """Return why c is no formation to engage or to lead to, or None; names quantity, value and limit.
+    """Return why c is no shape to engage in or to lead to, or None; names quantity, value and limit.
 
-    Args:
-        spread: of c, where it is known.
+    `spread` of c is passed where it is known.
     """
     outside = first_outside(c, space.bounds)
     if outside >= 0:
-        return _value_fault(space, c, outside)
+        name, value, (low, high) = space.names[outside], float(c[outside]), space.bounds[outside].tolist()
+        if not abs(value) < FAR:
+            return f"{name} is {value:g}; allowed: up to {FAR:g}"
+        return f"{name} is {value:.3g}; allowed: between {low:.3g} and {high:.3g}"
     spread = space.spread(c) if spread is None else spread
     if spread <= limits.spread_min_m:
         return f"{space.spread_text} is {spread:.2f} m; allowed: above {limits.spread_min_m:g} m"
@@ -372,7 +338,7 @@ def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: floa
 
 
 def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
-    """Return the open bounds (4n, 2) of variables of which `shape_fault` finds none at fault, but for the condition."""
+    """Return the open bounds (4n, 2) within which `shape_fault` finds no fault, apart from the condition."""
     bounds = space.bounds.copy()
     for k in space.tilts:
         bounds[k, 0] = max(bounds[k, 0], -limits.tilt_max_rad)
@@ -389,15 +355,13 @@ def first_outside(c: Array, bounds: Array) -> int:
     return -1
 
 
-def _value_fault(space: ClusterSpace, c: Array, k: int) -> str:
-    name, value, (low, high) = space.names[k], float(c[k]), space.bounds[k].tolist()
-    if not abs(value) < FAR:
-        return f"{name} is {value:g}; allowed: up to {FAR:g}"
-    return f"{name} is {value:.3g}; allowed: between {low:.3g} and {high:.3g}"
+def formation_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
+    """Return why the formation may not be led to c, by its shape or the places of its robots, or None."""
+    return shape_fault(space, c, limits) or place_fault(space, c, gains, limits)
 
 
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the robots may not stand where c puts them (too near to each other, too low), or None."""
+    """Return why the robots may not be where c puts them (too near to each other, too low), or None."""
     p_W, _ = space.inverse(c)
     if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
         return None

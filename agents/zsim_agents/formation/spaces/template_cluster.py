@@ -151,7 +151,7 @@ class TemplateCluster(ClusterSpace):
         return float(np.linalg.eigvalsh(inertia((S + S.T) / 2))[0]) / self._reach_m
 
     def condition(self, c: Array) -> float:
-        """Return the condition number of J^-1, velocity, heading and phi of the robots counted by their root mean square.
+        """Return the condition number of J^-1, the robots' velocities, headings and phi weighted by their rms.
 
         So it does not grow with the number of robots; a formation with robots farther than 4 m from the centroid is
         scaled down to that. w_k and the centroid are orthonormal in this measure; what is left is a matrix of 7 x 7:
