@@ -35,7 +35,7 @@ from zsim_agents.cameras.rendering.scene import DroneStates, scene_of
 BEHIND_MAX = 5
 ASK_S = 0.5  # wall; the world answers in milliseconds
 OVERTAKING_S = 0.1  # wall; a bye of higher priority would pass the last pictures, and a recorder close before them
-DRAIN_S = 1.0  # wall; how long the last truths of a run are waited for
+DRAIN_S = 1.0  # wall; how long to wait for the last truths of a run
 PENDING_MAX = 64  # gates of which the truth of a drone may be missing
 
 

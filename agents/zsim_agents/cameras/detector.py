@@ -449,6 +449,3 @@ def _spread(points: NDArray, x: float, y: float, r: float) -> tuple[float, float
             sxx, sxy, syy = sxx + dx * dx, sxy + dx * dy, syy + dy * dy
     centre, radius = spread(n, sx, sy, sxx, sxy, syy)
     return centre, radius, math.sqrt(rough / n)
-
-
-PIXELS_MAX = 1920 * 1080 * 2  # of a picture that is decoded; twice what a camera of a scenario may have

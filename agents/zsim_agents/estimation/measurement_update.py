@@ -63,14 +63,14 @@ from zsim_agents.estimation.kalman_update import (
 
 ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
 YAW = ATTITUDE + 2  # place in the error state
-VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would drown the rest
+VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and larger squares would cost all others their digits
 SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
-HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which turns the attitude to it
-SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
-MOVES_SIGMAS = 2.0  # of the velocity, chosen: one that stands still moves so fast at 2 % of the samples
+HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which sets the heading
+SET_DOWN_SIGMA_RAD = 0.05  # rad: accuracy of setting a drone down by eye, where there is no magnetometer
+MOVES_SIGMAS = 2.0  # of the velocity, chosen: the estimate of a drone at rest exceeds it in 2 % of the samples
 DENIED_S = 2.0  # s since two drones saw each other, chosen: errors grow little meanwhile
-HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
-COSINE_MIN = 0.1  # of the sonar's ray to the vertical; flatter than 84 deg it does not hit the ground below
+HEADING_WAIT_S = 1.0  # s without a reading of the magnetometer, after which the scenario's heading is used
+COSINE_MIN = 0.1  # of the sonar's ray to the vertical; beyond 84 deg it does not hit the ground below
 
 
 @inlined
@@ -118,7 +118,7 @@ def start_heading(
             seen = product(matrix(quaternion(row, NOMINAL.q_WB)), product(R_BS, vector(readings[at], READING.values)))
             field = vector(setting, SETTING.field_W)
             angle = math.atan2(field[1], field[0]) - math.atan2(seen[1], seen[0])
-            _turn_heading(row, counts, setting[SETTING.gravity], angle)  # its certainty comes from the update
+            _turn_heading(row, counts, setting[SETTING.gravity], angle)  # its variance follows from the update
             return
         at = after[at]
     if not rows.layout[i, LAYOUT.compass] or t_s - row[NOMINAL.t_first_gate] > HEADING_WAIT_S:
@@ -130,7 +130,7 @@ def start_heading(
 @inlined
 def _turn_heading(row: np.ndarray, counts: np.ndarray, gravity: float, angle: float) -> None:
     strapdown.turn_heading(row, gravity, angle)
-    counts[COUNT.kept] = 0  # a turn makes the past meaningless
+    counts[COUNT.kept] = 0  # a turn invalidates the history
     counts[COUNT.heading_known] = 1
 
 
@@ -314,7 +314,7 @@ def inflate(rows: Rows, i: int, P: np.ndarray, kind: int, z: np.ndarray, expecte
 def widen(P: np.ndarray, k: int, variance: float, layout: np.ndarray) -> None:
     """Add a variance to a state of position or velocity, and to its clones: all have the same error."""
     first = layout[LAYOUT.first_clone] + k
-    end = first + CLONED * layout[LAYOUT.clones]  # beyond, P has room for those of other drones
+    end = first + CLONED * layout[LAYOUT.clones]  # beyond are the places of larger error states
     P[k, k] += variance
     for a in range(first, end, CLONED):
         P[a, k] += variance

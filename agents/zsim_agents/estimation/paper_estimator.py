@@ -28,8 +28,8 @@ from zsim_agents.estimation.drone_estimator import StateEstimate
 
 YAW = 3  # place in the state
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
-YAW_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye
-DRIFT_S = 1.0  # s, for which the gyroscope's bias is taken as the same; it is not estimated
+YAW_SIGMA_RAD = 0.05  # rad: accuracy of setting a drone down by eye
+DRIFT_S = 1.0  # s during which the gyroscope's bias is assumed constant; it is not estimated
 SPEED_SIGMA_M_S = 1.0  # m/s, of a drone whose own velocity is not known
 IMU_GAP_MAX_S = 0.1  # s; over a longer one no rate is integrated
 

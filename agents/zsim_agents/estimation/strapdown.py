@@ -49,7 +49,7 @@ ACCEL_MAX_M_S2 = 500.0  # m/s^2, 50 g: no MEMS accelerometer of a drone reads mo
 GYRO_MAX_RAD_S = 100.0  # rad/s, 5700 deg/s: likewise
 MANOEUVRE_M_S2 = 0.3  # m/s^2, standard deviation of the acceleration in gusts of 0.5 m/s (0.16) and in transit
 MANOEUVRE_S = 0.5  # s, its correlation time
-LOST_TURN_RAD_S = 0.5  # rad/s, standard deviation of the rate that a missing gyroscope sample hides
+LOST_TURN_RAD_S = 0.5  # rad/s, standard deviation of the rate during a missing gyroscope sample
 COAST_TURN_DENSITY = LOST_TURN_RAD_S**2 * 2.0 * MANOEUVRE_S  # rad^2/s
 COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 
@@ -85,7 +85,7 @@ def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
     before, after = state[5], moved[5]
     jolt = abs(after[0] - before[0]) + abs(after[1] - before[1]) + abs(after[2] - before[2])
     if jolt > setting[SETTING.jolt]:
-        hidden = 0.5 * jolt * dt  # what a step anywhere between two samples hides
+        hidden = 0.5 * jolt * dt  # error of a step anywhere between two samples
         row[NOMINAL.lost_velocity] += hidden * hidden
     row[NOMINAL.t] = t_s
     row[NOMINAL.dt_squared] += dt * dt
@@ -155,7 +155,7 @@ def grow(rows: Rows, i: int, P: np.ndarray) -> np.ndarray:
         F, Q = np.eye(n), np.zeros((n, n))
         write_growth(rows, i, F, Q)
         if n < P.shape[0]:
-            predict_jointly(P, 0, F, Q)  # the clones, which stay as they are, are the others
+            predict_jointly(P, 0, F, Q)  # the clones, which do not change, are the other errors
         else:
             P = predicted_covariance(P, F, Q)
     begin_interval(row, row[NOMINAL.t])

@@ -31,7 +31,7 @@ PairTable = NDArray[np.int64]
 
 RATES = ("vx", "vy", "vz", "yaw rate")  # of a robot, in the order of r_dot
 NEAR_M = 1e-6  # robots that are nearer have no direction from one to the other
-SETTLED_M_S = 1e-9  # a rate that lacks less is reached
+SETTLED_M_S = 1e-9  # a smaller deficit of the rate is ignored
 LOAD_MIN = 1e-9  # against division by zero
 GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three robots in a corner need a few
 

@@ -63,7 +63,11 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         RunError: the plan can never be flown, with the reason.
     """
     with _refusals_of(scenario, cluster):
-        space, gains, law_name = scenario_space(scenario, cluster), gains_of(cluster.gains), cluster.law or "proportional"
+        space, gains, law_name = (
+            scenario_space(scenario, cluster),
+            gains_of(cluster.gains),
+            cluster.law or "proportional",
+        )
         law = LAWS.get(law_name) or plugin.load(law_name, "law", ControlLaw, is_constructed=True)
         _rehearse(space, gains, law)
         limits = EngagementLimits()

@@ -23,7 +23,7 @@ FAR = 1e6  # m or rad: beyond it a value is a mistake
 ROUNDING_M = 1e-9  # of a place computed from variables (1e-14 at 50 m): the limit itself is allowed
 VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # state of an estimate
 AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
-DOWN = frozenset({"landed", "emergency"})  # states of a drone that is on the ground, or falls to it
+DOWN = frozenset({"landed", "emergency"})  # states of a drone on the ground, or falling
 HELD_ON_REQUEST = "held on request"  # reasons of a formation, from which a display derives the possible requests
 READY_TO_ENGAGE = "ready to engage"
 GUARD_PARTS = "the guard parts"
@@ -67,15 +67,15 @@ class EngagementLimits:
     """
 
     shape: ShapeLimits = field(default_factory=ShapeLimits)
-    flight_slack: float = 1.5  # so that noise of the estimates at the limit holds nobody
-    assembly_height_m: float = 1.5  # many rotor radii over the ground, and a fall that the hull takes
+    flight_slack: float = 1.5  # so that noise at the limit does not hold the formation
+    assembly_height_m: float = 1.5  # many rotor radii over the ground, and a fall that the hull withstands
     assembly_within_m: float = 0.3  # three sigma of the barometer
-    assembly_climb_m_s: float = 0.5  # half of what the firmware allows: the drones climb alike
-    age_max_s: float = 0.5  # as the firmware's silence: 25 gates
+    assembly_climb_m_s: float = 0.5  # half of what the firmware allows: all drones climb equally
+    age_max_s: float = 0.5  # as long as the firmware tolerates silence: 25 gates
     sigma_max_m: float = 1.0  # half of the least separation of 2 m
     yaw_sigma_max_rad: float = math.radians(15.0)  # half of the 30 deg at which three sigma turn a velocity by 90 deg
-    in_flight_factor: float = 2.0  # of a position: 2 m, as of a single GPS fix: nothing else helps any more
-    heal_s: float = 0.5  # 25 gates without a fault are no accident
+    in_flight_factor: float = 2.0  # of a position: 2 m, as of a single GPS fix
+    heal_s: float = 0.5  # 25 gates without a fault are no coincidence
     resend_s: float = 1.0  # ten times the delay of commands in the paper's scenario, 100 ms
 
     @property

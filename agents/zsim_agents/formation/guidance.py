@@ -59,7 +59,7 @@ class Guidance:
         self._home: Reference = Hold(np.zeros(space.size))
         self._flown: Reference = self._home
         self._goal = np.zeros(space.size)
-        self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last answer of value
+        self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last result of `value`
 
     def value(self, t_s: float) -> tuple[Array, Array]:
         """Return c_des and its rate, each (4n,); computed once a gate."""

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Kernel = NDArray[np.float32]
 ARM_M = 0.1785  # m, of the AR.Drone, for records whose drones name no rotors
 ROTOR_RADIUS_M = 0.10  # m, 8 inch propellers of the AR.Drone
-SUN_AZIMUTH_RAD, SUN_ELEVATION_RAD = math.radians(215.0), math.radians(50.0)  # chosen: a winter noon seen from behind
+SUN_AZIMUTH_RAD, SUN_ELEVATION_RAD = math.radians(215.0), math.radians(50.0)  # chosen: a noon in winter
 SUN_W = np.array(
     [
         math.cos(SUN_ELEVATION_RAD) * math.cos(SUN_AZIMUTH_RAD),
