@@ -63,12 +63,9 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         RunError: the plan can never be flown, with the reason.
     """
     with _refusals_of(scenario, cluster):
-        space, gains, law_name = (
-            scenario_space(scenario, cluster),
-            gains_of(cluster.gains),
-            cluster.law or "proportional",
-        )
-        law = LAWS.get(law_name) or plugin.load(law_name, "law", ControlLaw, is_constructed=True)
+        space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
+        name = cluster.law or "proportional"
+        law = LAWS.get(name) or plugin.load(name, "law", ControlLaw, is_constructed=True)
         _rehearse(space, gains, law)
         limits = EngagementLimits()
         if cluster.gains.sigma_max_m is not UNSET:
