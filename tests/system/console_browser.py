@@ -24,6 +24,7 @@ IN_SIGHT = """() => ['land', 'emergency'].every(name => {
 })"""
 POLL_MS = 100  # between two looks at what a page shows
 PATIENCE_MS = 1000 * PATIENCE_S
+HOLD_MS = 600  # of orders.html: as long a button of an emergency or a take-over is held down
 
 
 class BrowserPage:
@@ -41,6 +42,13 @@ class BrowserPage:
 
     def press(self, name: str) -> None:
         self.page.get_by_role("button", name=name, exact=True).click()
+
+    def hold(self, selector: str) -> None:
+        """Hold a button down by the mouse until it is confirmed."""
+        self.page.locator(selector).hover()
+        self.page.mouse.down()
+        self.page.wait_for_timeout(HOLD_MS + 200)
+        self.page.mouse.up()
 
     def select_tab(self, tab: str) -> None:
         wanted = self.page.get_by_role("tab", name=tab, exact=True)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from chromium import needs_browser
-from console_browser import IN_SIGHT, PATIENCE_MS, POLL_MS, SCREENS
+from console_browser import HOLD_MS, IN_SIGHT, PATIENCE_MS, POLL_MS, SCREENS
 from page_overflow import overflow
 from wire import PATIENCE_S
 
@@ -241,7 +241,6 @@ def test_the_next_run_on_a_console_s_port_has_none_of_these_copies(head: Head, t
     assert head.page.locator(".files a").get_attribute("href") == "/report"
 
 
-HOLD_MS = 600  # of orders.html
 STALL_MS = 5000  # of the page: more than what is called lost
 STALL_JS = "ms => { const until = performance.now() + ms; while (performance.now() < until); }"
 

@@ -18,7 +18,6 @@ from test_console_flying import SEES, click_map
 pytestmark = needs_browser
 
 SIZES = ({"width": 1440, "height": 900}, {"width": 1024, "height": 768}, {"width": 390, "height": 844})
-HOLD_MS = 600  # as in orders.html
 LATE_MS, LOST_MS = 1000, 3000  # as there
 STALL_MS = 5000  # of the page; above LOST_MS
 REST_MS = 1500  # after which sliders that rest are sent; above REST_S
@@ -37,14 +36,6 @@ def picture(page: BrowserPage, name: str) -> None:
             page.page.wait_for_timeout(LATE_MS)
             page.page.screenshot(path=f"{PICTURES}/{name}-{size['width']}.png", timeout=PATIENCE_MS)
         page.page.set_viewport_size(SIZES[1])
-
-
-def hold(page: Any, selector: str) -> None:
-    """Hold a button by the mouse until it is confirmed."""
-    page.locator(selector).hover()
-    page.mouse.down()
-    page.wait_for_timeout(HOLD_MS + 200)
-    page.mouse.up()
 
 
 def note(page: BrowserPage, text: str) -> None:
@@ -81,7 +72,7 @@ def test_no_order_is_lost_where_page_console_or_world_stand_still(
     assert "controller.main" in str(over.text_content())
     over.click()  # too short
     note(page, "hold it")
-    hold(page.page, "#zsim-flight .over")
+    page.hold("#zsim-flight .over")
     page.page.wait_for_function(f"() => {BAR} === 'flying'")
 
     # a console that stands still: what is flown is not called alive, and the order waits, in red and with its age
@@ -209,7 +200,7 @@ def test_a_confirmation_names_drone_place_and_height_and_its_marker_stays(
     page.page.wait_for_timeout(LATE_MS)
     assert asked(run, "acquire") == []
     picture(page, "confirm-over")
-    hold(page.page, "#zsim-map .there .go")
+    page.hold("#zsim-map .there .go")
     run.commander = "console.1"
     page.page.locator("#zsim-flight .text").get_by_text("goes to").wait_for()
     assert [args["drone"] for args in asked(run, "acquire")] == ["drone1"]
