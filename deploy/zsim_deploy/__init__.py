@@ -1,6 +1,6 @@
 """The command line, and launching processes here and on other hosts.
 
-Floors from the ground: arguments, inventory, roles, launch, hosts, push, render, cli; a room imports those
+Floors from the ground: arguments, inventory, roles, launch, certificates, hosts and render, cli; each imports those
 below it. cli/ has the commands, roles/ what each process of a run does, launch/ and hosts/ start and supervise them.
 """
 

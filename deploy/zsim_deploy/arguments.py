@@ -1,16 +1,20 @@
-"""Options that several commands share: those of a flight, and those by which a command connects to a world."""
+"""What commands share: options that are declared once, what they are made into, and lines for a terminal."""
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from enum import StrEnum
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
+from typer import Argument, BadParameter, Exit, Option
 
-from zsim.errors import RunError
+from zsim.contract.run_messages import RATE_MAX
+from zsim.errors import RunError, ZsimError, printable
 from zsim.extras import install_command
 
 if TYPE_CHECKING:
@@ -19,42 +23,54 @@ if TYPE_CHECKING:
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONNECT_VARIABLE = "ZSIM_CONNECT"  # of the environment: the endpoint where --connect is not given
 RUN_ID = "{run}"  # in the folder of a record: a recorder that is started again finds the one that it had begun
-CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}  # modules by extra
-FLIGHT_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy", "filterpy")}
-REPORT_NEEDS = {"report": ("matplotlib", "jinja2", "mcap", "zstandard")}
 CONSOLE_PORT = 8080  # of its page
-RUN, HOSTS = "Run", "On several machines"  # panels of the help
+PORT_MAX = 65535
 REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
 CHANGED = "--changed"  # of the world: what a launcher, whose scenario is resolved, has changed of its file
+OTHER_OUT = "give --out another folder"  # remedy
 LOOK_S = 5.0  # wall; for which a command that a person types waits for a world
 
+# Panels of the help
+RUN, HOSTS = "Run", "On several machines"
+ROLES = "Roles, started by hand, on any machine, in any order"
+WATCH, TRANSLATE, POKE = "Watch and steer", "Others come in", "Look and poke"
 
-def positive(value: float | None) -> float | None:
-    """Return the value of an option that is None or a number above 0."""
-    if value is not None and not 0 < value < math.inf:
-        raise typer.BadParameter(f"is {value:g}; must be a finite number > 0")
-    return value
-
-
-def not_negative(value: float | None) -> float | None:
-    """Return the value of an option that is None or a number from 0 on."""
-    if value is not None and not 0 <= value < math.inf:
-        raise typer.BadParameter(f"is {value:g}; must be a finite number >= 0")
-    return value
+# Modules that a command needs, by the extra that brings them
+CAMERA_NEEDS = {"cameras": ("cv2",)}
+CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}
+FLIGHT_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy", "filterpy")}
+REPORT_NEEDS = {"report": ("matplotlib", "jinja2", "mcap", "zstandard")}
 
 
-def finite(value: float | None) -> float | None:
-    """Return the value of an option that is None or a finite number."""
-    if value is not None and not math.isfinite(value):
-        raise typer.BadParameter(f"is {value:g}; must be a finite number")
-    return value
+def say(text: str) -> None:
+    """Print a line for a person on standard output."""
+    print(printable(text), flush=True)
+
+
+def note(text: str) -> None:
+    """Print a line for a person on standard error."""
+    print(printable(text), file=sys.stderr, flush=True)
+
+
+def failed(cause: str) -> Exit:
+    """Print why a command ends with exit code 1, as its last line; return the exception to raise."""
+    note(cause)
+    return Exit(1)
+
+
+@contextmanager
+def file_fault(path: Path, fault: str, remedy: str, kind: type[ZsimError] = RunError) -> Iterator[None]:
+    """Turn an OSError on a file into an error of one line: `PATH: FAULT (REASON); REMEDY`."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{path}: {fault} ({error.strerror}); {remedy}") from error
 
 
 def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
-    """Refuse to begin without what a command needs.
+    """Refuse to begin where modules that a command needs are missing.
 
     Args:
-        command: its name.
         needs: modules, by the extra that brings them.
 
     Raises:
@@ -66,60 +82,105 @@ def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
         raise RunError(f"{command}: {lacking}; {install_command(missing.values())}")
 
 
-def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[str, str]) -> str:
-    """Return a refusal of an endpoint with where it comes from, if that is the environment."""
-    value = environment.get(CONNECT_VARIABLE)
-    is_given = any(each.partition("=")[0] == "--connect" for each in arguments)
-    return f"{text} ({value} is from {CONNECT_VARIABLE})" if value and value in text and not is_given else text
+# Checks of values
+
+
+def _check(is_allowed: Callable[[float], bool], allowed: str) -> Callable[[float | None], float | None]:
+    """Return a callback that refuses values which are not allowed; None is."""
+
+    def check(value: float | None) -> float | None:
+        if value is not None and not is_allowed(value):
+            raise BadParameter(f"is {value:g}; must be {allowed}")
+        return value
+
+    return check
+
+
+finite = _check(math.isfinite, "a finite number")
+positive = _check(lambda value: 0 < value < math.inf, "a finite number > 0")
+not_negative = _check(lambda value: 0 <= value < math.inf, "a finite number >= 0")
+
+
+def between(least: float, greatest: float) -> Callable[[float | None], float | None]:
+    """Return a callback that refuses values outside a range."""
+    return _check(lambda value: least <= value <= greatest, f">= {least:g} and <= {greatest:g}")
 
 
 def check_range(from_: float | None, to: float | None) -> None:
     """Refuse `--to` before `--from`."""
     if from_ is not None and to is not None and to < from_:
-        raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
+        raise BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
 
 
-ScenarioPath = Annotated[Path, typer.Argument(help="Scenario file (YAML).", show_default=False)]
-Set = Annotated[list[str] | None, typer.Option("--set", help="Override a field: a.b.c=value. Repeatable.")]
-Seed = Annotated[int | None, typer.Option(help="Seed instead of the scenario's.")]
-Duration = Annotated[float | None, typer.Option(help="Simulated seconds instead of the scenario's.")]
-Realtime = Annotated[bool, typer.Option(REALTIME, help="Pace by the wall clock and wait for nobody.")]
-RateOption = Annotated[float | None, typer.Option(help="Simulated per wall second (realtime 1, lockstep unpaced).")]
-Connect = Annotated[
-    str, typer.Option("--connect", envvar=CONNECT_VARIABLE, help="Where the world (or a router) listens.")
-]
-Federation = Annotated[str, typer.Option(help="Name of the federation: the prefix of its keys.")]
+def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[str, str]) -> str:
+    """Add to the refusal of an endpoint that it comes from the environment, if it does."""
+    value = environment.get(CONNECT_VARIABLE)
+    is_given = any(each.partition("=")[0] == "--connect" for each in arguments)
+    return f"{text} ({value} is from {CONNECT_VARIABLE})" if value and value in text and not is_given else text
+
+
+# Options of several commands
+
+
+class RowOrder(StrEnum):
+    """By what the rows of `zsim ps` are sorted; of figures the greatest is first."""
+
+    ROLE = "role"
+    HOST = "host"
+    STATE = "state"
+    AGE = "age"
+    LAG = "lag"
+    MESSAGES = "messages"
+    RESTARTS = "restarts"
+    ATTENTION = "attention"
+
+
+ScenarioPath = Annotated[Path, Argument(help="Scenario file (YAML).", show_default=False)]
+Set = Annotated[list[str] | None, Option("--set", help="Override a field: a.b.c=value. Repeatable.")]
+Seed = Annotated[int | None, Option(help="Seed instead of the scenario's.")]
+Duration = Annotated[float | None, Option(help="Simulated seconds instead of the scenario's.")]
+Realtime = Annotated[bool, Option(REALTIME, help="Pace by the wall clock and wait for nobody.")]
+Rate = Annotated[float | None, Option(help="Simulated per wall second (realtime 1, lockstep unpaced).")]
+Connect = Annotated[str, Option("--connect", envvar=CONNECT_VARIABLE, help="Where the world (or a router) listens.")]
+Federation = Annotated[str, Option(help="Name of the federation: the prefix of its keys.")]
 Wait = Annotated[
-    float | None,
-    typer.Option(callback=not_negative, help="Seconds to wait for a world; for ever if not given."),
+    float | None, Option(callback=not_negative, help="Seconds to wait for a world; for ever if not given.")
 ]
-Launched = Annotated[str | None, typer.Option("--launched", hidden=True)]  # by `zsim run`, for the run of this id
-Tls = Annotated[Path | None, typer.Option("--tls", help="Folder of this process's certificate (zsim certs init).")]
-Access = Annotated[Path | None, typer.Option("--access", help="Zenoh's access control (zsim certs init).")]
-Host = Annotated[str | None, typer.Option("--host", help="Name of this host, as others see it.")]
-Insecure = Annotated[bool, typer.Option("--insecure", help="Without TLS, on a network that is nobody else's.")]
-
-
+Launched = Annotated[str | None, Option("--launched", hidden=True)]  # by `zsim run`, for the run of this id
+Tls = Annotated[Path | None, Option("--tls", help="Folder of this process's certificate (zsim certs init).")]
+Access = Annotated[Path | None, Option("--access", help="Zenoh's access control (zsim certs init).")]
+Host = Annotated[str | None, Option("--host", help="Name of this host, as others see it.")]
+Insecure = Annotated[bool, Option("--insecure", help="Without TLS, on a network that is nobody else's.")]
 Keys = Annotated[
-    list[str] | None, typer.Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
+    list[str] | None, Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
 ]
 Trust = Annotated[
-    bool,
-    typer.Option("--trust", help="Import the modules that the scenario names. That runs them: trust who wrote them."),
+    bool, Option("--trust", help="Import the modules that the scenario names. That runs them: trust who wrote them.")
 ]
-From = Annotated[
-    float | None, typer.Option("--from", callback=not_negative, help="Simulated seconds of the first message.")
-]
-To = Annotated[float | None, typer.Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
-
-
+From = Annotated[float | None, Option("--from", callback=not_negative, help="Simulated seconds of the first message.")]
+To = Annotated[float | None, Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
 Force = Annotated[
-    bool, typer.Option("--force", help="Replace an earlier run in the folder; other files there stay as they are.")
+    bool, Option("--force", help="Replace an earlier run in the folder; other files there stay as they are.")
 ]
+Report = Annotated[bool, Option(help="Make the report at the end.")]
+Listen = Annotated[list[str] | None, Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")]
+Recorded = Annotated[Path, Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)]
+
+
+def process_option(default: str) -> Any:
+    """Return the option by which a process is named.
+
+    Args:
+        default: its name without a certificate.
+    """
+    return Option(help=f"Process name (default {default}, or the certificate's).")
+
+
+# What options are made into
 
 
 def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":
-    """Return who this process is on the network."""
+    """Return the identity of this process on the network."""
     from zsim.transport.tls import Identity
 
     plain = Identity(tls=tls, access=access, insecure=insecure)
@@ -166,10 +227,7 @@ class FlightOptions(NamedTuple):
     """What is to be flown, and how fast.
 
     Attributes:
-        path: of the scenario.
         seed, duration: instead of the scenario's.
-        realtime: paced by the wall clock.
-        rate: simulated per wall second.
         overrides: texts `a.b.c=value`.
     """
 
@@ -194,12 +252,11 @@ class FlightOptions(NamedTuple):
 
     def mode_and_rate(self) -> tuple[str, float]:
         """Return the mode of a run, and its pace in simulated per wall seconds; 0 is as fast as it goes."""
-        if self.rate is not None and not 0 < self.rate <= 1000:
-            raise typer.BadParameter(f"--rate is {self.rate:g}; must be > 0 and <= 1000")
+        if self.rate is not None and not 0 < self.rate <= RATE_MAX:
+            raise BadParameter(f"--rate is {self.rate:g}; must be > 0 and <= {RATE_MAX:g}")
         return ("realtime", self.rate or 1.0) if self.realtime else ("lockstep", self.rate or 0.0)
 
     def pace(self) -> list[str]:
-        """Return mode and rate as options of the world."""
         return pace_options(*self.mode_and_rate())
 
 
@@ -208,10 +265,9 @@ class WorldAccess(NamedTuple):
 
     Attributes:
         endpoint: on which the world or a router listens.
-        federation: prefix of its keys.
-        wait_s: for a world; None for ever.
+        wait_s: for a world; None waits indefinitely.
         tls: folder of the process's certificate.
-        insecure: without TLS, on a network that is nobody else's.
+        insecure: without TLS, on a network of one's own.
         host: its name, as others see it.
         launched: run of which it is a part, of processes that a launcher starts.
     """
@@ -226,21 +282,42 @@ class WorldAccess(NamedTuple):
 
     @property
     def who(self) -> "Identity":
-        """Return who the process is on the network."""
         return identity(self.host, self.tls, self.insecure)
 
 
-Options = Mapping[str, tuple[Any, Any]]
-"""Annotation and default of each option, in the order of the tuple that they make."""
-_FLIGHT: Options = {
-    "scenario": (ScenarioPath, inspect.Parameter.empty),
-    "seed": (Seed, None),
-    "duration": (Duration, None),
-    "realtime": (Realtime, False),
-    "rate": (RateOption, None),
-    "set_": (Set, None),
-}
-_WORLD: Options = {
+def option_group(argument: str, make: Callable[..., Any], options: Mapping[str, tuple[Any, Any]]) -> Callable[..., Any]:
+    """Return a decorator that gives a command some options in place of the argument that is made of them.
+
+    Args:
+        make: makes it of the values, in the order of the options.
+        options: annotation and default of each.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @wraps(command)
+        def with_options(**values: Any) -> None:
+            made = make(*(values.pop(option, default) for option, (_, default) in options.items()))
+            command(**values, **{argument: made})
+
+        parameters = [
+            inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+            for option, (annotation, default) in options.items()
+        ]
+        signature = inspect.signature(command)
+        own = [each for each in signature.parameters.values() if each.name != argument]
+        together = [each.replace(kind=each.KEYWORD_ONLY) for each in (*own, *parameters)]
+        with_options.__signature__ = signature.replace(parameters=together)  # type: ignore[attr-defined]
+        with_options.__annotations__ = {each.name: each.annotation for each in together}
+        return with_options
+
+    return decorate
+
+
+def _without_tls(connect: str, federation: str, wait: float | None, *more: Any) -> WorldAccess:
+    return WorldAccess(connect, federation, wait, None, *more)
+
+
+_OBSERVER: dict[str, tuple[Any, Any]] = {
     "connect": (Connect, DEFAULT_ENDPOINT),
     "federation": (Federation, "zsim"),
     "wait": (Wait, LOOK_S),
@@ -248,40 +325,30 @@ _WORLD: Options = {
     "insecure": (Insecure, False),
     "host": (Host, None),
 }
-
-
-def flight_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of its argument `flight`."""
-    return _with_options(command, "flight", FlightOptions, _FLIGHT)
-
-
-def observer_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that a person types the options of its argument `reach`."""
-    return _with_options(command, "reach", WorldAccess, _WORLD)
-
-
-def participant_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that runs a process of a federation the options of its argument `reach`: it waits for a world."""
-    options = {**_WORLD, "wait": (Wait, None), "launched": (Launched, None)}
-    return _with_options(command, "reach", WorldAccess, options)
-
-
-def _with_options(
-    command: Callable[..., None], name: str, make: Callable[..., Any], options: Options
-) -> Callable[..., None]:
-    """Return the command as typer is to see it: the options in place of the argument that is made of them."""
-
-    @wraps(command)
-    def with_options(**values: Any) -> None:
-        made = make(*(values.pop(option, default) for option, (_, default) in options.items()))
-        command(**values, **{name: made})
-
-    parameters = [
-        inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-        for option, (annotation, default) in options.items()
-    ]
-    signature = inspect.signature(command, eval_str=True)
-    own = [each.replace(kind=each.KEYWORD_ONLY) for each in signature.parameters.values() if each.name != name]
-    together = [*parameters, *own] if make is FlightOptions else [*own, *parameters]
-    with_options.__signature__ = signature.replace(parameters=together)  # type: ignore[attr-defined]
-    return with_options
+_PARTICIPANT = {**_OBSERVER, "wait": (Wait, None), "launched": (Launched, None)}
+flight_options = option_group(
+    "flight",
+    FlightOptions,
+    {
+        "scenario": (ScenarioPath, inspect.Parameter.empty),
+        "seed": (Seed, None),
+        "duration": (Duration, None),
+        "realtime": (Realtime, False),
+        "rate": (Rate, None),
+        "set_": (Set, None),
+    },
+)
+observer_options = option_group("reach", WorldAccess, _OBSERVER)
+"""Of a command that a person types, with an argument `reach`."""
+participant_options = option_group("reach", WorldAccess, _PARTICIPANT)
+"""Of a command that runs a process of a federation, with an argument `reach`: it waits for a world."""
+several_options = option_group(
+    "reach", _without_tls, {name: each for name, each in _PARTICIPANT.items() if name != "tls"}
+)
+"""The same for a process that stands for several, which can have no certificate: that is for one."""
+listener_options = option_group(
+    "who",
+    identity,
+    {"host": (Host, None), "tls": (Tls, None), "insecure": (Insecure, False), "access": (Access, None)},
+)
+"""Of a command that runs a process to which others connect, with an argument `who`."""

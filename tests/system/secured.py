@@ -24,9 +24,8 @@ from wire import PATIENCE_S
 from zsim.scenario import scenario_file
 from zsim.transport import connection
 from zsim.transport.tls import Identity
-from zsim_deploy.inventory import certificates
-from zsim_deploy.inventory.certificates import CertificateRequest
-from zsim_deploy.inventory.enrolment import access_control
+from zsim_deploy import certificates
+from zsim_deploy.certificates import CertificateRequest, access_control
 
 HOST = "lab"
 SITE = "router.site"

@@ -19,7 +19,7 @@ from zsim.record import RecordReader
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_analysis.in_process import fly
-from zsim_deploy.launch.death_policy import RESTART_WINDOW_S, RESTARTS_MAX
+from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX
 
 pytestmark = pytest.mark.soak
 

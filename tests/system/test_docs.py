@@ -46,8 +46,8 @@ from zsim.sensors.camera import CAMERAS, BottomCamera, FrontCamera, Hats, Sighti
 from zsim.sensors.sensor import ErrorModel, Mount, Sensor
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors
 from zsim.vehicles import vehicle
+from zsim_deploy import inventory
 from zsim_deploy.cli.cli import app
-from zsim_deploy.inventory import inventory
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])

@@ -9,7 +9,7 @@ from refused import has_terms
 from secured import Certificates, tls_endpoint
 
 from zsim.scenario import scenario_file
-from zsim_deploy.inventory.enrolment import access_control
+from zsim_deploy.certificates import access_control
 
 IN_LOCKSTEP = PAIR.replace("clusters:", "processes: {expect: [matlab.main]}\nclusters:").replace(
     "duration_s: 12", "duration_s: 2"

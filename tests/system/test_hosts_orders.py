@@ -14,7 +14,7 @@ from lab import LAUNCHER, Lab
 from refused import has_terms
 
 from zsim.transport.tls import KEY
-from zsim_deploy.launch.end_signals import UNREAD
+from zsim_deploy.launch.supervisor import UNREAD
 
 IN_FLIGHT = r" [1-9][0-9]*\.[0-9] . 3600 s"  # a line of progress after the first second
 

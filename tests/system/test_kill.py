@@ -16,7 +16,7 @@ from zsim.record import RecordReader, repair
 from zsim.record.completeness import record_completeness
 from zsim.scenario import scenario_file
 from zsim_analysis.in_process import fly
-from zsim_deploy.launch.end_signals import UNREAD
+from zsim_deploy.launch.supervisor import UNREAD
 
 REASONS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "terminated"}
 SEEN_DEAD = ("death", "superseded")  # the second where it is back before its death is noticed

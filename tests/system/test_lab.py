@@ -16,8 +16,8 @@ from federation import Role, wait_gone
 from lab import LAUNCHER, Lab
 
 from zsim.errors import HostsError
+from zsim_deploy import inventory
 from zsim_deploy.hosts.host_link import HostLink
-from zsim_deploy.inventory import inventory
 
 PORT = 9000
 SOON_S, LATE_S = 120.0, 0.4  # an answer that must come, one that must not

@@ -19,18 +19,11 @@ from lab import LAUNCHER, Lab
 from refused import has_terms
 
 from zsim import __version__
-from zsim_deploy.hosts.host_link import HostLink
-from zsim_deploy.hosts.ssh_connection import shell_line
-from zsim_deploy.inventory import inventory, processes
-from zsim_deploy.push import on_host
-from zsim_deploy.push.installer import (
-    choose_interpreter,
-    interpreter_query,
-    open_installer,
-    parse_interpreters,
-    wheel_target,
-)
-from zsim_deploy.push.wheelhouse import Wheelhouse, WheelSet
+from zsim_deploy import inventory
+from zsim_deploy.hosts import on_host
+from zsim_deploy.hosts.host_link import HostLink, shell_line
+from zsim_deploy.hosts.push import choose_interpreter, interpreter_query, open_installer, parse_interpreters
+from zsim_deploy.hosts.wheelhouse import Wheelhouse, WheelSet, wheel_target
 
 CACHE = Path(tempfile.gettempdir()) / "zsim-tests-cache"  # kept between runs, as a user's is
 PUSH_S = 180.0  # wall time for two installations on a loaded machine
@@ -81,7 +74,7 @@ def look(lab: Lab, hosts: Path, name: str, python: str) -> dict[str, Any]:
 
 def gather(lab: Lab, hosts: Path, *names: str) -> dict[str, WheelSet]:
     """Gather, outside of the lab where there is an index, what `zsim push` needs inside."""
-    wanted = processes.needed_extras(inventory.load(hosts).inventory)
+    wanted = inventory.needed_extras(inventory.load(hosts).inventory)
     found = parse_interpreters(over_ssh(lab, hosts, names[0], "sh", "-c", interpreter_query()))
     python = choose_interpreter(names[0], found, sys.version_info[:2]).path
     printed = look(lab, hosts, names[0], python)

@@ -25,8 +25,8 @@ from wire import PATIENCE_S
 
 from zsim.record import RecordReader
 from zsim.scenario import scenario_file
-from zsim_deploy.inventory import inventory
-from zsim_deploy.render import compose, kubernetes, systemd
+from zsim_deploy import inventory
+from zsim_deploy.render import STATE, STOP_S, compose, kubernetes, systemd
 
 ROOT = Path(__file__).parents[2]
 STEP = ROOT / "scenarios/step.yaml"
@@ -52,7 +52,7 @@ def rendered(folder: Path, target: str, insecure: bool = False, text: str = HOST
     """Write what a target renders into a folder; return that."""
     hosts = folder / "hosts.yaml"
     hosts.write_text(text + f"security: {{insecure: {str(insecure).lower()}}}\n")
-    render = {"systemd": systemd.render, "compose": compose.render, "kubernetes": kubernetes.render}[target]
+    render = {"systemd": systemd, "compose": compose, "kubernetes": kubernetes}[target]
     out = folder / target
     for name, content in render(inventory.load(hosts), scenario_file.load(scenario)).items():
         (out / name).parent.mkdir(parents=True, exist_ok=True)
@@ -192,7 +192,7 @@ def units(out: Path, state: Path) -> Iterator[Unit]:
     """Yield the units of all hosts; `state` is in the place of StateDirectory=."""
     for path in sorted(out.glob("*/*.service")):
         (line,) = re.findall(r"^ExecStart=(.*)$", path.read_text(), re.MULTILINE)
-        line = line.replace(systemd.STATE, str(state))
+        line = line.replace(STATE, str(state))
         words = [word.replace("%%", "%") for word in shlex.split(line.replace(":", "", 1))]
         yield Unit(path.stem.removeprefix("zsim-"), words)
 
@@ -302,4 +302,4 @@ def test_a_world_ends_by_the_signal_of_its_unit(tmp_path: Path) -> None:
         assert any("tcp/127.0.0.1:" in line for line in world.stdout)
         world.terminate()
         assert "ended: terminated" in world.stdout.read()
-        assert world.wait(systemd.STOP_S) == 0
+        assert world.wait(STOP_S) == 0

@@ -22,7 +22,7 @@ from secured import Certificates, tls_endpoint
 from zsim.scenario import scenario_file
 from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.ros_types import RosTypes
-from zsim_deploy.inventory.enrolment import access_control
+from zsim_deploy.certificates import access_control
 
 TWIST, EMPTY = "geometry_msgs/msg/Twist", "std_msgs/msg/Empty"
 IMAGE, CAMERAS = "sensor_msgs/msg/CompressedImage", ("ardrone/", "ardrone/front/", "ardrone/bottom/")

@@ -14,7 +14,7 @@ from zsim.contract.run_messages import Join
 from zsim.scenario import scenario_file
 from zsim.transport import connection
 from zsim.transport.link_watch import Awaited
-from zsim_deploy.inventory.enrolment import access_control
+from zsim_deploy.certificates import access_control
 from zsim_deploy.roles.router_links import RouterLinks
 
 ESTIMATOR, GATE_NS = "estimator.drone1", 20_000_000

@@ -10,7 +10,7 @@ from refused import has_terms
 from secured import Certificates, KeyLog, RawClient, tls_endpoint
 
 from zsim.scenario import scenario_file
-from zsim_deploy.inventory.enrolment import access_control
+from zsim_deploy.certificates import access_control
 
 EYES = ONE.replace("sensors: {preset: paper}", "sensors: {preset: paper, front_camera: {rate_hz: 10}}")
 LET_IN = ("camera.drone1", "detector.drone1", "operator.main")

@@ -23,7 +23,7 @@ from zsim.scenario import rights, scenario_file
 from zsim.scenario.rights import permits
 from zsim.transport import connection
 from zsim.transport.tls import Identity, peer_fault
-from zsim_deploy.inventory.enrolment import access_control
+from zsim_deploy.certificates import access_control
 
 WAYS = ("at the world", "through a router")
 TOKENS = tuple(key for key in KEYS if key.startswith("process/") and key.count("/") == 1)

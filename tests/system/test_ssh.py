@@ -10,15 +10,15 @@ from refused import has_terms
 from sshd import make_key
 
 from zsim.errors import HostsError
-from zsim_deploy.hosts import ssh_connection
-from zsim_deploy.inventory import inventory
-from zsim_deploy.inventory.inventory import Host
+from zsim_deploy import inventory
+from zsim_deploy.hosts import host_link
+from zsim_deploy.inventory import Host
 
 
 def refusal(lab: Lab, base: Path, host: Host) -> str:
     """Return what is said of a host that cannot be connected to."""
     with lab.inside(LAUNCHER), pytest.raises(HostsError) as caught:
-        asyncio.run(ssh_connection.connect("h1", host, base))
+        asyncio.run(host_link.connect("h1", host, base))
     return str(caught.value)
 
 
@@ -53,7 +53,7 @@ def test_each_refusal_is_a_line(lab: Lab, tmp_path: Path) -> None:
 
 
 def test_a_host_that_does_not_answer_is_a_line(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ssh_connection, "CONNECT_S", 0.5)
+    monkeypatch.setattr(host_link, "CONNECT_S", 0.5)
     lab.cut("h1")
     line = refusal(lab, lab.folder, given(lab))
     assert has_terms(line, "h1: ", f"{lab.address('h1')} port {inventory.SSH_PORT}", "0.5 s")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from zsim_deploy.cli import record_commands
+from zsim_deploy.cli import run_commands
 
 ROOT = Path(__file__).parents[2]
 
@@ -18,5 +18,5 @@ def test_a_gate_is_defined_where_it_is_first_read(page: str) -> None:
 
 
 def test_a_run_that_counts_gates_says_what_one_is(capsys: pytest.CaptureFixture[str]) -> None:
-    assert record_commands._fault_of(True, "complete: 10 gates", []) == ""
+    assert run_commands._fault_of(True, "complete: 10 gates", []) == ""
     assert "gate: an instant" in capsys.readouterr().out

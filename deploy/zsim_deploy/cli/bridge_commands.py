@@ -1,23 +1,20 @@
-"""`zsim console`, `gateway`, `ros1` and `ros2`: the processes that show a run, and translate it for other programs."""
+"""The processes that show a run, and translate it: `console`, `gateway`, `ros1`, `ros2`, `mavlink` and `ardrone`."""
 
+import math
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from typer import Argument, BadParameter, Option
 
-from zsim.errors import RunError, SessionError, printable
+from zsim.errors import RunError, SessionError
+from zsim_bridges.ardrone.server.addresses import FIRST_ADDRESS
 from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
-from zsim_deploy.arguments import (
-    CONSOLE_NEEDS,
-    CONSOLE_PORT,
-    LOOK_S,
-    WorldAccess,
-    participant_options,
-    positive,
-    require,
-)
+from zsim_deploy import arguments as opt
+from zsim_deploy.arguments import file_fault, require, say
+from zsim_deploy.cli.role_commands import serve_as
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -25,80 +22,89 @@ if TYPE_CHECKING:
     from zsim.contract.messages import Info
     from zsim.transport.session import Session
     from zsim.transport.tls import Identity
+    from zsim_bridges.vehicle_links.flight_limits import FlightLimits
 
-OPERATE, TRANSLATE = "Watch and steer", "Others come in"  # panels of the help
 TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everybody on the machine
 DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID that ROS 2 takes
-
-GATEWAY_NEEDS = {"gateway": ("aiohttp",)}  # modules by extra
+KEY_BYTES = 32
+GCS_PORT, GCS_LOCAL_PORT = 14550, 18570  # PX4's simulation: to the ground station, and the first port here
+API_PORT, API_LOCAL_PORT = 14540, 14580  # likewise for programs
+GATEWAY_NEEDS = {"gateway": ("aiohttp",)}
 ROS1_NEEDS = {"ros1": ("rosbags",)}
 ROS2_NEEDS = {"ros2": ("rosbags", "xxhash")}
 
 app = typer.Typer()
+mavlink = typer.Typer(
+    name="mavlink", no_args_is_help=True, help="MAVLink: the drones of a run as vehicles of PX4 or ArduPilot."
+)
+ardrone = typer.Typer(name="ardrone", help="Programs for the AR.Drone fly drones of a run.", no_args_is_help=True)
+
+PaceAsked = Annotated[
+    float | None,
+    Option(callback=opt.positive, help="Simulated per wall second, asked of the world.", show_default=False),
+]
+SigningKey = Annotated[
+    Path | None, Option(help="File with the key of MAVLink 2 signatures; unsigned messages are refused.")
+]
 
 
-@app.command(rich_help_panel=OPERATE)
-@participant_options
+@app.command(rich_help_panel=opt.WATCH)
+@opt.participant_options
 def console(
-    reach: WorldAccess,
-    listen: Annotated[str, typer.Option(help="Address on which the page is served.")] = "127.0.0.1",
+    reach: opt.WorldAccess,
+    listen: Annotated[str, Option(help="Address on which the page is served.")] = "127.0.0.1",
     port: Annotated[
         int | None,
-        typer.Option(
-            help=f"Port of the page ({CONSOLE_PORT}, or another where that is taken).",
+        Option(
             min=1,
-            max=65535,
+            max=opt.PORT_MAX,
+            help=f"Port of the page ({opt.CONSOLE_PORT}, or another where that is taken).",
             show_default=False,
         ),
     ] = None,
-    token: Annotated[
-        str | None, typer.Option(envvar=TOKEN, help="What operators must show; needed off loopback.")
-    ] = None,
+    token: Annotated[str | None, Option(envvar=TOKEN, help="What operators must show; needed off loopback.")] = None,
     rate_hz: Annotated[
         float | None,
-        typer.Option(
-            callback=positive, help="Pictures a second (20; 10 from 20 drones or 4 × real time on).", show_default=False
+        Option(
+            callback=opt.positive,
+            help="Pictures a second (20; 10 from 20 drones or 4 × real time on).",
+            show_default=False,
         ),
     ] = None,
-    name: Annotated[
-        str,
-        typer.Option(help="Process name (default the certificate's, or console.1, .2, …)."),
-    ] = "",
+    name: Annotated[str, Option(help="Process name (default the certificate's, or console.1, .2, …).")] = "",
     folder: Annotated[
-        Path | None, typer.Option(help="Folder of the run, named on the page when it is over.", show_default=False)
+        Path | None, Option(help="Folder of the run, named on the page when it is over.", show_default=False)
     ] = None,
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
-    require("console", CONSOLE_NEEDS)
+    require("console", opt.CONSOLE_NEEDS)
     from zsim.runtime.progress import JsonProgress
     from zsim.transport.open_files import SERVER_FILES, require_files
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.server.http_proxy import ListenAddress
     from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import log_printer, serve_runs
+    from zsim_deploy.roles.roles import log_printer
 
     # Of normal priority: an operator's emergency goes through it, and one that gave way would be reported as silent.
     own_name = process_name("console", name, reach.who, "*")
-    say = JsonProgress().say if reach.launched else log_printer(None)
+    tell = JsonProgress().say if reach.launched else log_printer(None)
     require_files(SERVER_FILES, "a console and its pages")
     world = f"federation {reach.federation!r} on {reach.endpoint}"
-    address = ListenAddress(listen, port or CONSOLE_PORT, or_any=port is None)
-    shown = Console(address, own_name.removesuffix(".*"), token, rate_hz, say, world, folder)
+    address = ListenAddress(listen, port or opt.CONSOLE_PORT, or_any=port is None)
+    shown = Console(address, own_name.removesuffix(".*"), token, rate_hz, tell, world, folder)
     with shown.open():
-        serve_runs(own_name, shown.serve, reach, remain=shown.remain)
+        serve_as("console", own_name, shown.serve, reach, remain=shown.remain)
 
 
-@app.command(rich_help_panel=TRANSLATE)
-@participant_options
+@app.command(rich_help_panel=opt.TRANSLATE)
+@opt.participant_options
 def gateway(
-    reach: WorldAccess,
-    listen: Annotated[str, typer.Option(help="Address on which clients come in.")] = "127.0.0.1",
-    http: Annotated[int, typer.Option(help="Port of HTTP and WebSocket.", min=1, max=65535)] = 8000,
-    lines: Annotated[int, typer.Option(help="Port of JSON lines on TCP.", min=1, max=65535)] = 7470,
-    token: Annotated[
-        str | None, typer.Option(envvar=TOKEN, help="What clients must show; needed off loopback.")
-    ] = None,
-    name: Annotated[str, typer.Option(help="Process name (default gateway.main, or the certificate's).")] = "",
+    reach: opt.WorldAccess,
+    listen: Annotated[str, Option(help="Address on which clients come in.")] = "127.0.0.1",
+    http: Annotated[int, Option(min=1, max=opt.PORT_MAX, help="Port of HTTP and WebSocket.")] = 8000,
+    lines: Annotated[int, Option(min=1, max=opt.PORT_MAX, help="Port of JSON lines on TCP.")] = 7470,
+    token: Annotated[str | None, Option(envvar=TOKEN, help="What clients must show; needed off loopback.")] = None,
+    name: Annotated[str, opt.process_option("gateway.main")] = "",
 ) -> None:
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     require("gateway", GATEWAY_NEEDS)
@@ -108,21 +114,20 @@ def gateway(
     from zsim_bridges.web.http_connections import CONNECTIONS_MAX
     from zsim_deploy.roles.priority import lower_priority
     from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import log_printer, serve_runs
+    from zsim_deploy.roles.roles import log_printer
 
-    lower_priority()
-    who = reach.who
+    lower_priority()  # before its threads are started
     own_name = process_name("gateway", name, reach.who)
 
     def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
-        return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_client_identity(who, process))
+        return find_world(reach.endpoint, reach.federation, opt.LOOK_S, identity=_client_identity(reach.who, process))
 
     require_files(SERVER_FILES, "a gateway and its clients")
     allow_files(SERVER_FILES + CONNECTIONS_MAX + CLIENTS_MAX)
     ports = GatewayPorts(listen, http, lines)
     served = Gateway(ports, own_name, token, connect_as, log_printer(reach.launched), secured=reach.tls is not None)
     with served.open():
-        serve_runs(own_name, served.serve, reach)
+        serve_as("gateway", own_name, served.serve, reach)
 
 
 def _client_identity(who: "Identity", process: str) -> "Identity":
@@ -137,48 +142,46 @@ def _client_identity(who: "Identity", process: str) -> "Identity":
     return who._replace(tls=folder, process=process)
 
 
-@app.command(rich_help_panel=TRANSLATE)
-@participant_options
+# ROS
+
+
+@app.command(rich_help_panel=opt.TRANSLATE)
+@opt.participant_options
 def ros1(
-    reach: WorldAccess,
-    master: Annotated[str, typer.Option(envvar="ROS_MASTER_URI", help="The ROS master.")] = DEFAULT_MASTER,
+    reach: opt.WorldAccess,
+    master: Annotated[str, Option(envvar="ROS_MASTER_URI", help="The ROS master.")] = DEFAULT_MASTER,
     ros_host: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--ros-host",
             "--ip",
             help="Name or address under which ROS nodes reach this host (default $ROS_HOSTNAME, $ROS_IP, or found).",
         ),
     ] = None,
-    name: Annotated[str, typer.Option(help="Process name (default ros1.main, or the certificate's).")] = "",
+    name: Annotated[str, opt.process_option("ros1.main")] = "",
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     require("ros1", ROS1_NEEDS)
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
-    from zsim_deploy.roles.priority import lower_priority
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import serve_runs
 
-    lower_priority()
-    own_name = process_name("ros1", name, reach.who)
     bridge = partial(serve, master_uri=master, host=ros_host or own_address(master))
     try:
-        serve_runs(own_name, bridge, reach)
+        serve_as("ros1", name, bridge, reach, lowered=True)
     except NodeShutdownError as error:
-        print(printable(str(error)))
+        say(str(error))
 
 
-@app.command(rich_help_panel=TRANSLATE)
-@participant_options
+@app.command(rich_help_panel=opt.TRANSLATE)
+@opt.participant_options
 def ros2(
-    reach: WorldAccess,
-    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=DOMAIN_MAX, help="ROS_DOMAIN_ID.")] = 0,
+    reach: opt.WorldAccess,
+    domain: Annotated[int, Option(envvar="ROS_DOMAIN_ID", min=0, max=DOMAIN_MAX, help="ROS_DOMAIN_ID.")] = 0,
     router: Annotated[
-        str | None, typer.Option(help="Where ROS's own router (rmw_zenohd) listens; the world's hub if not given.")
+        str | None, Option(help="Where ROS's own router (rmw_zenohd) listens; the world's hub if not given.")
     ] = None,
-    name: Annotated[str, typer.Option(help="Process name (default ros2.main, or the certificate's).")] = "",
+    name: Annotated[str, opt.process_option("ros2.main")] = "",
     write_package: Annotated[
-        Path | None, typer.Option(help="Only write the ROS package zsim_msgs into this folder, for a ROS workspace.")
+        Path | None, Option(help="Only write the ROS package zsim_msgs into this folder, for a ROS workspace.")
     ] = None,
 ) -> None:
     """Show the drones to ROS 2 (RMW_IMPLEMENTATION=rmw_zenoh_cpp) as topics and services, without ROS here."""
@@ -188,19 +191,14 @@ def ros2(
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
-    from zsim_deploy.roles.priority import lower_priority
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"
-        raise typer.BadParameter(f"--tls needs --router, the endpoint of a rmw_zenohd: {why}")
-    lower_priority()
+        raise BadParameter(f"--tls needs --router, the endpoint of a rmw_zenohd: {why}")
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
     network = RosNetwork(domain, router, to_router)
-    own_name = process_name("ros2", name, reach.who)
-    serve_runs(own_name, partial(serve, network=network, wall_ns=time.time_ns), reach)
+    serve_as("ros2", name, partial(serve, network=network, wall_ns=time.time_ns), reach, lowered=True)
 
 
 def _write_package(folder: Path) -> None:
@@ -211,12 +209,224 @@ def _write_package(folder: Path) -> None:
     """
     from zsim_bridges.ros2.ros_types import PACKAGE
 
-    try:
+    with file_fault(folder, "cannot be written", "give --write-package another folder"):
         for name, text in PACKAGE.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
-    except OSError as error:
-        why = f"cannot be written ({error.strerror}); give --write-package another folder"
-        raise RunError(f"{folder}: {why}") from error
-    print(printable(f"wrote {folder}; build it with colcon in a ROS workspace"))
+    say(f"wrote {folder}; build it with colcon in a ROS workspace")
+
+
+# MAVLink
+
+
+@mavlink.command("serve")
+@opt.participant_options
+def serve_mavlink(
+    reach: opt.WorldAccess,
+    autopilot: Annotated[Literal["px4", "ardupilot"], Option(help="Whose modes and parameters.")] = "px4",
+    gcs: Annotated[str, Option(help="The ground station, HOST:PORT.")] = f"127.0.0.1:{GCS_PORT}",
+    api: Annotated[
+        str | None, Option(help=f"Programs, HOST:PORT of the first; +1 each (default 127.0.0.1:{API_PORT}).")
+    ] = None,
+    listen: Annotated[str, Option(help="Address on which the vehicles' ports are opened.")] = "127.0.0.1",
+    gcs_local: Annotated[
+        int | None,
+        Option(
+            min=1,
+            max=opt.PORT_MAX,
+            help=f"First port that talks with the ground station; +1 each (default {GCS_LOCAL_PORT}).",
+        ),
+    ] = None,
+    api_local: Annotated[
+        int | None,
+        Option(
+            min=1, max=opt.PORT_MAX, help=f"First port that talks with programs; +1 each (default {API_LOCAL_PORT})."
+        ),
+    ] = None,
+    first_system_id: Annotated[
+        int, Option(min=1, max=254, help="Of the first drone; +1 each. The default ports move with it.")
+    ] = 1,
+    signing_key: SigningKey = None,
+    rate: PaceAsked = None,
+    telemetry: Annotated[Literal["normal", "full"], Option(help="Rates of the messages.")] = "normal",
+    protocol: Annotated[int, Option(min=1, max=2, help="Version of MAVLink that is sent; both are read.")] = 2,
+    name: Annotated[str, opt.process_option("mavlink.main")] = "",
+) -> None:
+    """Offer each drone as a vehicle: QGroundControl, MAVSDK, DroneKit, MAVProxy fly it."""
+    from zsim_bridges.mavlink.serve.mavlink_server import MavlinkOptions, serve
+
+    ahead = first_system_id - 1  # as of PX4's simulation, whose ports go by the system id too
+    options = MavlinkOptions(
+        autopilot=autopilot,
+        level=telemetry,
+        listen=listen,
+        gcs=_endpoint("--gcs", gcs, listen),
+        gcs_local=gcs_local or GCS_LOCAL_PORT + ahead,
+        api=_endpoint("--api", api or f"127.0.0.1:{API_PORT + ahead}", listen),
+        api_local=api_local or API_LOCAL_PORT + ahead,
+        key=read_key(signing_key) if signing_key else None,
+        version=1 if protocol == 1 else 2,
+        rate=rate,
+        first_system_id=first_system_id,
+    )
+    if options.key and options.version == 1:
+        raise BadParameter("--signing-key needs MAVLink 2; leave out --protocol 1")
+    serve_as("mavlink", name, partial(serve, options=options), reach)
+
+
+def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
+    """Return the address of HOST:PORT."""
+    from socket import gaierror, gethostbyname
+
+    from zsim_bridges.web.loopback import is_loopback
+
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) <= opt.PORT_MAX:
+        raise BadParameter(f"{option} is {text!r}; must be HOST:PORT")
+    try:
+        address = gethostbyname(host)
+    except (gaierror, UnicodeError) as error:
+        raise BadParameter(f"{option} is {text!r}; {host} is no host that is known here") from error
+    if is_loopback(listen) and not is_loopback(address):
+        raise BadParameter(f"{option} is {text!r}, which {listen} does not reach; give --listen an address")
+    return address, int(port)
+
+
+def read_key(path: Path) -> bytes:
+    """Return the key in a file: 32 bytes, 64 hexadecimal digits, or a passphrase, whose SHA-256 it is.
+
+    Raises:
+        RunError: the file cannot be read, or is empty.
+    """
+    from hashlib import sha256
+
+    with file_fault(path, "cannot be read", "give --signing-key a file with the key"):
+        content = path.read_bytes()
+    if len(content) == KEY_BYTES:
+        return content
+    text = content.strip()
+    if not text:
+        allowed = f"{KEY_BYTES} bytes, {2 * KEY_BYTES} hexadecimal digits, or a passphrase"
+        raise RunError(f"{path}: is empty; must hold {allowed}")
+    try:
+        key = bytes.fromhex(text.decode())
+    except ValueError:
+        return sha256(text).digest()
+    return key if len(key) == KEY_BYTES else sha256(text).digest()
+
+
+# AR.Drone
+
+
+@ardrone.command("serve")
+@opt.participant_options
+def serve_ardrone(
+    reach: opt.WorldAccess,
+    addresses: Annotated[
+        str, Option(help="Address of the first drone, the others follow it; or DRONE=ADDRESS,DRONE=ADDRESS.")
+    ] = FIRST_ADDRESS,
+    peer: Annotated[
+        list[str] | None,
+        Option(help="Host that is obeyed on addresses that are not loopback. Repeatable.", show_default=False),
+    ] = None,
+    rate: PaceAsked = None,
+    name: Annotated[str, opt.process_option("ardrone.main")] = "",
+) -> None:
+    """Offer each drone as an AR.Drone 2.0 on an address of its own."""
+    from zsim_bridges.ardrone.server.addresses import peer_addresses
+    from zsim_bridges.ardrone.server.ardrone_server import ArdroneOptions, serve
+
+    options = ArdroneOptions(addresses, peer_addresses(peer or ()), rate)
+    serve_as("ardrone", name, partial(serve, options=options), reach)
+
+
+# Real aircraft
+
+
+DroneName = Annotated[str, Argument(help="The drone of the run that it is; `body: external` in the scenario.")]
+Armed = Annotated[bool, Option("--armed", help="Obey from the start; else an operator asks `arm` first.")]
+Speed = Annotated[float, Option(callback=opt.positive, help="Greatest horizontal speed, m/s.")]
+Climb = Annotated[float, Option(callback=opt.positive, help="Greatest vertical speed, m/s.")]
+Radius = Annotated[float | None, Option(callback=opt.positive, help="Fence about the origin of W, m.")]
+Ceiling = Annotated[float | None, Option(callback=opt.positive, help="Greatest height over the origin of W, m.")]
+
+
+def _bounds(
+    armed: bool, speed: float, climb: float, radius: float | None, ceiling: float | None
+) -> "tuple[FlightLimits, bool]":
+    """Return within what a driver flies, and whether it obeys from the start."""
+    from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+
+    radius_m, ceiling_m = (math.inf if limit is None else limit for limit in (radius, ceiling))
+    return FlightLimits(speed, climb, radius_m=radius_m, ceiling_m=ceiling_m), armed
+
+
+driver_options = opt.option_group(
+    "bounds",
+    _bounds,
+    {
+        "armed": (Armed, False),
+        "speed": (Speed, 2.0),
+        "climb": (Climb, 1.0),
+        "radius": (Radius, None),
+        "ceiling": (Ceiling, None),
+    },
+)
+
+
+@mavlink.command("drive")
+@opt.participant_options
+@driver_options
+def drive_mavlink(
+    reach: opt.WorldAccess,
+    bounds: "tuple[FlightLimits, bool]",
+    drone: DroneName,
+    address: Annotated[str, Argument(help="UDP port of the vehicle: udp://HOST:PORT.")],
+    local_port: Annotated[int, Option(min=0, max=opt.PORT_MAX, help="UDP port here; 0 for any.")] = 0,
+    system: Annotated[int, Option(min=0, max=255, help="Its system id; 0 for the first that shows itself.")] = 0,
+    signing_key: SigningKey = None,
+    origin: Annotated[
+        str | None, Option(help="Where its local frame begins, X,Y,Z m in W (default: as it says).")
+    ] = None,
+) -> None:
+    """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
+    from zsim_bridges.mavlink.mavlink_driver import drive
+    from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_host, position, udp_channel
+
+    options = DriverOptions(drone, *bounds, position(origin) if origin else None, None)
+    channel = udp_channel(address, local_port)
+    check_host(channel.host)
+    key = read_key(signing_key) if signing_key else None
+    serve = partial(drive, options=options, channel=channel, system=system, key=key)
+    serve_as("driver", "", serve, reach, drone)
+
+
+@ardrone.command("drive")
+@opt.participant_options
+@driver_options
+def drive_ardrone(
+    reach: opt.WorldAccess,
+    bounds: "tuple[FlightLimits, bool]",
+    drone: DroneName,
+    address: Annotated[str, Argument(help="Address of the aircraft, such as 192.168.1.12.")],
+    origin: Annotated[
+        str | None, Option(help="Where it stands at the start, X,Y,Z m in W (default: the scenario's place).")
+    ] = None,
+    yaw: Annotated[
+        float | None,
+        Option(callback=opt.finite, help="Its heading at the start, deg from east (default: by its magnetometer)."),
+    ] = None,
+    ultrasound: Annotated[
+        int, Option(min=7, max=8, help="Of its sonar, 7 or 8; neighbours that differ disturb each other less.")
+    ] = 8,
+) -> None:
+    """Let an AR.Drone 2.0 fly as a drone of the run."""
+    from zsim_bridges.ardrone.ardrone_driver import drive
+    from zsim_bridges.ardrone.drive.aircraft_session import AircraftSettings
+    from zsim_bridges.vehicle_links.driver_options import DriverOptions, aircraft_host, check_host, position
+
+    options = DriverOptions(drone, *bounds, position(origin) if origin else None, yaw)
+    check_host(aircraft_host(address))
+    settings = AircraftSettings(ultrasound=ultrasound)
+    serve_as("driver", "", partial(drive, options=options, address=address, settings=settings), reach, drone)

@@ -9,35 +9,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, BadParameter, Option
 
-from zsim.errors import printable
 from zsim_deploy import INTERRUPTED
-from zsim_deploy.arguments import Trust, WorldAccess, observer_options, positive
-from zsim_deploy.cli.record_commands import note_skipped
+from zsim_deploy.arguments import POKE, Trust, WorldAccess, failed, note, observer_options, positive, say
+from zsim_deploy.cli.run_commands import note_skipped
 
 if TYPE_CHECKING:
     from zsim.contract.messages import Info
     from zsim.contract.run_messages import Fault
-    from zsim.scenario.fault_kinds import FaultKind
     from zsim.transport.session import Session
 
-PANEL = "Look and poke"
+SOURCE = "zsim.fault"
+ALL = "all"
 
 app = typer.Typer()
 faults = typer.Typer(
     name="fault", help="Inject faults into a running federation, and clear them.", no_args_is_help=True
 )
 
-SOURCE = "zsim.fault"
-ALL = "all"
 
-
-@app.command(rich_help_panel=PANEL)
+@app.command(rich_help_panel=POKE)
 @observer_options
 def keys(
     reach: WorldAccess,
     expression: Annotated[
-        str, typer.Argument(metavar="[KEY]", help="Only these, e.g. 'drone/drone1/**'.", show_default=False)
+        str, Argument(metavar="[KEY]", help="Only these, e.g. 'drone/drone1/**'.", show_default=False)
     ] = "**",
 ) -> None:
     """List the keys in use, with their message and how many came in a second."""
@@ -46,19 +43,19 @@ def keys(
     with connected(reach) as (link, _):
         found = inspection.list_keys(link, expression)
         for key, kind, count in found:
-            print(printable(f"{key:<36} {kind:<14} {count:>6}"))
+            say(f"{key:<36} {kind:<14} {count:>6}")
         if not found:
-            raise _failed(f"no key in use matches {expression}{inspection.keys_like(link, expression)}")
+            raise failed(f"no key in use matches {expression}{inspection.keys_like(link, expression)}")
 
 
-@app.command(rich_help_panel=PANEL)
+@app.command(rich_help_panel=POKE)
 @observer_options
 def echo(
     reach: WorldAccess,
-    key: Annotated[str, typer.Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")],
-    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
-    raw: Annotated[bool, typer.Option("--raw", help="Payload as hexadecimal digits.")] = False,
-    timeout: Annotated[float | None, typer.Option(callback=positive, help="Stop after so many seconds.")] = None,
+    key: Annotated[str, Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")],
+    count: Annotated[int | None, Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
+    raw: Annotated[bool, Option("--raw", help="Payload as hexadecimal digits.")] = False,
+    timeout: Annotated[float | None, Option(callback=positive, help="Stop after so many seconds.")] = None,
 ) -> None:
     """Print the messages on a key as JSON lines; exit code 1 where --timeout is over and they have not come."""
     from zsim_deploy.cli import inspection
@@ -67,56 +64,56 @@ def echo(
         print(json.dumps({"key": name, "message": message}), flush=True)
 
     with connected(reach) as (link, _):
-        came = inspection.echo(link, key, count, emit, raw, timeout or math.inf, _note)
+        came = inspection.echo(link, key, count, emit, raw, timeout or math.inf, note)
     if came < (count or 1):
-        raise _failed(f"{came or 'no'} messages on {key} within {timeout:g} s")
+        raise failed(f"{came or 'no'} messages on {key} within {timeout:g} s")
 
 
-@app.command(rich_help_panel=PANEL)
+@app.command(rich_help_panel=POKE)
 @observer_options
 def hz(
     reach: WorldAccess,
-    key: Annotated[str, typer.Argument(help="Key or expression.")],
-    window: Annotated[int, typer.Option(help="Messages that the rate is taken over.", min=2, max=1_000_000)] = 1000,
-    seconds: Annotated[float | None, typer.Option(callback=positive, help="Stop after so many seconds.")] = None,
+    key: Annotated[str, Argument(help="Key or expression.")],
+    window: Annotated[int, Option(help="Messages that the rate is taken over.", min=2, max=1_000_000)] = 1000,
+    seconds: Annotated[float | None, Option(callback=positive, help="Stop after so many seconds.")] = None,
 ) -> None:
     """Print how often messages come on a key, in wall and in simulated time."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
-        came = inspection.hz(link, key, window, seconds or math.inf, lambda line: print(printable(line), flush=True))
+        came = inspection.hz(link, key, window, seconds or math.inf, say)
     if not came:
-        raise _failed(f"no message on {key} within {seconds:g} s")
+        raise failed(f"no message on {key} within {seconds:g} s")
 
 
-@app.command(rich_help_panel=PANEL)
+@app.command(rich_help_panel=POKE)
 @observer_options
 def pub(
     reach: WorldAccess,
-    key: Annotated[str, typer.Argument(help="Key, e.g. drone/drone1/cmd/velocity.")],
-    message: Annotated[str, typer.Argument(help='JSON, e.g. \'{"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}\'.')],
-    count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many times.")] = 1,
-    rate_hz: Annotated[float, typer.Option(callback=positive, max=1000, help="How often per wall second.")] = 10.0,
+    key: Annotated[str, Argument(help="Key, e.g. drone/drone1/cmd/velocity.")],
+    message: Annotated[str, Argument(help='JSON, e.g. \'{"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}\'.')],
+    count: Annotated[int, Option("--count", "-n", min=1, help="How many times.")] = 1,
+    rate_hz: Annotated[float, Option(callback=positive, max=1000, help="How often per wall second.")] = 10.0,
 ) -> None:
     """Send a command to a drone; t_ns, seq and source are filled in. Exit code 1 where the world refuses it."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, info):
         sent = inspection.publish(link, info, key, message, count, rate_hz)
-    print(printable(f"published {sent.sent} on {key}"))
+    say(f"published {sent.sent} on {key}")
     if sent.note:
-        _note(sent.note)
+        note(sent.note)
     if sent.refused:
-        raise _failed(f"refused {sent.refused} of {sent.sent}: {sent.reason}")
+        raise failed(f"refused {sent.refused} of {sent.sent}: {sent.reason}")
 
 
-@app.command(rich_help_panel=PANEL)
+@app.command(rich_help_panel=POKE)
 @observer_options
 def ask(
     reach: WorldAccess,
-    key: Annotated[str, typer.Argument(help="world/control or cluster/NAME/control.")],
-    op: Annotated[str, typer.Argument(help="E.g. pause, resume, step, stop; engage, hold, land, target.")],
-    args: Annotated[str, typer.Argument(help="JSON map, e.g. '{\"gates\": 50}'.")] = "{}",
+    key: Annotated[str, Argument(help="world/control or cluster/NAME/control.")],
+    op: Annotated[str, Argument(help="E.g. pause, resume, step, stop; engage, hold, land, target.")],
+    args: Annotated[str, Argument(help="JSON map, e.g. '{\"gates\": 50}'.")] = "{}",
 ) -> None:
     """Send a request to the world or a controller and print the answer. Exit code 1 where it is refused."""
     from zsim_deploy.cli import inspection
@@ -126,28 +123,13 @@ def ask(
     print("ok" if result is None else json.dumps(result))
 
 
-def _note(text: str) -> None:
-    print(printable(text), file=sys.stderr, flush=True)
-
-
-def _failed(text: str) -> typer.Exit:
-    """Print why a command ends with exit code 1; return the exception to raise."""
-    _note(text)
-    return typer.Exit(1)
-
-
 @contextmanager
 def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
     """Yield a session to the federation's hub, and the `world/info` of its run."""
     from zsim.transport.connection import find_world
 
-    def say(text: str) -> None:
-        print(printable(text), file=sys.stderr)
-
-    with find_world(reach.endpoint, reach.federation, reach.wait_s, say, reader=True, identity=reach.who) as (
-        link,
-        info,
-    ):
+    world = find_world(reach.endpoint, reach.federation, reach.wait_s, note, reader=True, identity=reach.who)
+    with world as (link, info):
         try:
             yield link, info
         except KeyboardInterrupt:  # the usual end of `zsim echo` and `zsim hz`
@@ -163,7 +145,7 @@ def seconds(text: str | None) -> float | None:
     try:
         return typed_duration_s(text)
     except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
+        raise BadParameter(str(error)) from None
 
 
 def _duration(text: str | None) -> str | None:
@@ -174,11 +156,11 @@ def _duration(text: str | None) -> str | None:
 
 For = Annotated[
     str | None,
-    typer.Option("--for", callback=_duration, help="E.g. 10s, 500ms, 2min; until it is cleared if not given."),
+    Option("--for", callback=_duration, help="E.g. 10s, 500ms, 2min; until it is cleared if not given."),
 ]
 At = Annotated[
     str | None,
-    typer.Option("--at", callback=_duration, help="Simulated time when it begins, e.g. 40s; now if not given."),
+    Option("--at", callback=_duration, help="Simulated time when it begins, e.g. 40s; now if not given."),
 ]
 
 
@@ -187,11 +169,11 @@ At = Annotated[
 def add(
     reach: WorldAccess,
     target: Annotated[
-        str, typer.Argument(help="Drone, link (a/b), process, cluster, or world: as the kind asks.", show_default=False)
+        str, Argument(help="Drone, link (a/b), process, cluster, or world: as the kind asks.", show_default=False)
     ],
-    kind: Annotated[str, typer.Argument(help="One of `zsim fault kinds`.", show_default=False)],
+    kind: Annotated[str, Argument(help="One of `zsim fault kinds`.", show_default=False)],
     parameters: Annotated[
-        list[str] | None, typer.Argument(help="NAME=VALUE, e.g. factor=3 or 'value_m=[2, 0, 0]'.", show_default=False)
+        list[str] | None, Argument(help="NAME=VALUE, e.g. factor=3 or 'value_m=[2, 0, 0]'.", show_default=False)
     ] = None,
     for_: For = None,
     at: At = None,
@@ -202,20 +184,20 @@ def add(
     with connected(reach) as (link, _):
         done = _ask(link, "fault_add", args)
     until = "until it is cleared" if done["until_ns"] is None else f"to {done['until_ns'] / 1e9:.2f} s"
-    print(printable(f"fault {done['id']}: {kind} of {target} from {done['from_ns'] / 1e9:.2f} s {until}"))
+    say(f"fault {done['id']}: {kind} of {target} from {done['from_ns'] / 1e9:.2f} s {until}")
 
 
 @faults.command()
 @observer_options
 def clear(
     reach: WorldAccess,
-    which: Annotated[str, typer.Argument(help="Number, target or kind of faults, or all.")] = ALL,
+    which: Annotated[str, Argument(help="Number, target or kind of faults, or all.")] = ALL,
 ) -> None:
     """End faults: all, or those of a number, a target or a kind."""
     with connected(reach) as (link, info):
         done = _ask(link, "fault_clear", selector(which, info.scenario))
     cleared = ", ".join(map(str, done["cleared"])) or "nothing: no fault was planned or acting"
-    print(printable(f"cleared {cleared}"))
+    say(f"cleared {cleared}")
 
 
 @faults.command("list")
@@ -228,18 +210,19 @@ def list_(reach: WorldAccess) -> None:
     with connected(reach) as (link, _):
         now_ns = max((messages.decode(keys.CLOCK, s.payload).t_ns for s in link.get(keys.CLOCK)), default=0)
         answers = [messages.decode(keys.FAULTS, sample.payload) for sample in link.get(keys.FAULTS)]
-    rows = [row(fault, now_ns) for message in answers for fault in message.faults if not _is_over(fault, now_ns)]
+    faults = [fault for message in answers for fault in message.faults]
+    rows = [row(fault, now_ns) for fault in faults if fault.until_ns is None or fault.until_ns > now_ns]
     if rows:
         kinds = ("figure", "figure", "name", "name", "figure", "text")
         print_table(FittedTable([Column("", kind) for kind in kinds], rows))
     else:
-        print("no fault is planned or acts", file=sys.stderr)
+        note("no fault is planned or acts")
 
 
 @faults.command()
 def kinds(
     scenario: Annotated[
-        Path | None, typer.Argument(help="A scenario, for the kinds of its users' sensors too.", show_default=False)
+        Path | None, Argument(help="A scenario, for the kinds of its users' sensors too.", show_default=False)
     ] = None,
     trust: Trust = False,
 ) -> None:
@@ -251,9 +234,14 @@ def kinds(
 
     with plugin.names_only(not trust) as skipped:
         own = declarations(scenario_file.load(scenario).drones) if scenario else {}
-    rows = [
-        (name, kind.strikes, "  ".join(_parameters(kind)) or "-") for name, kind in fault_kinds.kinds_of(own).items()
-    ]
+    rows = []
+    for name, kind in fault_kinds.kinds_of(own).items():
+        parameters = [
+            f"{parameter.name}: {fault_kinds.expected(parameter)}{'' if parameter.required else ' (may be left out)'}"
+            for parameter in kind.parameters
+        ]
+        needed = ["--for is needed"] if kind.lasts == "ends" else []
+        rows.append((name, kind.strikes, "  ".join([*parameters, *needed]) or "-"))
     print_table(FittedTable([Column("", "name"), Column(""), Column("", "text")], rows))
     note_skipped(skipped)
 
@@ -280,17 +268,6 @@ def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:
     return (str(fault.id), state, fault.target, fault.kind, times, parameters)
 
 
-def _is_over(fault: "Fault", now_ns: int) -> bool:
-    return fault.until_ns is not None and fault.until_ns <= now_ns
-
-
-def _parameters(kind: "FaultKind") -> list[str]:
-    from zsim.scenario.fault_kinds import expected
-
-    parameters = [f"{p.name}: {expected(p)}{'' if p.required else ' (may be left out)'}" for p in kind.parameters]
-    return [*parameters, *(["--for is needed"] if kind.lasts == "ends" else [])]
-
-
 def _values(parameters: Sequence[str]) -> dict[str, Any]:
     """Return the map that texts NAME=VALUE make; values are YAML."""
     from zsim.scenario.fault_kinds import typed_parameters
@@ -298,7 +275,7 @@ def _values(parameters: Sequence[str]) -> dict[str, Any]:
     try:
         return typed_parameters(parameters)
     except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
+        raise BadParameter(str(error)) from None
 
 
 def _ask(link: "Session", op: str, args: dict[str, Any]) -> dict[str, Any]:

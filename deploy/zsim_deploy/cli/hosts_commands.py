@@ -1,58 +1,122 @@
-"""The commands of a run on several hosts: push, doctor, up, ps, logs, restart, move, down."""
+"""The commands of a run on several hosts, from `zsim push` to `zsim down`, and `zsim certs` and `zsim render`."""
 
 import codecs
 import contextlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from zsim.errors import printable
-from zsim_deploy.arguments import HOSTS, REPORT_NEEDS, FlightOptions, Force, Insecure, flight_options, require
-from zsim_deploy.hosts.row_choice import RowChoice, RowOrder
+from zsim.errors import HostsError, RunError, printable
+from zsim.scenario.rights import ROUTER, WORLD
+from zsim.transport.tls import DAYS
+from zsim_deploy import arguments as opt
+from zsim_deploy.arguments import note, require, say
 
-app = typer.Typer()
+if TYPE_CHECKING:
+    from zsim_deploy.inventory import InventoryFile
 
-UP_NEEDS = {"hosts": ("asyncssh", "cryptography"), "record": ("mcap", "zstandard")}  # modules by extra
+UP_NEEDS = {"hosts": ("asyncssh", "cryptography"), "record": ("mcap", "zstandard")}
 EVERY = ""  # federation
 FOLLOW_S = 0.2  # between two looks at a log that is followed
+FIRST_OPERATOR = "main"
+DAYS_MIN = 0.05  # an hour, longer than a flight
+DAYS_MAX = 825.0  # what browsers took at most; CA/Browser Forum, ballot 193
+WARN = timedelta(days=3)  # before a certificate ends, when `show` warns
 
-Hosts = Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
-Federation = Annotated[str, typer.Option(help="Federation that is up.")]
+app = typer.Typer()
+certs = typer.Typer(name="certs", help="Make and show the certificates of a federation.", no_args_is_help=True)
+rendering = typer.Typer(
+    name="render", help="Write systemd units, compose files or manifests for an inventory.", no_args_is_help=True
+)
+
+Hosts = Annotated[Path, Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
+Inventory = Annotated[Path, Argument(help="Inventory (YAML): hosts and which role runs where.", show_default=False)]
+Federation = Annotated[str, Option(help="Federation that is up.")]
 Only = Annotated[
     list[str] | None,
-    typer.Option("--only", help="Only roles that match, or what they work for, or hosts: 'drone1*'. Repeatable."),
+    Option("--only", help="Only roles that match, or what they work for, or hosts: 'drone1*'. Repeatable."),
 ]
-Sort = Annotated[RowOrder | None, typer.Option("--sort", help="By what rows are sorted, the greatest figure first.")]
-Role = Annotated[str, typer.Argument(help="Process name, e.g. estimator.drone2.", show_default=False)]
+Sort = Annotated[opt.RowOrder | None, Option("--sort", help="By what rows are sorted, the greatest figure first.")]
+Role = Annotated[str, Argument(help="Process name, e.g. estimator.drone2.", show_default=False)]
 
 
-@flight_options
-def up(
-    flight: FlightOptions,
+@app.command(rich_help_panel=opt.HOSTS)
+def push(
     hosts: Hosts,
-    out: Annotated[Path | None, typer.Option(help="Folder of the run (default runs/NAME-TIME).")] = None,
-    insecure: Insecure = False,
-    report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
+    host: Annotated[list[str] | None, Option("--host", help="Only this host. Repeatable.")] = None,
+    extra: Annotated[
+        list[str] | None, Option("--extra", help="An extra beside those of the host's roles. Repeatable.")
+    ] = None,
+) -> None:
+    """Install zsim on the hosts, each with the extras that its roles need; they need ssh and Python, no internet."""
+    import asyncio
+
+    from zsim_deploy import inventory
+    from zsim_deploy.hosts.push import PushProgress, default_cache
+    from zsim_deploy.hosts.push import push as push_to
+
+    placed = inventory.load(hosts)
+    with PushProgress() as stages:
+        done = asyncio.run(push_to(placed, host or [], extra or [], stages.update, default_cache()))
+    changed = sum(done.values())
+    nothing = "nothing to do; all hosts have what they need"
+    say(f"installed on {changed} of {len(done)} hosts" if changed else nothing)
+
+
+@app.command(rich_help_panel=opt.HOSTS)
+def doctor(
+    hosts: Hosts,
+    scenario: Annotated[Path | None, Argument(help="Scenario whose roles are to be placed.")] = None,
+) -> None:
+    """Check every host: ssh, versions, clock, load, and how the hosts reach each other."""
+    from zsim.runtime.progress import PipedConsole
+    from zsim.scenario import scenario_file
+    from zsim_deploy import inventory
+    from zsim_deploy.hosts.doctor import check_hosts
+
+    placed = inventory.load(hosts)
+    places = inventory.placement(placed, scenario_file.load(scenario)) if scenario else None
+    result = check_hosts(placed, places)
+    console = PipedConsole()
+    for shown in result.tables:
+        console.print(shown)
+    for warning in result.warnings:
+        note(f"warning: {warning}")
+    if result.faults:
+        raise HostsError("\n".join(result.faults))
+    say("all hosts are ready")
+
+
+@app.command(rich_help_panel=opt.HOSTS)
+@opt.flight_options
+def up(
+    flight: opt.FlightOptions,
+    hosts: Hosts,
+    out: Annotated[Path | None, Option(help="Folder of the run (default runs/NAME-TIME).")] = None,
+    insecure: opt.Insecure = False,
+    report: opt.Report = True,
     only: Only = None,
     sort: Sort = None,
-    force: Force = False,
+    force: opt.Force = False,
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything.
 
     --only and --sort are of the table that is shown; every role is started whatever they are.
     """
-    require("up", UP_NEEDS | (REPORT_NEEDS if report else {}))
-    from zsim.scenario.rights import ROUTER
+    require("up", UP_NEEDS | (opt.REPORT_NEEDS if report else {}))
     from zsim.transport.open_files import host_launcher_files, require_files
-    from zsim_deploy.cli.record_commands import conclude
-    from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
-    from zsim_deploy.hosts.status_table import StatusTable
-    from zsim_deploy.inventory import inventory
+    from zsim_deploy import inventory
+    from zsim_deploy.cli.run_commands import conclude
+    from zsim_deploy.hosts.host_run import HostRun
+    from zsim_deploy.hosts.status_table import RowChoice, StatusTable
+    from zsim_deploy.launch.run_folder import make_directory, new_launch
 
     loaded = flight.scenario(elsewhere=True)
     placed = inventory.load(hosts)
@@ -64,53 +128,39 @@ def up(
     mode, pace = flight.mode_and_rate()
     count, hosts_count = len(inventory.roles(loaded)), len(placed.inventory.hosts)
     require_files(host_launcher_files(count, hosts_count), f"{count} processes on {hosts_count} hosts")
-    with _folder(out, loaded, force) as folder:
-        with StatusTable(loaded.duration_s, choice=choice) as status:
-            options = HostRunOptions(loaded, placed, folder, mode, pace, changed=flight.changed())
-            outcome = HostRun(options, status).run()
-        conclude(outcome, folder, report)
-
-
-@contextlib.contextmanager
-def _folder(out: Path | None, scenario: Any, force: bool) -> Iterator[Path]:
-    """Yield a folder for a run, which is removed again if the run was refused and nothing is in it."""
-    from zsim_deploy.launch.run_folder import make_directory
-
     was_there = out is not None and out.exists()
-    folder = make_directory(out, scenario, force)
+    folder = make_directory(out, loaded, force)
     try:
-        yield folder
+        with StatusTable(loaded.duration_s, choice=choice) as status:
+            launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()))
+            outcome = HostRun(loaded, placed, folder, launch, status).run()
+        conclude(outcome, folder, report)
     finally:
-        if not was_there:
+        if not was_there:  # and the run was refused: nothing is in it
             with contextlib.suppress(OSError):
                 folder.rmdir()
 
 
-def down(federation: Federation = "zsim") -> None:
-    """End the run that is up, on all hosts."""
-    from zsim_deploy.hosts import control_socket
-
-    control_socket.ask(federation, "down")
+# Of a run that is up
 
 
+@app.command(rich_help_panel=opt.HOSTS)
 def ps(
     roles: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[ROLE]...", help="The same as --only.", show_default=False),
+        list[str] | None, Argument(metavar="[ROLE]...", help="The same as --only.", show_default=False)
     ] = None,
     only: Only = None,
     sort: Sort = None,
-    federation: Annotated[str, typer.Option(help="Only runs of this federation.")] = EVERY,
-    as_json: Annotated[bool, typer.Option("--json", help="As a JSON line.")] = False,
+    federation: Annotated[str, Option(help="Only runs of this federation.")] = EVERY,
+    as_json: Annotated[bool, Option("--json", help="As a JSON line.")] = False,
 ) -> None:
     """Show the processes of the runs on this machine: role, host, pid, state, lag, age, messages/s, restarts.
 
     A narrow terminal shows fewer columns, --json all of them, in a line for each run.
     """
-    from zsim.errors import RunError
     from zsim.terminal.fitted_table import print_table
     from zsim_deploy.hosts import control_socket
-    from zsim_deploy.hosts.status_table import table
+    from zsim_deploy.hosts.status_table import RowChoice, table
 
     runs = []
     for name in control_socket.launchers():
@@ -127,36 +177,18 @@ def ps(
         if as_json:
             print(json.dumps(status))
         elif status["rows"]:
-            print(printable(_run_line(status)))
+            clock = status["clock"]
+            say(f"{status['out']}: {clock['t_s']:.1f} s, {clock['state']}" if clock else f"{status['out']}")
             print_table(table(status["rows"]))
 
 
-def _run_line(status: dict[str, Any]) -> str:
-    clock = status["clock"]
-    return f"{status['out']}: {clock['t_s']:.1f} s, {clock['state']}" if clock else f"{status['out']}"
-
-
-@contextlib.contextmanager
-def seen_by_ps(federation: str, status: Callable[[], dict[str, Any]]) -> Iterator[None]:
-    """Let `zsim ps` see a run of this process while it lasts; a machine without a place to listen goes without."""
-    from zsim.errors import RunError
-
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(RunError, ImportError):  # no such sockets on Windows
-            from zsim_deploy.hosts import control_socket
-
-            name = control_socket.of_run(federation)
-            stack.enter_context(control_socket.ControlSocket(name, {"ps": status}))
-        yield
-
-
+@app.command(rich_help_panel=opt.HOSTS)
 def logs(
     role: Role,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what is written from now on.")] = False,
+    follow: Annotated[bool, Option("--follow", "-f", help="Go on with what is written from now on.")] = False,
     federation: Federation = "zsim",
 ) -> None:
     """Print the log of a process of the run that is up; progress and events are shown by `zsim up` itself."""
-    from zsim.errors import RunError
     from zsim_deploy.hosts import control_socket
 
     where = control_socket.ask(federation, "where")
@@ -164,8 +196,16 @@ def logs(
         raise RunError(f"role is {role!r}; must be one of {', '.join(where['roles'])}")
     path = Path(where["out"]) / "logs" / f"{role}.log"
     if not path.exists():
-        print(printable(_silent(role)), file=sys.stderr)
-    for text in _written(path, follow, lambda: _is_up(federation, where["out"])):
+        shown = "its progress and events are shown by `zsim up`, and are in the record"
+        note(f"{role} has logged nothing; {shown}" if role == WORLD else f"{role} has logged nothing yet")
+
+    def goes_on() -> bool:
+        try:
+            return control_socket.ask(federation, "where")["out"] == where["out"]
+        except RunError:
+            return False
+
+    for text in _written(path, follow, goes_on):
         sys.stdout.write(printable(text))
         sys.stdout.flush()
 
@@ -187,94 +227,155 @@ def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[
         last = not goes_on()
 
 
-def _silent(role: str) -> str:
-    """Return why the log of a role is empty."""
-    from zsim.scenario.rights import WORLD
-
-    if role == WORLD:
-        return "world has logged nothing; its progress and events are shown by `zsim up`, and are in the record"
-    return f"{role} has logged nothing yet"
-
-
-def _is_up(federation: str, out: str) -> bool:
-    """Return whether the launcher of a federation still has the run of this folder."""
-    from zsim.errors import RunError
-    from zsim_deploy.hosts import control_socket
-
-    try:
-        return control_socket.ask(federation, "where")["out"] == out
-    except RunError:
-        return False
-
-
+@app.command(rich_help_panel=opt.HOSTS)
 def restart(role: Role, federation: Federation = "zsim") -> None:
     """Start a process of the run anew where it is; it takes over from its former self."""
     from zsim_deploy.hosts import control_socket
 
-    print(printable(f"restarting {control_socket.ask(federation, 'restart', role=role)}"))
+    say(f"restarting {control_socket.ask(federation, 'restart', role=role)}")
 
 
+@app.command(rich_help_panel=opt.HOSTS)
 def move(
     role: Role,
-    host: Annotated[str, typer.Argument(help="Host of the inventory.", show_default=False)],
+    host: Annotated[str, Argument(help="Host of the inventory.", show_default=False)],
     federation: Federation = "zsim",
 ) -> None:
     """Let another host run a process of the run from now on."""
     from zsim_deploy.hosts import control_socket
 
-    print(printable(f"moving {control_socket.ask(federation, 'move', role=role, host=host)}"))
+    say(f"moving {control_socket.ask(federation, 'move', role=role, host=host)}")
 
 
-def doctor(
-    hosts: Hosts,
-    scenario: Annotated[Path | None, typer.Argument(help="Scenario whose roles are to be placed.")] = None,
-) -> None:
-    """Check every host: ssh, versions, clock, load, and how the hosts reach each other."""
-    from zsim.errors import HostsError
-    from zsim.runtime.progress import PipedConsole
-    from zsim_deploy.hosts.doctor import check_hosts
-    from zsim_deploy.inventory import inventory
+@app.command(rich_help_panel=opt.HOSTS)
+def down(federation: Federation = "zsim") -> None:
+    """End the run that is up, on all hosts."""
+    from zsim_deploy.hosts import control_socket
 
-    placed = inventory.load(hosts)
-    result = check_hosts(placed, _placement(placed, scenario))
-    console = PipedConsole()
-    for shown in result.tables:
-        console.print(shown)
-    for warning in result.warnings:
-        print(printable(f"warning: {warning}"), file=sys.stderr)
-    if result.faults:
-        raise HostsError("\n".join(result.faults))
-    print("all hosts are ready")
+    control_socket.ask(federation, "down")
 
 
-def _placement(placed: Any, scenario: Path | None) -> dict[str, str] | None:
-    from zsim.scenario import scenario_file
-    from zsim_deploy.inventory import inventory
-
-    return inventory.placement(placed, scenario_file.load(scenario)) if scenario else None
+# Certificates
 
 
-def push(
-    hosts: Hosts,
-    host: Annotated[list[str] | None, typer.Option("--host", help="Only this host. Repeatable.")] = None,
-    extra: Annotated[
-        list[str] | None, typer.Option("--extra", help="An extra beside those of the host's roles. Repeatable.")
+@certs.command()
+def init(
+    hosts: Inventory,
+    scenario: Annotated[Path, Option(help="Scenario whose processes they are for.", show_default=False)],
+    set_: opt.Set = None,
+    operator: Annotated[
+        list[str] | None,
+        Option(help=f"NAME or NAME@HOST of who looks and commands, beside who is there ({FIRST_OPERATOR} at first)."),
     ] = None,
+    days: Annotated[float, Option(callback=opt.between(DAYS_MIN, DAYS_MAX), help="How long they are good for.")] = DAYS,
+    renew: Annotated[bool, Option("--renew", help="Make all of them anew, by the same authority.")] = False,
+    force: Annotated[bool, Option("--force", help="Make a new authority; nothing made before is good.")] = False,
 ) -> None:
-    """Install zsim on the hosts, each with the extras that its roles need; they need ssh and Python, no internet."""
-    import asyncio
+    """Make what is missing: authority, certificates, and access control for the world and the routers."""
+    from zsim_deploy import certificates, inventory
 
-    from zsim_deploy.inventory import inventory
-    from zsim_deploy.push.push import PushProgress, default_cache
-    from zsim_deploy.push.push import push as push_to
+    placed, now = inventory.load(hosts), datetime.now(UTC)
+    folder = certificates.folder_of(placed)
+    operators = [*(operator or ()), *certificates.operators(folder, placed.inventory.hosts)] or [FIRST_OPERATOR]
+    enrolment = certificates.Enrolment(placed, opt.load_scenario(scenario, set_, elsewhere=True), operators)
+    signer, wanted = certificates.authority(folder, now, force), enrolment.certificates()
+    lacking = [each for each in wanted if renew or certificates.renewal_reason(folder, signer.certificate, each, now)]
+    for each in lacking:
+        certificates.issue(folder, signer, each, now, days)
+    for host, process, rules in enrolment.access():
+        content = json.dumps(rules, indent=2) + "\n"
+        certificates.write(folder / host / f"{process}.access.json", content.encode())
+    _warn_of_exposed_keys(placed)
+    kept = len(wanted) - len(lacking)
+    say(f"{folder}: {len(lacking)} certificates made, {kept} kept; zsim certs show {hosts} lists them")
 
+
+@certs.command()
+def show(hosts: Inventory) -> None:
+    """List the certificates that are there: for whom, for which addresses, until when."""
+    from zsim.terminal.fitted_table import Column, FittedTable, print_table
+    from zsim_deploy import certificates, inventory
+
+    placed, now = inventory.load(hosts), datetime.now(UTC)
+    folder = certificates.folder_of(placed)
+    statuses = certificates.show(folder, now)
+    if not statuses:
+        raise RunError(f"{folder}: has no certificates; make them with `{certificates.init_command(placed)}`")
+    rows, over = [], False
+    for status in statuses:
+        soon = "ends soon" if status.until - now < WARN else ""
+        over = over or bool(soon) or certificates.EXPIRED in status.fault
+        until, addresses = f"{status.until:%Y-%m-%d %H:%M}Z", ", ".join(status.addresses)
+        rows.append((status.host, status.process, until, addresses, status.fault or soon))
+    print_table(FittedTable([Column("", kind) for kind in ("name", "name", "figure", "text", "text")], rows))
+    if over or any(status.fault for status in statuses):
+        note(f"make them anew with `{certificates.init_command(placed, renew=over)}`")
+    _warn_of_exposed_keys(placed)
+
+
+def _warn_of_exposed_keys(placed: "InventoryFile") -> None:
+    from zsim_deploy.certificates import exposed_keys
+
+    if warning := exposed_keys(placed):
+        note(f"warning: {warning}")
+
+
+# Files for other launchers
+
+Out = Annotated[Path, Option("--out", help="Folder to write into; what was rendered there before is replaced.")]
+ForceRendering = Annotated[
+    bool, Option("--force", help="Overwrite files that no rendering wrote, or that were changed since.")
+]
+
+
+@rendering.command()
+@opt.flight_options
+def systemd(flight: opt.FlightOptions, hosts: Hosts, out: Out, force: ForceRendering = False) -> None:
+    """Write HOST/zsim-PROCESS.service and HOST/zsim.target for every host."""
+    from zsim_deploy import render
+
+    _write(out, "systemd", render.systemd(*_placed_and_scenario(hosts, flight), flight.pace()), force)
+
+
+@rendering.command()
+@opt.flight_options
+def compose(flight: opt.FlightOptions, hosts: Hosts, out: Out, force: ForceRendering = False) -> None:
+    """Write HOST/compose.yaml and HOST/Dockerfile for every host."""
+    from zsim_deploy import render
+
+    _write(out, "compose", render.compose(*_placed_and_scenario(hosts, flight), flight.pace()), force)
+
+
+@rendering.command()
+@opt.flight_options
+def kubernetes(
+    flight: opt.FlightOptions,
+    hosts: Hosts,
+    out: Out,
+    image: Annotated[str | None, Option(help="Image as the nodes find it (default zsim:VERSION).")] = None,
+    force: ForceRendering = False,
+) -> None:
+    """Write the manifests of a run, a Dockerfile, and a script that makes the Secrets from the certificates."""
+    from zsim_deploy import render
+
+    texts = render.kubernetes(*_placed_and_scenario(hosts, flight), flight.pace(), image or render.IMAGE)
+    _write(out, "kubernetes", texts, force)
+
+
+def _placed_and_scenario(hosts: Path, flight: opt.FlightOptions) -> tuple[Any, Any]:
+    """Return the inventory and the scenario; print what has no command in them."""
+    from zsim_deploy import inventory
+
+    loaded = flight.scenario(elsewhere=True)
     placed = inventory.load(hosts)
-    with PushProgress() as stages:
-        done = asyncio.run(push_to(placed, host or [], extra or [], stages.update, default_cache()))
-    changed = sum(done.values())
-    nothing = "nothing to do; all hosts have what they need"
-    print(printable(f"installed on {changed} of {len(done)} hosts" if changed else nothing))
+    for remark in inventory.own_programs(placed, loaded):
+        note(remark)
+    return placed, loaded
 
 
-for _command in (push, doctor, up, ps, logs, restart, move, down):
-    app.command(rich_help_panel=HOSTS)(_command)
+def _write(out: Path, target: str, texts: Mapping[str, str], force: bool) -> None:
+    from zsim_deploy import render
+
+    removed = render.write(out, target, texts, force)
+    more = f"; removed of an earlier rendering: {', '.join(removed)}" if removed else ""
+    say(f"{len(texts)} files in {out}{more}")

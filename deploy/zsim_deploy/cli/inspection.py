@@ -20,8 +20,8 @@ LISTEN_S = 1.0  # wall time that `keys` listens: every live key of the contract 
 PACKET_S = 0.05  # wait between two looks into an empty subscription
 LINE_S = 1.0  # between two lines of `hz`
 SILENCE_S = 1.0  # after which a key with messages is reported as silent; later where its own gaps are longer
-UNHEARD_S = 3.0  # after which it is said that a key has no publisher; whatever comes at all comes once a second
-NAMED_MAX = 5  # keys that are named in place of one that nobody publishes
+UNHEARD_S = 3.0  # after which a key without messages is reported; every live key has one at least once a second
+NAMED_MAX = 5  # similar keys that are named where a key has no publisher
 OUTCOME_S = 3.0  # wall; how long the world may take to say what becomes of a command; a standing one does not say it
 UNKNOWN_SENDER = "somebody"  # source of the event of a message that could not be decoded
 PUB, ASK = "zsim.pub", "zsim.ask"
@@ -38,10 +38,11 @@ def list_keys(link: Session, expression: str, listen_s: float = LISTEN_S) -> lis
     counts: Counter[str] = Counter()
     for known in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
         counts.update({sample.key: 0 for sample in link.get(known) if keys.matches(expression, sample.key)})
-    subscription = link.subscribe(expression)
-    for sample in _samples(subscription, time.monotonic() + listen_s):
+    for sample in _samples(link.subscribe(expression), time.monotonic() + listen_s):
         counts[sample.key] += 1
-    return [(key, _kind(key), count) for key, count in sorted(counts.items())]
+    kinds = {key: messages.type_of(key) for key in counts}
+    names = {key: kind.__name__ if kind else "not of the contract" for key, kind in kinds.items()}
+    return [(key, names[key], count) for key, count in sorted(counts.items())]
 
 
 def echo(
@@ -53,19 +54,14 @@ def echo(
     timeout_s: float = math.inf,
     note: Callable[[str], None] = lambda text: None,
 ) -> int:
-    """Hand every message on an expression to `emit` until `count` have come, or the time is over.
+    """Hand every message on an expression to `emit` until `count` have come, or the time is over; return how many came.
 
     Args:
-        link: an open session.
-        expression: the keys.
         count: after which it returns, None for none.
         emit: takes key and message.
         raw: payloads in hexadecimal digits.
         timeout_s: wall time after which it returns.
-        note: takes a line for people, as that nobody publishes there.
-
-    Returns:
-        how many came.
+        note: takes a line for people, such as that the key has no publisher.
     """
     subscription = link.subscribe(expression)
     until_s, number = time.monotonic() + timeout_s, 0
@@ -84,14 +80,14 @@ def echo(
 
 
 def keys_like(link: Session, expression: str) -> str:
-    """Return, as the end of a line, which keys in use are most like one that nobody publishes."""
+    """Return the end of a line on a key without a publisher: the keys in use most like it."""
     in_use = [key for key, _, _ in list_keys(link, "**")]
     named = ", ".join(get_close_matches(expression, in_use, NAMED_MAX))
     return f"; keys in use like it: {named}" if named else "; `zsim keys` lists the keys in use"
 
 
 def readable(sample: ReceivedSample) -> Any:
-    """Return a message as values that JSON has; one outside of the contract is decoded as far as possible."""
+    """Return a message as JSON values; one outside of the contract is decoded as far as possible."""
     try:
         return _plain(messages.decode(sample.key, sample.payload))
     except DecodeError as error:
@@ -102,7 +98,7 @@ def readable(sample: ReceivedSample) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: bytes in base64, as its repr what JSON has no form for."""
+    """Return a value as JSON values: bytes in base64, and as its repr what JSON cannot represent."""
     try:
         return msgspec.to_builtins(value, str_keys=True, enc_hook=repr)
     except messages.REFUSALS:  # for instance a key that is neither text nor a number
@@ -160,7 +156,10 @@ def hz(link: Session, expression: str, window: int, seconds: float, emit: Callab
         time.sleep(min(LINE_S, until_s - now_s))
         for _ in range(len(arrived)):
             wall_s, payload = arrived.popleft()
-            rate.add(wall_s, _stamp(head, payload))
+            t_ns = None
+            with suppress(*messages.REFUSALS):
+                t_ns = head.decode(payload).t_ns
+            rate.add(wall_s, t_ns)
         if not rate.total and time.monotonic() >= unheard_s:
             nothing, unheard_s = f"no message on {expression} yet{keys_like(link, expression)}", math.inf
         emit(rate.line(time.monotonic()) if rate.total else nothing)
@@ -169,18 +168,6 @@ def hz(link: Session, expression: str, window: int, seconds: float, emit: Callab
 
 class _Stamp(msgspec.Struct):
     t_ns: int | None = None
-
-
-def _stamp(head: "msgspec.msgpack.Decoder[_Stamp]", payload: bytes) -> int | None:
-    try:
-        return head.decode(payload).t_ns
-    except messages.REFUSALS:
-        return None
-
-
-def _kind(key: str) -> str:
-    kind = messages.type_of(key)
-    return kind.__name__ if kind else "not of the contract"
 
 
 def _samples(subscription: Subscription, until_s: float) -> Iterator[ReceivedSample]:
@@ -200,7 +187,6 @@ class Published(NamedTuple):
     """What became of commands that were sent by hand.
 
     Attributes:
-        sent: how many.
         refused: how many of them the world refused, as far as its events say.
         reason: of the first refusal.
         note: why nothing is known of them, empty if it is.
@@ -218,21 +204,37 @@ def publish(link: Session, info: messages.Info, key: str, text: str, count: int,
     t_ns, seq and source are filled in.
 
     Args:
-        link: an open session.
-        info: of the run.
         key: `drone/NAME/cmd/KIND` of a drone of the run.
         text: a JSON map of the message's fields.
         count: how many times, the first at once.
         rate_hz: how often per wall second.
 
     Raises:
-        RunError: no JSON, not the message of that key, or a key on which nobody sends by hand.
+        RunError: no JSON, not the message of that key, or a key that takes no commands.
     """
-    fields = _fields(_command_key(key, info), text)
+    _refuse_wildcards(key, "pub")
+    kind = messages.type_of(key)
+    if kind is None:
+        raise RunError(f"{key}: is no key of the contract; `zsim keys` lists those in use, docs/protocol.md all")
+    if not keys.matches(COMMANDS, key):
+        raise RunError(f"{key}: only the process that this is about writes here; must be {COMMANDS.replace('*', '…')}")
+    drones = [drone.name for drone in info.drones]
+    if keys.thing(key) not in drones:
+        raise RunError(f"{key}: drone is {keys.thing(key)!r}; must be one of {', '.join(drones)}")
+    named = [name for name in messages.fields(kind) if name not in ("t_ns", "seq", "source")]
+    example = "{" + ", ".join(f'"{name}": …' for name in named) + "}"
+    fields = _map(f"{key}: the message", text, example)
+    if "source" in kind.__struct_fields__:
+        fields = {"source": PUB, **fields}
     events, clock, start_s = link.subscribe(keys.EVENT), _Now(link), time.monotonic()
     for seq in range(count):
         time.sleep(max(0.0, start_s + seq / rate_hz - time.monotonic()))
-        link.put_raw(key, _payload(key, {"t_ns": clock.t_ns(), "seq": seq, **fields}))
+        payload = msgspec.msgpack.encode({"t_ns": clock.t_ns(), "seq": seq, **fields})
+        try:
+            messages.decode(key, payload)
+        except DecodeError as error:
+            raise RunError(str(error)) from error
+        link.put_raw(key, payload)
     return _outcome(events, clock, info.gate_ns, (key, str(fields.get("source", PUB))), count)
 
 
@@ -240,11 +242,7 @@ def _outcome(events: Subscription, clock: "_Now", gate_ns: int, ours: tuple[str,
     """Return what the world's events say of commands, once the last has taken effect or was refused.
 
     Args:
-        events: of the world.
-        clock: of the run.
-        gate_ns: between two gates.
         ours: key and source of the commands.
-        sent: how many.
     """
     key, source = ours
     accepted, refused, last_ns, reason = 0, 0, 0, ""
@@ -254,13 +252,10 @@ def _outcome(events: Subscription, clock: "_Now", gate_ns: int, ours: tuple[str,
         for sample in events.drain():
             with suppress(DecodeError):
                 event: run_messages.Event = messages.decode(keys.EVENT, sample.payload)
+                command = str(event.data.get("command"))
                 if event.kind == "refused" and event.subject == key and event.source in (source, UNKNOWN_SENDER):
                     refused, reason = refused + 1, reason or event.text
-                elif (
-                    event.kind == "command"
-                    and event.source == source
-                    and key == keys.command(event.subject, str(event.data.get("command")))
-                ):
+                elif (event.kind, event.source) == ("command", source) and key == keys.command(event.subject, command):
                     accepted += 1
                     last_ns = max(last_ns, int(event.data.get("apply_t_ns", 0)) + gate_ns)
         if refused >= sent or (accepted + refused >= sent and now_ns >= last_ns):
@@ -294,30 +289,9 @@ class _Now:
         return messages.decode(keys.CLOCK, self._newest.payload) if self._newest else None
 
 
-def _command_key(key: str, info: messages.Info) -> str:
-    """Return the key if a command of a drone may be sent there."""
-    _refuse_wildcards(key, "pub")
-    kind = messages.type_of(key)
-    if kind is None:
-        raise RunError(f"{key}: is no key of the contract; `zsim keys` lists those in use, docs/protocol.md all")
-    if not keys.matches(COMMANDS, key):
-        raise RunError(f"{key}: only the process that this is about writes here; must be {COMMANDS.replace('*', '…')}")
-    drones = [drone.name for drone in info.drones]
-    if keys.thing(key) not in drones:
-        raise RunError(f"{key}: drone is {keys.thing(key)!r}; must be one of {', '.join(drones)}")
-    return key
-
-
 def _refuse_wildcards(key: str, command: str) -> None:
     if "*" in key:
         raise RunError(f"key is {key!r}; `zsim {command}` takes one key, without wildcards")
-
-
-def _fields(key: str, text: str) -> dict[str, Any]:
-    kind = messages.type_of(key)
-    assert kind is not None
-    fields = _map(f"{key}: the message", text, _example(kind))
-    return {"source": PUB, **fields} if "source" in kind.__struct_fields__ else fields
 
 
 def _map(what: str, text: str, example: str) -> dict[str, Any]:
@@ -333,20 +307,6 @@ def _map(what: str, text: str, example: str) -> dict[str, Any]:
     except messages.REFUSALS as error:
         raise RunError(f"{what} cannot be sent ({error}); must be a map such as '{example}'") from error
     return fields
-
-
-def _payload(key: str, fields: dict[str, Any]) -> bytes:
-    payload = msgspec.msgpack.encode(fields)
-    try:
-        messages.decode(key, payload)
-    except DecodeError as error:
-        raise RunError(str(error)) from error
-    return payload
-
-
-def _example(kind: type[msgspec.Struct]) -> str:
-    names = [name for name in messages.fields(kind) if name not in ("t_ns", "seq", "source")]
-    return "{" + ", ".join(f'"{name}": …' for name in names) + "}"
 
 
 def ask(link: Session, key: str, op: str, text: str) -> Any:

@@ -1,66 +1,42 @@
-"""The commands that are one role of a federation each, and `zsim replay`, which stands in for the world."""
+"""The commands that are one role of a federation each."""
 
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from zsim.contract.run_messages import RATE_MAX
 from zsim.scenario.role_table import AGENTS, Role
-from zsim_deploy.arguments import (
-    CHANGED,
-    CONSOLE_NEEDS,
-    DEFAULT_ENDPOINT,
-    RUN,
-    RUN_ID,
-    Access,
-    Connect,
-    Federation,
-    FlightOptions,
-    From,
-    Host,
-    Insecure,
-    Keys,
-    Launched,
-    Realtime,
-    Tls,
-    To,
-    Trust,
-    Wait,
-    WorldAccess,
-    check_range,
-    flight_options,
-    identity,
-    participant_options,
-    require,
-)
+from zsim_deploy import arguments as opt
+from zsim_deploy.arguments import require
 
-REPLAY_NEEDS = {"record": ("mcap", "zstandard")}  # modules by extra
-ROLES = "Roles, started by hand, on any machine, in any order"
+if TYPE_CHECKING:
+    from zsim.transport.tls import Identity
+    from zsim_deploy.roles.camera_roles import Drones as Chosen
+    from zsim_deploy.roles.roles import Serve
+
+SOME_DRONES = "Drones, or patterns: 'drone*'; all that have cameras if not given."
 
 app = typer.Typer()
+Drones = Annotated[list[str] | None, Argument(metavar="[DRONE]...", help=SOME_DRONES, show_default=False)]
 
 
-@app.command(rich_help_panel=ROLES)
-@flight_options
+@app.command(rich_help_panel=opt.ROLES)
+@opt.flight_options
+@opt.listener_options
 def world(
-    flight: FlightOptions,
-    listen: Annotated[
-        list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
-    ] = None,
-    expect: Annotated[list[str] | None, typer.Option(help="Wait for this process too, e.g. recorder.")] = None,
+    flight: opt.FlightOptions,
+    who: "Identity",
+    listen: opt.Listen = None,
+    expect: Annotated[list[str] | None, Option(help="Wait for this process too, e.g. recorder.")] = None,
     journal: Annotated[
-        Path | None, typer.Option(help="Folder of the run's journal: started again with it, it goes on.")
+        Path | None, Option(help="Folder of the run's journal: started again with it, it goes on.")
     ] = None,
-    all_died: Annotated[bool, typer.Option("--all-died", hidden=True)] = False,
-    changed: Annotated[list[str] | None, typer.Option(CHANGED, hidden=True)] = None,
-    launched: Launched = None,
-    tls: Tls = None,
-    access: Access = None,
-    insecure: Insecure = False,
-    host: Host = None,
+    all_died: Annotated[bool, Option("--all-died", hidden=True)] = False,
+    changed: Annotated[list[str] | None, Option(opt.CHANGED, hidden=True)] = None,
+    launched: opt.Launched = None,
 ) -> None:
     """Run the world: integrates all drones and owns simulated time."""
     from zsim.scenario import scenario_file
@@ -72,9 +48,8 @@ def world(
     modules = plugin.folders() if launched else ()
     loaded = scenario_file.load(path, overrides, modules, seed=flight.seed, duration_s=flight.duration)
     mode, pace = flight.mode_and_rate()
-    who = identity(host, tls, insecure, access)
     changes = [*(changed or ()), *flight.changed()]
-    endpoints = listen or [DEFAULT_ENDPOINT]
+    endpoints = listen or [opt.DEFAULT_ENDPOINT]
     world_role.world(loaded, mode, pace, endpoints, launched, expect, who, journal, all_died, changes)
 
 
@@ -83,58 +58,51 @@ def _agent_command(name: str, role: Role) -> Callable[..., None]:
     about = str(role.about)
     several_help = f"{about.capitalize()}s, or patterns: '{about}*'."
 
-    def start(things: list[str], reach: WorldAccess) -> None:
+    def start(things: list[str], reach: opt.WorldAccess) -> None:
         from zsim_deploy.roles import process_identity, roles
 
         roles.agent(roles.agent_of(name, things), reach, process_identity.process_of(name, things))
 
     def several(
-        reach: WorldAccess,
-        things: Annotated[
-            list[str], typer.Argument(metavar=f"{about.upper()}...", help=several_help, show_default=False)
-        ],
+        reach: opt.WorldAccess,
+        things: Annotated[list[str], Argument(metavar=f"{about.upper()}...", help=several_help, show_default=False)],
     ) -> None:
         start(things, reach)
 
     def one(
-        reach: WorldAccess,
-        thing: Annotated[str, typer.Argument(metavar=about.upper(), help=f"Name of the {about}.")] = "main",
+        reach: opt.WorldAccess,
+        thing: Annotated[str, Argument(metavar=about.upper(), help=f"Name of the {about}.")] = "main",
     ) -> None:
         start([thing], reach)
 
-    return participant_options(several if role.joint else one)
+    return opt.participant_options(several if role.joint else one)
 
 
 for _name, _role in AGENTS.items():
     _also = ", or of several in one process" if _role.joint else ""
     _help = f"Run the {_name} of one {_role.about}{_also}."
-    app.command(_name, rich_help_panel=ROLES, help=_help)(_agent_command(_name, _role))
+    app.command(_name, rich_help_panel=opt.ROLES, help=_help)(_agent_command(_name, _role))
 
 
-@app.command("host", rich_help_panel=ROLES)
+@app.command("host", rich_help_panel=opt.ROLES)
+@opt.several_options
 def host_agents(
+    reach: opt.WorldAccess,
     names: Annotated[
-        list[str],
-        typer.Argument(metavar="NAME...", help="Processes, or patterns: 'estimator.*' controller.main."),
+        list[str], Argument(metavar="NAME...", help="Processes, or patterns: 'estimator.*' controller.main.")
     ],
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = None,
-    launched: Launched = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Run several estimators and controllers in one process, which is faster."""
     from zsim_deploy.roles import roles
 
-    roles.agent(roles.host(names), WorldAccess(connect, federation, wait, None, insecure, host, launched))
+    roles.agent(roles.host(names), reach)
 
 
-@app.command(rich_help_panel=ROLES)
-@participant_options
+@app.command(rich_help_panel=opt.ROLES)
+@opt.participant_options
 def record(
-    reach: WorldAccess,
-    out: Annotated[Path, typer.Option(help=f"Folder for run.mcap; {RUN_ID} in its name is the id of the run.")] = Path(
+    reach: opt.WorldAccess,
+    out: Annotated[Path, Option(help=f"Folder for run.mcap; {opt.RUN_ID} in its name is the id of the run.")] = Path(
         "."
     ),
 ) -> None:
@@ -146,76 +114,90 @@ def record(
     roles.recorder(out, reach)
 
 
-@app.command(rich_help_panel=ROLES)
+@app.command(rich_help_panel=opt.ROLES)
+@opt.listener_options
 def router(
-    name: Annotated[str, typer.Argument(help="Name of the router.")] = "main",
-    listen: Annotated[str, typer.Option(help="Endpoint for its clients.")] = "tcp/127.0.0.1:7448",
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    realtime: Realtime = False,
-    launched: Launched = None,
-    tls: Tls = None,
-    access: Access = None,
-    insecure: Insecure = False,
-    host: Host = None,
+    who: "Identity",
+    name: Annotated[str, Argument(help="Name of the router.")] = "main",
+    listen: Annotated[str, Option(help="Endpoint for its clients.")] = "tcp/127.0.0.1:7448",
+    connect: opt.Connect = opt.DEFAULT_ENDPOINT,
+    federation: opt.Federation = "zsim",
+    realtime: opt.Realtime = False,
+    launched: opt.Launched = None,
 ) -> None:
     """Run a router: carries the clients of one network to a world, or a router, in another."""
     from zsim_deploy.roles import roles
 
-    mode = "realtime" if realtime else "lockstep"
-    roles.router(name, listen, connect, federation, mode, launched, identity(host, tls, insecure, access))
+    roles.router(name, listen, connect, federation, "realtime" if realtime else "lockstep", launched, who)
 
 
-def _rate(value: float) -> float:
-    """Return a pace that a replay can have."""
-    if not 0 <= value <= RATE_MAX:
-        raise typer.BadParameter(f"is {value:g}; must be >= 0 and <= {RATE_MAX:g}")
-    return value
-
-
-@app.command(rich_help_panel=RUN)
-def replay(
-    directory: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)
-    ],
-    rate: Annotated[
-        float, typer.Option(callback=_rate, help="Simulated per wall second; 0 = as fast as it goes.")
-    ] = 1.0,
-    from_: From = 0.0,
-    to: To = None,
-    keys: Keys = None,
-    expect: Annotated[
-        list[str] | None,
-        typer.Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
-    ] = None,
-    paused: Annotated[bool, typer.Option("--paused", help="Stand at the first instant until asked to resume.")] = False,
-    console: Annotated[
-        bool, typer.Option("--console", help="Show it in the browser, with a timeline; stand still at its end.")
-    ] = False,
-    listen: Annotated[
-        list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
-    ] = None,
-    federation: Annotated[str | None, typer.Option(help="Name of the federation (default the record's).")] = None,
-    tls: Tls = None,
-    access: Access = None,
-    insecure: Insecure = False,
-    host: Host = None,
-    trust: Trust = False,
+@app.command(rich_help_panel=opt.ROLES)
+@opt.participant_options
+def camera(
+    reach: opt.WorldAccess,
+    drones: Drones = None,
+    name: Annotated[str, opt.process_option("camera.DRONE, camera.main for several")] = "",
 ) -> None:
-    """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
-    require("replay", REPLAY_NEEDS)
-    if console:
-        require("console", CONSOLE_NEEDS)
-    from zsim.schema import plugin
-    from zsim_deploy.launch.console_process import console_beside
-    from zsim_deploy.roles.world_role import ReplayOptions, play
-    from zsim_world.playback.playback import PlaybackRange
+    """Draw what the cameras of one drone see, or of several in one process, as JPEG."""
+    require("camera", opt.CAMERA_NEEDS)
+    from zsim_deploy.roles import camera_roles
 
-    check_range(from_, to)
-    to_ns = None if to is None else round(to * 1e9)
-    choice = PlaybackRange(round((from_ or 0.0) * 1e9), to_ns, tuple(keys or ["**"]), paused, holds=console)
-    endpoints = tuple(listen or [DEFAULT_ENDPOINT])
-    options = ReplayOptions(choice, rate, tuple(expect or ()), endpoints, federation)
-    beside = console_beside(endpoints[0], directory, federation, tls) if console else nullcontext()
-    with plugin.names_only(not trust), beside:
-        play(directory, options, identity(host, tls, insecure, access))
+    serve = partial(camera_roles.camera, names=drones or ())
+    _serve_pictures("camera", serve, camera_roles.of_camera, reach, drones, name)
+
+
+@app.command(rich_help_panel=opt.ROLES)
+@opt.participant_options
+def detect(
+    reach: opt.WorldAccess,
+    drones: Drones = None,
+    diameter: Annotated[
+        float | None, Option(callback=opt.positive, help="Of a hat, m (default the scenario's).", show_default=False)
+    ] = None,
+    name: Annotated[str, opt.process_option("detector.DRONE, detector.main for several")] = "",
+) -> None:
+    """Find magenta hats in the pictures of one drone, or of several in one process."""
+    require("detect", opt.CAMERA_NEEDS)
+    from zsim_deploy.roles import camera_roles
+
+    serve = partial(camera_roles.detector, names=drones or (), diameter_m=diameter)
+    _serve_pictures("detector", serve, camera_roles.of_detector, reach, drones, name)
+
+
+def _serve_pictures(
+    role: str, serve: "Serve", chosen: "Chosen", reach: opt.WorldAccess, drones: Sequence[str] | None, name: str
+) -> None:
+    """Serve as a camera or a detector, named after its drone if one alone is named."""
+    from zsim_deploy.roles.camera_roles import slack_ns, stands_for
+    from zsim_deploy.roles.process_identity import PATTERN
+
+    one = drones[0] if drones and len(drones) == 1 else ""
+    thing = one if one and not set(one) & set(PATTERN) else "main"
+    does = {"stands_for": partial(stands_for, role, chosen, drones or ()), "slack_ns": partial(slack_ns, role)}
+    serve_as(role, name, serve, reach, thing, lowered=True, **does)
+
+
+def serve_as(
+    role: str,
+    name: str,
+    serve: "Serve",
+    reach: opt.WorldAccess,
+    thing: str = "main",
+    lowered: bool = False,
+    **does: Any,
+) -> None:
+    """Serve one run after the other as the process that a command means.
+
+    Args:
+        role, name, thing: of which its name is made.
+        serve: what it does in a run.
+        lowered: with lower priority than what the world waits for.
+        does: what more `serve_runs` is given.
+    """
+    from zsim_deploy.roles import roles
+    from zsim_deploy.roles.priority import lower_priority
+    from zsim_deploy.roles.process_identity import process_name
+
+    if lowered:
+        lower_priority()
+    roles.serve_runs(process_name(role, name, reach.who, thing), serve, reach, **does)

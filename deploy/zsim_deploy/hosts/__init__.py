@@ -1,4 +1,4 @@
-"""A run on several hosts: checked by `zsim doctor`, planned, started over ssh, watched, its record brought home.
+"""A run on several hosts: installed by `zsim push`, checked by `zsim doctor`, started over ssh, watched, brought home.
 
-`ssh_connection`, `host_link` and `host_links` reach the hosts, for `zsim push` too. Imports launch, roles, inventory.
+`host_link` reaches the hosts; `probe` and `on_host` run there. Imports launch, roles, certificates, inventory.
 """

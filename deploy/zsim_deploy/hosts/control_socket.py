@@ -1,4 +1,4 @@
-"""How `zsim ps`, `logs`, `restart`, `move` and `down` reach the `zsim up` that runs on this machine: a local socket.
+"""How `zsim ps`, `logs`, `restart`, `move` and `down` reach the launcher that runs on this machine: a local socket.
 
 One request and one answer per connection, a JSON line each: {op, args} and {ok, error, result}.
 """
@@ -9,16 +9,16 @@ import json
 import os
 import socket
 import stat
-import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from zsim import __version__
-from zsim.errors import RunError, ZsimError, printable
+from zsim.errors import RunError, ZsimError
 from zsim.output_folder import no_locks, take_lock
+from zsim_deploy.arguments import file_fault, note
 
 REQUEST_S = 5.0  # from the same machine
 ANSWER_S = 150.0  # a move connects to a host, asks it about itself, and brings a certificate: 135 s at most
@@ -33,94 +33,6 @@ def place(federation: str) -> Path:
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(runtime) / "zsim" if runtime else Path(tempfile.gettempdir()) / f"zsim-{os.getuid()}"
     return folder / f"{federation}.sock"
-
-
-class ControlSocket:
-    """The launcher's end.
-
-    Args:
-        federation: whose launcher it is.
-        acts: by name; each is called in a thread, with the request's arguments, and returns what JSON can hold.
-
-    Raises:
-        RunError: another launcher of the federation runs on this machine, or there is no place to listen.
-    """
-
-    def __init__(self, federation: str, acts: dict[str, Act]) -> None:
-        self._acts = acts
-        self._path = place(federation)
-        _make_folder(self._path.parent)
-        self._lock = _lock(federation, self._path.with_suffix(".lock"))
-        self._socket = socket.socket(socket.AF_UNIX)
-        try:
-            self._path.unlink(missing_ok=True)  # of a launcher that was killed: its lock is ours
-            self._socket.bind(str(self._path))
-            self._socket.listen()
-        except OSError as error:
-            self._socket.close()
-            os.close(self._lock)
-            raise RunError(f"{self._path}: cannot listen there ({_reason(error, self._path)})") from error
-        self._thread = threading.Thread(target=self._serve, name="control socket", daemon=True)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        while True:
-            try:
-                connection, _ = self._socket.accept()
-            except OSError:
-                return
-            threading.Thread(target=self._answer, args=(connection,), name="control answer", daemon=True).start()
-
-    def _answer(self, connection: socket.socket) -> None:
-        with connection, contextlib.suppress(OSError):
-            connection.settimeout(REQUEST_S)
-            with connection.makefile("rb") as request:
-                line = request.readline(LINE_MAX)
-            connection.sendall(json.dumps(self._carry_out(line)).encode() + b"\n")
-
-    def _carry_out(self, line: bytes) -> dict[str, Any]:
-        try:
-            act, args = self._parsed(line)
-        except (ValueError, KeyError, TypeError) as error:
-            return {
-                "ok": False,
-                "error": f"it is no request of zsim {__version__} ({error}); is `zsim up` of another version?",
-            }
-        try:
-            return {"ok": True, "result": act(**args)}
-        except (ZsimError, TimeoutError) as error:
-            return {"ok": False, "error": str(error) or "it took too long"}
-        except Exception as error:
-            return {"ok": False, "error": f"it failed by a fault of zsim: {error!r}"}
-
-    def _parsed(self, line: bytes) -> tuple[Act, dict[str, Any]]:
-        """Return what is asked for, and the arguments, which fit."""
-        request = json.loads(line)
-        act, args = self._acts[request["op"]], request.get("args", {})
-        inspect.signature(act).bind(**args)
-        return act, args
-
-    def close(self) -> None:
-        """Answer nobody any more."""
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
-        self._path.unlink(missing_ok=True)
-        self._thread.join(1.0)
-        os.close(self._lock)
-        if "@" in self._path.stem:  # of one run: nobody waits for its lock
-            self._path.with_suffix(".lock").unlink(missing_ok=True)
-
-    def __enter__(self) -> "ControlSocket":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def of_run(federation: str) -> str:
-    """Return under which name a `zsim run` of this process listens: there may be several of a federation."""
-    return f"{federation}@{os.getpid()}"
 
 
 def launchers() -> list[str]:
@@ -144,61 +56,20 @@ def _lives(pid: str) -> bool:
     return True
 
 
-def _make_folder(folder: Path) -> None:
-    """Make the folder in which launchers listen, or make sure that nobody else made it."""
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-    except OSError as error:
-        raise RunError(
-            f"{folder}: cannot be made ({error.strerror}); set XDG_RUNTIME_DIR to a folder of yours"
-        ) from error
-    _refuse_if_foreign(folder)
-
-
-def _refuse_if_foreign(folder: Path) -> None:
-    """Refuse a folder in which another user could listen in our place.
-
-    Raises:
-        RunError: it belongs to somebody else, others may write in it, or it is none.
-    """
-    status = folder.lstat()
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
-        raise RunError(
-            f"{folder}: is not a folder that is yours alone (owner {status.st_uid}, mode {status.st_mode & 0o777:o}); "
-            f"must be of user {os.getuid()} with mode 700; remove it, or set XDG_RUNTIME_DIR to a folder of yours"
-        )
-
-
-def _lock(federation: str, path: Path) -> int:
-    """Return the lock that one launcher of a federation holds for as long as it lives, however it ends."""
-    try:
-        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be made ({error.strerror}); set XDG_RUNTIME_DIR to another folder") from error
-    if not take_lock(lock):
-        os.close(lock)
-        raise RunError(
-            f"federation {federation!r} is up already on this machine; end it with "
-            f"`zsim down --federation {federation}`, or fly in another one: --set federation=NAME"
-        )
-    if "@" not in path.stem and (warning := no_locks(path.parent)):  # a run has a name of its own
-        print(printable(warning), file=sys.stderr)
-    return lock
-
-
-def _reason(error: OSError, path: Path) -> str:
-    if len(os.fsencode(path)) > PATH_MAX:
-        return f"the path is longer than {PATH_MAX} bytes; set XDG_RUNTIME_DIR or TMPDIR to a shorter one"
-    return str(error.strerror or error)
-
-
 def ask(federation: str, op: str, **args: Any) -> Any:
     """Ask the launcher of a federation on this machine.
 
     Raises:
-        RunError: nobody is up, it does not answer, or it refuses; with its reason.
+        RunError: no launcher is up, it does not answer, or it refuses; with its reason.
     """
-    with _connected(federation) as line:
+    path = place(federation)
+    with socket.socket(socket.AF_UNIX) as line:
+        line.settimeout(ANSWER_S)
+        try:
+            line.connect(str(path))
+        except OSError as error:
+            raise RunError(f"no `zsim up` of federation {federation!r} runs on this machine; start one") from error
+        _refuse_if_foreign(path.parent)
         try:
             line.sendall(json.dumps({"op": op, "args": args}).encode() + b"\n")
             with line.makefile("rb") as stream:
@@ -212,18 +83,120 @@ def ask(federation: str, op: str, **args: Any) -> Any:
     return answer["result"]
 
 
-def _connected(federation: str) -> socket.socket:
-    """Return a connection to the launcher."""
-    path, line = place(federation), socket.socket(socket.AF_UNIX)
-    line.settimeout(ANSWER_S)
-    try:
-        line.connect(str(path))
-    except OSError as error:
-        line.close()
-        raise RunError(f"no `zsim up` of federation {federation!r} runs on this machine; start one") from error
-    try:
+@contextlib.contextmanager
+def seen_by_ps(federation: str, status: Callable[[], dict[str, Any]]) -> Iterator[None]:
+    """Let `zsim ps` see a run of this process while it lasts; a machine without a place to listen goes without."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(RunError, AttributeError):  # no such sockets on Windows
+            name = f"{federation}@{os.getpid()}"  # there may be several of a federation
+            stack.enter_context(ControlSocket(name, {"ps": status}))
+        yield
+
+
+class ControlSocket:
+    """The launcher's end.
+
+    Args:
+        federation: whose launcher it is.
+        acts: by name; each is called in a thread, with the request's arguments, and returns what JSON can hold.
+
+    Raises:
+        RunError: another launcher of the federation runs on this machine, or there is no place to listen.
+    """
+
+    def __init__(self, federation: str, acts: dict[str, Act]) -> None:
+        self._acts = acts
+        self._path = path = place(federation)
+        with file_fault(path.parent, "cannot be made", "set XDG_RUNTIME_DIR to a folder of yours"):
+            path.parent.mkdir(mode=0o700, exist_ok=True)
         _refuse_if_foreign(path.parent)
-    except RunError:
-        line.close()
-        raise
-    return line
+        self._lock = _lock(federation, path.with_suffix(".lock"))
+        self._socket = socket.socket(socket.AF_UNIX)
+        try:
+            path.unlink(missing_ok=True)  # of a launcher that was killed: its lock is ours
+            self._socket.bind(str(path))
+            self._socket.listen()
+        except OSError as error:
+            self._socket.close()
+            os.close(self._lock)
+            is_long = len(os.fsencode(path)) > PATH_MAX
+            why = f"the path is longer than {PATH_MAX} bytes; set XDG_RUNTIME_DIR or TMPDIR to a shorter one"
+            raise RunError(f"{path}: cannot listen there ({why if is_long else error.strerror or error})") from error
+        self._thread = threading.Thread(target=self._serve, name="control socket", daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._answer, args=(connection,), name="control answer", daemon=True).start()
+
+    def _answer(self, connection: socket.socket) -> None:
+        with connection, contextlib.suppress(OSError):
+            connection.settimeout(REQUEST_S)
+            with connection.makefile("rb") as request:
+                line = request.readline(LINE_MAX)
+            connection.sendall(json.dumps(self._carry_out(line)).encode() + b"\n")
+
+    def _carry_out(self, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            act, args = self._acts[request["op"]], request.get("args", {})
+            inspect.signature(act).bind(**args)
+        except (ValueError, KeyError, TypeError) as error:
+            other = f"it is no request of zsim {__version__} ({error}); is `zsim up` of another version?"
+            return {"ok": False, "error": other}
+        try:
+            return {"ok": True, "result": act(**args)}
+        except (ZsimError, TimeoutError) as error:
+            return {"ok": False, "error": str(error) or "it took too long"}
+        except Exception as error:
+            return {"ok": False, "error": f"it failed by a fault of zsim: {error!r}"}
+
+    def close(self) -> None:
+        """Stop answering."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        self._path.unlink(missing_ok=True)
+        self._thread.join(1.0)
+        os.close(self._lock)
+        if "@" in self._path.stem:  # of one run: no other launcher waits for its lock
+            self._path.with_suffix(".lock").unlink(missing_ok=True)
+
+    def __enter__(self) -> "ControlSocket":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _refuse_if_foreign(folder: Path) -> None:
+    """Refuse a folder in which another user could listen instead of us.
+
+    Raises:
+        RunError: it belongs to another user, others may write in it, or it is no folder.
+    """
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise RunError(
+            f"{folder}: is not a folder that is yours alone (owner {status.st_uid}, mode {status.st_mode & 0o777:o}); "
+            f"must be of user {os.getuid()} with mode 700; remove it, or set XDG_RUNTIME_DIR to a folder of yours"
+        )
+
+
+def _lock(federation: str, path: Path) -> int:
+    """Return the lock that one launcher of a federation holds for as long as it lives, however it ends."""
+    with file_fault(path, "cannot be made", "set XDG_RUNTIME_DIR to another folder"):
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    if not take_lock(lock):
+        os.close(lock)
+        raise RunError(
+            f"federation {federation!r} is up already on this machine; end it with "
+            f"`zsim down --federation {federation}`, or fly in another one: --set federation=NAME"
+        )
+    if "@" not in path.stem and (warning := no_locks(path.parent)):  # a run has a name of its own
+        note(warning)
+    return lock

@@ -1,29 +1,24 @@
-"""`zsim doctor`: whether the hosts of an inventory can fly together, before anything is started on them; as tables."""
+"""`zsim doctor`: whether the hosts of an inventory can fly together; nothing is started on them."""
 
 import asyncio
 import platform
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 from zsim import __version__
 from zsim.errors import HostsError, ZsimError
-from zsim.terminal.fitted_table import FittedTable
-from zsim_deploy import SAFE_PATH
-from zsim_deploy.hosts.doctor_tables import hosts_table, paths_table
-from zsim_deploy.hosts.host_link import HostLink
-from zsim_deploy.hosts.host_links import ProgramEndedError, RemoteProgram, open_program
+from zsim.terminal.fitted_table import Column, FittedTable
+from zsim_deploy import SAFE_PATH, certificates
+from zsim_deploy import inventory as inv
+from zsim_deploy.hosts.host_link import HostLink, ProgramEndedError, RemoteProgram, open_program, shell_line, shell_word
 from zsim_deploy.hosts.host_plan import leftovers, port_in_use
-from zsim_deploy.hosts.host_report import HostReport, NetworkPath
-from zsim_deploy.hosts.ssh_connection import shell_line, shell_word
-from zsim_deploy.inventory import enrolment
-from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.inventory import InventoryFile
 
 CLOCK_OFFSET_MAX_S = 1.0  # certificates are back-dated by a day and logs are compared; time on the wire is simulated
-LOAD_MAX = 0.5  # of the cores; what is busy already slows everybody in lockstep
+LOAD_MAX = 0.5  # of the cores; a busy host slows all the others in lockstep
 FREE_MIN_BYTES = 1_000_000_000  # a run of an hour with three drones records about this
 BITS_PER_S_MIN = 10e6  # three drones in realtime send 2 Mbit/s to a recorder; lockstep goes as fast as the link
 PERFORMANCE = {"performance"}
@@ -35,19 +30,112 @@ NO_PROGRAM = ("not found", "no such file")  # in the errors of shells, in lower 
 NO_PROGRAM_CODES = (126, 127)  # … and the codes with which they end; POSIX, 2.8.2
 NEEDED_TO_COMPUTE = "scipy"  # without it a host runs no world and no agent; a router, or a recorder, does without
 OFFSET_ASKS = 3  # the answer with the shortest round trip gives the clock's offset best
+HOST_COLUMNS = (
+    Column("host", "name"),
+    Column("python", worth=3),
+    Column("zsim"),
+    Column("round\ntrip", worth=6, right=True),
+    Column("clock", worth=7, right=True),
+    Column("load", worth=5, right=True),
+    Column("cores", worth=4, right=True),
+    Column("governor", "text", worth=2),
+    Column("finger\nprint"),
+)
+PATH_COLUMNS = (
+    Column("from", "name"),
+    Column("to", "name"),
+    Column("port", right=True),
+    Column("round trip", "text"),
+    Column("bandwidth", worth=1, right=True),
+)
+
+
+class HostReport(NamedTuple):
+    """The facts of a host by its own probe, and what asking it showed.
+
+    Attributes:
+        clock_offset_s: its wall clock minus ours, good to half the round trip.
+        remedy: how it gets another zsim.
+    """
+
+    facts: dict[str, Any]
+    round_trip_s: float
+    clock_offset_s: float
+    remedy: str = "run `zsim push --hosts FILE`"
+
+
+class NetworkPath(NamedTuple):
+    """How a host reaches the port on which another listens."""
+
+    source: str
+    target: str
+    port: int
+    figures: dict[str, Any]
+
+
+class CheckResult(NamedTuple):
+    """What is to be shown of the hosts, and what is wrong with them, a line each."""
+
+    tables: list[FittedTable]
+    faults: list[str]
+    warnings: list[str]
+
+
+def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
+    """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
+    result = asyncio.run(_check_hosts(placed, places))
+    lacks = certificates.certificate_faults(placed, places, datetime.now(UTC))
+    warning = certificates.exposed_keys(placed)
+    warnings = [*result.warnings, *([warning] if warning else [])]
+    return result._replace(faults=[*lacks, *result.faults], warnings=warnings)
+
+
+async def _check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
+    links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
+    pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
+    try:
+        results = await asyncio.gather(
+            *(host_report(link, pythons[name], placed.word) for name, link in links.items()), return_exceptions=True
+        )
+        reports: dict[str, HostReport] = {}
+        faults: list[str] = []
+        for name, result in zip(links, results, strict=True):
+            if isinstance(result, HostReport):
+                reports[name] = result
+            elif isinstance(result, ZsimError):
+                faults.append(str(result))
+            else:
+                raise result
+        wrong, warnings = compare_reports(reports)
+        paths: list[NetworkPath] = []  # one after the other
+        for (target, port), sources in inv.connections(placed, places).items() if places else ():
+            if target in reports:
+                chosen = [links[name] for name in sorted(sources & set(reports))]
+                paths += await network_paths(chosen, links[target], pythons, port)
+        cut, slow = path_faults(paths)
+        left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
+        tables = [hosts_table(reports), *([paths_table(paths)] if paths else [])]
+        warnings = [*warnings, *slow, *(line for lines in left for line in lines)]
+        return CheckResult(tables, [*faults, *wrong, *cut], warnings)
+    finally:
+        for link in links.values():
+            await link.close()
+
+
+# Hosts
 
 
 async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:
     """Ask a host about itself.
 
     Args:
-        python: interpreter there that has zsim.
         hosts: the inventory's path, for remedies.
 
     Raises:
         HostsError: it has no zsim, or cannot be asked.
     """
-    remedy = _remedy(link, hosts)
+    push = f"run `zsim push --hosts {hosts}`"  # which leaves a zsim with a Python of its own alone
+    remedy = f"install it there, or leave hosts.{link.name}.python out and {push}" if link.host.python else push
     try:
         async with _probe(link, python, "about", link.host.folder) as there:
             facts = await there.answer(ABOUT_S)
@@ -55,12 +143,6 @@ async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostR
     except ProgramEndedError as error:
         raise HostsError(f"{link.name}: {_probe_fault(link, python, remedy, error)}") from error
     return HostReport(facts, round_trip_s, offset_s, remedy)
-
-
-def _remedy(link: HostLink, hosts: str) -> str:
-    """Return how a host gets another zsim; `zsim push` leaves one with a Python of its own alone."""
-    push = f"run `zsim push --hosts {hosts}`"
-    return f"install it there, or leave hosts.{link.name}.python out and {push}" if link.host.python else push
 
 
 def _probe_fault(link: HostLink, python: str, remedy: str, error: ProgramEndedError) -> str:
@@ -76,7 +158,6 @@ def _probe_fault(link: HostLink, python: str, remedy: str, error: ProgramEndedEr
 
 
 def _probe(link: HostLink, python: str, *words: str) -> AbstractAsyncContextManager[RemoteProgram]:
-    """Run a probe on a host as long as the block lasts."""
     return open_program(link, f"{shell_word(python)} {SAFE_PATH} -m zsim_deploy.hosts.probe {shell_line(words)}")
 
 
@@ -90,32 +171,11 @@ async def _offset(probe: RemoteProgram) -> tuple[float, float]:
 
 
 def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str]]:
-    """Return what keeps the hosts from flying together, and what is only worth knowing, a line each."""
+    """Return faults that keep the hosts from flying together, and warnings, a line each."""
     faults = [line for name, report in reports.items() for line in _faults(name, report)]
     warnings = [line for name, report in reports.items() for line in _warnings(name, report)]
     computing = {name: report for name, report in reports.items() if NEEDED_TO_COMPUTE in report.facts["parts"]}
     return faults, [*warnings, *_different_fingerprints(computing)]
-
-
-def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
-    """Yield that hosts compute with different fingerprints, with what of them differs, and which lacks a package."""
-    prints = {name: report.facts["fingerprint"] for name, report in reports.items()}
-    if len(set(prints.values())) < 2:
-        return
-    shown = ", ".join(f"{name} {text[:8]}" for name, text in prints.items())
-    parts = {name: report.facts["parts"] for name, report in reports.items()}
-    names = dict.fromkeys(part for each in parts.values() for part in each)
-    differing = [part for part in names if len({each.get(part) for each in parts.values()}) > 1]
-    causes = "; ".join(f"{part}: {_values(part, parts)}" for part in differing)
-    yield f"the hosts compute with different numeric fingerprints ({shown}); same bits are not promised; {causes}"
-    for name, report in reports.items():
-        lacking = " and ".join(part for part in differing if part not in parts[name])
-        if lacking:
-            yield f"{name}: has no {lacking}, with which others compute; {report.remedy}"
-
-
-def _values(part: str, parts: dict[str, dict[str, str]]) -> str:
-    return ", ".join(f"{name} {each.get(part, 'none')}" for name, each in parts.items())
 
 
 def _faults(name: str, report: HostReport) -> Iterator[str]:
@@ -125,8 +185,7 @@ def _faults(name: str, report: HostReport) -> Iterator[str]:
     ours = platform.python_version_tuple()[:2]
     if tuple(facts["python"].split(".")[:2]) != ours:
         yield f"{name}: Python is {facts['python']}; must be {'.'.join(ours)} as here, for the same bits"
-    if facts["unwritable"]:
-        why = facts["unwritable"]
+    if why := facts["unwritable"]:
         yield f"{name}: its folder cannot be used ({why}); correct hosts.{name}.folder, or make it there"
 
 
@@ -136,36 +195,70 @@ def _warnings(name: str, report: HostReport) -> Iterator[str]:
         yield f"{name}: its clock is {report.clock_offset_s:+.1f} s off; set it with chrony or ntp"
     if facts["load"] > LOAD_MAX * facts["cores"]:
         yield f"{name}: load is {facts['load']:.1f} on {facts['cores']} cores; lockstep goes at the pace of the slowest"
-    slow = set(facts["governors"]) - PERFORMANCE
-    if slow:
+    if slow := set(facts["governors"]) - PERFORMANCE:
         yield f"{name}: the CPU governor is {', '.join(sorted(slow))}; performance is steadier (cpupower frequency-set)"
     if facts["free_bytes"] < FREE_MIN_BYTES:
         yield f"{name}: {facts['free_bytes'] / 1e9:.1f} GB are free on its disk; a record of an hour takes about 1 GB"
+
+
+def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
+    """Yield a warning of different numeric fingerprints with the parts that differ, and one per missing package."""
+    prints = {name: report.facts["fingerprint"] for name, report in reports.items()}
+    if len(set(prints.values())) < 2:
+        return
+    shown = ", ".join(f"{name} {text[:8]}" for name, text in prints.items())
+    parts = {name: report.facts["parts"] for name, report in reports.items()}
+    names = dict.fromkeys(part for each in parts.values() for part in each)
+    differing = [part for part in names if len({each.get(part) for each in parts.values()}) > 1]
+    values = {part: [f"{name} {each.get(part, 'none')}" for name, each in parts.items()] for part in differing}
+    causes = "; ".join(f"{part}: {', '.join(found)}" for part, found in values.items())
+    yield f"the hosts compute with different numeric fingerprints ({shown}); same bits are not promised; {causes}"
+    for name, report in reports.items():
+        if lacking := " and ".join(part for part in differing if part not in parts[name]):
+            yield f"{name}: has no {lacking}, with which others compute; {report.remedy}"
+
+
+def hosts_table(reports: Mapping[str, HostReport]) -> FittedTable:
+    rows = [
+        (
+            name,
+            report.facts["python"],
+            report.facts["zsim"],
+            f"{1e3 * report.round_trip_s:.1f} ms",
+            f"{1e3 * report.clock_offset_s:+.1f} ms",
+            f"{report.facts['load']:.2f}",
+            str(report.facts["cores"]),
+            ", ".join(report.facts["governors"]) or "-",
+            report.facts["fingerprint"][:8],
+        )
+        for name, report in reports.items()
+    ]
+    return FittedTable(HOST_COLUMNS, rows)
+
+
+# The network between them
 
 
 async def network_paths(
     links: Sequence[HostLink], target: HostLink, python: dict[str, str], port: int
 ) -> list[NetworkPath]:
     """Return how the hosts reach a port of another, on which nothing else may listen."""
+
+    async def reach(link: HostLink) -> dict[str, Any]:
+        try:
+            async with _probe(link, python[link.name], "reach", target.host.address, str(port)) as client:
+                return await client.answer(REACH_S)
+        except HostsError as error:
+            return {"error": str(error)}
+
     try:
         async with _probe(target, python[target.name], "serve", str(port)) as server:
             message = await server.answer(READY_S)
             if "error" in message:
                 return [NetworkPath(target.name, target.name, port, message)]
-            return [
-                NetworkPath(link.name, target.name, port, await _reach(link, target, python, port)) for link in links
-            ]
+            return [NetworkPath(link.name, target.name, port, await reach(link)) for link in links]
     except HostsError as error:
         return [NetworkPath(target.name, target.name, port, {"error": str(error)})]
-
-
-async def _reach(link: HostLink, target: HostLink, python: dict[str, str], port: int) -> dict[str, Any]:
-    words = ("reach", target.host.address, str(port))
-    try:
-        async with _probe(link, python[link.name], *words) as client:
-            return await client.answer(REACH_S)
-    except HostsError as error:
-        return {"error": str(error)}
 
 
 def path_faults(paths: Sequence[NetworkPath]) -> tuple[list[str], list[str]]:
@@ -192,60 +285,11 @@ def _path_fault(path: NetworkPath) -> str:
             return f"{path.source}: {fault}"
 
 
-class CheckResult(NamedTuple):
-    """What is to be shown of the hosts, and what is wrong with them, a line each."""
-
-    tables: list[FittedTable]
-    faults: list[str]
-    warnings: list[str]
-
-
-def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
-    """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
-    result = asyncio.run(_check_up(placed, places))
-    lacks = enrolment.certificate_faults(placed, places, datetime.now(UTC))
-    warning = enrolment.exposed_keys(placed)
-    return result._replace(
-        faults=[*lacks, *result.faults], warnings=[*result.warnings, *([warning] if warning else [])]
-    )
-
-
-async def _check_up(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
-    links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
-    pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
-    try:
-        results = await asyncio.gather(
-            *(host_report(link, pythons[name], placed.word) for name, link in links.items()), return_exceptions=True
-        )
-        reports: dict[str, HostReport] = {}
-        faults: list[str] = []
-        for name, result in zip(links, results, strict=True):
-            if isinstance(result, HostReport):
-                reports[name] = result
-            elif isinstance(result, ZsimError):
-                faults.append(str(result))
-            else:
-                raise result
-        wrong, warnings = compare_reports(reports)
-        paths = await _paths(placed, places, links, pythons, set(reports)) if places else []
-        cut, slow = path_faults(paths)
-        left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
-        tables = [hosts_table(reports), *([paths_table(paths)] if paths else [])]
-        return CheckResult(
-            tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)]
-        )
-    finally:
-        for link in links.values():
-            await link.close()
-
-
-async def _paths(
-    placed: InventoryFile, places: dict[str, str], links: dict[str, HostLink], pythons: dict[str, str], there: set[str]
-) -> list[NetworkPath]:
-    """Return how the hosts reach what their roles and routers connect to, one path after the other."""
-    paths: list[NetworkPath] = []
-    for (target, port), sources in inv.connections(placed, places).items():
-        if target in there:
-            chosen = [links[name] for name in sorted(sources & there)]
-            paths += await network_paths(chosen, links[target], pythons, port)
-    return paths
+def paths_table(paths: Sequence[NetworkPath]) -> FittedTable:
+    rows = []
+    for path in paths:
+        figures, cells = path.figures, (path.figures.get("error", ""), "-")
+        if "error" not in figures:
+            cells = (f"{1e3 * figures['round_trip_s']:.2f} ms", f"{figures['bits_per_s'] / 1e6:.0f} Mbit/s")
+        rows.append((path.source, path.target, str(path.port), *cells))
+    return FittedTable(PATH_COLUMNS, rows)

@@ -1,31 +1,29 @@
-"""What a run puts on each host: processes with their command lines, files; and what other runs have left there."""
+"""What a run puts on each host, processes and files, and what earlier runs have left there."""
 
 import shlex
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
 
-import msgspec
+from msgspec.structs import replace
 
 from zsim.errors import HostsError
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import CERTIFICATES, KEY
-from zsim_deploy.hosts.host_link import HostLink
-from zsim_deploy.hosts.ssh_connection import json_answer, shell_line, shell_word
-from zsim_deploy.inventory import enrolment
-from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.enrolment import folder_of, init_command
-from zsim_deploy.inventory.inventory import SSH_PORT, Host, InventoryFile
-from zsim_deploy.inventory.processes import MODULE, ProcessFiles, access_file, command, own_programs, processes
-from zsim_deploy.launch.interrupted_run import JOURNAL
+from zsim_deploy import certificates
+from zsim_deploy import inventory as inv
+from zsim_deploy.arguments import file_fault
+from zsim_deploy.hosts.host_link import HostLink, json_answer, shell_line, shell_word
+from zsim_deploy.inventory import MODULE, SSH_PORT, Host, InventoryFile, ProcessFiles
+from zsim_deploy.launch.run_folder import JOURNAL
 from zsim_deploy.roles.stop_channel import FOLDER
 
 ACCESS = "access.json"
 RECORD = "run.mcap"
 RUNS = "runs"  # below the folder of zsim on a host: a folder per run
-# Whose processes still run is no earlier run; where there is no ps, nobody is known to.
+# A run whose processes still run is no earlier run; where there is no ps, none is known to run.
 LIST_RUNS = f"""
 alive=$(ps -A -ww -o args 2>/dev/null || ps -A -o args 2>/dev/null)
 for run in *; do
@@ -57,13 +55,10 @@ class HostPlan:
     """The processes of one run that zsim starts, and where; it does not change.
 
     Args:
-        placed: the inventory.
-        scenario: what is flown.
         run_id: names the run's folder on each host.
         pace: options of the world: `--realtime`, `--rate R`.
 
     Attributes:
-        placed: the inventory.
         processes: by name, the routers first, each after the one that it connects to.
         remarks: on programs of the user's own, which are not started.
 
@@ -76,14 +71,14 @@ class HostPlan:
         self._scenario = scenario
         self._run_id = run_id
         self._pace = pace
-        in_order = sorted(processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
+        in_order = sorted(inv.processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
         self.processes = {process.name: process for process in in_order}
-        self.remarks = own_programs(placed, scenario)
+        self.remarks = inv.own_programs(placed, scenario)
 
     def moved(self, name: str, host: str) -> "HostPlan":
         """Return the same plan but for the host of one process."""
         places = {**inv.placement(self.placed, self._scenario), name: host}
-        placed = self.placed._replace(inventory=msgspec.structs.replace(self.placed.inventory, roles=places))
+        placed = self.placed._replace(inventory=replace(self.placed.inventory, roles=places))
         return HostPlan(placed, self._scenario, self._run_id, self._pace)
 
     def hosts(self) -> list[str]:
@@ -91,11 +86,9 @@ class HostPlan:
         return sorted({process.host for process in self.processes.values()})
 
     def host(self, name: str) -> str:
-        """Return where a process runs."""
         return self.processes[name].host
 
     def folder(self, host: str) -> str:
-        """Return the folder of this run on a host."""
         return f"{runs_folder(self.placed.inventory.hosts[host])}/{self._run_id}"
 
     def keys(self, host: str) -> str:
@@ -103,7 +96,6 @@ class HostPlan:
         return f"{self.folder(host)}/{FOLDER}"
 
     def record(self) -> str:
-        """Return where the record is written, on the recorder's host."""
         return f"{self.folder(self.host(RECORDER))}/{RECORD}"
 
     def way_to_record(self) -> str:
@@ -117,11 +109,10 @@ class HostPlan:
         return [process.port for process in self.processes.values() if process.host == host and process.port]
 
     def certificate_faults(self, now: datetime) -> list[str]:
-        """Return what of the certificates is missing or of no use at a time, a line for each fault."""
-        return enrolment.certificate_faults(self.placed, {name: self.host(name) for name in self.processes}, now)
+        """Return a line for each fault of the certificates at a given time."""
+        return certificates.certificate_faults(self.placed, {name: self.host(name) for name in self.processes}, now)
 
     def python(self, host: str) -> str:
-        """Return the interpreter of a host that has zsim."""
         return inv.python(self.placed.inventory.hosts[host])
 
     def arguments(self, name: str) -> list[str]:
@@ -129,7 +120,7 @@ class HostPlan:
         process, folder = self.processes[name], self.folder(self.host(name))
         identity = f"{self.keys(process.host)}/{name}"
         files = ProcessFiles(f"{folder}/scenario.yaml", identity, f"{identity}/{ACCESS}", folder)
-        role, *options = command(process, files)[len(MODULE) :]
+        role, *options = inv.command(process, files)[len(MODULE) :]
         journal = ["--journal", f"{folder}/{JOURNAL}"] if name == WORLD else []
         return [role, "--launched", self._run_id, *journal, *options]
 
@@ -152,34 +143,26 @@ class HostPlan:
         process = self.processes[name]
         if not process.secure:
             return {}
-        source = folder_of(self.placed) / process.host
+        source = certificates.folder_of(self.placed) / process.host
         paths = {file: source / name / file for file in CERTIFICATES}
         if process.port is not None:
-            paths[ACCESS] = source / access_file(process)
-        return {f"{FOLDER}/{name}/{file}": self._read(path) for file, path in paths.items()}
-
-    def _read(self, path: Path) -> bytes:
-        try:
-            return path.read_bytes()
-        except OSError as error:
-            raise HostsError(
-                f"{path}: cannot be read ({error.strerror}); make certificates with "
-                f"`{init_command(self.placed)}`, or set security.insecure on a network of your own"
-            ) from error
+            paths[ACCESS] = source / inv.access_file(process)
+        init = certificates.init_command(self.placed)
+        remedy = f"make certificates with `{init}`, or set security.insecure on a network of your own"
+        contents = {}
+        for file, path in paths.items():
+            with file_fault(path, "cannot be read", remedy, HostsError):
+                contents[f"{FOLDER}/{name}/{file}"] = path.read_bytes()
+        return contents
 
 
 def runs_folder(host: Host) -> str:
     """Return the folder of runs on a host, from its root or as ~/ from the home."""
-    home = "" if host.folder.startswith(("/", "~/")) else "~/"
-    return f"{home}{host.folder}/{RUNS}"
+    return f"{inv.below_home(host.folder)}/{RUNS}"
 
 
 async def leftovers(link: HostLink, base: Path) -> list[str]:
-    """Return what earlier runs have left on a host: at most a line on records, and one on private keys.
-
-    Args:
-        link: to the host.
-        base: folder of the inventory.
+    """Describe what earlier runs have left on a host: at most a line on records, and one on private keys.
 
     Raises:
         HostsError: it could not be asked.
@@ -191,7 +174,7 @@ async def leftovers(link: HostLink, base: Path) -> list[str]:
 
 
 def leftover_lines(name: str, host: Host, base: Path, output: Iterable[str]) -> list[str]:
-    """Return lines for a person from what LIST_RUNS prints; a greeting of the login shell is passed over."""
+    """Describe what LIST_RUNS prints; a greeting of the login shell is skipped."""
     folder = runs_folder(host)
     words = [line.split(" ", 1) for line in output]
     runs = {kind: [word[1] for word in words if word[0] == kind and len(word) > 1] for kind in (RECORD, KEY)}
@@ -213,16 +196,16 @@ def scp(host: Host, base: Path, path: str) -> str:
     """Return the command that copies a file from a host to here, as `zsim up` reaches the host."""
     address = host.ssh or host.address
     shown = f"[{address}]" if ":" in address else address
-    known = f"UserKnownHostsFile={base / Path(host.known_hosts).expanduser()}" if host.known_hosts else None
     words = ["scp", *(["-P", str(host.port)] if host.port != SSH_PORT else [])]
     words += ["-i", str(base / Path(host.key).expanduser())] if host.key else []
-    words += ["-o", known] if known else []
+    if host.known_hosts:
+        words += ["-o", f"UserKnownHostsFile={base / Path(host.known_hosts).expanduser()}"]
     user = f"{host.user}@" if host.user else ""
     return shlex.join([*words, f"{user}{shown}:{path.removeprefix('~/')}", "."])
 
 
 async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list[str]:
-    """Return a line for each port of a host on which somebody else listens.
+    """Return a line for each port of a host that is in use by another program.
 
     Raises:
         HostsError: it could not be asked.
@@ -236,6 +219,6 @@ async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list
 
 
 def port_in_use(host: str, port: int) -> str:
-    """Return a line on a port of a host on which somebody else listens."""
+    """Return a line on a port of a host that is in use by another program."""
     remedy = "end that (`ss -ltnp` there shows it), or give another port in the inventory"
     return f"{host}: port {port} is in use there, perhaps by another run; {remedy}"

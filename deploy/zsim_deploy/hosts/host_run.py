@@ -1,10 +1,15 @@
-"""A run on several hosts: checked, prepared, started over ssh, watched, ended, and its record brought home."""
+"""A run on several hosts: checked, prepared, started over ssh, watched, ended, and its record brought home.
+
+The requests of `zsim ps`, `logs`, `restart`, `move` and `down` are carried out here, each in a thread of the control
+socket.
+"""
 
 import contextlib
+import threading
 import time
-import uuid
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, wait
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,45 +17,30 @@ from typing import Any, NamedTuple
 from zsim.errors import HostsError, RunError, ZsimError
 from zsim.record import repair
 from zsim.scenario import scenario_file
-from zsim.scenario.rights import RECORDER, WORLD
+from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.arguments import changed_options, pace_options
+from zsim_deploy.arguments import OTHER_OUT, changed_options, file_fault, pace_options
+from zsim_deploy.certificates import exposed_keys
 from zsim_deploy.hosts.control_socket import ControlSocket
-from zsim_deploy.hosts.doctor import compare_reports, host_report
-from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
-from zsim_deploy.hosts.host_links import HostLinks, fetch
+from zsim_deploy.hosts.doctor import HostReport, compare_reports, host_report
+from zsim_deploy.hosts.host_link import EventLoopThread, HostLink, HostLinks, fetch, shell_word
 from zsim_deploy.hosts.host_plan import RECORD, HostPlan, leftovers, port_faults
-from zsim_deploy.hosts.host_report import HostReport
-from zsim_deploy.hosts.launcher_requests import LauncherRequests
 from zsim_deploy.hosts.remote_process import ProcessLog, RemoteProcess
-from zsim_deploy.hosts.ssh_connection import shell_word
 from zsim_deploy.hosts.status_table import StatusTable
-from zsim_deploy.inventory.enrolment import exposed_keys
-from zsim_deploy.inventory.inventory import InventoryFile
-from zsim_deploy.launch.end_signals import EndSignals
-from zsim_deploy.launch.supervisor import Outcome, Supervisor
+from zsim_deploy.inventory import MODULES, InventoryFile, extras
+from zsim_deploy.launch.run_folder import Launch
+from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor
 
 CONNECT_S = 30.0  # how long all hosts together may take to let us in, …
 CHECK_S = 60.0  # … to be checked: a small computer takes 5 s to import numpy, a poor link adds a dozen round trips, …
 PREPARE_S = 30.0  # … and to take their files
-CLEAN_S = 5.0  # how long a host may take to remove the run's folder; one that was lost holds nobody up for longer
-
-
-@dataclass
-class HostRunOptions:
-    """How to run a scenario, of whose file some fields were changed, on the hosts of an inventory."""
-
-    scenario: Scenario
-    placed: InventoryFile
-    out: Path
-    mode: str = "lockstep"
-    rate: float = 0.0
-    run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
-    changed: Sequence[str] = ()
-
-    def pace(self) -> list[str]:
-        """Return mode, rate and changed fields as options of the world."""
-        return [*pace_options(self.mode, self.rate), *changed_options(self.changed)]
+CLEAN_S = 5.0  # how long a host may take to remove the run's folder; a lost host delays the end no longer than this
+JOIN_S = 60.0  # until a host that was not used so far is connected and checked
+IMPORT_S = 20.0  # until a Python has shown that it can run a role; a small computer takes 5 s
+BRING_S = 30.0  # until a certificate is on a host
+LEAVE_S = 20.0  # until a process whose place was taken a moment ago has ended, which takes a second
+LOOK_S = 0.1  # between two looks whether it has
+ORDER_S = 5.0  # until the supervisor, which looks every 50 ms, carries out an order
 
 
 class HostInspection(NamedTuple):
@@ -64,24 +54,25 @@ class HostInspection(NamedTuple):
 class HostRun:
     """One run on several hosts.
 
-    Args:
-        options: what to run where.
-        status: takes progress.
-
     Raises:
         InventoryError: a process has no place.
     """
 
-    def __init__(self, options: HostRunOptions, status: StatusTable) -> None:
-        self._options = options
+    def __init__(
+        self, scenario: Scenario, placed: InventoryFile, out: Path, launch: Launch, status: StatusTable
+    ) -> None:
+        self._scenario = scenario
+        self._placed = placed
+        self._out = out
         self._status = status
-        self._logs = options.out / "logs"
-        self._plan = HostPlan(options.placed, options.scenario, options.run_id, options.pace())
-        self._supervisor = Supervisor(options.scenario.processes, status)
+        pace = [*pace_options(launch.mode, launch.rate), *changed_options(launch.changed)]
+        self._plan = HostPlan(placed, scenario, launch.run_id, pace)  # another one after each move
+        self._supervisor = Supervisor(scenario.processes, status)
         self._loop = EventLoopThread()
-        self._links = HostLinks(options.placed, self._plan.hosts(), self._loop)
+        self._links = HostLinks(placed, self._plan.hosts(), self._loop)
         self._record_stays = False
-        self._signals = EndSignals(options.out / "up.log", status.hang_up)
+        self._signals = EndSignals(out / "up.log", status.hang_up)
+        self._one_at_a_time = threading.Lock()  # of requests that replace a process
 
     def run(self) -> Outcome:
         """Run to the end; whatever happens, no process or key of it is left on any host that can be reached.
@@ -90,9 +81,19 @@ class HostRun:
             RunError: the federation is up already on this machine.
             HostsError: with a line for every certificate that is missing, or every host that cannot take part.
         """
+        requests = {
+            "ps": lambda: {"rows": self._status.rows(), "clock": self._status.clock_now(), **self._where()},
+            "where": self._where,
+            "down": lambda: self._supervisor.interrupt("ended by zsim down"),
+            "restart": self._restart,
+            "move": self._move,
+        }
         try:
-            with self._signals, self._control_socket():
-                self._refuse_unless_certified()
+            with self._signals, ControlSocket(self._scenario.federation, requests):
+                if faults := self._plan.certificate_faults(datetime.now(UTC)):
+                    raise HostsError("\n".join(faults))
+                if warning := exposed_keys(self._placed):
+                    self._status.say(f"warning: {warning}")
                 self._timed("connect", lambda: self._links.on_all(HostLink.open, CONNECT_S))
                 self._timed("check", self._check)
                 with self._cleaned():
@@ -102,25 +103,6 @@ class HostRun:
             with contextlib.suppress(HostsError):
                 self._links.close()
             self._loop.close()
-
-    def _look(self) -> None:
-        """End the run where nobody sees it any more; show which hosts are silent."""
-        self._signals.look()
-        if self._signals.reason:
-            self._supervisor.interrupt(self._signals.reason)
-        self._status.report_silent_hosts()
-
-    def _refuse_unless_certified(self) -> None:
-        if faults := self._plan.certificate_faults(datetime.now(UTC)):
-            raise HostsError("\n".join(faults))
-        if warning := exposed_keys(self._options.placed):
-            self._status.say(f"warning: {warning}")
-
-    def _control_socket(self) -> ControlSocket:
-        requests = LauncherRequests(
-            self._plan, self._links, self._loop, self._supervisor, self._status, self._options.out, self._remote
-        )
-        return ControlSocket(self._options.scenario.federation, requests.handlers())
 
     def _timed(self, what: str, act: Callable[[], Any]) -> None:
         start_s = time.monotonic()
@@ -137,9 +119,9 @@ class HostRun:
 
     async def _inspect(self, link: HostLink) -> HostInspection:
         python = self._plan.python(link.name)
-        report = await host_report(link, python, self._options.placed.word)
+        report = await host_report(link, python, self._placed.word)
         taken = await port_faults(link, python, self._plan.ports(link.name))
-        return HostInspection(report, taken, await leftovers(link, self._options.placed.folder))
+        return HostInspection(report, taken, await leftovers(link, self._placed.folder))
 
     async def _prepare(self, link: HostLink) -> None:
         """Put the scenario, and the certificates where there are any, on a host."""
@@ -147,7 +129,9 @@ class HostRun:
             await link.put_files(self._plan.folder(link.name), files, PREPARE_S)
 
     def _fly(self) -> Outcome:
-        self._make_logs()
+        with file_fault(self._out, "cannot be written", OTHER_OUT):
+            (self._out / "logs").mkdir(parents=True, exist_ok=True)
+            (self._out / "scenario.yaml").write_text(scenario_file.to_text(self._scenario))
         for remark in self._plan.remarks:
             self._status.say(remark)
         self._supervisor.members = [self._remote(self._plan, name) for name in self._plan.processes]
@@ -168,25 +152,26 @@ class HostRun:
             self._status.say(fault)
         return outcome
 
-    def _make_logs(self) -> None:
-        out = self._options.out
-        try:
-            self._logs.mkdir(parents=True, exist_ok=True)
-            (out / "scenario.yaml").write_text(scenario_file.to_text(self._options.scenario))
-        except OSError as error:
-            raise RunError(f"{out}: cannot be written ({error.strerror}); give --out another folder") from error
+    def _look(self) -> None:
+        """End the run when nobody can see its output any more; show which hosts are silent."""
+        self._signals.look()
+        if self._signals.reason:
+            self._supervisor.interrupt(self._signals.reason)
+        self._status.report_silent_hosts()
 
     def _remote(self, plan: HostPlan, name: str) -> RemoteProcess:
         host = plan.host(name)
-        log = ProcessLog(self._logs / f"{name}.log", self._status.say)
+        log = ProcessLog(self._out / "logs" / f"{name}.log", self._status.say)
         on_line = self._supervisor.handle_line if name == WORLD else None
         link = self._links.by_name[host]
         more = (on_line, plan.folder(host), plan.identity(name))
         return RemoteProcess(name, plan.arguments(name), link, plan.python(host), self._loop, log, *more)
 
+    # The end
+
     def _fetch(self) -> str:
-        """Bring the record home; return why it is not here, empty if it is."""
-        host, into = self._plan.host(RECORDER), self._options.out / RECORD
+        """Fetch the record; return why that failed, empty if it did not."""
+        host, into = self._plan.host(RECORDER), self._out / RECORD
         self._status.say(f"fetching the record from {host}:{self._plan.record()} …")
         try:
             is_there = self._loop.call(fetch(self._links.by_name[host], self._plan.record(), into))
@@ -199,8 +184,8 @@ class HostRun:
         return "" if is_there else "nothing was recorded"
 
     @contextlib.contextmanager
-    def _cleaned(self) -> Any:
-        """Leave nothing of the run on the hosts in the end, but a record that could not be fetched."""
+    def _cleaned(self) -> Iterator[None]:
+        """Clean the hosts at the end of the run, except for a record that could not be fetched."""
         try:
             yield
         finally:
@@ -218,3 +203,91 @@ class HostRun:
         if self._record_stays and link.name == self._plan.host(RECORDER):
             command = f"rm -rf {keys}; [ -e {shell_word(self._plan.record())} ] || {command}"
         await link.run(command, timeout_s=CLEAN_S, what=f"removing {self._plan.folder(link.name)}")
+
+    # Requests
+
+    def _where(self) -> dict[str, Any]:
+        return {"out": str(self._out.absolute()), "roles": list(self._plan.processes)}
+
+    def _restart(self, role: str) -> str:
+        self._refuse_unless_runs(role)
+        if role in (WORLD, RECORDER):
+            raise RunError(f"{role} cannot be restarted: the run lives in it; end the run with `zsim down`")
+        with self._one_at_a_time:
+            return self._take_over(self._plan, role)
+
+    def _move(self, role: str, host: str) -> str:
+        self._refuse_unless_runs(role)
+        if role in (WORLD, RECORDER) or role.startswith(f"{ROUTER}."):
+            raise RunError(f"{role} cannot be moved while the run goes on; change the inventory and run again")
+        if host not in (hosts := self._plan.placed.inventory.hosts):
+            raise RunError(f"host is {host!r}; must be one of {', '.join(hosts)}")
+        with self._one_at_a_time:
+            plan = self._plan.moved(role, host)
+            if faults := plan.certificate_faults(datetime.now(UTC)):
+                raise HostsError("\n".join(faults))
+            link = self._links.by_name.get(host) or self._join(host)
+            self._loop.call(_refuse_unless_able(link, plan.python(host), role))
+            return self._take_over(plan, role)
+
+    def _refuse_unless_runs(self, role: str) -> None:
+        if not self._supervisor.members:
+            raise RunError("the run has not started yet; try again when it flies")
+        if role not in self._plan.processes:
+            raise RunError(f"role is {role!r}; must be one of {', '.join(self._plan.processes)}")
+
+    def _join(self, host: str) -> HostLink:
+        """Return a link to a host that was not used so far, after checking it."""
+        link = self._links.to(host)
+        try:
+            report = self._loop.call(host_report(link, self._plan.python(host)), JOIN_S)
+            faults, warnings = compare_reports({host: report})
+            if faults:
+                raise HostsError("\n".join(faults))
+        except BaseException:
+            self._loop.spawn(link.close())
+            raise
+        for warning in warnings:
+            self._status.say(f"warning: {warning}")
+        self._links.add(link)
+        self._status.links = self._links.by_name
+        return link
+
+    def _take_over(self, plan: HostPlan, role: str) -> str:
+        """Start a process that takes over the name of another, which leaves by itself, or is killed if it hangs."""
+        host = plan.host(role)
+        if files := plan.identity(role):
+            self._loop.call(self._links.by_name[host].put_files(plan.folder(host), files, BRING_S))
+        until_s = time.monotonic() + LEAVE_S
+        while self._supervisor.is_being_replaced(role) and time.monotonic() < until_s:
+            time.sleep(LOOK_S)
+        new = self._remote(plan, role)
+
+        def take() -> None:
+            self._supervisor.replace(new)
+            self._plan = plan
+
+        carried_out = self._supervisor.submit(take)
+        wait([carried_out], ORDER_S)
+        carried_out.cancel()  # changes nothing where it is being carried out
+        try:
+            carried_out.result()
+        except CancelledError as error:
+            raise RunError("the run is ending; nothing is started any more") from error
+        return f"{role} on {host}"
+
+
+async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
+    """Refuse a host whose Python cannot import what a role is made of.
+
+    Raises:
+        HostsError: with what it lacks.
+    """
+    for extra in extras([role]):
+        code = f"import {MODULES[extra]}"
+        command = f"{shell_word(python)} -c {shell_word(code)}"
+        try:
+            await link.run(command, timeout_s=IMPORT_S, what=code)
+        except HostsError as error:
+            remedy = f"install its extra {extra} there, as `zsim push --extra {extra}` does"
+            raise HostsError(f"{error}; {role} cannot run on {link.name}; {remedy}") from error

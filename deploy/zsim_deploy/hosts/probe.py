@@ -30,7 +30,7 @@ BULKS_BYTES = tuple(16_384 << power for power in range(9))  # up to 4 MB, which 
 BULK_S = 1.0  # a bulk that takes so long is long enough to measure the bandwidth
 CHUNK_BYTES = 65_536
 TIMEOUT_S = 10.0  # wall time; the least bulk takes so long at 13 kbit/s, and no other is sent unless half took 1 s
-SERVE_S = 60.0  # a server that nobody needs any more ends by itself
+SERVE_S = 60.0  # a server that is no longer needed ends by itself
 SHORTEST_S = 1e-4  # what remains of a bulk's time without the round trip is at least this; 4 MB in it are 300 Gbit/s
 DONE = b"."
 
@@ -60,12 +60,12 @@ def unwritable(folder: Path) -> str | None:
 
 
 def _nearest(folder: Path) -> Path:
-    """Return a folder, or what there is of its path."""
+    """Return the nearest existing part of a path."""
     return next(path for path in (folder, *folder.parents) if os.path.exists(path))
 
 
 def clock(requests: TextIO) -> None:
-    """Print the wall clock for each line that comes."""
+    """Print the wall-clock time for each line received."""
     for _ in requests:
         print(json.dumps({"time_ns": time.time_ns()}), flush=True)
 
@@ -142,7 +142,7 @@ def _bits_per_s(link: socket.socket, round_trip_s: float) -> float:
 
 
 def _send_s(link: socket.socket, size: int) -> float:
-    """Return how long it takes to send so many bytes and to have them confirmed."""
+    """Return the time to send so many bytes and to have them confirmed [s]."""
     start_s = time.monotonic()
     link.sendall(size.to_bytes(SIZE_BYTES, "big") + bytes(size))
     if not link.recv(len(DONE)):
@@ -151,7 +151,6 @@ def _send_s(link: socket.socket, size: int) -> float:
 
 
 def main() -> None:
-    """Run the command of the command line."""
     match sys.argv[1:]:
         case ["about", folder]:
             print(json.dumps(about(Path(folder).expanduser().absolute())), flush=True)

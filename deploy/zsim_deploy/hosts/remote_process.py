@@ -16,10 +16,10 @@ from typing import Any
 import asyncssh
 
 from zsim.errors import HostsError
-from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
-from zsim_deploy.hosts.ssh_connection import shell_line
-from zsim_deploy.inventory.processes import MODULE
+from zsim_deploy.hosts.host_link import EventLoopThread, HostLink, shell_line
+from zsim_deploy.inventory import MODULE
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
+from zsim_deploy.launch.supervisor import end_text
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
 ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that
@@ -29,47 +29,13 @@ LOST = -1000  # code of a process whose end is not known
 PID = "zsim-pid "  # begins the line with its process id; a login shell may print something before
 
 
-class ProcessLog:
-    """The log file of a process; where it cannot be written, that is reported once, and only the last line is kept.
-
-    Args:
-        path: of the file, named after the process.
-        say: takes a line when it cannot be written.
-
-    Attributes:
-        last: line that is not empty.
-    """
-
-    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        self.last = ""
-        self._path = path
-        self._say = say
-        self._is_whole = True
-
-    def write(self, line: str) -> None:
-        """Add a line, which ends in a line feed."""
-        self.last = line.strip() or self.last
-        try:
-            with self._path.open("a", errors="replace") as file:
-                file.write(line)
-        except OSError as error:
-            if self._is_whole:
-                self._is_whole = False
-                self._say(f"{self._path}: cannot be written ({error.strerror}); what it would have there is lost")
-
-
 class RemoteProcess:
     """A role on another host.
 
     Args:
-        name: process name `role.thing`.
         arguments: of the `zsim` command there.
-        link: to the host.
-        python: interpreter there that has zsim.
-        loop: on which the link lives.
         log: of its output.
         on_line: takes every line of its standard output; None sends that to the log too.
-        folder: of the run there.
         files: what it needs below that folder and takes away when it ends; brought again whenever it is started again.
     """
 
@@ -80,7 +46,7 @@ class RemoteProcess:
         link: HostLink,
         python: str,
         loop: EventLoopThread,
-        log: ProcessLog,
+        log: "ProcessLog",
         on_line: Callable[[str], None] | None = None,
         folder: str = "",
         files: Mapping[str, bytes] | None = None,
@@ -125,46 +91,52 @@ class RemoteProcess:
         self._life = self._loop.spawn(self._live())
 
     async def _live(self) -> None:
-        """Run the process to its end, which is noticed whatever happens."""
+        """Run the process to its end, and note how it ended in every case."""
         code = LOST
         try:
             code = await self._run()
         except (asyncssh.Error, OSError, HostsError) as error:
-            self._lose(f"the connection to {self.host} broke ({error})")
+            self._fault = f"the connection to {self.host} broke ({error})"
         except Exception as error:
-            self._lose(f"the launcher could not follow it ({error!r})")
+            self._fault = f"the launcher could not follow it ({error!r})"
         finally:
+            if self._fault:
+                self._log.write(f"{self._fault}\n")
             self._code = code
             self._ended.set()
 
-    def _lose(self, fault: str) -> None:
-        self._fault = fault
-        self._log.write(f"{fault}\n")
-
     async def _run(self) -> int:
+        async def beat(process: "asyncssh.SSHClientProcess[str]") -> None:
+            with contextlib.suppress(OSError, asyncssh.Error):
+                while True:
+                    await asyncio.sleep(BEAT_S)
+                    process.stdin.write("beat\n")
+
         if self._starts > 1 and self._files:
             await self._link.put_files(self._folder, self._files, LEND_S, retry=True)
+        settings = " ".join(f"{name}={value}" for name, value in SINGLE_THREADED.items())
+        command = f"echo {PID}$$; exec env {settings} {shell_line([self._python, *MODULE, *self._arguments])}"
         async with (
             self._link.channel(retry=True) as connection,
-            connection.create_process(self._command(), encoding="utf-8", errors="replace") as process,
+            connection.create_process(command, encoding="utf-8", errors="replace") as process,
         ):
-            self.pid = await _pid(process.stdout)
+            async for line in process.stdout:
+                if line.startswith(PID):
+                    self.pid = int(line.removeprefix(PID))
+                    break
             self._process = process
             process.stdin.write(f"orphan-after {ORPHAN_S:g}\n")
             if self._stop is not None:
                 self._send(f"stop {self._stop}\n")
-            beats = asyncio.create_task(self._beat(process))
+            beats = asyncio.create_task(beat(process))
             try:
                 await asyncio.gather(self._read_lines(process.stdout, self._on_line), self._read_lines(process.stderr))
                 done = await process.wait()
             finally:
                 beats.cancel()
-            return _code(done)
-
-    def _command(self) -> str:
-        words = [self._python, *MODULE, *self._arguments]
-        settings = " ".join(f"{name}={value}" for name, value in SINGLE_THREADED.items())
-        return f"echo {PID}$$; exec env {settings} {shell_line(words)}"
+            if done.exit_signal:
+                return -int(getattr(signal, f"SIG{done.exit_signal[0]}", signal.SIGKILL))
+            return done.exit_status if done.exit_status is not None else LOST
 
     async def _read_lines(self, stream: Any, on_line: Callable[[str], None] | None = None) -> None:
         async for line in stream:
@@ -173,25 +145,12 @@ class RemoteProcess:
             else:
                 self._log.write(line)
 
-    @staticmethod
-    async def _beat(process: "asyncssh.SSHClientProcess[str]") -> None:
-        with contextlib.suppress(OSError, asyncssh.Error):
-            while True:
-                await asyncio.sleep(BEAT_S)
-                process.stdin.write("beat\n")
-
     def outcome(self) -> str:
-        """Return how it ended, as text."""
-        code = self._code
-        if code == LOST:
+        if self._code == LOST:
             return self._fault or f"the connection to {self.host} broke"
-        if code is not None and code < 0:
-            return f"killed by signal {-code}"
-        last = self.last_log_line()
-        return f"exit code {code}" + (f": {last}" if last else "")
+        return end_text(self._code, self.last_log_line())
 
     def last_log_line(self) -> str:
-        """Return the last line that it wrote to its log."""
         return self._log.last
 
     def request_stop(self, reason: str) -> None:
@@ -212,31 +171,47 @@ class RemoteProcess:
         """Send SIGKILL, as to one that hangs, or stop trying to start it; returns at once."""
         if self._code is not None or self._life is None:
             return
-        if self.pid:
-            self._loop.spawn(self._kill(self.pid))
-        else:
+        if not self.pid:
             self._life.cancel()
+            return
 
-    async def _kill(self, pid: int) -> None:
-        with contextlib.suppress(HostsError):
-            await self._link.run(f"kill -9 {pid}", timeout_s=KILL_S)
+        async def kill(command: str) -> None:
+            with contextlib.suppress(HostsError):
+                await self._link.run(command, timeout_s=KILL_S)
+
+        self._loop.spawn(kill(f"kill -9 {self.pid}"))
 
     def close(self) -> None:
-        """End it whatever it does; one that cannot be reached ends by itself."""
+        """End it in any case; one that cannot be reached ends by itself."""
         if self._life is not None:
             self.kill()
             self._ended.wait(KILL_S)
 
 
-async def _pid(output: "asyncssh.SSHReader[str]") -> int:
-    """Return the process id that the shell prints, 0 if it ends without."""
-    async for line in output:
-        if line.startswith(PID):
-            return int(line.removeprefix(PID))
-    return 0
+class ProcessLog:
+    """The log file of a process; where it cannot be written, that is reported once, and only the last line is kept.
 
+    Args:
+        path: of the file, named after the process.
+        say: takes a line when it cannot be written.
 
-def _code(done: asyncssh.SSHCompletedProcess) -> int:
-    if done.exit_signal:
-        return -int(getattr(signal, f"SIG{done.exit_signal[0]}", signal.SIGKILL))
-    return done.exit_status if done.exit_status is not None else LOST
+    Attributes:
+        last: line that is not empty.
+    """
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self.last = ""
+        self._path = path
+        self._say = say
+        self._is_whole = True
+
+    def write(self, line: str) -> None:
+        """Add a line, which ends in a line feed."""
+        self.last = line.strip() or self.last
+        try:
+            with self._path.open("a", errors="replace") as file:
+                file.write(line)
+        except OSError as error:
+            if self._is_whole:
+                self._is_whole = False
+                self._say(f"{self._path}: cannot be written ({error.strerror}); what it would have there is lost")

@@ -2,18 +2,22 @@
 
 import time
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.console import Console, Group
 from rich.live import Live
 
+from zsim.errors import RunError
 from zsim.runtime.progress import Screen, cell, describe
 from zsim.scenario.rights import WORLD
 from zsim.terminal.fitted_table import Column, FittedTable
-from zsim_deploy.hosts.host_link import HostLink
-from zsim_deploy.hosts.remote_process import RemoteProcess
-from zsim_deploy.hosts.row_choice import RowChoice, needs_attention
+from zsim_deploy.arguments import RowOrder
+
+if TYPE_CHECKING:
+    from zsim_deploy.hosts.host_link import HostLink
+    from zsim_deploy.hosts.remote_process import RemoteProcess
 
 FIRST_S = 1.0  # simulated; from then on it flies
 SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second …
@@ -22,6 +26,17 @@ WAITED_S = 0.5  # a process that is waited for longer is shown so; waiting for l
 SILENT_PROCESS_S = 1.8  # health comes once a second; so one that is stopped is shown within 2 s
 STALE_S = 3.0  # health comes once a second; older figures are not shown
 AROUND = 4  # lines of a terminal beside the rows: progress, two of the head, and how many rows are not shown
+NAMED_MAX = 8  # roles that a refusal names
+LONGEST_S = float("inf")  # of a process that was never heard of: shown before all others
+ATTENTION = (  # beginnings of states, the most urgent first; then all others, and last those of NOTHING_AMISS
+    "ended (",
+    "lost",
+    "no sign of life",
+    "host silent",
+    "waited for",
+    "waits for",
+)
+NOTHING_AMISS = ("running", "ended")
 COLUMNS = (
     Column("role", "name"),
     Column("host", "name"),
@@ -33,6 +48,7 @@ COLUMNS = (
     Column("round\ntrip", worth=1, right=True),
     Column("re-\nstarts", worth=4, right=True),
 )
+Row = Mapping[str, Any]
 
 
 class StatusTable(Screen):
@@ -40,16 +56,13 @@ class StatusTable(Screen):
 
     Attributes:
         members: the processes; to be given before it is shown.
-        links: to the hosts.
         stages_s: how long each step before the processes' start took.
 
     Args:
-        duration_s: simulated time of the run.
-        console: the terminal.
         choice: which rows the live table has, in which order.
     """
 
-    def __init__(self, duration_s: float, console: Console | None = None, choice: RowChoice | None = None) -> None:
+    def __init__(self, duration_s: float, console: Console | None = None, choice: "RowChoice | None" = None) -> None:
         super().__init__(duration_s, console)
         self._choice = choice or RowChoice()
         self.members: Sequence[Any] = ()
@@ -66,15 +79,11 @@ class StatusTable(Screen):
         self._clock = {**line, "wall_s": time.monotonic()}
         if line["t_s"] >= FIRST_S and not self._flies:
             self._flies = True
-            self.say(self._start_up())
+            took_s = time.monotonic() - self._begun_s
+            stages_s = {**self.stages_s, "processes": took_s - sum(self.stages_s.values())}
+            self.say(f"flies after {took_s:.1f} s: " + ", ".join(f"{what} {s:.1f} s" for what, s in stages_s.items()))
         if not self._is_live:
             super().clock(line)
-
-    def _start_up(self) -> str:
-        """Return how long it took until simulated time went on, and where it went."""
-        took_s = time.monotonic() - self._begun_s
-        stages_s = {**self.stages_s, "processes": took_s - sum(self.stages_s.values())}
-        return f"flies after {took_s:.1f} s: " + ", ".join(f"{what} {s:.1f} s" for what, s in stages_s.items())
 
     def health(self, line: dict[str, Any]) -> None:
         """Take a process's health; the messages that it has taken in since the last one give its rate."""
@@ -86,7 +95,7 @@ class StatusTable(Screen):
         self._health[line["name"]] = {**line, "wall_s": now_s, "per_s": rate}
 
     def report_silent_hosts(self) -> None:
-        """Show once which host does not answer any more, and that it is back."""
+        """Report once that a host no longer answers, and once that it is back."""
         for name, link in self.links.items():
             silent_s = link.silent_s()
             if _is_silent(link) and name not in self._silent:
@@ -98,14 +107,12 @@ class StatusTable(Screen):
                 self.say(f"host {name} answers again")
 
     def clock_now(self) -> dict[str, Any] | None:
-        """Return the last clock of the world."""
         return self._clock
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return one row per process, for the table and for `zsim ps`."""
         return [self._row(member) for member in self.members]
 
-    def _row(self, member: RemoteProcess) -> dict[str, Any]:
+    def _row(self, member: "RemoteProcess") -> dict[str, Any]:
         link, health = self.links[member.host], self._health.get(member.name)
         fresh = health is not None and time.monotonic() - health["wall_s"] < STALE_S
         return {
@@ -127,22 +134,27 @@ class StatusTable(Screen):
             last_s = max(last_s or 0.0, self._clock["wall_s"])
         return None if last_s is None else time.monotonic() - last_s
 
-    def _state(self, member: RemoteProcess, link: HostLink) -> str:
-        if member.state == "running" and _is_silent(link):
+    def _state(self, member: "RemoteProcess", link: "HostLink") -> str:
+        if member.state != "running":
+            return f"ended ({member.outcome()})" if member.state == "ended" and member.code else member.state
+        if _is_silent(link):
             return f"host silent {link.silent_s():.0f} s"
-        if member.state == "running" and (silent_s := self._no_sign_s(member.name, link)):
+        if silent_s := self._no_sign_s(member.name, link):
             return f"no sign of life for {silent_s:.0f} s"
-        waited = [w for w in (self._clock or {}).get("waiting_for", ()) if w["name"] == member.name]
-        if member.state == "running" and waited and waited[0].get("held_by"):
-            return f"waits for {', '.join(waited[0]['held_by'])}"
-        if member.state == "running" and waited and waited[0]["since_wall_s"] > WAITED_S:
-            return f"waited for {waited[0]['since_wall_s']:.0f} s"
-        return f"ended ({member.outcome()})" if member.state == "ended" and member.code else member.state
+        for waited in (self._clock or {}).get("waiting_for", ()):
+            if waited["name"] != member.name:
+                continue
+            if waited.get("held_by"):
+                return f"waits for {', '.join(waited['held_by'])}"
+            if waited["since_wall_s"] > WAITED_S:
+                return f"waited for {waited['since_wall_s']:.0f} s"
+            break
+        return member.state
 
-    def _no_sign_s(self, name: str, link: HostLink) -> float:
+    def _no_sign_s(self, name: str, link: "HostLink") -> float:
         """Return for how long a process has been silent, 0 where that is not long [s, wall].
 
-        All that is known of the others comes from the world: while that is silent only it is known to be.
+        All that is known of the others comes from the world: while that is silent, only the world is known to be.
         """
         now_s, patience_s = time.monotonic(), SILENT_PROCESS_S + ROUND_TRIPS * link.round_trip_s
         heard_s = self._health[name]["wall_s"] if name in self._health else None
@@ -160,38 +172,96 @@ class StatusTable(Screen):
         if len(rows) <= lines:
             return Group(head, table(rows, one_line=True))
         first = rows if self._choice.sort else sorted(rows, key=needs_attention)
-        return Group(head, table(first[:lines], one_line=True), cell(_more(first[lines:])))
+        states = Counter(row["state"] for row in first[lines:])
+        counted = ", ".join(f"{count} {state}" for state, count in states.most_common(3))
+        more = f"… and {len(first) - lines} more: {counted}{', …' if len(states) > 3 else ''}; `zsim ps` shows all"
+        return Group(head, table(first[:lines], one_line=True), cell(more))
 
 
-def _more(rows: Sequence[dict[str, Any]]) -> str:
-    """Return what is known of rows that a terminal has no lines for."""
-    states = Counter(row["state"] for row in rows)
-    counted = ", ".join(f"{count} {state}" for state, count in states.most_common(3))
-    return f"… and {len(rows)} more: {counted}{', …' if len(states) > 3 else ''}; `zsim ps` shows all"
-
-
-def _is_silent(link: HostLink) -> bool:
+def _is_silent(link: "HostLink") -> bool:
     return link.silent_s() > SILENT_S + ROUND_TRIPS * link.round_trip_s
 
 
 def table(rows: Sequence[dict[str, Any]], one_line: bool = False) -> FittedTable:
     """Return the rows as a table for people; `one_line`: what a line has no room for is cut."""
-    return FittedTable(COLUMNS, [_cells(row) for row in rows], one_line=one_line)
-
-
-def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    return (
-        row["role"],
-        row["host"],
-        str(row["pid"] or "-"),
-        row["state"],  # it may hold output of a process
-        _figure(row["lag_ms"], "{:.0f} ms"),
-        _figure(row.get("age_s"), "{:.1f} s"),
-        _figure(row["messages_per_s"], "{:.0f}"),
-        _figure(row["round_trip_ms"], "{:.1f} ms"),
-        str(row["restarts"]),
-    )
+    cells = [
+        (
+            row["role"],
+            row["host"],
+            str(row["pid"] or "-"),
+            row["state"],  # it may hold output of a process
+            _figure(row["lag_ms"], "{:.0f} ms"),
+            _figure(row.get("age_s"), "{:.1f} s"),
+            _figure(row["messages_per_s"], "{:.0f}"),
+            _figure(row["round_trip_ms"], "{:.1f} ms"),
+            str(row["restarts"]),
+        )
+        for row in rows
+    ]
+    return FittedTable(COLUMNS, cells, one_line=one_line)
 
 
 def _figure(value: float | None, form: str) -> str:
     return "-" if value is None else form.format(value)
+
+
+# Which rows are shown, and in which order
+
+
+class RowChoice(NamedTuple):
+    """What of a table is shown.
+
+    Attributes:
+        only: patterns of roles (`estimator.*2`), of what they work for (`drone1*`) or of hosts; all rows if empty.
+        sort: by what; as they come if None.
+    """
+
+    only: Sequence[str] = ()
+    sort: RowOrder | None = None
+
+    def of(self, rows: Sequence[Row]) -> list[Any]:
+        """Return the rows that are shown, in their order; of equal ones the first stays first."""
+        shown = [row for row in rows if not self.only or any(_matches(pattern, row) for pattern in self.only)]
+        return shown if self.sort is None else sorted(shown, key=_KEYS[self.sort])
+
+    def check(self, rows: Sequence[Row]) -> None:
+        """Refuse a pattern that matches no row.
+
+        Raises:
+            RunError: with some roles that there are.
+        """
+        for pattern in self.only:
+            if not any(_matches(pattern, row) for row in rows):
+                roles = [row["role"] for row in rows]
+                more = [f"and {len(roles) - NAMED_MAX} more"] if len(roles) > NAMED_MAX else []
+                named = ", ".join([*roles[:NAMED_MAX], *more]) or "none"
+                raise RunError(f"role is {pattern!r}; must match a role, what it works for, or a host: {named}")
+
+
+def _matches(pattern: str, row: Row) -> bool:
+    thing = row["role"].partition(".")[2]
+    return any(fnmatchcase(name, pattern) for name in (row["role"], thing, row["host"]) if name)
+
+
+def needs_attention(row: Row) -> int:
+    """Return the rank of a row by its state: 0 is the most urgent."""
+    state = row["state"]
+    if state in NOTHING_AMISS:
+        return len(ATTENTION) + 1 + NOTHING_AMISS.index(state)
+    return next((rank for rank, begins in enumerate(ATTENTION) if state.startswith(begins)), len(ATTENTION))
+
+
+def _greatest(field: str, unknown: float) -> Callable[[Row], float]:
+    return lambda row: -(unknown if row.get(field) is None else row[field])
+
+
+_KEYS: dict[RowOrder, Callable[[Row], Any]] = {
+    RowOrder.ROLE: lambda row: row["role"],
+    RowOrder.HOST: lambda row: row["host"],
+    RowOrder.STATE: lambda row: row["state"],
+    RowOrder.AGE: _greatest("age_s", LONGEST_S),
+    RowOrder.LAG: _greatest("lag_ms", LONGEST_S),
+    RowOrder.MESSAGES: _greatest("messages_per_s", 0.0),
+    RowOrder.RESTARTS: _greatest("restarts", 0.0),
+    RowOrder.ATTENTION: needs_attention,
+}

@@ -1,1 +1,1 @@
-"""A run on this host: processes started, supervised, ended. Imports roles."""
+"""A run on this host: processes started, supervised, ended. Imports roles and inventory."""

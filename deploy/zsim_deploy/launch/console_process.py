@@ -22,7 +22,7 @@ SLOW_S = 2.0  # wall; after which it is shown what is waited for
 class RunConsole:
     """Owns the console of a run, which goes on until the report is there and pages have copies.
 
-    To be entered before the run, so that nothing is left of it whatever happens. Ctrl-C ends the wait for its pages.
+    To be entered before the run, so that the console never outlives it. Ctrl-C ends the wait for its pages.
 
     Attributes:
         process: once there is one.
@@ -48,20 +48,18 @@ class RunConsole:
         if self.process is None:
             return
         hurries = self.outcome.interrupted or isinstance(error, (KeyboardInterrupt, SystemExit))
+        limit_s = INTERRUPTED_S if hurries else COPIED_S
         try:
             with interruptible():
-                self._wait(self.process, INTERRUPTED_S if hurries else COPIED_S)
+                self.process.request_stop(self.outcome.reason)
+                if not self.process.wait(min(SLOW_S, limit_s)) and limit_s > SLOW_S:
+                    text = f"{self.process.name}: its pages may copy the report and the record; Ctrl-C ends that"
+                    print(printable(text), file=sys.stderr)
+                    self.process.wait(limit_s - SLOW_S)
         except KeyboardInterrupt:
             pass  # the run is over, and ended as it did
         finally:
             self.process.close()
-
-    def _wait(self, process: RunProcess, limit_s: float) -> None:
-        process.request_stop(self.outcome.reason)
-        if not process.wait(min(SLOW_S, limit_s)) and limit_s > SLOW_S:
-            text = f"{process.name}: its pages may copy the report and the record; Ctrl-C ends that"
-            print(printable(text), file=sys.stderr)
-            process.wait(limit_s - SLOW_S)
 
 
 @contextmanager
@@ -70,15 +68,19 @@ def console_beside(endpoint: str, record: Path, federation: str | None, tls: Pat
 
     Args:
         endpoint: on which the world listens; where that is all addresses, it is reached on this machine.
-        record: what is played.
         federation: in whose name; None for that of the record.
         tls: folder of a certificate, None without.
 
     Raises:
         RunError, RecordError: there is no record.
     """
-    command = [*ZSIM, *_arguments(endpoint, federation or _federation_of(record), tls)]
-    process = subprocess.Popen(command)
+    if federation is None:
+        from zsim_analysis.reading.recorded_run import open_run
+
+        with open_run(record) as (_, _, scenario):
+            federation = scenario.federation
+    reach = ["--connect", endpoint.replace("0.0.0.0", "127.0.0.1"), "--federation", federation]
+    process = subprocess.Popen([*ZSIM, "console", *reach, *(["--tls", str(tls)] if tls else [])])
     try:
         yield
     finally:
@@ -88,15 +90,3 @@ def console_beside(endpoint: str, record: Path, federation: str | None, tls: Pat
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def _arguments(endpoint: str, federation: str, tls: Path | None) -> list[str]:
-    where = ["--connect", endpoint.replace("0.0.0.0", "127.0.0.1"), "--federation", federation]
-    return ["console", *where, *(["--tls", str(tls)] if tls else [])]
-
-
-def _federation_of(record: Path) -> str:
-    from zsim_analysis.reading.recorded_run import open_run
-
-    with open_run(record) as (_, _, scenario):
-        return scenario.federation

@@ -1,7 +1,8 @@
-"""The roles of a run as child processes: forked from a process that has everything imported, which is far cheaper.
+"""The processes of a run on this host: started, watched, stopped, their output kept in logs.
 
-Roles are children of this process either way. Only Linux can do it; elsewhere, and if the fork server is gone or does
-not answer, a role is started as any other program.
+They are forked from a process that has everything imported, which is far cheaper, and are children of this process
+either way. Only Linux can do it; elsewhere, and if the fork server is gone or does not answer, a role is started as any
+other program.
 """
 
 import ctypes
@@ -15,11 +16,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import TracebackType
 from typing import IO, NamedTuple, Protocol
 
 from zsim.runtime.progress import SlowStart
 from zsim_deploy import SAFE_PATH
+from zsim_deploy.launch.supervisor import end_text
 
 SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
@@ -35,7 +38,7 @@ PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are
 REPLY_MAX = 32  # bytes, of an answer: READY, or a process number
 ANSWER_S = 5.0  # the fork server answers within 20 ms, unless it is stopped
 POLL_S = 0.01  # how often one looks whether it has ended
-UNKNOWN = 0  # exit code, as of Popen, where somebody else has taken it
+UNKNOWN = 0  # exit code, as of Popen, where the status was collected elsewhere
 
 
 class RoleProcess(Protocol):
@@ -50,61 +53,103 @@ class RoleProcess(Protocol):
     def kill(self) -> None: ...
 
 
-class ForkedProcess:
-    """A child of this process.
+class ChildProcess:
+    """A role as a child process.
 
     Args:
-        pid: its process number.
-        stdin, stdout: our ends of its pipes.
+        arguments: of the `zsim` command.
+        logs: folder for its standard error.
+        on_line: takes every line of its standard output; None sends that to the log too.
     """
 
-    def __init__(self, pid: int, stdin: IO[str], stdout: IO[str] | None) -> None:
-        self.pid = pid
-        self.stdin: IO[str] | None = stdin
-        self.stdout = stdout
-        self._code: int | None = None
-        self._lock = threading.Lock()
+    def __init__(
+        self,
+        name: str,
+        arguments: list[str],
+        logs: Path,
+        launcher: "RoleLauncher",
+        on_line: Callable[[str], None] | None = None,
+    ) -> None:
+        self.name = name
+        self.role = name.split(".", 1)[0]
+        self.restarts = 0
+        self._arguments = arguments
+        self._log = logs / f"{name}.log"
+        self._launcher = launcher
+        self._on_line = on_line
+        self._reader: threading.Thread | None = None
+        self._process: RoleProcess | None = None
 
-    def poll(self) -> int | None:
-        """Return its exit code, negative for a signal; None while it lives."""
-        with self._lock:
-            return self._poll()
+    def start(self) -> None:
+        """Start it, or start it again."""
+        with self._log.open("a") as log:
+            self._process = process = self._launcher.start(self._arguments, log, listened=self._on_line is not None)
+        if on_line := self._on_line:
 
-    def _poll(self) -> int | None:
-        if self._code is None:
-            try:
-                pid, status = os.waitpid(self.pid, os.WNOHANG)
-            except ChildProcessError:
-                self._code = UNKNOWN
-            else:
-                self._code = os.waitstatus_to_exitcode(status) if pid else None
-        return self._code
+            def read() -> None:
+                assert process.stdout is not None
+                for line in process.stdout:
+                    on_line(line)
 
-    def wait(self, timeout: float | None = None) -> int:
-        """Return its exit code when it has ended.
+            self._reader = threading.Thread(target=read, daemon=True)
+            self._reader.start()
 
-        Raises:
-            subprocess.TimeoutExpired: it has not, within so many seconds.
-        """
-        until_s = None if timeout is None else time.monotonic() + timeout
-        while (code := self.poll()) is None:
-            if until_s is not None and time.monotonic() >= until_s:
-                raise subprocess.TimeoutExpired(f"process {self.pid}", timeout or 0.0)
-            time.sleep(POLL_S)
-        return code
+    @property
+    def pid(self) -> int:
+        return self._process.pid if self._process else 0
+
+    @property
+    def code(self) -> int | None:
+        """Return its exit code, None while it lives; negative for a signal."""
+        return self._process.poll() if self._process else None
+
+    def outcome(self) -> str:
+        return end_text(self.code, self.last_log_line())
+
+    def last_log_line(self) -> str:
+        try:
+            lines = self._log.read_text(errors="replace").strip().splitlines()
+        except OSError:
+            return ""
+        return lines[-1] if lines else ""
+
+    def request_stop(self, reason: str) -> None:
+        """Ask it to leave; harmless when it is gone."""
+        if self._process is None or self._process.stdin is None or self._process.stdin.closed:
+            return
+        with suppress(OSError):  # it is gone already
+            self._process.stdin.write(f"stop {reason}\n")
+            self._process.stdin.flush()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until it has ended; return whether it has."""
+        if self._process is None:
+            return True
+        try:
+            self._process.wait(timeout=max(0.0, timeout_s))
+        except subprocess.TimeoutExpired:
+            return False
+        if self._reader is not None:
+            self._reader.join(timeout=1.0)
+        return True
 
     def kill(self) -> None:
-        """Send SIGKILL; harmless when it is gone."""
-        with self._lock, suppress(ProcessLookupError):
-            if self._poll() is None:
-                os.kill(self.pid, signal.SIGKILL)
+        """Send SIGKILL, as to one that hangs."""
+        if self._process is not None:
+            self._process.kill()
 
-
-class _Pipe(NamedTuple):
-    """Both ends, as file numbers."""
-
-    read: int
-    write: int
+    def close(self) -> None:
+        """End it in any case, and close its pipes."""
+        if self._process is None:
+            return
+        self.kill()
+        self._process.wait()
+        if self._reader is not None:
+            self._reader.join(timeout=1.0)
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):
+                if pipe is not None:
+                    pipe.close()
 
 
 class RoleLauncher:
@@ -146,7 +191,15 @@ class RoleLauncher:
             listened: whether its standard output is a pipe too; else that goes to the log.
         """
         with self._lock:
-            return self._fork(arguments, log, listened) or _spawn(arguments, log, listened)
+            return self._fork(arguments, log, listened) or subprocess.Popen(
+                [*COMMAND, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE if listened else log,
+                stderr=log,
+                text=True,
+                env={**SINGLE_THREADED, **os.environ},
+                start_new_session=True,
+            )
 
     def _start_forkserver(self) -> None:
         """Start the fork server, and wait until it has loaded everything."""
@@ -163,7 +216,7 @@ class RoleLauncher:
         finally:
             start.over()
 
-    def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> ForkedProcess | None:
+    def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> "ForkedProcess | None":
         """Return None where the fork server cannot do it."""
         packet = json.dumps(list(arguments)).encode()
         if self._line is None or len(packet) > PACKET_MAX:
@@ -214,9 +267,61 @@ class RoleLauncher:
             self._forkserver.wait()
 
 
+class ForkedProcess:
+    """A child of this process, with our ends of its pipes."""
+
+    def __init__(self, pid: int, stdin: IO[str], stdout: IO[str] | None) -> None:
+        self.pid = pid
+        self.stdin: IO[str] | None = stdin
+        self.stdout = stdout
+        self._code: int | None = None
+        self._lock = threading.Lock()
+
+    def poll(self) -> int | None:
+        """Return its exit code, negative for a signal; None while it lives."""
+        with self._lock:
+            return self._poll()
+
+    def _poll(self) -> int | None:
+        if self._code is None:
+            try:
+                pid, status = os.waitpid(self.pid, os.WNOHANG)
+            except ChildProcessError:
+                self._code = UNKNOWN
+            else:
+                self._code = os.waitstatus_to_exitcode(status) if pid else None
+        return self._code
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Return its exit code when it has ended.
+
+        Raises:
+            subprocess.TimeoutExpired: it has not, within so many seconds.
+        """
+        until_s = None if timeout is None else time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if until_s is not None and time.monotonic() >= until_s:
+                raise subprocess.TimeoutExpired(f"process {self.pid}", timeout or 0.0)
+            time.sleep(POLL_S)
+        return code
+
+    def kill(self) -> None:
+        """Send SIGKILL; harmless when it is gone."""
+        with self._lock, suppress(ProcessLookupError):
+            if self._poll() is None:
+                os.kill(self.pid, signal.SIGKILL)
+
+
+class _Pipe(NamedTuple):
+    """Both ends, as file numbers."""
+
+    read: int
+    write: int
+
+
 @contextmanager
 def _subreaper() -> Iterator[None]:
-    """Become, for as long as it takes, the parent of what descendants leave behind."""
+    """Adopt orphaned descendants for as long as the block lasts."""
     libc, former = ctypes.CDLL(None), ctypes.c_int()
     libc.prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(former), 0, 0, 0)
     libc.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
@@ -229,15 +334,3 @@ def _subreaper() -> Iterator[None]:
 def _close(*files: int) -> None:
     for file in files:
         os.close(file)
-
-
-def _spawn(arguments: Sequence[str], log: IO[str], listened: bool) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [*COMMAND, *arguments],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE if listened else log,
-        stderr=log,
-        text=True,
-        env={**SINGLE_THREADED, **os.environ},
-        start_new_session=True,
-    )

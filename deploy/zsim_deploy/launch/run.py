@@ -1,17 +1,18 @@
-"""A whole run: every process of a scenario started, watched, recorded, ended, and reported."""
+"""A whole run on this host: every process of a scenario started, watched, recorded, and ended."""
 
 import contextlib
 import os
 import re
 import signal
 import socket
-import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from zsim.errors import RecordError, RunError, RunFailedError, SessionError
+from msgspec.structs import replace
+
+from zsim.errors import RecordError, RunFailedError, SessionError
 from zsim.output_folder import no_locks
 from zsim.record import repair
 from zsim.record.record_reader import RECORD
@@ -19,26 +20,24 @@ from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.consistency import unflown_plans
 from zsim.scenario.external_bodies import driver_lines
+from zsim.scenario.rights import watched
 from zsim.scenario.scenario import Scenario
-from zsim.schema import plugin
+from zsim.sensors.camera import BottomCamera, FrontCamera
 from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
-from zsim_deploy.arguments import changed_options, load_scenario, pace_options
-from zsim_deploy.inventory.processes import COMMANDS
-from zsim_deploy.launch import interrupted_run
-from zsim_deploy.launch.camera_children import CameraChild, camera_children
-from zsim_deploy.launch.child_process import ChildProcess
+from zsim_deploy.arguments import OTHER_OUT, changed_options, file_fault, load_scenario, pace_options
+from zsim_deploy.inventory import COMMANDS
+from zsim_deploy.launch import run_folder
 from zsim_deploy.launch.console_process import RunConsole
-from zsim_deploy.launch.end_signals import EndSignals
-from zsim_deploy.launch.free_ports import DEFAULT_PORT, free_port, is_free
-from zsim_deploy.launch.interrupted_run import JOURNAL, Launch
-from zsim_deploy.launch.role_launcher import RoleLauncher
-from zsim_deploy.launch.supervisor import Outcome, Supervisor
+from zsim_deploy.launch.role_launcher import ChildProcess, RoleLauncher
+from zsim_deploy.launch.run_folder import JOURNAL, Launch
+from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 RECORDER = "recorder"
 CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
+DEFAULT_PORT = 7447  # Zenoh's own
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
 
 
@@ -47,193 +46,89 @@ class RunOptions:
     """How to run a scenario.
 
     Attributes:
-        out: folder of the run.
+        launch: what is kept of it, for a run that goes on.
         order: names of processes in the order in which they are started.
         console: owns the console that is started; None for a run without.
         continued: whether it goes on where an earlier launch of it was interrupted.
         supervisor: over its processes, once they are started.
-        changed: texts `a.b.c=value` by which the scenario was changed against its file.
     """
 
     scenario: Scenario
     out: Path
-    mode: str = "lockstep"
-    rate: float = 0.0
-    listen: str | None = None
-    insecure: bool = False
-    hosted: bool = False
-    order: list[str] = field(default_factory=list)
+    launch: Launch
+    order: Sequence[str] = ()
     console: RunConsole | None = None
     cameras: bool = False
     detect: bool = False
-    run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
     continued: bool = False
     supervisor: Supervisor | None = None
-    changed: Sequence[str] = ()
 
     def status(self) -> dict[str, Any]:
         """Return what `zsim ps` shows of the run; callable from any thread."""
-        here = {
-            "role": "in-process",
-            "host": socket.gethostname(),
-            "pid": os.getpid(),
-            "state": "running",
-            "restarts": 0,
-        }
-        alone = {**here, "lag_ms": None, "messages_per_s": None, "round_trip_ms": None}
-        rows = self.supervisor.rows() if self.supervisor else [alone]
+        figures = dict.fromkeys(("lag_ms", "messages_per_s", "round_trip_ms"))
+        here = {"role": "in-process", "host": socket.gethostname(), "pid": os.getpid(), "state": "running"}
+        rows = self.supervisor.rows() if self.supervisor else [{**here, "restarts": 0, **figures}]
         clock = self.supervisor.clock if self.supervisor else None
         return {"rows": rows, "clock": clock, "out": str(self.out.absolute()), "roles": [row["role"] for row in rows]}
 
-    def camera_children(self) -> list[CameraChild]:
+    def camera_children(self) -> "list[CameraChild]":
         """Return the cameras and detectors that are started."""
         return camera_children(self.scenario, self.cameras or self.scenario.gates("camera"), self.detect)
 
 
-def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launcher: RoleLauncher) -> list[ChildProcess]:
-    """Return the processes of a run, not started."""
-    logs, file = options.out / "logs", options.out / "scenario.yaml"
-    scenario, federation = options.scenario, options.scenario.federation
-    # Another run's world may listen where ours could not: nobody of this run is to join that one.
-    launched = ["--launched", options.run_id, *(["--insecure"] if options.insecure else [])]
-    reach = ["--connect", endpoint, "--federation", federation, *launched]
-    pace = pace_options(options.mode, options.rate)
-    world = [
-        "world",
-        str(file),
-        "--listen",
-        endpoint,
-        "--expect",
-        RECORDER,
-        *pace,
-        *launched,
-        *changed_options(options.changed),
-    ]
-    world += ["--journal", str(options.out / JOURNAL), *(["--all-died"] if options.continued else [])]
-    record = ["record", "--out", str(options.out), *reach]
-    children = [
-        ChildProcess("world", world, logs, launcher, supervisor.handle_line),
-        ChildProcess(RECORDER, record, logs, launcher),
-    ]
-    wanted = scenario.processes.expect
-    names = [name for name in agents_of(scenario) if wanted is None or name in wanted]
-    if options.hosted and names:
-        children.append(ChildProcess(names[-1], ["host", *reach, "--", *names], logs, launcher))
-    else:
-        # a name of the contract may begin with -
-        split = [name.partition(".") for name in names]
-        children += [
-            ChildProcess(f"{role}.{thing}", [role, *reach, "--", thing], logs, launcher) for role, _, thing in split
-        ]
-    if options.console:
-        show = ["console", "--name", CONSOLE, "--folder", str(options.out), *reach]
-        children.append(ChildProcess(CONSOLE, show, logs, launcher, supervisor.handle_line))
-        options.console.own(children[-1])
-    for role, name, drones in options.camera_children():
-        draw = [COMMANDS.get(role, role), "--name", name, *reach, "--", *drones]
-        children.append(ChildProcess(name, draw, logs, launcher))
-    rank = {name: i for i, name in enumerate(options.order)}
-    return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
-
-
-def check_endpoint(endpoint: str | None, insecure: bool) -> None:
-    """Refuse an endpoint on which no world can listen, before anything is started.
-
-    Raises:
-        SessionError: it is malformed, or less secure than was asked for.
-    """
-    if endpoint is None:
-        return
-    from zsim.transport.connection import check_listening
-
-    check_listening([endpoint], Identity(insecure=insecure))
-    if endpoint.startswith("tcp/") and not re.fullmatch(r"tcp/.+:[0-9]{1,5}", endpoint):
-        raise SessionError(f"endpoint is {endpoint!r}; must be tcp/ADDRESS:PORT such as tcp/127.0.0.1:{DEFAULT_PORT}")
-
-
-def check_open_files(options: RunOptions) -> None:
-    """Refuse a run of more processes than this machine allows files for, before anything is started.
-
-    Raises:
-        SessionError: with how many files there must be.
-    """
-    cameras = {child.name for child in options.camera_children()}
-    expected = {*options.scenario.expected(), RECORDER}
-    agents = 1 if options.hosted else len(expected - cameras) - 1
-    count = 2 + agents + (options.console is not None) + len(cameras)
-    require_files(launcher_files(count, len(expected)), f"{count} processes")
-
-
-def options_of(folder: Path) -> tuple[RunOptions, bool]:
-    """Return how an interrupted run goes on, and whether in one process: then it is flown once more, as all of it.
-
-    Raises:
-        RunError, RecordError: nothing of it is left to fly, or it cannot be gone on with.
-    """
-    launch = interrupted_run.launch_of(folder)
-    if launch.in_process:
-        (folder / RECORD).unlink(missing_ok=True)
-    else:
-        interrupted_run.reopen_record(folder)
-    scenario = load_scenario(folder / "scenario.yaml", None, modules=map(Path, launch.modules))
-    pace = (launch.mode, launch.rate)
-    where = (launch.listen, launch.insecure, launch.hosted)
-    how = {"run_id": launch.run_id, "continued": True, "changed": launch.changed}
-    return RunOptions(scenario, folder, *pace, *where, **how), launch.in_process
-
-
-def fly(options: RunOptions, in_process: bool) -> Outcome:
+def fly(options: RunOptions) -> Outcome:
     """Run a scenario, as real processes or in this one, and show its progress; Ctrl-C is an outcome, too."""
+    run = run_in_process if options.launch.in_process else run_processes
     with Screen(options.scenario.duration_s) as screen:
         try:
-            return run_in_process(options, screen) if in_process else run_processes(options, screen)
+            return run(options, screen)
         except KeyboardInterrupt as error:
             return Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
 
 
 def run_processes(options: RunOptions, screen: Screen) -> Outcome:
-    """Run a scenario as real processes; the record is finished whatever happens.
+    """Run a scenario as real processes; the record is finished in any case.
 
     Raises:
         KeyboardInterrupt: with the reason, where nothing flew yet, or Ctrl-C came twice.
     """
+
+    def interrupt(number: int, _: object) -> None:
+        raise KeyboardInterrupt(REASONS[number])
+
     with EndSignals(options.out / "run.log", screen.hang_up) as signals:
         try:
-            with handled_by(_interrupt):
+            with handled_by(interrupt):
                 outcome = _run(options, screen, signals)
         except KeyboardInterrupt:
             with contextlib.suppress(OSError):
-                (options.out / "logs").rmdir()  # nobody has written there: the folder may be used again
-                interrupted_run.forget(options.out)
+                (options.out / "logs").rmdir()  # nothing was written there: the folder may be used again
+                run_folder.forget_launch(options.out)
             raise
         with contextlib.suppress(RecordError):
-            repair(options.out / "run.mcap")
+            repair(options.out / RECORD)
         return outcome
 
 
 def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
-    scenario, listen = options.scenario, options.listen
+    """Prepare the folder and the fork server, and run on an endpoint; on another one where its port was lost."""
     if not options.continued:
-        _write_scenario(options, in_process=False)
+        _write_scenario(options)
     _say_headline(options, screen)
-    if options.camera_children() and not options.rate and not scenario.gates("camera"):
+    if options.camera_children() and not options.launch.rate and not options.scenario.gates("camera"):
         screen.say("as fast as it goes, a lockstep run is faster than its cameras; --rate 1 leaves them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
-        if listen:
+        if listen := options.launch.listen:
             return _run_on(options, listen, screen, launcher, signals)
-        return _run_on_free_port(options, screen, launcher, signals)
-
-
-def _say_headline(options: RunOptions, screen: Screen) -> None:
-    scenario = options.scenario
-    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    for line in (*unflown_plans(scenario), no_locks(options.out)):
-        if line:
-            screen.say(line)
-
-
-def _interrupt(number: int, _: object) -> None:
-    raise KeyboardInterrupt(REASONS[number])
+        tries = 0
+        while True:
+            tries, port = tries + 1, free_port(screen)
+            endpoint = f"tcp/127.0.0.1:{port}"
+            outcome = _run_on(options, endpoint, screen, launcher, signals)
+            # lost: another process took the port between our check of it and the start of our world
+            was_lost = outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not is_free(port)
+            if not was_lost or tries == PORTS_TRIED:
+                return outcome
 
 
 def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher, signals: EndSignals) -> Outcome:
@@ -252,38 +147,34 @@ def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLa
     return supervisor.run(end_with_output)
 
 
-def _run_on_free_port(
-    options: RunOptions, screen: Screen, launcher: RoleLauncher, signals: EndSignals, tries: int = PORTS_TRIED
-) -> Outcome:
-    port = free_port(screen)
-    endpoint = f"tcp/127.0.0.1:{port}"
-    outcome = _run_on(options, endpoint, screen, launcher, signals)
-    if tries > 1 and _lost_port(outcome, endpoint, port):
-        return _run_on_free_port(options, screen, launcher, signals, tries - 1)
-    return outcome
-
-
-def _lost_port(outcome: Outcome, endpoint: str, port: int) -> bool:
-    """Return whether another process took the port between our check of it and the start of our world."""
-    return outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not is_free(port)
-
-
-def _write_scenario(options: RunOptions, in_process: bool) -> None:
-    """Put what is to be flown, and how, into the run's folder.
-
-    Raises:
-        RunError: it cannot be written.
-    """
-    pace = (options.mode, options.rate)
-    where = (options.listen, tuple(map(str, plugin.folders())), tuple(options.changed))
-    launch = Launch(options.run_id, *pace, in_process, options.hosted, options.insecure, *where)
-    try:
-        if not in_process:
-            (options.out / "logs").mkdir(exist_ok=True)
-        (options.out / "scenario.yaml").write_text(scenario_file.to_text(options.scenario))
-        interrupted_run.keep(options.out, launch)
-    except OSError as error:
-        raise RunError(f"{options.out}: cannot be written ({error.strerror}); give --out another folder") from error
+def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launcher: RoleLauncher) -> list[ChildProcess]:
+    logs, scenario, launch = options.out / "logs", options.scenario, options.launch
+    # Another run's world may listen where ours could not: no process of this run is to join that one.
+    launched = ["--launched", launch.run_id, *(["--insecure"] if launch.insecure else [])]
+    reach = ["--connect", endpoint, "--federation", scenario.federation, *launched]
+    pace = [*pace_options(launch.mode, launch.rate), *launched, *changed_options(launch.changed)]
+    world = ["world", str(options.out / "scenario.yaml"), "--listen", endpoint, "--expect", RECORDER, *pace]
+    world += ["--journal", str(options.out / JOURNAL), *(["--all-died"] if options.continued else [])]
+    commands = {"world": world, RECORDER: ["record", "--out", str(options.out), *reach]}
+    wanted = scenario.processes.expect
+    names = [name for name in agents_of(scenario) if wanted is None or name in wanted]
+    if launch.hosted and names:
+        commands[names[-1]] = ["host", *reach, "--", *names]
+    else:
+        for role, _, thing in (name.partition(".") for name in names):
+            commands[f"{role}.{thing}"] = [role, *reach, "--", thing]  # a name of the contract may begin with -
+    if options.console:
+        commands[CONSOLE] = ["console", "--name", CONSOLE, "--folder", str(options.out), *reach]
+    for role, name, drones in options.camera_children():
+        commands[name] = [COMMANDS.get(role, role), "--name", name, *reach, "--", *drones]
+    children = []
+    for name, command in commands.items():
+        on_line = supervisor.handle_line if name in ("world", CONSOLE) else None
+        children.append(ChildProcess(name, command, logs, launcher, on_line))
+        if options.console and name == CONSOLE:
+            options.console.own(children[-1])
+    rank = {name: i for i, name in enumerate(options.order)}
+    return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 
 
 def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
@@ -292,7 +183,7 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
     from zsim_world.fleet.fleet import DivergedError
 
     if not options.continued:
-        _write_scenario(options, in_process=True)
+        _write_scenario(options)
     _say_headline(options, screen)
     with EndSignals(options.out / "run.log", screen.hang_up) as signals:
         stop = StopChannel()
@@ -302,12 +193,152 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
             return signals.reason or stop.reason()
 
         try:
-            ended = fly(options.scenario, options.out / "run.mcap", reason, screen, changed=options.changed)
+            ended = fly(options.scenario, options.out / RECORD, reason, screen, changed=options.launch.changed)
         except (DivergedError, RunFailedError) as error:
             return Outcome(str(error), failed=True)
         finally:
             stop.restore_signals()
         interrupted = reason() is not None
         if not interrupted:
-            interrupted_run.forget(options.out)
+            run_folder.forget_launch(options.out)
         return Outcome(ended, interrupted=interrupted)
+
+
+def _say_headline(options: RunOptions, screen: Screen) -> None:
+    scenario = options.scenario
+    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
+    for line in (*unflown_plans(scenario), no_locks(options.out)):
+        if line:
+            screen.say(line)
+
+
+def _write_scenario(options: RunOptions) -> None:
+    """Put what is to be flown, and how, into the run's folder.
+
+    Raises:
+        RunError: it cannot be written.
+    """
+    with file_fault(options.out, "cannot be written", OTHER_OUT):
+        if not options.launch.in_process:
+            (options.out / "logs").mkdir(exist_ok=True)
+        (options.out / "scenario.yaml").write_text(scenario_file.to_text(options.scenario))
+        run_folder.keep_launch(options.out, options.launch)
+
+
+# Before anything is started
+
+
+def options_of(folder: Path) -> RunOptions:
+    """Return how an interrupted run goes on; one in one process is flown anew, all of it.
+
+    Raises:
+        RunError, RecordError: nothing of it is left to fly, or it cannot be gone on with.
+    """
+    launch = run_folder.launch_of(folder)
+    if launch.in_process:
+        (folder / RECORD).unlink(missing_ok=True)
+    else:
+        run_folder.reopen_record(folder)
+    scenario = load_scenario(folder / "scenario.yaml", None, modules=map(Path, launch.modules))
+    return RunOptions(scenario, folder, launch, continued=True)
+
+
+def check_endpoint(endpoint: str | None, insecure: bool) -> None:
+    """Refuse an endpoint on which no world can listen.
+
+    Raises:
+        SessionError: it is malformed, or less secure than was asked for.
+    """
+    if endpoint is None:
+        return
+    from zsim.transport.connection import check_listening
+
+    check_listening([endpoint], Identity(insecure=insecure))
+    if endpoint.startswith("tcp/") and not re.fullmatch(r"tcp/.+:[0-9]{1,5}", endpoint):
+        raise SessionError(f"endpoint is {endpoint!r}; must be tcp/ADDRESS:PORT such as tcp/127.0.0.1:{DEFAULT_PORT}")
+
+
+def check_open_files(options: RunOptions) -> None:
+    """Refuse a run of more processes than this machine allows files for.
+
+    Raises:
+        SessionError: with how many files there must be.
+    """
+    cameras = {child.name for child in options.camera_children()}
+    expected = {*options.scenario.expected(), RECORDER}
+    agents = 1 if options.launch.hosted else len(expected - cameras) - 1
+    count = 2 + agents + (options.console is not None) + len(cameras)
+    require_files(launcher_files(count, len(expected)), f"{count} processes")
+
+
+def free_port(screen: Screen) -> int:
+    """Return Zenoh's port, or another free one, shown on the screen, where that is taken."""
+    if is_free(DEFAULT_PORT):
+        return DEFAULT_PORT
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    screen.say(f"port {DEFAULT_PORT} is in use; this run is on tcp/127.0.0.1:{port} (--connect for other commands)")
+    return port
+
+
+def is_free(port: int) -> bool:
+    """Return whether a port of this machine is free."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
+
+
+# Cameras
+
+
+class CameraChild(NamedTuple):
+    """A camera or detector that is started with a run.
+
+    Attributes:
+        role: `camera` or `detector`.
+        drones: whose cameras it is for; empty for all that have cameras.
+    """
+
+    role: str
+    name: str
+    drones: tuple[str, ...] = ()
+
+
+def with_cameras(scenario: Scenario) -> Scenario:
+    """Return a scenario in which some drone has a camera: where none has, all get the AR.Drone's two."""
+    if any(drone.sensors.cameras() for drone in scenario.drones):
+        return scenario
+    two = {"front_camera": FrontCamera(), "bottom_camera": BottomCamera()}
+    drones = [replace(drone, sensors=replace(drone.sensors, **two)) for drone in scenario.drones]
+    return replace(scenario, drones=drones)
+
+
+def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[CameraChild]:
+    """Return the cameras and detectors that a scenario expects, as far as they are known by name, or that a user wants.
+
+    There is one for each drone that a name in `expect` is about, and ROLE.main for the others.
+
+    Args:
+        cameras: whether the pictures of all that have cameras are to be drawn.
+        detect: whether hats are to be found in the pictures of all.
+    """
+    having = watched("", scenario)
+    everybody = [drone.name for drone in scenario.drones]  # a detector's cameras need not be zsim's
+    expected = scenario.processes.expect or ()
+    children: list[CameraChild] = []
+    for role, known, drones, wanted in (
+        ("camera", having, having, cameras),
+        ("detector", everybody, having or everybody, detect),
+    ):
+        own = [CameraChild(role, f"{role}.{drone}", (drone,)) for drone in known if f"{role}.{drone}" in expected]
+        main, names = f"{role}.main", {child.name for child in own}
+        others = tuple(drone for drone in drones if f"{role}.{drone}" not in expected)
+        if drones and main not in names and (main in expected or (wanted and others)):
+            own.append(CameraChild(role, main, others if own else ()))
+        children += own
+    return children

@@ -1,18 +1,32 @@
-"""The folder of a run: made new, or one that holds nothing which a run would hide or be mixed up with."""
+"""The folder of a run: made new, or one that holds nothing which a run would hide or be mixed up with.
 
+How the run was launched is kept in it, beside the journal of its world, so that an interrupted run can go on.
+"""
+
+import json
 import shutil
 import time
+import uuid
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from zsim.errors import RunError
+import msgspec
+
+from zsim.contract import keys, messages
+from zsim.errors import DecodeError, RunError
 from zsim.output_folder import refuse_others
 from zsim.record.mcap_layout import LIBRARY, OURS, is_ours
+from zsim.record.record_cut import cut_at_last
+from zsim.record.record_reader import RECORD
 from zsim.record.record_writer import is_being_written
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.launch.interrupted_run import JOURNAL, LAUNCH
+from zsim.schema import plugin
+from zsim_deploy.arguments import OTHER_OUT, file_fault
 
-RECORD, LOGS, SCENARIO, FIGURES = "run.mcap", "logs", "scenario.yaml", "figures"
+LOGS, SCENARIO, FIGURES = "logs", "scenario.yaml", "figures"
+JOURNAL = "journal"  # what the world hands itself is there
+LAUNCH = "launch.json"  # in it
 LEFT = (SCENARIO, "run.log", "up.log")  # beside empty logs and an empty journal: all that a run leaves that never flew
 WRITTEN = (RECORD, "summary.json", "report.html", *LEFT)  # of a run that is replaced
 WRITTEN_INTO = {LOGS: (".log",), FIGURES: (".png", ".pdf", ".svg")}  # suffixes of a run's files, by folder
@@ -23,24 +37,24 @@ def make_directory(out: Path | None, scenario: Scenario, force: bool = False) ->
 
     Args:
         out: as given; None for a new one named after scenario and time.
-        scenario: that is flown.
         force: take one that holds other files, too, which stay as they are; an earlier run of zsim's is removed.
 
     Raises:
         RunError: it holds a run, or other files, or cannot be made; with `force`, the run is under way, or its record
             is not zsim's.
     """
-    folder = out or _fresh(Path("runs") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    if out is None:  # two runs may start within one second
+        first = Path("runs") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+        names = [first, *(first.with_name(f"{first.name}-{i}") for i in range(2, 1000))]
+        out = next(name for name in names if not name.exists())
+    with file_fault(out, "cannot be made", OTHER_OUT):
+        out.mkdir(parents=True, exist_ok=True)
         if force:
-            _remove_run(folder)
+            _remove_run(out)
         else:
-            _refuse_run(folder)
-        refuse_others(folder, (*LEFT, LOGS, JOURNAL), force, "fly into")
-    except OSError as error:
-        raise RunError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
-    return folder
+            _refuse_run(out)
+        refuse_others(out, (*LEFT, LOGS, JOURNAL), force, "fly into")
+    return out
 
 
 def _refuse_run(folder: Path) -> None:
@@ -70,7 +84,7 @@ def _remove_run(folder: Path) -> None:
     journaled = (journal / LAUNCH).exists() or any(journal.glob("*.entries"))
     failed = (folder / SCENARIO).exists() and (folder / LOGS / "world.log").exists()
     if not (record.exists() or journaled or failed):
-        return  # `logs`, `figures` and `journal` are somebody else's
+        return  # `logs`, `figures` and `journal` are not of a run
     if is_being_written(record):
         raise RunError(f"{folder}: a run is flown into it now; end that one, or give --out another folder")
     for name, suffixes in WRITTEN_INTO.items():
@@ -85,7 +99,80 @@ def _remove_run(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def _fresh(folder: Path) -> Path:
-    """Return a folder that is not there yet: two runs may start within one second."""
-    names = [folder, *(folder.with_name(f"{folder.name}-{i}") for i in range(2, 1000))]
-    return next(name for name in names if not name.exists())
+# An interrupted run
+
+
+class Launch(msgspec.Struct, frozen=True):
+    """How a run was launched.
+
+    Attributes:
+        modules: folders in which those that its scenario names were looked for.
+        changed: texts `a.b.c=value` by which the scenario was changed against its file.
+    """
+
+    run_id: str
+    mode: str = "lockstep"
+    rate: float = 0.0
+    in_process: bool = False
+    hosted: bool = False
+    insecure: bool = False
+    listen: str | None = None
+    modules: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
+
+
+def new_launch(**how: Any) -> Launch:
+    """Return a launch of a new run, with the modules that its scenario has been loaded with."""
+    return Launch(uuid.uuid4().hex[:12], modules=tuple(map(str, plugin.folders())), **how)
+
+
+def keep_launch(folder: Path, launch: Launch) -> None:
+    """Note how a run is launched.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    (folder / JOURNAL).mkdir(exist_ok=True)
+    content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold bytes that are no UTF-8
+    (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
+
+
+def forget_launch(folder: Path) -> None:
+    """Remove the note: nothing flew, or all of it."""
+    with suppress(OSError):
+        (folder / JOURNAL / LAUNCH).unlink(missing_ok=True)
+        (folder / JOURNAL).rmdir()
+
+
+def launch_of(folder: Path) -> Launch:
+    """Return how a run was launched that is to go on.
+
+    Raises:
+        RunError: nothing is left of it to do, or it is no run.
+    """
+    place = folder / JOURNAL / LAUNCH
+    try:
+        return msgspec.convert(json.loads(place.read_bytes()), Launch)
+    except FileNotFoundError as error:
+        state = "is over" if (folder / RECORD).exists() else "is not there"
+        raise RunError(f"{folder}: the run {state}; must be the folder of one that was interrupted") from error
+    except (OSError, ValueError, msgspec.MsgspecError) as error:
+        raise RunError(f"{place}: cannot be read ({error}); must be as zsim run has left it") from error
+
+
+def reopen_record(folder: Path) -> None:
+    """Take the end of the interrupted run off its record.
+
+    Raises:
+        RecordError: it cannot be written, or another process writes it.
+    """
+
+    def is_end(payload: bytes) -> bool:
+        try:
+            return messages.decode(keys.EVENT, payload).kind == "end"
+        except DecodeError:
+            return False
+
+    record = folder / RECORD
+    if record.exists():
+        cut_at_last(record, keys.EVENT, is_end)

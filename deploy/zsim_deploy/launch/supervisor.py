@@ -4,29 +4,37 @@ Where a process runs, on this machine (`ChildProcess`) or on another one (`Remot
 """
 
 import json
+import signal
 import socket
 import time
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from zsim.errors import RunError
 from zsim.runtime.progress import ProgressSink
+from zsim.scenario.role_table import OnDeath, is_needed, lets_drop, on_death, on_overdue
 from zsim.scenario.scenario import Processes
 from zsim_deploy import USER_FAULT
-from zsim_deploy.launch.death_policy import SUPERSEDED, DeathPolicy
-from zsim_deploy.launch.world_watch import WorldWatch
+from zsim_deploy.roles.closed_output import CLOSED, STREAMS, is_unread, redirect_output
 from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
 POLL_S = 0.05  # how often the processes are looked at
 END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
-WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for everybody
+WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for all
 INTERRUPT_S = 2.0  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
 SILENT_S = 10.0  # after which a world that has printed nothing is named; it takes 1 s, and compiles with a notice
+QUIET_WORLD_S = 1.8  # a world that stands still shows its clock once a second; so a stop is named within 2 s
 TAKE_OVER_S = 60.0  # how long a process may stay once another was started in its place; a slow one starts in half
+RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
+RESTART_WINDOW_S = 20.0
+SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
+UNREAD = "nobody reads the output any more"  # as of `zsim run … | head`
+OUTPUT_LOOK_S = 0.1  # between two looks at who reads the output
 
 
 class RunProcess(Protocol):
@@ -49,6 +57,13 @@ class RunProcess(Protocol):
     def close(self) -> None: ...
 
 
+def end_text(code: int | None, last_line: str) -> str:
+    """Describe how a process ended, by its exit code and the last line of its log."""
+    if code is not None and code < 0:
+        return f"killed by signal {-code}"
+    return f"exit code {code}" + (f": {last_line}" if last_line else "")
+
+
 @dataclass
 class Outcome:
     """How a run ended."""
@@ -67,12 +82,14 @@ class Supervisor:
 
     Attributes:
         members: to be given before `run`; the world among them.
-        lasting: the one of them that goes on after the run, to be stopped and closed by the caller, whatever happens.
+        lasting: the one of them that goes on after the run; the caller has to stop and close it in any case.
+        clock: the world's last; None before the first.
     """
 
     def __init__(self, processes: Processes, show: ProgressSink) -> None:
         self.members: list[RunProcess] = []
         self.lasting: RunProcess | None = None
+        self.clock: dict[str, Any] | None = None
         self._deaths = DeathPolicy(processes)
         self._show = show
         self._reason = ""
@@ -82,29 +99,37 @@ class Supervisor:
         self._until_s: float | None = None
         self._silent_s: float | None = None  # when a world without a line of its own is to be named (monotonic)
         self._dead: set[str] = set()
-        self._lost: dict[str, int | None] = {}  # pid of who has ended without a bye
+        self._lost: dict[str, int | None] = {}  # pid of each that has ended without a bye
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
-        self._gone: list[RunProcess] = []  # nobody waits for them any more
+        self._gone: list[RunProcess] = []  # no longer waited for
         self._world_watch = WorldWatch()
-        self.clock: dict[str, Any] | None = None  # the world's last
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
     def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
         """Start everything, watch it to its end, leave nothing behind.
+
+        Ctrl-C and SIGTERM are requests to end the run in order; a second Ctrl-C does not wait.
 
         Args:
             look: called at every look at the processes.
         """
         if self._interrupted:
             return Outcome(self._interrupted, interrupted=True)
-        with self._interrupts():
+
+        def on_signal(number: int, _: object) -> None:
+            if self._interrupted:
+                raise KeyboardInterrupt(TWICE_INTERRUPTED)
+            self._interrupted = REASONS[number]
+
+        with handled_by(on_signal):
             try:
                 for child in self.members:
                     child.start()
                 self._watch(look)
                 self._finish()
             finally:
-                self._cancel_requests()
+                while not self._requests.empty():
+                    self._requests.get()[1].cancel()
                 replaced = [*(child for child, _ in self._leaving.values()), *self._gone]
                 _close([*self._leaving_with_run(), *replaced])
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
@@ -112,15 +137,24 @@ class Supervisor:
     def _leaving_with_run(self) -> list[RunProcess]:
         return [child for child in self.members if child is not self.lasting]
 
-    def _interrupts(self) -> AbstractContextManager[None]:
-        """Take Ctrl-C and SIGTERM as a request to end the run in order; a second Ctrl-C does not wait."""
+    def rows(self) -> list[dict[str, Any]]:
+        """Return name, process number, state and restarts of each process, for `zsim ps`; callable from any thread."""
+        host = socket.gethostname()
+        return [
+            {
+                "role": child.name,
+                "host": host,
+                "pid": child.pid or None,
+                "state": "running" if child.code is None else f"ended ({child.outcome()})" if child.code else "ended",
+                "lag_ms": None,
+                "messages_per_s": None,
+                "round_trip_ms": None,
+                "restarts": child.restarts,
+            }
+            for child in self.members
+        ]
 
-        def on_signal(number: int, _: object) -> None:
-            if self._interrupted:
-                raise KeyboardInterrupt(TWICE_INTERRUPTED)
-            self._interrupted = REASONS[number]
-
-        return handled_by(on_signal)
+    # What the world says
 
     def handle_line(self, text: str) -> None:
         """Take a line of the world's progress."""
@@ -146,23 +180,17 @@ class Supervisor:
 
     def _on_event(self, event: dict[str, Any]) -> None:
         self._show.event(event)
-        if event["kind"] == "end":
+        kind, subject, data = event["kind"], event.get("subject", ""), event.get("data", {})
+        if kind == "end":
             self._reason = self._reason or event["text"]
-        elif event["kind"] == "overdue":
-            self._on_overdue(event)
-        elif event["kind"] == "failure" and event["data"].get("on_death") == "end":
+        elif kind == "overdue" and data.get("on_overdue") == "drop":  # it has not come back, the run goes on without
+            self.submit(lambda: self._give_up(subject))
+        elif kind == "overdue" or (kind == "failure" and data.get("on_death") == "end"):
             self._fail(event["text"])
-        elif event["kind"] == "death" and event["data"].get("on_death") == "end":
-            self._fail(f"{event['subject']} died")
-        elif event["kind"] == "death" and event["data"].get("on_death") == "restart":
-            self.submit(lambda: self._on_death(event["subject"], event["data"].get("pid")))
-
-    def _on_overdue(self, event: dict[str, Any]) -> None:
-        """End what has not come back in its time, if the run goes on without it."""
-        if event["data"].get("on_overdue") == "drop":
-            self.submit(lambda: self._give_up(event["subject"]))
-        else:
-            self._fail(event["text"])
+        elif kind == "death" and data.get("on_death") == "end":
+            self._fail(f"{subject} died")
+        elif kind == "death" and data.get("on_death") == "restart":
+            self.submit(lambda: self._on_death(subject, data.get("pid")))
 
     def _give_up(self, name: str) -> None:
         for child in self.members:
@@ -170,27 +198,25 @@ class Supervisor:
                 self._dead.add(name)
                 child.kill()
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Return name, process number, state and restarts of each process, for `zsim ps`; callable from any thread."""
-        host = socket.gethostname()
-        return [
-            {
-                "role": child.name,
-                "host": host,
-                "pid": child.pid or None,
-                "state": "running" if child.code is None else f"ended ({child.outcome()})" if child.code else "ended",
-                "lag_ms": None,
-                "messages_per_s": None,
-                "round_trip_ms": None,
-                "restarts": child.restarts,
-            }
-            for child in self.members
-        ]
+    def _on_death(self, name: str, pid: int | None) -> None:
+        """Restart a process that the world reports dead where its exit code gave no reason to.
+
+        It has left its place to the one that is dead now, or has ended with 0 without a bye, as by `os._exit(0)`.
+        """
+        for child in self.members:
+            if child.name == name and child.pid == pid and child.code in (0, None):
+                self._lost[name] = pid
+                self._dead.discard(name)
+            elif child.name == name and child.code == SUPERSEDED and name in self._dead:
+                self._show.say(f"{name} is started again, since the process that took its place is dead")
+                self._dead.discard(name)
+                child.restarts += 1
+                child.start()
 
     # Watching
 
     def _watch(self, look: Callable[[], None]) -> None:
-        """Return when the world has ended, or when it has to."""
+        """Return when the world has ended, or is to be ended."""
         world = next(child for child in self.members if child.role == "world")
         self._silent_s = time.monotonic() + SILENT_S
         while world.code is None or self._restarts_world(world):
@@ -204,7 +230,10 @@ class Supervisor:
                     self._on_exit(child, world)
             self._carry_out_requests()
             self._release_replaced()
-            self._name_silent(world)
+            if self._silent_s is not None and time.monotonic() > self._silent_s:
+                self._silent_s = None
+                silent = f"the world (pid {world.pid}) has not begun after {SILENT_S:g} s"
+                self._show.say(f"{silent}: {world.last_log_line() or 'its log is empty'}; the others wait")
             if line := self._world_watch.change(time.monotonic(), world.pid):
                 self._show.say(line)
             look()
@@ -213,7 +242,7 @@ class Supervisor:
             self._fail_after_end(f"the world died: {world.outcome()}")
 
     def _restarts_world(self, world: RunProcess) -> bool:
-        """Start a world again that died in its run; return whether that was so."""
+        """Restart a world that died in its run; return whether it was restarted."""
         code = world.code
         flew = code is not None and code not in (0, USER_FAULT) and (self._flies or code < 0)
         if not flew or self._reason or self._interrupted:
@@ -226,18 +255,47 @@ class Supervisor:
         world.start()
         return True
 
+    def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
+        """Apply on_death to a role that ended while the world runs."""
+        if child.code == SUPERSEDED or (child.code == 0 and self._lost.get(child.name) != child.pid):
+            self._dead.add(child.name)
+            if child.code == SUPERSEDED:
+                self._show.say(child.last_log_line())
+            return
+        action, why = self._deaths.decide(child.name, child.code, self._flies)
+        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {why}")
+        if action == "restart":
+            child.restarts += 1
+            child.start()
+            return
+        self._dead.add(child.name)
+        if action == "end":
+            self._fail(f"{child.name} ended: {child.outcome()}")
+            world.request_stop(self._reason)
+
+    # Orders from other threads
+
     def submit(self, act: Callable[[], Any]) -> Future[Any]:
         """Let the watch do something between two looks at the processes; callable from any thread.
 
         Returns:
-            what comes of it, also if it fails; cancelled when the run ends before.
+            its result or exception; cancelled when the run ends before.
         """
         outcome: Future[Any] = Future()
         self._requests.put((act, outcome))
         return outcome
 
+    def _carry_out_requests(self) -> None:
+        while not self._requests.empty():
+            act, outcome = self._requests.get()
+            if outcome.set_running_or_notify_cancel():
+                try:
+                    outcome.set_result(act())
+                except Exception as error:  # whatever it is, the run goes on
+                    outcome.set_exception(error)
+
     def interrupt(self, reason: str) -> None:
-        """End the run for everybody, as Ctrl-C does."""
+        """End the run for all processes, as Ctrl-C does."""
         self._interrupted = self._interrupted or reason
 
     def replace(self, new: RunProcess) -> None:
@@ -259,11 +317,11 @@ class Supervisor:
         new.start()
 
     def is_being_replaced(self, name: str) -> bool:
-        """Return whether a process is taking the place of another that has not left yet; callable from any thread."""
+        """Whether a process is taking the place of another that has not left yet; callable from any thread."""
         return name in self._leaving
 
     def _release_replaced(self) -> None:
-        """Let go of those that have left their place; kill one that hangs there."""
+        """Release replaced processes that have ended; kill one that hangs."""
         for name, (child, since_s) in list(self._leaving.items()):
             hangs = child.code is None and time.monotonic() - since_s > TAKE_OVER_S
             if hangs:
@@ -273,67 +331,19 @@ class Supervisor:
                 del self._leaving[name]
                 self._gone.append(child)
 
-    def _carry_out_requests(self) -> None:
-        while not self._requests.empty():
-            act, outcome = self._requests.get()
-            if outcome.set_running_or_notify_cancel():
-                _settle(outcome, act)
-
-    def _cancel_requests(self) -> None:
-        while not self._requests.empty():
-            self._requests.get()[1].cancel()
-
-    def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
-        """Apply on_death to a role that ended while the world runs."""
-        if child.code == SUPERSEDED or (child.code == 0 and self._lost.get(child.name) != child.pid):
-            self._dead.add(child.name)
-            if child.code == SUPERSEDED:
-                self._show.say(child.last_log_line())
-            return
-        action, why = self._deaths.decide(child.name, child.code, self._flies)
-        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {why}")
-        if action == "restart":
-            child.restarts += 1
-            child.start()
-            return
-        self._dead.add(child.name)
-        if action == "end":
-            self._fail(f"{child.name} ended: {child.outcome()}")
-            world.request_stop(self._reason)
-
-    def _on_death(self, name: str, pid: int | None) -> None:
-        """Take it from the world that a process has died, if nobody else would start it again.
-
-        It has left its place to the one that is dead now, or has ended with 0 without a bye, as by `os._exit(0)`.
-        """
-        for child in self.members:
-            if child.name == name and child.pid == pid and child.code in (0, None):
-                self._lost[name] = pid
-                self._dead.discard(name)
-            elif child.name == name and child.code == SUPERSEDED and name in self._dead:
-                self._show.say(f"{name} is started again, since who took its place is dead")
-                self._dead.discard(name)
-                child.restarts += 1
-                child.start()
-
-    def _name_silent(self, world: RunProcess) -> None:
-        """Show once whom all others wait for, where the world has not begun."""
-        if self._silent_s is not None and time.monotonic() > self._silent_s:
-            self._silent_s = None
-            last = world.last_log_line() or "its log is empty"
-            self._show.say(f"the world (pid {world.pid}) has not begun after {SILENT_S:g} s: {last}; the others wait")
+    # Ending
 
     def _fail(self, reason: str) -> None:
         self._reason, self._failed = self._reason or reason, True
 
     def _fail_after_end(self, reason: str) -> None:
-        """Take a failure of who was to end with the run: that counts, and no end in order that the world reported."""
+        """Note a failure of a process that was to end with the run: it overrides an orderly end that was reported."""
         if not self._failed and not self._interrupted:
             self._reason = ""
         self._fail(reason)
 
     def _finish(self) -> None:
-        """Let everybody leave; the recorder leaves last, by itself."""
+        """Let all processes leave; the recorder leaves last, by itself."""
         members = self._leaving_with_run()
         for child in members:
             if self._failed or self._interrupted or child.role != "recorder":
@@ -353,16 +363,138 @@ class Supervisor:
         return max(0.0, self._until_s - now_s)
 
 
-def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
-    """Carry out a request; its future gets any exception, and the run goes on."""
-    try:
-        outcome.set_result(act())
-    except Exception as error:
-        outcome.set_exception(error)
-
-
 def _close(members: Sequence[RunProcess]) -> None:
     """End all of them at once, so one that cannot be reached does not delay the others."""
     with ThreadPoolExecutor(len(members)) as pool:
         for closed in [pool.submit(member.close) for member in members]:
             closed.result()
+
+
+class DeathDecision(NamedTuple):
+    """What to do, and why, for people."""
+
+    action: OnDeath
+    why: str
+
+
+class DeathPolicy:
+    """Decides by what the scenario says of deaths, and by how often a process has died."""
+
+    def __init__(self, processes: Processes) -> None:
+        self._processes = processes
+        self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
+
+    def decide(self, name: str, code: int | None, flies: bool) -> DeathDecision:
+        """Count the death of a process; return what to do.
+
+        Args:
+            flies: whether the run has begun.
+        """
+        action = on_death(self._processes.on_death, name)
+        if action == "end":
+            return DeathDecision("end", "on_death: end")
+        is_settled = flies and (action == "wait" or lets_drop(self._processes.on_death, name))  # by the scenario itself
+        if code == USER_FAULT and not is_settled:
+            return self._without(name, flies, "a restart would not help", is_needed(name))
+        if action == "restart":
+            deaths = self._deaths[name]
+            deaths.append(time.monotonic())
+            if len(deaths) > RESTARTS_MAX and deaths[-1] - deaths[0] < RESTART_WINDOW_S:
+                return self._without(name, flies, f"more than {RESTARTS_MAX} restarts within {RESTART_WINDOW_S:g} s")
+        return DeathDecision(action, f"on_death: {action}")
+
+    def _without(self, name: str, flies: bool, why: str, ends: bool = False) -> DeathDecision:
+        """Return what to do where no restart helps."""
+        overdue = on_overdue(self._processes.on_overdue or {}, name, gating=self._processes.gating or ())
+        ends = ends or overdue == "end" or self._processes.gates(name.partition(".")[0])
+        is_awaited = not flies and not is_needed(name) and name in (self._processes.expect or ())
+        if ends or is_awaited:  # a run that has not begun would wait for it indefinitely
+            return DeathDecision("end", f"{why}; the run ends")
+        return DeathDecision("drop", f"{why}; it is given up, and the run goes on without it")
+
+
+class WorldWatch:
+    """Notices when the world falls silent: a stopped process cannot report that itself.
+
+    Nothing is noticed before its first line: it may compile.
+    """
+
+    def __init__(self) -> None:
+        self._last_s: float | None = None
+        self._is_silent = False
+        self._ends_for: list[str] = []
+
+    def received(self, now_s: float) -> None:
+        """Note a line of the world; callable from any thread."""
+        self._last_s = now_s
+
+    def clock(self, line: dict[str, Any]) -> None:
+        """Note whom a world that has ended waits for: its links to them close only when they take what is left."""
+        if line.get("state") == "stopped":
+            self._ends_for = [each["name"] for each in line.get("waiting_for", ())]
+
+    def change(self, now_s: float, pid: int) -> str | None:
+        """Return the line for the user when the world has fallen silent or is back, None as long as it is as before."""
+        if self._last_s is None or self._is_silent == (now_s - self._last_s >= QUIET_WORLD_S):
+            return None
+        self._is_silent = not self._is_silent
+        if not self._is_silent:
+            return f"world (pid {pid}) is back"
+        if self._ends_for:
+            named = ", ".join(self._ends_for)
+            return f"world (pid {pid}) has ended and waits for {named}: stopped, or out of reach"
+        silent_s = now_s - self._last_s
+        go_on = f"kill -CONT {pid} lets it go on"
+        return f"world (pid {pid}) shows no sign of life for {silent_s:.1f} s: it is stopped ({go_on}) or out of reach"
+
+
+class EndSignals:
+    """Takes SIGTERM and SIGHUP for as long as it is entered; SIGHUP stays ignored under nohup.
+
+    Nothing is raised for a closed terminal, as shells send that signal more than once: `hung_up` is called, and output
+    goes to a file from then on.
+
+    Args:
+        log: that file; it is made when there is something to write.
+        hung_up: called, in a signal handler too, when nothing more can be drawn.
+
+    Attributes:
+        reason: why the output can no longer be seen; empty while it can.
+    """
+
+    def __init__(self, log: Path, hung_up: Callable[[], None]) -> None:
+        self._log = log
+        self._hung_up = hung_up
+        self.reason = ""
+        self._looked_s = 0.0
+
+    def __enter__(self) -> "EndSignals":
+        wanted: dict[int, Any] = {signal.SIGTERM: signal.default_int_handler}
+        if hasattr(signal, "SIGHUP"):  # not on Windows
+            wanted[signal.SIGHUP] = self._on_hangup
+        self._former = {number: signal.getsignal(number) for number in wanted}
+        for number, handler in wanted.items():
+            if self._former[number] is not signal.SIG_IGN:
+                signal.signal(number, handler)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
+
+    def _on_hangup(self, *_: object) -> None:
+        self.reason = CLOSED
+        redirect_output(self._log)
+        self._hung_up()
+
+    def look(self) -> None:
+        """Notice that the reader of a pipe has gone; to be called repeatedly, as nothing need be written for it."""
+        if time.monotonic() - self._looked_s < OUTPUT_LOOK_S:
+            return
+        unread = [stream for stream in STREAMS if is_unread(stream)]
+        if unread:
+            self.reason = self.reason or UNREAD
+            redirect_output(self._log, unread, UNREAD)
+        if STREAMS[-1] in unread:
+            self._hung_up()
+        self._looked_s = time.monotonic()

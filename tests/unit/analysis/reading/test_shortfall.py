@@ -32,7 +32,7 @@ from zsim_analysis.report.figures.report_figures import figures
 from zsim_analysis.report.make_report import facts, judge, page
 from zsim_analysis.report.pages import COLUMN_IN, PAGE_IN, VERMILION, legend_above, new_figure
 from zsim_analysis.report.tables import table
-from zsim_deploy.cli import record_commands
+from zsim_deploy.cli import run_commands
 
 State = Callable[[float], dict[str, Any]]
 SOON: tuple[str, ...] = ("clusters.main.plan.takeoff_s=1", "report.window_s=[4, 30]")
@@ -474,7 +474,7 @@ def test_table_figures_page_and_exit_code_show_it(tmp_path: Path, capsys: pytest
     assert "too fast" in page(summary, [])
     outcome = type("Outcome", (), {"interrupted": False, "failed": False, "reason": "over"})()
     with pytest.raises(typer.Exit) as exit_:
-        record_commands.conclude(outcome, tmp_path, True)
+        run_commands.conclude(outcome, tmp_path, True)
     assert exit_.value.exit_code == 1
     assert "too fast" in " ".join(capsys.readouterr().out.split())  # whatever the width of the terminal
 
@@ -522,7 +522,7 @@ def end_of(folder: Path, report: bool, capsys: pytest.CaptureFixture[str]) -> tu
     outcome = type("Outcome", (), {"interrupted": False, "failed": False, "reason": "over"})()
     code = 0
     try:
-        record_commands.conclude(outcome, folder, report)
+        run_commands.conclude(outcome, folder, report)
     except typer.Exit as end:
         code = end.exit_code
     out, err = capsys.readouterr()

@@ -21,7 +21,7 @@ from zsim_bridges.mavlink.serve.vehicle_ports import DATAGRAM_MAX, VehiclePort, 
 from zsim_bridges.mavlink.wire import dialect
 from zsim_bridges.mavlink.wire.frame import Link, Parser, Received
 from zsim_bridges.vehicle_links.run_pace import set_pace
-from zsim_deploy.cli.mavlink_commands import _endpoint, read_key
+from zsim_deploy.cli.bridge_commands import _endpoint, read_key
 
 GCS = ("192.0.2.7", 14550)
 

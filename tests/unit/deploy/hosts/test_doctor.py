@@ -18,16 +18,25 @@ from typing import Any
 
 import pytest
 from refused import has_terms, refused
+from rich.console import Console
 
 from zsim import __version__
 from zsim.errors import HostsError
+from zsim_deploy import certificates
+from zsim_deploy.certificates import CertificateRequest
 from zsim_deploy.hosts import doctor, probe
-from zsim_deploy.hosts.doctor import CheckResult, check_hosts, compare_reports, path_faults
+from zsim_deploy.hosts.doctor import (
+    CheckResult,
+    HostReport,
+    NetworkPath,
+    check_hosts,
+    compare_reports,
+    hosts_table,
+    path_faults,
+    paths_table,
+)
 from zsim_deploy.hosts.host_link import HostLink
-from zsim_deploy.hosts.host_report import HostReport, NetworkPath
-from zsim_deploy.inventory import certificates
-from zsim_deploy.inventory.certificates import CertificateRequest
-from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
+from zsim_deploy.inventory import Host, Inventory, InventoryFile
 
 SOUND = {
     "python": platform.python_version(),
@@ -350,3 +359,19 @@ def test_a_folder_is_asked_for_where_it_would_be_made(tmp_path, monkeypatch):
     assert has_terms(probe.unwritable(tmp_path / "file" / "zsim"), f"{tmp_path}/file", "no folder")
     monkeypatch.setattr(probe.os, "access", lambda path, _mode: path != tmp_path)
     assert has_terms(probe.unwritable(tmp_path / "zsim"), str(tmp_path), "written")
+
+
+SAID = {"python": "3.11.2", "zsim": "1", "fingerprint": "abc", "cores": 2, "load": 0.1, "governors": ["[/x]"]}
+
+
+@pytest.mark.parametrize(
+    ("table", "terms"),
+    [
+        (paths_table([NetworkPath("h2", "h1", 7447, {"error": "cannot open [/tmp/x]"})]), ("open [/tmp/x]",)),
+        (hosts_table({"h1": HostReport(SAID, 0.001, 0.0)}), ("[/x]",)),
+    ],
+)
+def test_brackets_are_no_markup(table, terms):
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table)
+    assert has_terms(console.file.getvalue(), *terms)  # type: ignore[attr-defined]

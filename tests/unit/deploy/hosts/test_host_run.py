@@ -12,12 +12,12 @@ from rich.console import Console
 
 from zsim.errors import HostsError
 from zsim.scenario import scenario_file
+from zsim_deploy import inventory
 from zsim_deploy.hosts import host_run as module
-from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
+from zsim_deploy.hosts.host_run import HostRun
 from zsim_deploy.hosts.status_table import StatusTable
-from zsim_deploy.inventory import inventory
-from zsim_deploy.launch.end_signals import UNREAD
-from zsim_deploy.launch.supervisor import Outcome
+from zsim_deploy.launch.run_folder import Launch
+from zsim_deploy.launch.supervisor import UNREAD, Outcome
 from zsim_deploy.roles.closed_output import CLOSED
 
 SCENARIO = "name: one\nduration_s: 1\ndrones: [{name: drone1, position_m: [0, 0, 0]}]\nprocesses: {expect: []}\n"
@@ -51,8 +51,7 @@ def up(board: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     scenario, hosts = tmp_path / "one.yaml", tmp_path / "hosts.yaml"
     scenario.write_text(SCENARIO)
     hosts.write_text(yaml.safe_dump(HOSTS))
-    options = HostRunOptions(scenario_file.load(scenario), inventory.load(hosts), tmp_path / "out", run_id="abc")
-    found = HostRun(options, board)
+    found = HostRun(scenario_file.load(scenario), inventory.load(hosts), tmp_path / "out", Launch("abc"), board)
     monkeypatch.setattr(found._links, "listen", lambda: None)
     yield found
     found._loop.close()

@@ -1,15 +1,20 @@
 """The table of `zsim up`: what a row says of a process, and which host is named as silent."""
 
 import io
+import random
 import time
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from refused import has_terms
+from refused import has_terms, refused
 from rich.console import Console
 
-from zsim_deploy.hosts.status_table import StatusTable, table
+from zsim.errors import RunError
+from zsim.terminal.fitted_table import FittedTable
+from zsim.terminal.name_cell import shortened
+from zsim_deploy.hosts.doctor import HostReport, NetworkPath, hosts_table, paths_table
+from zsim_deploy.hosts.status_table import RowChoice, RowOrder, StatusTable, needs_attention, table
 
 
 class Link:
@@ -141,3 +146,136 @@ def test_who_waits_for_another_s_outputs_is_not_the_one_waited_for(board):
     waiting = {"name": "estimator.d1", "host": "h1", "since_wall_s": 3.2, "held_by": ["planner.d1"]}
     board.clock(clock(1.0, waiting_for=[waiting]))
     assert board.rows()[0]["state"] == "waits for planner.d1"
+
+
+FIGURES = {"pid": 7, "lag_ms": 1.0, "messages_per_s": 50.0, "round_trip_ms": 1.0, "restarts": 0, "age_s": 0.5}
+
+
+def row(role: str, host: str = "lab-pc", state: str = "running", **more: Any) -> dict[str, Any]:
+    return {"role": role, "host": host, "state": state, **FIGURES, **more}
+
+
+ROWS = [
+    row("world"),
+    row("estimator.drone1", "pi-1", age_s=3.0, state="no sign of life for 3 s"),
+    row("estimator.drone12", "pi-2", lag_ms=20.0),
+    row("controller.main", age_s=None, lag_ms=None, restarts=2, state="starting"),
+]
+
+
+def roles(choice: RowChoice) -> list[str]:
+    return [each["role"].rpartition(".")[2] for each in choice.of(ROWS)]
+
+
+@pytest.mark.parametrize(
+    ("only", "shown"),
+    [
+        ([], ["world", "drone1", "drone12", "main"]),
+        (["drone1*"], ["drone1", "drone12"]),
+        (["drone1"], ["drone1"]),
+        (["estimator.*2", "world"], ["world", "drone12"]),
+        (["pi-?"], ["drone1", "drone12"]),
+    ],
+)
+def test_patterns_are_of_roles_of_what_they_work_for_and_of_hosts(only: list[str], shown: list[str]) -> None:
+    assert roles(RowChoice(only)) == shown
+
+
+@pytest.mark.parametrize(
+    ("sort", "shown"),
+    [
+        (RowOrder.AGE, ["main", "drone1", "world", "drone12"]),
+        (RowOrder.LAG, ["main", "drone12", "world", "drone1"]),
+        (RowOrder.RESTARTS, ["main", "world", "drone1", "drone12"]),
+        (RowOrder.ROLE, ["main", "drone1", "drone12", "world"]),
+        (RowOrder.HOST, ["world", "main", "drone1", "drone12"]),
+        (RowOrder.ATTENTION, ["drone1", "main", "world", "drone12"]),
+    ],
+)
+def test_the_greatest_figure_is_first(sort: RowOrder, shown: list[str]) -> None:
+    assert roles(RowChoice(sort=sort)) == shown
+
+
+def test_a_pattern_that_matches_nothing_is_refused() -> None:
+    with refused(RunError, "role", "'drone9*'", "world", "estimator.drone1"):
+        RowChoice(["drone*", "drone9*"]).check(ROWS)
+
+
+def test_states_have_an_order_of_urgency() -> None:
+    states = ["ended (exit code 2: x)", "no sign of life for 3 s", "host silent 3 s", "waited for 3 s"]
+    states += ["waits for world", "starting", "running", "ended"]
+    shuffled = random.Random(1).sample(states, len(states))
+    assert sorted(shuffled, key=lambda state: needs_attention(row("world", state=state))) == states
+
+
+def live(table: StatusTable, width: int) -> list[str]:
+    console = Console(file=io.StringIO(), width=width, height=24)
+    table.console = console
+    console.print(table._render())
+    return console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_of_200_processes_those_in_need_are_on_the_screen(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [row(f"estimator.formation-alpha-drone{i}", f"onboard-computer-{i}") for i in range(200)]
+    rows[150]["state"], rows[199]["state"] = "ended (exit code 1: no such file)", "no sign of life for 12 s"
+    table = StatusTable(10.0)
+    monkeypatch.setattr(table, "rows", lambda: rows)
+    shown = live(table, width)
+    assert len(shown) <= 24
+    first, second = [line for line in shown if "alpha-drone" in line][:2]
+    assert first.split()[0].endswith("drone150")
+    assert second.split()[0].endswith("drone199")
+    assert "180 more" in shown[-1]
+
+
+def test_where_all_processes_have_a_line_they_stay_in_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = StatusTable(10.0, choice=RowChoice(["drone1*", "world"]))
+    monkeypatch.setattr(table, "rows", lambda: ROWS)
+    names = [line.split()[0] for line in live(table, 100)[-3:]]
+    assert names == ["world", "estimator.drone1", "estimator.drone12"]
+
+
+# Names in narrow tables: their end is kept, since it tells them apart
+
+COLUMNS = 80  # of a terminal, by default
+ROLES = [f"estimator.formation-alpha-drone-{i:04}" for i in range(200)]
+HOST = "onboard-computer-of-drone-0012"
+LARGE = {"pid": 123456, "lag_ms": 1234.0, "messages_per_s": 12345.0, "round_trip_ms": 123.4, "restarts": 3}
+FACTS = {"python": "3.11.2", "zsim": "0.1.0", "fingerprint": "0123456789", "cores": 128, "load": 100.1, "governors": []}
+
+
+def lines(shown: FittedTable) -> list[str]:
+    console = Console(file=io.StringIO(), width=COLUMNS)
+    console.print(shown)
+    return console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("name", "width", "text"),
+    [("estimator.drone2", 16, "estimator.drone2"), ("estimator.drone2", 7, "…drone2"), ("d1", 1, "…")],
+)
+def test_the_beginning_of_a_name_is_left_out(name: str, width: int, text: str) -> None:
+    assert shortened(name, width) == text
+
+
+def test_processes_are_told_apart_in_a_terminal_of_80_columns() -> None:
+    rows = [{"role": role, "host": HOST, "state": "host silent 12 s", **LARGE} for role in ROLES]
+    shown = lines(table(rows))[-len(ROLES) :]
+    ends = [line.split()[0].removeprefix("…") for line in shown]
+    assert len(set(ends)) == len(ROLES)
+    assert all(role.endswith(end) for role, end in zip(ROLES, ends, strict=True))
+    assert all(HOST[-4:] in line and "host silent 12 s" in line and "1234 ms" in line for line in shown)
+
+
+def test_a_table_with_room_shows_whole_names() -> None:
+    *_, row = lines(table([{"role": "estimator.drone2", "host": "lab-pc", "state": "running", **LARGE}]))
+    assert row.split()[:2] == ["estimator.drone2", "lab-pc"]
+
+
+def test_hosts_are_told_apart_in_a_terminal_of_80_columns() -> None:
+    hosts = [f"onboard-computer-of-drone-{i:04}" for i in range(3)]
+    checked = lines(hosts_table({name: HostReport(FACTS, 0.001, 0.0) for name in hosts}))
+    paths = lines(paths_table([NetworkPath(name, HOST, 7447, {"error": "no route " * 9}) for name in hosts]))
+    for shown in (checked, paths):
+        assert all(any(line.split() and line.split()[0].endswith(name[-6:]) for line in shown) for name in hosts)

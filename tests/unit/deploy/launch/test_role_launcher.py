@@ -14,7 +14,7 @@ from refused import has_terms
 
 from zsim import __version__
 from zsim.runtime import progress
-from zsim_deploy.inventory.processes import MODULE
+from zsim_deploy.inventory import MODULE
 from zsim_deploy.launch import console_process
 from zsim_deploy.launch import role_launcher as module
 from zsim_deploy.launch.role_launcher import ForkedProcess, RoleLauncher, RoleProcess

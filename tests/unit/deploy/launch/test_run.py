@@ -1,19 +1,26 @@
 """`zsim run` before and around its processes: their command lines, the port, the folder."""
 
+import io
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 from refused import has_terms, refused
+from rich.console import Console
+from short_flight import DIVERGED_NS, ONE, diverge
 from synthetic_record import SCENARIOS
 
+from zsim.contract import keys, messages
 from zsim.errors import RunError, SessionError
+from zsim.record import RecordReader
+from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim_deploy.arguments import changed_fields
-from zsim_deploy.launch import free_ports, run
+from zsim_deploy.launch import run
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.run import RunOptions
+from zsim_deploy.launch.run_folder import new_launch
 from zsim_deploy.launch.supervisor import Outcome
 
 TAKEN = "the world died: exit code 2: cannot listen on tcp/127.0.0.1:{port} (Address already in use)"
@@ -64,14 +71,14 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> type[FakeSupervisor]:
     FakeSupervisor.outcomes, FakeSupervisor.ports = [], []
     monkeypatch.setattr(run, "RoleLauncher", NoRoleLauncher)
     monkeypatch.setattr(run, "Supervisor", FakeSupervisor)
-    for module in (run, free_ports):
-        monkeypatch.setattr(module, "is_free", lambda port: port == run.DEFAULT_PORT and not FakeSupervisor.ports)
+    monkeypatch.setattr(run, "is_free", lambda port: port == run.DEFAULT_PORT and not FakeSupervisor.ports)
     return FakeSupervisor
 
 
-def options(out: Path, *overrides: str, **others: Any) -> RunOptions:
+def options(out: Path, *overrides: str, cameras: bool = False, detect: bool = False, **how: Any) -> RunOptions:
     out.mkdir(exist_ok=True)
-    return RunOptions(scenario_file.load(SCENARIOS / "step.yaml", overrides), out, **others)
+    scenario = scenario_file.load(SCENARIOS / "step.yaml", overrides)
+    return RunOptions(scenario, out, new_launch(**how), cameras=cameras, detect=detect)
 
 
 def test_a_port_taken_in_between_is_another_port(watched: type[FakeSupervisor], tmp_path: Path):
@@ -104,7 +111,7 @@ def test_trying_ports_has_an_end(watched: type[FakeSupervisor], tmp_path: Path):
 def test_the_world_is_told_what_was_changed_of_the_file(tmp_path: Path):
     changed = changed_fields(["wind.gust_m_s=1"], 12345678, 20.0)
     assert changed == ["wind.gust_m_s=1", "seed=12345678", "duration_s=20.0"]
-    made = options(tmp_path, changed=changed)
+    made = options(tmp_path, changed=tuple(changed))
     children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
     world = next(child._arguments for child in children if child.name == "world")
     assert [word for flag, word in pairwise(world) if flag == "--changed"] == changed
@@ -192,7 +199,7 @@ def test_a_run_in_one_process_says_where_it_is_recorded(monkeypatch: pytest.Monk
     monkeypatch.setattr("zsim_analysis.in_process.fly", lambda *_, changed: "over")
     screen = Say()
     screen.hang_up = lambda: None  # type: ignore[attr-defined]
-    run.run_in_process(options(tmp_path), screen)  # type: ignore[arg-type]
+    run.run_in_process(options(tmp_path, in_process=True), screen)  # type: ignore[arg-type]
     assert any(has_terms(line, "into", str(tmp_path)) for line in screen.lines)
 
 
@@ -200,4 +207,30 @@ def test_a_folder_that_takes_no_files_is_a_line(tmp_path: Path):
     made = options(tmp_path)
     (tmp_path / "scenario.yaml").mkdir()
     with refused(RunError, "written"):
-        run._write_scenario(made, in_process=False)
+        run._write_scenario(made)
+
+
+class NoStopChannel:
+    """Leaves the signals to pytest."""
+
+    def reason(self) -> None:
+        return
+
+    def stopped(self) -> bool:
+        return False
+
+    def restore_signals(self) -> None: ...
+
+
+def test_a_diverged_run_in_one_process_has_failed_and_has_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    diverge(monkeypatch)
+    monkeypatch.setattr(run, "StopChannel", NoStopChannel)
+    options = run.RunOptions(scenario_file.from_text(ONE), tmp_path, new_launch(in_process=True))
+    outcome = run.run_in_process(options, Screen(1.0, Console(file=io.StringIO())))
+    assert outcome.failed
+    assert has_terms(outcome.reason, "d1", "0.120", "finite")
+    with RecordReader(tmp_path / "run.mcap") as reader:
+        recorded = [(m.key, messages.decode(m.key, m.payload)) for m in reader.messages()]
+    assert [event.kind for key, event in recorded if key == keys.EVENT] == ["diverged", "end"]
+    clocks = [clock for key, clock in recorded if key == keys.CLOCK]
+    assert (clocks[-1].state, clocks[-1].t_ns) == ("stopped", DIVERGED_NS)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from refused import has_terms
 
-from zsim_deploy.launch.end_signals import UNREAD, EndSignals
+from zsim_deploy.launch.supervisor import UNREAD, EndSignals
 from zsim_deploy.roles.stop_channel import interruptible
 
 
@@ -41,7 +41,7 @@ TALKS = """
 import signal, sys
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests may be under nohup
 from pathlib import Path
-from zsim_deploy.launch.end_signals import UNREAD, EndSignals
+from zsim_deploy.launch.supervisor import UNREAD, EndSignals
 told = []
 with EndSignals(Path(sys.argv[1]), lambda: told.append(1)):
     print("ready", flush=True)
@@ -87,7 +87,7 @@ def test_a_terminal_that_is_there_still_is_told_where_the_rest_is(tmp_path: Path
 LOOKS = """
 import sys
 from pathlib import Path
-from zsim_deploy.launch.end_signals import UNREAD, EndSignals
+from zsim_deploy.launch.supervisor import UNREAD, EndSignals
 told = []
 with EndSignals(Path(sys.argv[1]), lambda: told.append(1)) as signals:
     print("ready", flush=True)

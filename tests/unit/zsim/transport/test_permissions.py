@@ -7,7 +7,7 @@ from rights_table import KEYS, ROLES, SCENARIO, keys_of
 from zsim.contract import keys, messages
 from zsim.scenario import scenario_file
 from zsim.transport.permissions import Act, Permissions, permissions_of
-from zsim_deploy.inventory.enrolment import access_control
+from zsim_deploy.certificates import access_control
 
 ACTS: dict[Act, str] = {"publish": "p", "read": "r", "ask": "g"}
 RULES = access_control(scenario_file.from_text(SCENARIO), ROLES, {"router.site": ["estimator.drone2"]})

@@ -1,0 +1,510 @@
+"""A federation's certificate authority: certificates for each process and host, and what each of them may do.
+
+certs/ca.pem, certs/ca.key                                 the authority; the key stays where it was made
+certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem        of one process on one host, the folder of --tls
+certs/HOST/PROCESS.access.json                             of a process that listens: who may do what there
+
+Zenoh judges at the process that listens (the world, a router), by the common name in the certificate of the other
+side, both ways: what comes in from it and what goes out to it. An expression is allowed if a rule's includes it.
+docs.rs/zenoh-config, AclConfig.
+"""
+
+import ipaddress
+import os
+import shlex
+import stat
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from zsim.contract import keys
+from zsim.errors import InventoryError, RunError
+from zsim.scenario import rights
+from zsim.scenario.external_bodies import drivers_of
+from zsim.scenario.rights import OPERATOR, ROUTER, WORLD, Rights
+from zsim.scenario.scenario import Scenario
+from zsim.transport.tls import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
+from zsim_deploy import inventory as inv
+from zsim_deploy.arguments import file_fault
+from zsim_deploy.inventory import InventoryFile
+
+AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it
+AUTHORITY_KEY = "ca.key"
+BACK = timedelta(days=1)  # hosts in the field have clocks that are hours off
+EXPIRED = "expired on"  # a day
+OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+SHOWN_MAX = 4  # names in a line; all of them are missing together as a rule
+READABLE_BY_OTHERS = stat.S_IRGRP | stat.S_IROTH
+
+Root = x509.Certificate
+"""The certificate of an authority."""
+
+
+class CertificateRequest(NamedTuple):
+    """A certificate that is to be there.
+
+    Attributes:
+        host: name of the host in the inventory; a folder.
+        process: name of the process; the common name.
+        addresses: of the host, IP or DNS.
+    """
+
+    host: str
+    process: str
+    addresses: tuple[str, ...] = ()
+
+
+class CertificateStatus(NamedTuple):
+    """A certificate that is there, and what is wrong with it."""
+
+    host: str
+    process: str
+    addresses: tuple[str, ...]
+    until: datetime
+    fault: str
+
+
+class Authority(NamedTuple):
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+
+def folder_of(placed: InventoryFile) -> Path:
+    return placed.folder / Path(placed.inventory.security.certificates).expanduser()
+
+
+def init_command(placed: InventoryFile, renew: bool = False) -> str:
+    """Return the command that makes an inventory's certificates, as a person types it."""
+    return f"zsim certs init {placed.word} --scenario FILE{' --renew' if renew else ''}"
+
+
+# Making certificates
+
+
+def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
+    """Return the authority in a folder, made if there is none.
+
+    Args:
+        force: make another one, which invalidates every certificate made before.
+
+    Raises:
+        RunError: half of it is there, it has expired, or it cannot be read or written.
+    """
+    paths = (folder / AUTHORITY, folder / AUTHORITY_KEY)
+    there = [path for path in paths if path.exists()]
+    if force or not there:
+        return _make_authority(folder, now)
+    if len(there) == 1:
+        missing = next(path for path in paths if path not in there)
+        raise RunError(f"{missing}: is missing beside {there[0].name}; bring it here, or --force makes a new authority")
+    pair = _read_authority(*paths)
+    if now >= pair.certificate.not_valid_after_utc:
+        day = pair.certificate.not_valid_after_utc.date()
+        raise RunError(f"{paths[0]}: the authority expired on {day}; --force makes a new one")
+    return pair
+
+
+def _make_authority(folder: Path, now: datetime) -> Authority:
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name("zsim certificate authority")
+    unused = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement")
+    denied = dict.fromkeys(("digital_signature", *unused, "encipher_only", "decipher_only"), False)
+    certificate = (
+        _builder(name, name, key, now - BACK, now + timedelta(days=AUTHORITY_DAYS))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(x509.KeyUsage(key_cert_sign=True, crl_sign=True, **denied), critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    write(folder / AUTHORITY_KEY, _key_pem(key))
+    write(folder / AUTHORITY, _pem(certificate))
+    return Authority(certificate, key)
+
+
+def _read_authority(certificate: Path, key: Path) -> Authority:
+    try:
+        with file_fault(key, "cannot be read", "it belongs to whoever made it"):
+            read = serialization.load_pem_private_key(key.read_bytes(), password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise RunError(f"{key}: is no private key; --force makes a new authority") from error
+    pair = Authority(_load(certificate), read) if isinstance(read, ec.EllipticCurvePrivateKey) else None
+    if pair is None or pair.certificate.public_key() != pair.key.public_key():
+        raise RunError(f"{key}: is not the key of {certificate.name}; --force makes a new authority")
+    return pair
+
+
+def issue(folder: Path, signer: Authority, wanted: CertificateRequest, now: datetime, days: float = DAYS) -> Path:
+    """Make key and certificate of a process on a host; return the folder that they are in.
+
+    Raises:
+        RunError: they cannot be written.
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]  # routers are both
+    issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key())
+    name, until = _name(wanted.process), now + timedelta(days=days)
+    certificate = (
+        _builder(name, signer.certificate.subject, key, now - BACK, until)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        .add_extension(x509.SubjectAlternativeName(list(_alternative_names(wanted.addresses))), critical=False)
+        .add_extension(issuer, critical=False)
+        .sign(signer.key, hashes.SHA256())
+    )
+    place = folder / wanted.host / wanted.process
+    for file, content in zip(CERTIFICATES, (_pem(signer.certificate), _pem(certificate), _key_pem(key)), strict=True):
+        write(place / file, content)
+    return place
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, start: datetime, end: datetime
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(start)
+        .not_valid_after(end)
+    )
+
+
+def _name(text: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def _alternative_names(addresses: Iterable[str]) -> Iterator[x509.IPAddress | x509.DNSName]:
+    for address in dict.fromkeys((*addresses, *LOOPBACK)):
+        try:
+            yield x509.IPAddress(ipaddress.ip_address(address.partition("%")[0]))
+        except ValueError:
+            yield x509.DNSName(address)
+
+
+def _pem(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.PEM)
+
+
+def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    form = serialization.PrivateFormat.PKCS8
+    return key.private_bytes(serialization.Encoding.PEM, form, serialization.NoEncryption())
+
+
+def write(path: Path, content: bytes) -> None:
+    """Put a file in its place at once and readable by its owner alone; half a key is no key.
+
+    Raises:
+        RunError: it cannot be written.
+    """
+    fresh = path.with_name(f".{path.name}.new")
+    with file_fault(path, "cannot be written", "give another folder"):
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        fresh.unlink(missing_ok=True)
+        with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(content)
+        fresh.replace(path)
+
+
+# Certificates that are there
+
+
+def root(folder: Path) -> Root:
+    """Return the certificate of the authority in a folder; its key need not be there.
+
+    Raises:
+        RunError: there is none.
+    """
+    return _load(folder / AUTHORITY)
+
+
+def show(folder: Path, now: datetime) -> list[CertificateStatus]:
+    """Return every certificate in a folder, with what is wrong with it."""
+    statuses = []
+    for path in sorted(folder.glob(f"*/*/{CERTIFICATE}")):
+        certificate, place = _load(path), path.parent
+        fault = _fault(place, certificate, root(folder), now) or ""
+        until = certificate.not_valid_after_utc
+        statuses.append(CertificateStatus(place.parent.name, place.name, _addresses(certificate), until, fault))
+    return statuses
+
+
+def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
+    """Yield the operators who have a certificate in a folder, as NAME or, at one of the hosts, NAME@HOST."""
+    for host in (OPERATORS, *hosts):
+        for path in sorted((folder / host).glob(f"{OPERATOR}.*/{CERTIFICATE}")):
+            name = path.parent.name.removeprefix(f"{OPERATOR}.")
+            yield name if host == OPERATORS else f"{name}@{host}"
+
+
+def renewal_reason(folder: Path, signer: Root, wanted: CertificateRequest, now: datetime) -> str | None:
+    """Return why a certificate has to be made, None if the one that is there will do, with its key."""
+    place = folder / wanted.host / wanted.process
+    if not all((place / name).exists() for name in CERTIFICATES):
+        return "new"
+    try:
+        certificate = x509.load_pem_x509_certificate((place / CERTIFICATE).read_bytes())
+    except (OSError, ValueError):
+        return "cannot be read"
+    if fault := _fault(place, certificate, signer, now):
+        return fault
+    due = {str(name.value) for name in _alternative_names(wanted.addresses)}
+    return None if set(_addresses(certificate)) == due else "other addresses"
+
+
+def _fault(place: Path, certificate: x509.Certificate, signer: Root, now: datetime) -> str | None:
+    """Return the fault of a certificate or of the files beside it; `certs init` may have been interrupted."""
+    try:
+        authority_there, key = (place / AUTHORITY).read_bytes(), (place / KEY).read_bytes()
+        public = serialization.load_pem_private_key(key, password=None).public_key()
+    except (OSError, ValueError, TypeError, UnsupportedAlgorithm):
+        return "cannot be read"
+    try:
+        certificate.verify_directly_issued_by(signer)
+    except (InvalidSignature, ValueError, TypeError):
+        return "of another authority"
+    if authority_there != _pem(signer):
+        return "of another authority"
+    if public != certificate.public_key():
+        return "without its key"
+    return f"{EXPIRED} {certificate.not_valid_after_utc.date()}" if now >= certificate.not_valid_after_utc else None
+
+
+def _load(path: Path) -> x509.Certificate:
+    try:
+        with file_fault(path, "cannot be read", "zsim certs init makes it"):
+            return x509.load_pem_x509_certificate(path.read_bytes())
+    except ValueError as error:
+        raise RunError(f"{path}: is no certificate; zsim certs init makes it") from error
+
+
+def _addresses(certificate: x509.Certificate) -> tuple[str, ...]:
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return ()
+    return tuple(str(name.value) for name in names)
+
+
+def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, now: datetime) -> list[str]:
+    """Return a line for each fault of a run's certificates and access control.
+
+    Args:
+        places: host of each process that is to be started; its routers need not be among them. None takes the world.
+    """
+    if placed.inventory.security.insecure:
+        return []
+    folder = folder_of(placed)
+    if places is None:
+        places = inv.spread(placed.inventory.roles, [WORLD])
+    routers = {f"{ROUTER}.{name}": router.host for name, router in placed.inventory.routers.items()}
+    names: dict[str, list[str]] = {}
+    try:
+        if not (folder / AUTHORITY).exists():
+            remedy = f"make them with `{init_command(placed)}`, or set security.insecure on a network of your own"
+            return [f"{folder}: has no certificates; {remedy}"]
+        signer = root(folder)
+        for name, host in {**places, **routers}.items():
+            wanted = CertificateRequest(host, name, (placed.inventory.hosts[host].address,))
+            if fault := _unusable(folder, signer, wanted, now):
+                names.setdefault(fault, []).append(f"{name} on {host}")
+    except RunError as error:
+        return [str(error)]
+    except OSError as error:
+        return [f"{folder}: cannot be read ({error.strerror}); it belongs to whoever made it"]
+    lines = []
+    for fault, who in names.items():
+        more = f" and {len(who) - SHOWN_MAX} more" if len(who) > SHOWN_MAX else ""
+        remedy = f"make them with `{init_command(placed, renew=EXPIRED in fault)}`"
+        lines.append(f"{folder}: {fault}: {', '.join(who[:SHOWN_MAX])}{more}; {remedy}")
+    return lines
+
+
+def _unusable(folder: Path, signer: Root, wanted: CertificateRequest, now: datetime) -> str | None:
+    """Return what is wrong with a certificate, and with the access control beside it; None if nothing is."""
+    listens = wanted.process == WORLD or wanted.process.startswith(f"{ROUTER}.")
+    why = renewal_reason(folder, signer, wanted, now)
+    if why == "new":
+        return "certificate missing"
+    if why == "other addresses":
+        return "certificate for other addresses" if listens else None  # the address of a client is not checked
+    if why:
+        return f"certificate {why}"
+    there = (folder / wanted.host / f"{wanted.process}.access.json").exists()
+    return None if there or not listens else "access control missing"
+
+
+def exposed_keys(placed: InventoryFile) -> str | None:
+    """Return a warning of private keys that others than their owner can read; None if there are none."""
+    if placed.inventory.security.insecure:
+        return None
+    folder = folder_of(placed)
+    exposed = []
+    for path in (folder / AUTHORITY_KEY, *folder.glob(f"*/*/{KEY}")):
+        with suppress(OSError):
+            exposed += [path] if path.stat().st_mode & READABLE_BY_OTHERS else []
+    if not exposed:
+        return None
+    more = f" and {len(exposed) - 1} private keys more" if len(exposed) > 1 else ""
+    return f"{min(exposed)}{more} can be read by others on this machine; chmod -R go= {shlex.quote(str(folder))}"
+
+
+# Who needs a certificate, and access control
+
+
+class Enrolment:
+    """The certificates and the access control that an inventory and a scenario ask for.
+
+    Args:
+        scenario: whose processes run.
+        operators: people and programs that look and command, each NAME or NAME@HOST; at a host they come in as its
+            roles do, through its router if it has one, otherwise at the world. One may be at several places.
+
+    Raises:
+        InventoryError: a process has no place, or an operator is at no host of the inventory.
+        BadNameError: an operator's name is none of the contract.
+    """
+
+    def __init__(self, placed: InventoryFile, scenario: Scenario, operators: Sequence[str] = ()) -> None:
+        self._inventory = placed.inventory
+        self._scenario = scenario
+        self._places = inv.placement(placed, scenario)
+        self._operators = list(dict.fromkeys(self._read_operator(text, placed.source) for text in operators))
+        # Any host may run these: what the scenario names, and drivers, which it need not expect.
+        drivers = [name for name in drivers_of(scenario) if name not in self._places]
+        self._movable = [*(name for name in self._places if name != WORLD), *drivers]
+
+    def _read_operator(self, text: str, source: str) -> tuple[str, str | None]:
+        name, at, host = text.partition("@")
+        name = keys.name(name.removeprefix(f"{OPERATOR}."), OPERATOR)
+        if at and host not in self._inventory.hosts:
+            known = ", ".join(self._inventory.hosts)
+            raise InventoryError([f"{source}: operator {name!r} is at {host!r}; must be one of hosts: {known}"])
+        return f"{OPERATOR}.{name}", host or None
+
+    def certificates(self) -> list[CertificateRequest]:
+        """Return the certificates; a role has one for every host, so that it can be moved there during a run."""
+        hosts = self._inventory.hosts
+        wanted = [(self._places[WORLD], WORLD)]
+        wanted += [(router.host, f"{ROUTER}.{name}") for name, router in self._inventory.routers.items()]
+        wanted += [(host, name) for name in self._movable for host in hosts]
+        wanted += [(host or OPERATORS, name) for name, host in self._operators]
+        return [
+            CertificateRequest(host, name, (hosts[host].address,) if host in hosts else ()) for host, name in wanted
+        ]
+
+    def access(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
+        """Yield (host, process, access control) of every process that listens."""
+        clients = [*self._movable, *self._operators_at(None)]
+        yield self._places[WORLD], WORLD, access_control(self._scenario, clients, self._below(None))
+        for name, router in self._inventory.routers.items():
+            above = f"{ROUTER}.{router.upstream}" if router.upstream else WORLD
+            rules = access_control(self._scenario, self._at(name), self._below(name), [above])
+            yield router.host, f"{ROUTER}.{name}", rules
+
+    def _below(self, router: str | None) -> dict[str, list[str]]:
+        """Return the routers that connect to a router, or to the world, with all processes behind each."""
+        behind = {f"{ROUTER}.{name}": self._behind(name) for name in self._lower(router)}
+        return {name: processes for name, processes in behind.items() if processes}
+
+    def _behind(self, router: str) -> list[str]:
+        return [*self._at(router), *(process for name in self._lower(router) for process in self._behind(name))]
+
+    def _lower(self, router: str | None) -> list[str]:
+        return [name for name, below in self._inventory.routers.items() if below.upstream == router]
+
+    def _at(self, router: str) -> list[str]:
+        """Return the processes that may come to a router: every role, as any may be moved to a host of it."""
+        has_hosts = any(host.router == router for host in self._inventory.hosts.values())
+        return [*(self._movable if has_hosts else []), *self._operators_at(router)]
+
+    def _operators_at(self, router: str | None) -> list[str]:
+        """Return the operators that come in at a router, or at the world."""
+        hosts = self._inventory.hosts
+        routers = {host: hosts[host].router if host is not None else None for _, host in self._operators}
+        return list(dict.fromkeys(name for name, host in self._operators if routers[host] == router))
+
+
+# (flow, messages, whose keys): what a right is on the wire, seen from the process that listens
+_WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    ("ingress", ("declare_subscriber",), "reads"),
+    ("egress", ("put",), "reads"),
+    ("ingress", ("put",), "writes"),
+    ("ingress", ("query",), "asks"),
+    ("egress", ("reply",), "asks"),
+    ("ingress", ("declare_queryable", "reply"), "answers"),
+    ("egress", ("query",), "answers"),
+    ("ingress", ("liveliness_token",), "tokens"),
+    ("ingress", ("liveliness_query", "declare_liveliness_subscriber"), "watches"),
+    ("egress", ("liveliness_token",), "watches"),
+)
+# Declarations go to all, for without them nothing is sent; they hold no payload.
+_DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
+_MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
+ANYONE = "anyone"  # with a certificate of the authority; a subject without conditions matches everybody
+# What anyone may do is to ask what it may do: zsim.transport.permissions.
+_ASKS_ACCESS = (("ingress", "query"), ("egress", "reply"))
+
+
+def access_control(
+    scenario: Scenario, clients: Iterable[str], routers: Mapping[str, Iterable[str]], above: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Return the `access_control` of a process that listens.
+
+    Args:
+        scenario: whose drones and clusters the rights are about.
+        clients: names of the processes that connect to it.
+        routers: names of the routers that connect to it, with the processes behind each.
+        above: what it connects to itself, the world or another router.
+
+    Returns:
+        the map of Zenoh's configuration; everything is denied that is not in it. A process that is not named may ask
+        what it may do, and nothing else.
+    """
+    granted = {name: rights.of(name, scenario) for name in clients}
+    for name, behind in routers.items():
+        granted[name] = rights.union(rights.of(process, scenario) for process in behind)
+    granted |= dict.fromkeys(above, rights.ALL)
+    entries = [(name, list(_rules(name, right, scenario.federation))) for name, right in granted.items()]
+    asking = [_rule(ANYONE, (flow,), (act,), (keys.access("*"),), scenario.federation) for flow, act in _ASKS_ACCESS]
+    subjects = [{"id": name, "cert_common_names": [name]} for name, _ in entries]
+    entries.append((ANYONE, asking))
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [rule for _, rules in entries for rule in rules],
+        "subjects": [*subjects, {"id": ANYONE}],
+        "policies": [{"subjects": [name], "rules": [rule["id"] for rule in rules]} for name, rules in entries],
+    }
+
+
+def _rules(name: str, right: Rights, federation: str) -> Iterator[dict[str, Any]]:
+    if right == rights.ALL:
+        yield _rule(name, ("ingress", "egress"), _MESSAGES, rights.EVERYTHING, federation)
+        return
+    for flow, messages, field in _WIRE:
+        if expressions := getattr(right, field):
+            yield _rule(name, (flow,), messages, expressions, federation)
+    yield _rule(name, ("egress",), _DECLARATIONS, rights.EVERYTHING, federation)
+
+
+def _rule(
+    name: str, flows: tuple[str, ...], messages: tuple[str, ...], expressions: Iterable[str], federation: str
+) -> dict[str, Any]:
+    return {
+        "id": f"{name} {' '.join(flows)} {' '.join(messages)}",
+        "permission": "allow",
+        "flows": list(flows),
+        "messages": list(messages),
+        "key_exprs": [f"{federation}/{expression}" for expression in expressions],
+    }

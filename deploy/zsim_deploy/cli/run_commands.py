@@ -1,0 +1,463 @@
+"""`zsim run` and `validate`, and what is done with records: `report`, `sweep`, `export`, `rerun` and `replay`."""
+
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer import Argument, BadParameter, Option
+
+from zsim.contract.run_messages import RATE_MAX
+from zsim.errors import ZsimError, printable
+from zsim_analysis.export import Format
+from zsim_analysis.report import FORMATS
+from zsim_deploy import INTERRUPTED
+from zsim_deploy import arguments as opt
+from zsim_deploy.arguments import failed, note, require, say
+from zsim_deploy.roles.stop_channel import interruptible
+
+if TYPE_CHECKING:
+    from zsim.transport.tls import Identity
+    from zsim_analysis.reading.shortfall import Shortfall
+    from zsim_analysis.sweep.design import SweepPlan
+
+SWEEP_NEEDS = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "jinja2")}
+DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
+REPLAY_NEEDS = {"record": ("mcap", "zstandard")}
+WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy", Format.FOXGLOVE: "foxglove"}
+GATE = "a gate: an instant at which the processes meet"
+OF_PROCESSES = ("--realtime", "--rate", "--listen", "--hosted", "--console", "--cameras", "--detect")
+OF_A_NEW_RUN = (
+    *("--seed", "--duration", "--realtime", "--rate", "--set", "--out"),
+    *("--in-process", "--listen", "--insecure", "--hosted"),
+)
+
+app = typer.Typer()
+
+
+@app.command(rich_help_panel=opt.RUN)
+@opt.flight_options
+def run(
+    context: typer.Context,
+    flight: opt.FlightOptions,
+    out: Annotated[Path | None, Option(help="Folder of the run (default runs/NAME-TIME).", show_default=False)] = None,
+    in_process: Annotated[bool, Option("--in-process", help="Everything in this process, no Zenoh.")] = False,
+    listen: Annotated[
+        str | None, Option(help=f"Endpoint of the world (default {opt.DEFAULT_ENDPOINT}, or a free port).")
+    ] = None,
+    insecure: opt.Insecure = False,
+    hosted: Annotated[
+        bool, Option("--hosted", help="Estimators and controllers in one process: faster, the same bits.")
+    ] = False,
+    console: Annotated[bool, Option("--console", help="Show it in the browser, and steer it there.")] = False,
+    cameras: Annotated[
+        bool, Option("--cameras", help="Draw what cameras see; front and bottom where no drone has any.")
+    ] = False,
+    detect: Annotated[bool, Option("--detect", help="Find hats in the cameras' pictures.")] = False,
+    report: opt.Report = True,
+    continue_: Annotated[
+        bool, Option("--continue", help="SCENARIO is the folder of a run that was interrupted: it goes on.")
+    ] = False,
+    force: opt.Force = False,
+    order: Annotated[str, Option(hidden=True)] = "",
+) -> None:
+    """Fly a scenario: start every process, show progress, record, report."""
+    require("run", opt.FLIGHT_NEEDS | (opt.REPORT_NEEDS if report else {}))
+    from zsim_agents.hosting import check_plans
+    from zsim_deploy.hosts.control_socket import seen_by_ps
+    from zsim_deploy.launch.console_process import RunConsole
+    from zsim_deploy.launch.run import RunOptions, check_endpoint, check_open_files, fly, options_of, with_cameras
+    from zsim_deploy.launch.run_folder import make_directory, new_launch
+
+    if in_process and (useless := _given(context, OF_PROCESSES)):
+        raise BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
+    if console:
+        require("console", opt.CONSOLE_NEEDS)
+    shown = RunConsole() if console else None
+    if continue_:
+        if useless := _given(context, OF_A_NEW_RUN):
+            raise BadParameter(f"--continue goes on as the run was launched; leave out {useless}")
+        options = options_of(flight.path)
+    else:
+        check_endpoint(listen, insecure)
+        mode, pace = flight.mode_and_rate()
+        scenario = with_cameras(flight.scenario()) if cameras else flight.scenario()
+        if in_process:
+            check_plans(scenario, flight.path.name)  # as processes, controllers refuse them
+        how = {"in_process": in_process, "hosted": hosted, "insecure": insecure, "listen": listen}
+        launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()), **how)
+        options = RunOptions(scenario, Path(), launch, [name for name in order.split(",") if name])
+    options.console, options.cameras, options.detect = shown, cameras, detect
+    if not options.launch.in_process:
+        if options.camera_children():
+            require("run", opt.CAMERA_NEEDS)
+        check_open_files(options)
+    if not continue_:
+        options.out = make_directory(out, options.scenario, force)
+    with shown or nullcontext(), interruptible():
+        with seen_by_ps(options.scenario.federation, options.status):
+            outcome = fly(options)
+        if shown:
+            shown.outcome = outcome
+        conclude(outcome, options.out, report)
+
+
+def _given(context: typer.Context, options: Sequence[str]) -> str:
+    """Return which of some options the command line has, as a text; empty if none."""
+    sources = {each.opts[0]: context.get_parameter_source(each.name or "") for each in context.command.params}
+    return " and ".join(option for option in options if (source := sources[option]) and source.name == "COMMANDLINE")
+
+
+def conclude(outcome: Any, out: Path, report: bool) -> None:
+    """Print how a run ended, make its report, and end with the exit code for it."""
+    record = out / "run.mcap"
+    if outcome.interrupted:
+        note(f"ended: {outcome.reason}")
+        if record.exists():
+            note(f"the record so far is {record}; `zsim report {out}` makes its report")
+        sys.exit(INTERRUPTED)
+    fault = _judged_at_the_end(out, report, outcome.failed) if record.exists() else "nothing was recorded"
+    if record.exists():
+        say(f"ended: {outcome.reason}; the record is {record}")
+    if fault := outcome.reason if outcome.failed else fault:
+        if (out / "logs").exists():
+            note(f"logs are in {out / 'logs'}")
+        raise failed(f"ended: {fault}")
+
+
+def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
+    """Make the report of a run if that is wanted; return what the run did not do or lacks, empty if nothing."""
+    try:
+        if report:
+            return _report(out)
+        from zsim_analysis.reading.verdict import marks_of, verdict
+
+        judged = verdict(out / "run.mcap")
+        for mark, _ in marks_of(judged.shortfalls):
+            say(mark)
+        return _fault_of(judged.completeness.complete, str(judged.completeness), judged.shortfalls)
+    except ZsimError as error:
+        if not failed:
+            raise
+        note(str(error))
+        return str(error)
+    except KeyboardInterrupt:
+        note(f"interrupted; the record is kept, `zsim report {out}` makes its report")
+        sys.exit(INTERRUPTED)
+
+
+def _fault_of(complete: bool, state: str, shortfalls: "Sequence[Shortfall]") -> str:
+    """Print whether the record is complete; return what it lacks, or what the flight did not do, empty if nothing."""
+    say(f"record: {state}{f' ({GATE})' if 'gates' in state else ''}")
+    lacking = "" if complete else f"the record is {state}"
+    return lacking or next((each.text for each in shortfalls if each.fails), "")
+
+
+def note_skipped(names: Sequence[str]) -> None:
+    """Print which code that a document names was found, and not imported."""
+    for name in names:
+        note(f"note: {name} is there, and not imported: --trust runs it")
+
+
+@app.command(rich_help_panel=opt.RUN)
+def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust = False) -> None:
+    """Check a scenario and print what it resolves to; every fault is a line. Code that it names is not run."""
+    from zsim.scenario import scenario_file
+    from zsim.scenario.consistency import unflown_plans
+    from zsim.schema import plugin
+    from zsim_agents.hosting import check_plans
+
+    with plugin.names_only(not trust) as skipped:
+        loaded = opt.load_scenario(scenario, set_)
+        check_plans(loaded, scenario.name)
+    if modules := [name for name in skipped if ":" not in name]:  # of vehicles and sensors: their numbers are in there
+        lacking = f"what it resolves to is not printed, since that has numbers of {', '.join(modules)}"
+        note(f"{scenario.name}: all else is sound; {lacking}")
+    else:
+        print(printable(scenario_file.to_text(loaded)), end="", flush=True)
+    for line in unflown_plans(loaded):
+        note(f"{scenario.name}: {line}")
+    note_skipped(skipped)
+
+
+@app.command(rich_help_panel=opt.RUN)
+def report(
+    directories: Annotated[
+        list[Path], Argument(metavar="DIR...", help="Folder of a run or a sweep; of several runs, to compare.")
+    ],
+    out: Annotated[
+        Path | None, Option(help="Page that compares (default compare-NAMES.html beside the first).")
+    ] = None,
+    formats: Annotated[
+        str | None, Option("--format", help="pdf, svg or pdf,svg: figures are written so too.", show_default=False)
+    ] = None,
+    trust: opt.Trust = False,
+) -> None:
+    """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
+    require("report", opt.REPORT_NEEDS)
+    from zsim.record.record_reader import record_in
+    from zsim.schema import plugin
+    from zsim_analysis.sweep.design import is_sweep
+
+    wanted = tuple(formats.split(",")) if formats else ()
+    if not set(wanted) <= set(FORMATS):
+        allowed = f"{' or '.join(FORMATS)}, or both with a comma between"
+        raise BadParameter(f"--format is {formats!r}; must be {allowed}")
+    with plugin.names_only(not trust) as skipped:
+        if len(directories) > 1:
+            _compare(directories, out, wanted)
+        elif out is not None:
+            raise BadParameter("--out is for the page that compares several runs; leave it out")
+        else:
+            if not is_sweep(directories[0]):
+                record_in(directories[0])
+            _report(directories[0], wanted)
+    note_skipped(skipped)
+
+
+def _report(folder: Path, formats: Sequence[str] = ()) -> str:
+    """Make the report of a run or of a sweep, and print its table; return what the run did not do, or lacks.
+
+    Args:
+        folder: of the run or the sweep.
+        formats: of figures, beside PNG.
+    """
+    from rich.console import Console
+
+    from zsim.runtime.progress import PipedConsole, cell
+    from zsim_analysis.sweep.design import is_sweep
+
+    if is_sweep(folder):
+        from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report as make
+        from zsim_analysis.sweep.report.terminal_tables import terminal_text
+    else:
+        from zsim_analysis.report.make_report import make_report as make
+        from zsim_analysis.report.tables import terminal_text
+    with Console(stderr=True).status("reading …") as status:
+        summary: Any = make(folder, lambda text: status.update(cell(text)), formats)
+    PipedConsole().print(terminal_text(summary))
+    fault = "" if is_sweep(folder) else _fault_of(summary.record.complete, summary.record.state, summary.shortfalls)
+    say(f"report: {folder / 'report.html'}")
+    return fault
+
+
+def _compare(directories: list[Path], out: Path | None, formats: Sequence[str]) -> None:
+    from rich.console import Console
+
+    from zsim.record.record_reader import record_in
+    from zsim.runtime.progress import cell
+    from zsim_analysis.report.make_report import compare, comparison_path
+    from zsim_analysis.sweep.design import is_sweep
+
+    for directory in directories:
+        if is_sweep(directory):
+            raise BadParameter(f"{directory} is a sweep; runs can be compared, a sweep has a report of its own")
+        record_in(directory)
+    page = out or comparison_path(directories)
+    with Console(stderr=True).status("reading the records …") as status:
+        compare(directories, page, lambda text: status.update(cell(text)), formats)
+    say(f"report: {page}")
+
+
+@app.command(rich_help_panel=opt.RUN)
+def sweep(
+    scenario: opt.ScenarioPath,
+    runs: Annotated[
+        int | None, Option(min=1, help="How many runs (default: one per combination).", show_default=False)
+    ] = None,
+    vary: Annotated[
+        list[str] | None,
+        Option(
+            help="seed, seed=paired, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std). Repeatable."
+        ),
+    ] = None,
+    set_: opt.Set = None,
+    seed: opt.Seed = None,
+    duration: opt.Duration = None,
+    out: Annotated[
+        Path | None, Option(help="Folder (default runs/NAME-sweep-TIME); one that is not finished is gone on with.")
+    ] = None,
+    workers: Annotated[int | None, Option(min=1, max=1024, help="Processes (default: one per core).")] = None,
+    dask: Annotated[str | None, Option(help="Scheduler of a Dask cluster that flies the runs instead.")] = None,
+    keep_records: Annotated[bool, Option("--keep-records", help="Keep the record of every run.")] = False,
+    report: opt.Report = True,
+    force: Annotated[bool, Option("--force", help="Sweep into a folder that holds other files, too.")] = False,
+) -> None:
+    """Fly a scenario many times, with other seeds and values of its fields: one table, one report."""
+    if dask is not None and (keep_records or workers is not None):
+        useless = "--keep-records" if keep_records else "--workers"
+        raise BadParameter(f"{useless} is for processes of this host; leave it out, or --dask")
+    require("sweep", SWEEP_NEEDS if dask is None else DASK_NEEDS)
+    from zsim_analysis.sweep.sweep import SweepRequest
+    from zsim_analysis.sweep.sweep import sweep as fly
+
+    plan = _plan(scenario, vary or [], set_ or [], seed, duration, runs, keep_records)
+    folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        rows = fly(SweepRequest(plan, folder, workers, dask, force))
+    except KeyboardInterrupt:
+        note(f"interrupted; the same command with --out {folder} goes on, the table so far is in it")
+        sys.exit(INTERRUPTED)
+    failures = [row["failure"] for row in rows if row["failure"]]
+    short = [row["shortfall"] for row in rows if row.get("shortfall") and not row["failure"]]
+    _conclude(folder, failures, len(rows), report, short)
+
+
+def _plan(
+    path: Path,
+    vary: list[str],
+    overrides: list[str],
+    seed: int | None,
+    duration: float | None,
+    runs: int | None,
+    records: bool,
+) -> "SweepPlan":
+    from rich.console import Console
+
+    from zsim_analysis.sweep.design import make_plan, read_document
+
+    document, faults = read_document(path, overrides, seed=seed, duration_s=duration)
+    changed = opt.changed_fields(overrides, seed, duration)
+    with Console(stderr=True).status("checking every combination …") as status:
+
+        def look(run: int, of: int) -> None:
+            status.update(f"checking combination {run + 1} of {of}")
+
+        return make_plan(path.name, document, vary, runs, records, look, faults, changed)
+
+
+def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
+    """Print what did not end well, make the report, and fail if a run did not end well, or none flew its plan."""
+    for failure in sorted(set(failures), key=failures.count, reverse=True)[:5]:
+        note(f"{failures.count(failure)} of {runs} runs failed: {failure}")
+    if report:
+        _report(folder)
+    say(f"table: {folder / 'sweep.parquet'}")
+    if len(failures) == runs:
+        raise failed(f"none of {runs} runs ended well: {failures[0]}")
+    if failures:
+        raise failed(f"{len(failures)} of {runs} runs failed: {failures[0]}")
+    if len(failures) + len(short) == runs:
+        raise failed(f"none of {runs} runs was flown as planned: {short[0]}")
+
+
+@app.command(rich_help_panel=opt.RUN)
+def export(
+    run: opt.Recorded,
+    form: Annotated[
+        Format, Option("--format", help="Tables (csv, parquet), a MATLAB file, or an MCAP file for Foxglove.")
+    ],
+    keys: opt.Keys = None,
+    from_: opt.From = None,
+    to: opt.To = None,
+    out: Annotated[
+        Path | None,
+        Option(help="Where (default DIR/csv, DIR/parquet, DIR/run.mat, DIR/foxglove.mcap).", show_default=False),
+    ] = None,
+    force: Annotated[bool, Option("--force", help="Replace an earlier export.")] = False,
+    by_name: Annotated[
+        bool, Option("--by-name", help="A table of each drone, cluster and process: time in it only increases.")
+    ] = False,
+    trust: opt.Trust = False,
+) -> None:
+    """Write the record of a run as tables, for MATLAB, or for Foxglove and Rerun."""
+    if by_name and form not in (Format.CSV, Format.PARQUET):
+        raise BadParameter("--by-name is for tables; leave it out, or say --format csv or parquet")
+    require("export", {"export": ("mcap", "zstandard", WRITERS[form])})
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from zsim.record.record_reader import record_at
+    from zsim.schema import plugin
+
+    opt.check_range(from_, to)
+    record_at(run)
+    from zsim_analysis.export.make_export import export as write
+    from zsim_analysis.export.selection import MessageSelection
+
+    selection = MessageSelection(tuple(keys or ()), from_, to)
+    console = Console(stderr=True)
+    hidden = not console.is_terminal
+    with (
+        interruptible(),
+        plugin.names_only(not trust) as skipped,
+        Progress(console=console, transient=True, disable=hidden) as bar,
+    ):
+        task = bar.add_task("looking through the record", total=None)
+
+        def advance(count: int, of: int) -> None:
+            bar.update(task, description="reading messages", completed=count, total=of)
+
+        done = write(run, form, out, selection, force, advance, by_name)
+    for text in done.notes:
+        note(f"note: {text}")
+    for name, rows in done.tables.items():
+        say(f"{name:<40} {rows:>10}")
+    say("written: " + " ".join(map(str, done.paths)))
+    note_skipped(skipped)
+
+
+@app.command(rich_help_panel=opt.RUN)
+def rerun(
+    directory: opt.Recorded,
+    commands_only: Annotated[
+        bool, Option("--commands-only", help="Feed the world all recorded commands; run no agents.")
+    ] = False,
+    trust: opt.Trust = False,
+) -> None:
+    """Fly the run of a record again, from its own inputs, and print whether truth is the same; exit code 0 or 1."""
+    require("rerun", opt.FLIGHT_NEEDS)
+    from zsim.schema import plugin
+    from zsim_analysis.rerun import rerun_record
+
+    with plugin.names_only(not trust):
+        fault = rerun_record(directory, commands_only, say, note)
+    if fault:
+        raise failed(fault)
+
+
+@app.command(rich_help_panel=opt.RUN)
+@opt.listener_options
+def replay(
+    who: "Identity",
+    directory: opt.Recorded,
+    rate: Annotated[
+        float, Option(callback=opt.between(0, RATE_MAX), help="Simulated per wall second; 0 = as fast as it goes.")
+    ] = 1.0,
+    from_: opt.From = 0.0,
+    to: opt.To = None,
+    keys: opt.Keys = None,
+    expect: Annotated[
+        list[str] | None,
+        Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
+    ] = None,
+    paused: Annotated[bool, Option("--paused", help="Stand at the first instant until asked to resume.")] = False,
+    console: Annotated[
+        bool, Option("--console", help="Show it in the browser, with a timeline; stand still at its end.")
+    ] = False,
+    listen: opt.Listen = None,
+    federation: Annotated[str | None, Option(help="Name of the federation (default the record's).")] = None,
+    trust: opt.Trust = False,
+) -> None:
+    """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
+    require("replay", REPLAY_NEEDS)
+    if console:
+        require("console", opt.CONSOLE_NEEDS)
+    from zsim.schema import plugin
+    from zsim_deploy.launch.console_process import console_beside
+    from zsim_deploy.roles.world_role import ReplayOptions, play
+    from zsim_world.playback.playback import PlaybackRange
+
+    opt.check_range(from_, to)
+    to_ns = None if to is None else round(to * 1e9)
+    choice = PlaybackRange(round((from_ or 0.0) * 1e9), to_ns, tuple(keys or ["**"]), paused, holds=console)
+    endpoints = tuple(listen or [opt.DEFAULT_ENDPOINT])
+    options = ReplayOptions(choice, rate, tuple(expect or ()), endpoints, federation)
+    beside = console_beside(endpoints[0], directory, federation, who.tls) if console else nullcontext()
+    with plugin.names_only(not trust), beside:
+        play(directory, options, who)

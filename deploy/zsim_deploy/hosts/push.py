@@ -1,0 +1,356 @@
+"""`zsim push`: install zsim on the hosts of an inventory, over ssh alone; the hosts need no internet."""
+
+import asyncio
+import contextlib
+import getpass
+import json
+import os
+import re
+import socket
+import sys
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import asyncssh
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from zsim import __version__
+from zsim.errors import HostsError, InventoryError
+from zsim.runtime.progress import cell
+from zsim_deploy.hosts import on_host
+from zsim_deploy.hosts.host_link import (
+    HostLink,
+    ProgramEndedError,
+    RemoteProgram,
+    open_program,
+    raise_faults,
+    shell_line,
+    start_sftp,
+)
+from zsim_deploy.hosts.wheelhouse import Wheel, Wheelhouse, WheelSet, wheel_target
+from zsim_deploy.inventory import MODULES, Host, InventoryFile, known_extras, needed_extras
+from zsim_deploy.roles import warm_up
+
+LAUNCHER = "launcher"  # name of this machine among the hosts, in progress lines
+ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds
+INSTALL_S = 900.0  # wall time to unpack 100 MB of wheels on a slow memory card
+COMPILE_S = 900.0  # wall time to compile what flies; half a minute on a laptop's core
+COPIES = 4  # files under way to one host at a time
+START_S = 30.0  # wall time to start a Python on a small computer, over a poor link
+BEAT_S = 5.0  # how often the launcher shows that it lives
+SILENT_S = 60.0  # wall time without that, after which the program ends by itself; a link may be cut for shorter
+WAIT_S = 1800.0  # wall time for another push to end; as long as it may take to install and to compile
+OLDEST_MINOR = 11  # pyproject.toml, requires-python
+NEWEST_MINOR = 14  # the last Python whose name is tried
+PLAIN = "python3"
+ANSWER = re.compile(r"(python3(?:\.\d+)?) (\d+)\.(\d+)\.(\d+) (/.*)")  # command, version, path
+
+Progress = Callable[[str, str], None]  # host, what is being done there
+
+
+async def push(
+    placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
+) -> dict[str, bool]:
+    """Install on hosts what their roles need.
+
+    Args:
+        names: of the hosts; all of the inventory if empty.
+        more: extras for each of them beside those of its roles.
+        progress: takes a host and what is being done there.
+        cache: folder of the wheelhouse.
+
+    Returns:
+        For each host whether anything had to be done there.
+
+    Raises:
+        InventoryError: a host is not in the inventory, or there is no such extra.
+        HostsError: with a line for each host at which it failed; the others are done.
+    """
+    hosts = placed.inventory.hosts
+    more = list(more)
+    unknown = [f"--host {name}: must be one of {', '.join(hosts)}" for name in names if name not in hosts]
+    known = known_extras()
+    unknown += [f"--extra {name}: must be one of {', '.join(known)}" for name in more if name not in known]
+    if unknown:
+        raise InventoryError(unknown)
+    wanted = needed_extras(placed.inventory, more)
+    wheelhouse = Wheelhouse(cache, lambda text: progress(LAUNCHER, text))
+    chosen = list(dict.fromkeys(names)) or list(hosts)
+    work = [_push_to(name, hosts[name], placed.folder, wanted[name], wheelhouse, progress) for name in chosen]
+    results = raise_faults(await asyncio.gather(*work, return_exceptions=True))
+    return dict(zip(chosen, results, strict=True))
+
+
+async def _push_to(
+    name: str, host: Host, base: Path, wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Progress
+) -> bool:
+    """Install on one host; return whether anything had to be done."""
+    if host.python:
+        progress(name, f"has zsim of its own in {host.python}")
+        return False
+    link = HostLink(name, host, base)
+    try:
+        progress(name, "looking what is there")
+        output = await link.run(shell_line(["sh", "-c", interpreter_query()]), timeout_s=ASK_S)
+        interpreters = parse_interpreters(output.decode(errors="replace"))
+        python = choose_interpreter(name, interpreters, sys.version_info[:2]).path
+        async with open_installer(link, python, host.folder, partial(progress, name)) as there:
+            return await _install(link, there, wanted, wheelhouse, partial(progress, name))
+    except HostsError:
+        progress(name, "failed")
+        raise
+    finally:
+        await link.close()
+
+
+async def _install(
+    link: HostLink,
+    there: "Installer",
+    wanted: frozenset[str],
+    wheelhouse: Wheelhouse,
+    progress: Callable[[str], None],
+) -> bool:
+    """Install what is wanted; return whether anything had to be done."""
+    facts = await there.ask("look", ASK_S)
+    needed = await wheelhouse.wheel_set(link.name, wheel_target(link.name, facts), wanted)
+    described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
+    if is_installed(needed, facts["installed"]):
+        progress(f"{described} is there")
+        return False
+    await _copy(link, f"{facts['folder']}/wheels", missing(needed, facts), progress)
+    progress("installing")
+    order = {
+        "project": needed.project.path.name,
+        "pip": needed.pip.path.name,
+        "wheels": [wheel.path.name for wheel in _new(needed, facts["installed"])],
+        "extras": needed.extras,
+        "modules": [MODULES[extra] for extra in ("", *needed.extras) if extra in MODULES],
+        "note": needed.manifest(),
+    }
+    await there.ask("install", INSTALL_S, **order)
+    if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
+        progress("compiling what flies")
+        await there.ask("warm_up", COMPILE_S, module=warm_up.__name__, extras=needed.extras)
+    progress(f"{described} installed")
+    return True
+
+
+def is_installed(wanted: WheelSet, installed: dict[str, Any] | None) -> bool:
+    """Return whether a host has all that it needs in these versions, by the note of the last push."""
+    if installed is None or installed["project"] != wanted.project.sha256:
+        return False
+    return set(wanted.extras) <= set(installed["extras"]) and not _new(wanted, installed)
+
+
+def _new(wanted: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
+    """Return the wheels of other projects that are not installed yet."""
+    known = installed["wheels"] if installed else {}
+    return [wheel for wheel in wanted.others if known.get(wheel.path.name) != wheel.sha256]
+
+
+def missing(wanted: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
+    """Return the wheels that must be copied to a host, small ones last so that progress is smooth."""
+    needed = [wanted.project, wanted.pip, *_new(wanted, facts["installed"])]
+    lacking = [wheel for wheel in needed if facts["wheels"].get(wheel.path.name) != wheel.sha256]
+    return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
+
+
+async def _copy(link: HostLink, folder: str, wheels: Sequence[Wheel], progress: Callable[[str], None]) -> None:
+    """Copy wheels into a folder of a host; an incomplete copy never has the name of a wheel."""
+    total, done = sum(wheel.size_bytes for wheel in wheels), 0
+    gate = asyncio.Semaphore(COPIES)
+
+    async def one(sftp: asyncssh.SFTPClient, wheel: Wheel) -> None:
+        part, seen = f"{folder}/{wheel.path.name}.part", 0
+
+        def on_copied(_source: bytes, _target: bytes, copied: int, _size: int) -> None:
+            nonlocal done, seen
+            done, seen = done + copied - seen, copied
+            progress(f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
+
+        async with gate:
+            await sftp.put(str(wheel.path), part, progress_handler=on_copied)
+            await sftp.posix_rename(part, part.removesuffix(".part"))
+
+    try:
+        async with await start_sftp(link.name, await link.open()) as sftp:
+            await sftp.makedirs(folder, exist_ok=True)
+            await asyncio.gather(*(one(sftp, wheel) for wheel in wheels))
+    except (asyncssh.Error, OSError) as error:
+        why = f"copying to {folder} failed ({error}); is there space, is the link up?"
+        raise HostsError(f"{link.name}: {why}") from error
+
+
+def default_cache() -> Path:
+    """Return the folder of the wheelhouse on this machine (XDG Base Directory Specification)."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
+    except RuntimeError as error:  # HOME is not set, and the system does not know the user
+        why = "this user has no home for what is downloaded; set XDG_CACHE_HOME to a folder"
+        raise HostsError(f"push: {why}") from error
+
+
+# The Python of a host
+
+
+class Interpreter(NamedTuple):
+    """A Python of a host."""
+
+    command: str
+    version: tuple[int, int, int]
+    path: str
+
+
+def interpreter_query() -> str:
+    """Return a line of POSIX shell that prints command, version and path of every Python of a host."""
+    names = [PLAIN, *(f"python3.{minor}" for minor in range(NEWEST_MINOR, OLDEST_MINOR - 1, -1))]
+    code = 'import sys; print("%d.%d.%d" % sys.version_info[:3], sys.executable)'
+    return f"for p in {' '.join(names)}; do facts=$($p -c '{code}' 2>/dev/null) && echo $p $facts; done; true"
+
+
+def parse_interpreters(answer: str) -> list[Interpreter]:
+    """Return what `interpreter_query` printed; a greeting of the login shell is skipped."""
+    matches = filter(None, map(ANSWER.fullmatch, answer.splitlines()))
+    return [Interpreter(each[1], (int(each[2]), int(each[3]), int(each[4])), each[5]) for each in matches]
+
+
+def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
+    """Return the Python to install for: of the launcher's minor version, `python3` rather than another.
+
+    Raises:
+        HostsError: there is none; no run takes a host with another one, as its bits would differ.
+    """
+    fit = [each for each in interpreters if each.version[:2] == here]
+    if fit:
+        return max(fit, key=lambda each: (each.command == PLAIN, each.version))
+    wanted = ".".join(map(str, here))
+    if not interpreters:
+        raise HostsError(f"{name}: has no python3; must be Python {wanted} as here; install python{wanted} there")
+    by_version = {".".join(map(str, each.version)): each.command for each in reversed(interpreters)}
+    found = ", ".join(f"{command} {version}" for version, command in by_version.items())
+    raise HostsError(
+        f"{name}: has {found}; must be Python {wanted} as here, for the same bits; install python{wanted} beside it, "
+        "or start zsim here with a Python that it has"
+    )
+
+
+# The program on a host
+
+
+class Installer:
+    """on_host.py as it runs on a host: asked over one ssh channel, it ends with all that it does when that closes.
+
+    Args:
+        name: of the host, for errors.
+        python: that runs it, for errors.
+    """
+
+    def __init__(self, name: str, python: str, program: RemoteProgram) -> None:
+        self._name, self._python, self._program = name, python, program
+
+    async def lock(self, progress: Callable[[str], None]) -> None:
+        """Wait until no other push installs there.
+
+        Args:
+            progress: takes a line on who installs there.
+
+        Raises:
+            HostsError: the folder cannot be used, or another push takes too long.
+        """
+        message = await self._answer(START_S)
+        if holder := message.get("waits"):
+            progress(f"waiting for the push of {holder}")
+            message = await self._answer(WAIT_S, f"{holder} is pushing to it; wait for that to end, or end it there")
+        if why := message.get("unwritable"):
+            remedy = f"correct hosts.{self._name}.folder, or make it there"
+            raise HostsError(f"{self._name}: its folder cannot be used ({why}); {remedy}")
+        if why := message.get("unlocked"):
+            progress(f"its folder cannot be locked ({why}); do not let two commands push to it at a time")
+
+    async def ask(self, act: str, timeout_s: float, **order: Any) -> dict[str, Any]:
+        """Give an order and return the answer.
+
+        Raises:
+            HostsError: it failed, took longer, or the host is gone.
+        """
+        self._program.send(json.dumps({"act": act, **order}) + "\n")
+        message = await self._answer(timeout_s, f"to {act} took longer than {timeout_s:g} s; is it busy?")
+        if "error" in message:
+            raise HostsError(f"{self._name}: {message['error'][:300]}")
+        return message
+
+    async def beat(self) -> None:
+        """Send a sign of life at intervals."""
+        with contextlib.suppress(asyncssh.Error, OSError):
+            while True:
+                await asyncio.sleep(BEAT_S)
+                self._program.send("\n")
+
+    async def _answer(self, timeout_s: float, late: str = "") -> dict[str, Any]:
+        try:
+            return await self._program.answer(timeout_s, late)
+        except ProgramEndedError as error:
+            last = error.last or "printed nothing; does it run there?"
+            raise HostsError(f"{self._name}: {self._python} {last}") from error
+
+
+@contextlib.asynccontextmanager
+async def open_installer(
+    link: HostLink, python: str, folder: str, progress: Callable[[str], None]
+) -> AsyncIterator[Installer]:
+    """Let the program run on a host as long as the block lasts; it alone installs there.
+
+    Args:
+        python: that runs it.
+        folder: of zsim on the host.
+        progress: takes a line on who is waited for.
+
+    Raises:
+        HostsError: the host cannot be reached, its folder not be used, or the connection breaks.
+    """
+    script = Path(on_host.__file__).read_bytes()
+    start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # not to the end: that means to end
+    who = f"{getpass.getuser()}@{socket.gethostname()}"
+    async with open_program(link, shell_line([python, "-P", "-c", start, folder, who, f"{SILENT_S:g}"])) as program:
+        program.send(script.decode())
+        there = Installer(link.name, python, program)
+        beats = asyncio.create_task(there.beat())
+        try:
+            await there.lock(progress)
+            yield there
+        finally:
+            beats.cancel()
+
+
+class PushProgress:
+    """Shows the stage of each host while it is entered."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True)
+        self._now: dict[str, str] = {}
+        self._live = Live(console=self._console, get_renderable=self._table, refresh_per_second=5)
+
+    def __enter__(self) -> "PushProgress":
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def update(self, host: str, text: str) -> None:
+        kind, last = (re.sub(r"\d+ of", "", each) for each in (text, self._now.get(host, "")))
+        self._now[host] = text
+        if not self._console.is_terminal and kind != last:
+            self._console.print(cell(f"{host}: {text}"), soft_wrap=True)
+
+    def _table(self) -> Table:
+        table = Table.grid(padding=(0, 2))
+        for host, text in self._now.items():
+            table.add_row(cell(host), cell(text))
+        return table

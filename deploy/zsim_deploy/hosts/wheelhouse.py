@@ -1,0 +1,396 @@
+"""The wheels that hosts need, gathered on the launcher's machine by pip, once for each content.
+
+CACHE/wheels/*.whl           wheels of other projects, for all hosts
+CACHE/build/*.whl            wheels of what builds this project, for this machine
+CACHE/houses/KEY.json        names of the wheels that one kind of host needs; KEY is a hash of what was asked
+CACHE/zsim/KEY/zsim-*.whl    this project, built; KEY is a hash of its sources
+"""
+
+import asyncio
+import hashlib
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import sys
+import tempfile
+import tomllib
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import urldefrag
+
+import zsim
+from zsim.errors import HostsError
+from zsim_deploy import SAFE_PATH
+
+PROJECT = "zsim"
+KEY_DIGITS = 16  # 64 bits of a SHA-256; what one person builds never collides
+PIP = "pip"  # installs on a host that has none; never held to the version here, which may be too old for a newer Python
+RETRIES = "1"  # of pip, for each page of an index; with its own 5 it takes minutes where there is no network
+LINE_BYTES = 1 << 20  # of the longest line that pip prints
+NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # pip, before it tries again, with the reason
+MANYLINUX_OLDEST = 5  # glibc 2.5; PEP 600
+MANYLINUX2014 = 17  # glibc 2.17; PEP 599. pip takes manylinux2010 and manylinux1 together with manylinux2014
+
+Progress = Callable[[str], None]
+
+
+class PipError(Exception):
+    """pip failed; with its error line."""
+
+
+class UnreachableError(Exception):
+    """The package index does not answer."""
+
+
+class WheelTarget(NamedTuple):
+    """What wheels must fit.
+
+    Attributes:
+        abi: such as cp311; PEP 425.
+        platforms: platform tags that run there, the best first.
+    """
+
+    version: tuple[int, int]
+    abi: str
+    platforms: tuple[str, ...]
+
+    def options(self) -> list[str]:
+        """Return the options by which pip takes wheels for this target."""
+        platforms = [word for name in self.platforms for word in ("--platform", name)]
+        version = ".".join(map(str, self.version))
+        return ["--implementation", "cp", "--python-version", version, "--abi", self.abi, *platforms]
+
+    def __str__(self) -> str:
+        return f"Python {'.'.join(map(str, self.version))} on {self.platforms[0]}"
+
+
+def wheel_target(name: str, facts: Mapping[str, Any]) -> WheelTarget:
+    """Return what wheels for a host must fit.
+
+    Args:
+        name: of the host, for errors.
+        facts: of the host, by on_host.py.
+
+    Raises:
+        HostsError: wheels are not made for such a system.
+    """
+    major, minor = facts["version"]
+    if facts["implementation"] != "cpython":
+        raise HostsError(f"{name}: its Python is {facts['implementation']}; must be CPython; install that there")
+    platforms = _platforms(facts["platform"], facts["libc"])
+    if not platforms:
+        shown = " ".join(filter(None, (facts["platform"], *facts["libc"])))
+        raise HostsError(f"{name}: is {shown}; must be Linux with glibc, or macOS; install zsim by hand there")
+    return WheelTarget((major, minor), f"cp{major}{minor}{'t' if facts['free_threaded'] else ''}", tuple(platforms))
+
+
+def _platforms(system: str, libc: Sequence[str]) -> list[str]:
+    """Return the platform tags of PEP 600 (Linux) or of PEP 425 (macOS), the best first."""
+    kind, _, rest = system.partition("-")
+    if kind == "macosx":
+        return [f"macosx_{rest}".replace(".", "_").replace("-", "_")]
+    if kind != "linux" or libc[0] != "glibc":
+        return []
+    machine, newest = rest.replace("-", "_"), int(libc[1].split(".")[1])
+    tags = [f"manylinux_2_{minor}_{machine}" for minor in range(newest, MANYLINUX_OLDEST - 1, -1)]
+    if newest >= MANYLINUX2014:
+        tags.insert(newest - MANYLINUX2014 + 1, f"manylinux2014_{machine}")
+    return [*tags, f"linux_{machine}"]
+
+
+class Wheel(NamedTuple):
+    path: Path
+    sha256: str
+    size_bytes: int
+
+
+class WheelSet(NamedTuple):
+    """What one host needs."""
+
+    project: Wheel
+    pip: Wheel
+    others: tuple[Wheel, ...]
+    extras: tuple[str, ...]
+
+    def wheels(self) -> tuple[Wheel, ...]:
+        return (self.project, self.pip, *self.others)
+
+    def manifest(self) -> dict[str, Any]:
+        wheels = {wheel.path.name: wheel.sha256 for wheel in self.others}
+        return {"project": self.project.sha256, "extras": list(self.extras), "wheels": wheels}
+
+
+class Wheelhouse:
+    """Builds and downloads what is not there yet, one thing at a time."""
+
+    def __init__(self, folder: Path, progress: Progress) -> None:
+        self._folder, self._progress = folder, progress
+        self._unreachable = ""
+        self._lock = asyncio.Lock()
+        self._wheels, self._builders, self._houses = folder / "wheels", folder / "build", folder / "houses"
+        for made in (self._wheels, self._builders, self._houses):
+            made.mkdir(parents=True, exist_ok=True)
+
+    async def wheel_set(self, host: str, target: WheelTarget, extras: Iterable[str]) -> WheelSet:
+        """Return what a host needs.
+
+        Args:
+            host: its name, for errors.
+
+        Raises:
+            HostsError: the project cannot be built, a wheel that fits the host does not exist, or pip has no index.
+        """
+        async with self._lock:
+            if self._unreachable:
+                raise HostsError(self._unreachable)  # for the next host it would take as long again
+            try:
+                project = await self._project()
+                wanted = tuple(sorted(extras))
+                key = _key([requirements(project), wanted, target.options(), constraints()])
+                names = self._known(key) or await self._gather(host, key, project, wanted, target)
+            except UnreachableError as error:
+                self._unreachable = (
+                    f"launcher: the package index cannot be reached ({error}); connect this machine to it for the "
+                    "first push, or give pip a folder with all wheels (PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER)"
+                )
+                raise HostsError(self._unreachable) from error
+        wheels = [_wheel(self._wheels / name) for name in names]
+        installer = next(wheel for wheel in wheels if wheel.path.name.startswith(f"{PIP}-"))
+        others = tuple(wheel for wheel in wheels if wheel is not installer)
+        return WheelSet(_wheel(project), installer, others, wanted)
+
+    async def _project(self) -> Path:
+        """Return the wheel of this project: of the checkout, or of what is installed."""
+        checkout = _checkout()
+        source = str(checkout) if checkout else requirement(importlib.metadata.distribution(PROJECT))
+        folder = self._folder / PROJECT / _key([zsim.__version__, _sources(checkout)] if checkout else source)
+        if not folder.is_dir():
+            self._progress(f"building the wheel of {PROJECT}")
+            with tempfile.TemporaryDirectory(dir=self._folder) as made:
+                try:
+                    await self._build(source, checkout, f"{made}/wheel")
+                except PipError as error:
+                    raise HostsError(f"launcher: no wheel of {PROJECT} from {source}: {error}") from error
+                folder.parent.mkdir(exist_ok=True)
+                try:
+                    Path(made, "wheel").rename(folder)
+                except OSError:
+                    if not folder.is_dir():  # else another process has put the same there meanwhile
+                        raise
+                    shutil.rmtree(Path(made, "wheel"))
+        return next(folder.glob("*.whl"))
+
+    async def _build(self, source: str, checkout: Path | None, into: str) -> None:
+        """Build the wheel; what that needs is kept, so that the next time no index is asked."""
+        build = ("wheel", "--no-deps", "--wheel-dir", into, source)
+        if await is_kept(self._builders, build, self._progress):
+            return
+        if needs := _description(checkout)["build-system"]["requires"] if checkout else []:
+            await pip("download", "--dest", str(self._builders), *needs, progress=self._progress)
+        await pip(*build, "--find-links", str(self._builders), progress=self._progress)
+
+    def _known(self, key: str) -> list[str]:
+        """Return the wheels of a set that was gathered before; none if one of them is missing."""
+        note = self._houses / f"{key}.json"
+        names = json.loads(note.read_text()) if note.exists() else []
+        return names if all((self._wheels / name).exists() for name in names) else []
+
+    async def _gather(
+        self, host: str, key: str, project: Path, extras: Sequence[str], target: WheelTarget
+    ) -> list[str]:
+        self._progress(f"gathering the wheels for {target}" + (f" with {', '.join(extras)}" if extras else ""))
+        wanted = f"{project}[{','.join(extras)}]" if extras else str(project)
+        with tempfile.TemporaryDirectory(dir=self._folder) as made:
+            try:
+                other_versions = await download_wheels(
+                    [wanted, PIP], target, Path(made), constraints(), self._wheels, self._progress
+                )
+            except PipError as error:
+                raise HostsError(f"{host}: {_lacking(error, target)}") from error
+            names = sorted(path.name for path in Path(made).glob("*.whl") if path.name != project.name)
+            for name in names:
+                os.replace(Path(made, name), self._wheels / name)
+        if other_versions:
+            self._progress(f"{host}: {target} gets other versions of packages than are here: not the same bits")
+        note = self._houses / f"{key}.json"
+        note.with_suffix(".part").write_text(json.dumps(names))
+        os.replace(note.with_suffix(".part"), note)
+        return names
+
+
+def _lacking(error: PipError, target: WheelTarget) -> str:
+    """Return a line on the wheel that does not exist, from pip's error."""
+    match = re.search(r"satisfies the requirement ([\w.-]+)", str(error))
+    if match is None:
+        return f"no wheels for {target}: {error}"
+    other = "take another Python there, or build it there and give its folder to pip here (PIP_FIND_LINKS)"
+    return f"no wheel of {match[1]} for {target}; {other}"
+
+
+def requirements(project: Path) -> list[str]:
+    """Return the requirements in a wheel's metadata, for all extras."""
+    with zipfile.ZipFile(project) as archive:
+        name = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        lines = archive.read(name).decode().partition("\n\n")[0].splitlines()
+    return sorted(line for line in lines if line.startswith("Requires-"))
+
+
+def requirement(installed: importlib.metadata.Distribution) -> str:
+    """Return the requirement by which pip gets an installed distribution again: where it came from, or its version."""
+    origin = json.loads(installed.read_text("direct_url.json") or "{}")  # PEP 610
+    if "vcs_info" in origin:
+        return f"{PROJECT} @ {origin['vcs_info']['vcs']}+{origin['url']}@{origin['vcs_info']['commit_id']}"
+    return f"{PROJECT} @ {urldefrag(origin['url']).url}" if origin else f"{PROJECT}=={installed.version}"
+
+
+@cache
+def constraints() -> list[str]:
+    """Return the versions of what is installed here from an index."""
+    versions = set()
+    for each in importlib.metadata.distributions():
+        name = each.metadata["Name"].lower()
+        if name not in (PROJECT, PIP) and "+" not in each.version and not each.read_text("direct_url.json"):
+            versions.add(f"{name}=={each.version}")
+    return sorted(versions)
+
+
+def _checkout() -> Path | None:
+    """Return the folder from which this very code is imported, if it is a checkout of the project."""
+    root = Path(zsim.__file__).resolve().parents[1]
+    is_checkout = (root / "pyproject.toml").exists() and _description(root).get("project", {}).get("name") == PROJECT
+    return root if is_checkout else None
+
+
+def _description(root: Path) -> dict[str, Any]:
+    return tomllib.loads((root / "pyproject.toml").read_text())
+
+
+def _sources(root: Path) -> list[tuple[str, str]]:
+    """Return path and hash of every file that goes into the wheel, or decides how it is made."""
+    files = [root / "pyproject.toml", root / "README.md"]
+    for package in _description(root)["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
+        files += sorted(path for path in (root / package).rglob("*") if path.is_file())
+    kept = [path for path in files if "__pycache__" not in path.parts]
+    return [(str(path.relative_to(root)), _sha256(path)) for path in kept]
+
+
+def _wheel(path: Path) -> Wheel:
+    return Wheel(path, _sha256(path), path.stat().st_size)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _key(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:KEY_DIGITS]
+
+
+# pip of this Python, which gathers wheels for other ones
+
+
+async def download_wheels(
+    wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], kept: Path, progress: Progress
+) -> bool:
+    """Collect wheels for a target; where a project has only sources, build them here.
+
+    The versions are those of this machine where there are such wheels for the target, because equal versions are a
+    condition for equal bits. No index is asked where all of them are kept already.
+
+    Args:
+        wanted: requirements, as for pip.
+        into: folder, for the wheels only.
+        held: constraints, as for pip.
+        kept: folder with wheels of before.
+
+    Returns:
+        Whether the versions had to differ from the held ones.
+
+    Raises:
+        PipError: there are no wheels for the target.
+        UnreachableError: the index does not answer, so it is unknown whether there are.
+    """
+    fit = ("download", "--only-binary=:all:", *target.options(), "--dest", str(into))
+
+    async def download(wanted: Sequence[str], built: str) -> None:
+        """Download wheels; if that fails, build what has only sources into a folder, and take it from there."""
+        try:
+            await pip(*fit, *wanted, progress=progress)
+        except PipError:
+            progress("building here what has only sources")
+            await pip("wheel", "--wheel-dir", built, *wanted, progress=progress)
+            await pip(*fit, "--find-links", built, *wanted, progress=progress)
+
+    with tempfile.TemporaryDirectory() as aside:
+        limits = Path(aside, "constraints.txt")
+        limits.write_text("\n".join(held))
+        same = (*wanted, "--constraint", str(limits))
+        if await is_kept(kept, (*fit, *same), progress):
+            return False
+        try:
+            await download(same, f"{aside}/same")
+            return False
+        except PipError:
+            progress("looking for other versions than those here")
+            await download(wanted, f"{aside}/other")
+            return True
+
+
+async def is_kept(kept: Path, arguments: Sequence[str], progress: Progress) -> bool:
+    """Run pip with the wheels of a folder alone, and no index; return whether they were enough."""
+    if not any(kept.glob("*.whl")):
+        return False
+    try:
+        await pip(*arguments, "--no-index", "--find-links", str(kept), progress=progress)
+    except PipError:
+        return False
+    return True
+
+
+async def pip(*arguments: str, progress: Progress) -> None:
+    """Run pip of this Python, as the user has configured it but for how often it tries again.
+
+    Args:
+        progress: takes a line when an index does not answer.
+
+    Raises:
+        PipError: with its last line.
+        UnreachableError: with the reason why an index did not answer.
+    """
+    options = ("--disable-pip-version-check", "--no-input", "-q")
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, SAFE_PATH, "-m", "pip", *arguments, *options, stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT, limit=LINE_BYTES,
+        env={**os.environ, "PIP_RETRIES": RETRIES},
+    )  # fmt: skip
+    assert process.stdout is not None
+    lines: list[str] = []
+    unanswered = ""
+    try:
+        async for line in process.stdout:
+            lines.append(line.decode(errors="replace").strip())
+            if (match := NO_INDEX.search(lines[-1])) and not unanswered:
+                unanswered = _reason(match[1])
+                progress(f"the package index does not answer ({unanswered}); asking once more")
+        await process.wait()
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    if process.returncode and unanswered:
+        raise UnreachableError(unanswered)
+    if process.returncode:
+        lines = [line for line in lines if line] or ["it printed nothing"]
+        raise PipError(next((line for line in lines if line.startswith("ERROR: ")), lines[-1]).removeprefix("ERROR: "))
+
+
+def _reason(error: str) -> str:
+    """Return the reason in an error that pip shows, without what surrounds it."""
+    last = re.split(r"[:,] ", error)[-1].strip("\"')")
+    return re.sub(r"\[Errno -?\d+\] ", "", last) + (")" if "(" in last else "")

@@ -1,0 +1,454 @@
+"""An inventory: which hosts there are, how to reach them, which role runs where, and by which command line.
+
+Pure: reads a file and answers questions; nothing here opens a connection. docs/deployment.md explains the fields.
+"""
+
+import fnmatch
+import importlib.metadata
+import shlex
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+from msgspec import Meta
+
+from zsim.errors import InventoryError
+from zsim.scenario.rights import RECORDER, ROUTER, WORLD
+from zsim.scenario.role_table import AGENTS, ROLES, agent_names, on_death
+from zsim.scenario.scenario import DRONES_MAX, PROCESSES_MAX, Name, OnDeath, Scenario, Spec
+from zsim.schema import yaml_file
+from zsim.schema.checker import Fault, faults, first_lines
+from zsim_deploy import SAFE_PATH
+from zsim_deploy.arguments import REALTIME
+
+EXAMPLE = "examples/hosts.yaml"  # named where no inventory is given
+ZENOH_PORT = 7447  # Zenoh's own
+SSH_PORT = 22  # IANA
+HOSTS_MAX = DRONES_MAX  # with more, some have no drone
+ROLES_MAX = PROCESSES_MAX  # each a process at least
+ROUTER_PORT = 7448  # beside a world on the same host
+PROJECT = "zsim"
+MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # after the interpreter
+NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # there is one of each; in the order of placement
+OF_CAMERAS = ("camera", "detector")  # roles that no run waits for, unless the scenario names them
+COMMANDS = {RECORDER: "record", "detector": "detect"}  # of roles whose command has another name
+KINDS = {f"{name}.": ROLES[name].extra for name in (*AGENTS, *OF_CAMERAS)}  # by the beginning of the process name
+MODULES = {  # what proves that an extra is whole, the installation without extras first
+    "": "zsim.transport.session",
+    "agents": "zsim_agents.estimation.estimator",
+    "record": "zsim_agents.recorder",
+    "cameras": "zsim_agents.cameras.detector",
+    "world": "zsim_world.server.world_process",
+}
+
+Port = Annotated[int, Meta(ge=1, le=65535)]
+Address = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_.:%-]{1,253}\Z")]
+Text = Annotated[str, Meta(min_length=1, max_length=4096)]
+
+
+class Host(Spec, frozen=True, kw_only=True):
+    """A computer."""
+
+    address: Address
+    """How the other hosts reach it."""
+    ssh: Address | None = None
+    """How the launcher reaches it, where that differs."""
+    port: Port = SSH_PORT
+    user: Text | None = None
+    key: Text | None = None
+    """Private key file; None takes the agent's or ~/.ssh's."""
+    known_hosts: Text | None = None
+    """File with its host key; None takes ~/.ssh/known_hosts."""
+    folder: Text = ".zsim"
+    """Where zsim is installed and keeps what it needs there; relative to the home."""
+    python: Text | None = None
+    """Absolute path of the interpreter that has zsim; None takes the environment that `zsim push` makes."""
+    router: Name | None = None
+    """Router through which its roles reach the world; None goes to the world directly."""
+
+
+class Router(Spec, frozen=True, kw_only=True):
+    """A Zenoh router, run as a process of zsim."""
+
+    host: Name
+    port: Port = ROUTER_PORT
+    upstream: Name | None = None
+    """Router that it connects to; None is the world."""
+
+
+class Security(Spec, frozen=True, kw_only=True):
+    """Who may come in."""
+
+    certificates: Text = "certs"
+    """Folder of `zsim certs init`, relative to the inventory."""
+    insecure: bool = False
+    """No TLS and no access control, for a network of your own."""
+
+
+class Inventory(Spec, frozen=True, kw_only=True):
+    hosts: Annotated[dict[Name, Host], Meta(max_length=HOSTS_MAX)]
+    roles: Annotated[dict[Text, Name | Annotated[list[Name], Meta(max_length=HOSTS_MAX)]], Meta(max_length=ROLES_MAX)]
+    """Process name or pattern to a host, or to several over which what it matches is spread in order."""
+    routers: Annotated[dict[Name, Router], Meta(max_length=HOSTS_MAX)] = msgspec.field(default_factory=dict)
+    port: Port = ZENOH_PORT
+    """On which the world listens."""
+    security: Security = Security()
+
+
+class InventoryFile(NamedTuple):
+    """An inventory on disk: relative paths in it count from its folder."""
+
+    inventory: Inventory
+    folder: Path
+    source: str
+
+    @property
+    def word(self) -> str:
+        """Return its path as a word of a command."""
+        return shlex.quote(str(self.folder / self.source))
+
+
+def load(path: Path) -> InventoryFile:
+    """Return the inventory of a YAML file.
+
+    Raises:
+        InventoryError: with every fault, a line each.
+    """
+    document = yaml_file.read(path, EXAMPLE, InventoryError)
+    flaws = chain(faults(document, Inventory), _cross_faults(document))
+    lines = first_lines(f"{path.name}: {where} {text}" for where, text in flaws)
+    if lines:
+        raise InventoryError(lines)
+    return InventoryFile(msgspec.convert(document, Inventory), path.resolve().parent, path.name)
+
+
+def insecure(placed: InventoryFile) -> InventoryFile:
+    """Return an inventory with `security: {insecure: true}`."""
+    security = msgspec.structs.replace(placed.inventory.security, insecure=True)
+    return placed._replace(inventory=msgspec.structs.replace(placed.inventory, security=security))
+
+
+def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
+    """Yield the faults between fields: names that must be those of hosts and routers."""
+    hosts, routers = ([key for key, _ in _map(document, name)] for name in ("hosts", "routers"))
+    for key, wanted in _map(document, "roles"):
+        for name in wanted if isinstance(wanted, list) else [wanted]:
+            yield from _unknown(f"roles.{key}", name, hosts, "hosts")
+        if wanted == []:
+            yield f"roles.{key}", "names no host; must name one at least"
+    for key, router in _map(document, "routers"):
+        if isinstance(router, dict):
+            yield from _unknown(f"routers.{key}.host", router.get("host"), hosts, "hosts")
+            yield from _unknown(f"routers.{key}.upstream", router.get("upstream"), routers, "routers")
+    for key, host in _map(document, "hosts"):
+        if key in (".", ".."):
+            yield f"hosts.{key}", "names a folder that is another's; must have a letter or a digit"
+        if isinstance(host, dict):
+            yield from _unknown(f"hosts.{key}.router", host.get("router"), routers, "routers")
+    if isinstance(document.get("hosts"), dict) and not hosts:
+        yield "hosts", "has 0 entries; must have 1 at least"
+    yield from _circles(document)
+
+
+def _map(document: dict[str, Any], name: str) -> list[tuple[Any, Any]]:
+    """Return the entries of a map, none where it is no map or has too many: they are compared with each other."""
+    value = document.get(name)
+    return list(value.items()) if isinstance(value, dict) and len(value) <= ROLES_MAX else []
+
+
+def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Fault]:
+    if isinstance(name, str) and name not in known:
+        yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'there are none'}"
+
+
+def _circles(document: dict[str, Any]) -> Iterator[Fault]:
+    """Yield routers whose chain of upstreams is a circle and never reaches the world."""
+    above = {key: router.get("upstream") for key, router in _map(document, "routers") if isinstance(router, dict)}
+    upstream = {key: above for key, above in above.items() if isinstance(above, str)}
+    for start in upstream:
+        seen, at = {start}, upstream[start]
+        while at in upstream and at not in seen:
+            seen.add(at)
+            at = upstream[at]
+        if at == start:
+            yield f"routers.{start}.upstream", "leads back to itself; must lead to the world"
+
+
+# Placement
+
+
+def roles(scenario: Scenario) -> list[str]:
+    """Return the names of the processes that a scenario needs, the world first."""
+    return [WORLD, RECORDER, *(name for name in scenario.expected() if name != RECORDER)]
+
+
+def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
+    """Return the host of every process of a scenario, by the rule of `spread`.
+
+    Raises:
+        InventoryError: a process has no place, or nothing matches a pattern.
+    """
+    names, inventory = roles(scenario), placed.inventory
+    entries = inventory.roles
+    places = spread(entries, names)
+    lines = [f"roles has no place for {name}; add {name!r}" for name in names if name not in places]
+    unused = [key for key in entries if not any(fnmatch.fnmatchcase(name, key) for name in names)]
+    lines += [f"roles.{key} matches no process of {scenario.name!r}; it has {', '.join(names)}" for key in unused]
+    if WORLD in places:
+        first = {(places[WORLD], inventory.port): WORLD}
+        for name, router in inventory.routers.items():
+            other = first.setdefault((router.host, router.port), f"{ROUTER}.{name}")
+            if other != f"{ROUTER}.{name}":
+                taken = f"on which {other} listens on {router.host}"
+                lines.append(f"routers.{name}.port is {router.port}, {taken}; give another")
+    if lines:
+        raise InventoryError([f"{placed.source}: {line}" for line in lines])
+    return places
+
+
+def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict[str, str]:
+    """Return the hosts of processes, without those that have no place; an entry's hosts take turns.
+
+    A name takes precedence over a pattern, a longer pattern over a shorter one. The recorder is at the world's host
+    unless it is placed.
+    """
+    places: dict[str, str] = {}
+    turns: Counter[str] = Counter()
+    for name in names:
+        matching = [key for key in roles if fnmatch.fnmatchcase(name, key)]
+        if matching:
+            key = max(matching, key=lambda key: (key == name, len(key)))
+            hosts = _hosts_of(roles[key])
+            places[name] = hosts[turns[key] % len(hosts)]
+            turns[key] += 1
+        elif name == RECORDER and WORLD in places:
+            places[name] = places[WORLD]
+    return places
+
+
+def _hosts_of(entry: Name | list[Name]) -> list[str]:
+    return [entry] if isinstance(entry, str) else entry
+
+
+# Connections
+
+
+def endpoint(placed: InventoryFile, places: dict[str, str], host: str) -> str:
+    """Return where the roles of a host find the federation: their router, or the world."""
+    return listening(placed, *_listener(placed.inventory, places, placed.inventory.hosts[host].router))
+
+
+def upstream(placed: InventoryFile, places: dict[str, str], router: str) -> str:
+    """Return what a router connects to."""
+    return listening(placed, *_listener(placed.inventory, places, placed.inventory.routers[router].upstream))
+
+
+def listening(placed: InventoryFile, host: str, port: int) -> str:
+    """Return the endpoint on which a process of a host listens: its own address, reached from outside."""
+    address = placed.inventory.hosts[host].address
+    shown = f"[{address}]" if ":" in address else address
+    return f"{'tcp' if placed.inventory.security.insecure else 'tls'}/{shown}:{port}"
+
+
+def connections(placed: InventoryFile, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
+    """Return host and port of what listens, with the other hosts whose roles and routers connect to it."""
+    inventory = placed.inventory
+    ways = [(host, inventory.hosts[host].router) for name, host in places.items() if name != WORLD]
+    ways += [(router.host, router.upstream) for router in inventory.routers.values()]
+    sources: dict[tuple[str, int], set[str]] = {}
+    for source, above in ways:
+        target = _listener(inventory, places, above)
+        if target[0] != source:
+            sources.setdefault(target, set()).add(source)
+    return sources
+
+
+def _listener(inventory: Inventory, places: dict[str, str], router: str | None) -> tuple[str, int]:
+    """Return host and port of a router, or of the world."""
+    if router is None:
+        return places[WORLD], inventory.port
+    return inventory.routers[router].host, inventory.routers[router].port
+
+
+def routers_in_order(inventory: Inventory) -> list[str]:
+    """Return the routers, each after the one that it connects to."""
+
+    def depth(name: str) -> int:
+        above = inventory.routers[name].upstream
+        return 0 if above is None else 1 + depth(above)
+
+    return sorted(inventory.routers, key=lambda name: (depth(name), name))
+
+
+def below_home(path: str) -> str:
+    """Return a path on a host from its root, or as ~/ from the home of its user."""
+    return path if path.startswith(("/", "~/")) else f"~/{path}"
+
+
+def python(host: Host) -> str:
+    """Return the interpreter of a host that has zsim: as given, or the one that `zsim push` installs."""
+    return host.python or f"{below_home(host.folder)}/venv/bin/python"
+
+
+# Processes
+
+
+class PlannedProcess(NamedTuple):
+    """One process of a run.
+
+    Attributes:
+        name: `role.thing`.
+        words: of the command, without what depends on where its files are, and without the name that it is given.
+        thing: that name, of a drone, a cluster or a router; None where the command takes none.
+    """
+
+    name: str
+    host: str
+    words: tuple[str, ...]
+    thing: str | None
+    port: int | None
+    secure: bool
+    on_death: OnDeath
+
+    @property
+    def is_restarted(self) -> bool:
+        """Whether its service is to start it again: not a world, which has no journal there."""
+        return self.on_death == "restart" and self.name != WORLD
+
+    @property
+    def role(self) -> str:
+        return self.name.partition(".")[0]
+
+
+class ProcessFiles(NamedTuple):
+    """Where a process finds its files, as its command line has them.
+
+    Attributes:
+        identity: folder with ca.pem, certificate.pem and key.pem.
+    """
+
+    scenario: str
+    identity: str
+    access: str
+    out: str
+
+
+def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> list[PlannedProcess]:
+    """Return the processes that zsim can start: the world, the recorder, agents, cameras, then routers.
+
+    Args:
+        pace: options of the world: `--realtime`, `--rate R`.
+
+    Raises:
+        InventoryError: a process has no place, or nothing matches a pattern.
+    """
+    inventory, places = placed.inventory, placement(placed, scenario)
+
+    def planned(name: str, host: str, words: Iterable[str], thing: str | None, port: int | None) -> PlannedProcess:
+        death = on_death(scenario.processes.on_death, name)
+        return PlannedProcess(name, host, tuple(words), thing, port, not inventory.security.insecure, death)
+
+    def role(name: str, host: str) -> PlannedProcess:
+        role, _, thing = name.partition(".")
+        if name == WORLD:
+            listen = listening(placed, host, inventory.port)
+            return planned(name, host, (WORLD, "--listen", listen, "--expect", RECORDER, *pace), None, inventory.port)
+        reach = ("--connect", endpoint(placed, places, host), "--federation", scenario.federation)
+        words = (COMMANDS.get(role, role), *reach)
+        if role in OF_CAMERAS:
+            words = (*words, "--name", name)
+            thing = thing if thing in {drone.name for drone in scenario.drones} else ""  # none: of all with cameras
+        return planned(name, host, words, thing or None, None)
+
+    def router(name: str) -> PlannedProcess:
+        host, port = inventory.routers[name].host, inventory.routers[name].port
+        words = (ROUTER, "--listen", listening(placed, host, port), "--connect", upstream(placed, places, name))
+        more = ("--federation", scenario.federation, *([REALTIME] if REALTIME in pace else []))
+        return planned(f"{ROUTER}.{name}", host, (*words, *more), name, port)
+
+    ours = [role(name, host) for name, host in places.items() if _is_known(name, scenario)]
+    return ours + [router(name) for name in routers_in_order(inventory)]
+
+
+def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
+    """Return a remark on each expected process that is a program of the user's own, on one host or on all."""
+    places = placement(placed, scenario)
+    return [
+        f"{name} on {at} is a program of your own: start it yourself, it connects to {endpoint(placed, places, at)}"
+        for name, at in places.items()
+        if not _is_known(name, scenario) and host in (None, at)
+    ]
+
+
+def _is_known(name: str, scenario: Scenario) -> bool:
+    """Return whether zsim has a command for a process."""
+    return name in (WORLD, RECORDER, *agent_names(scenario)) or name.partition(".")[0] in OF_CAMERAS
+
+
+def command(process: PlannedProcess, files: ProcessFiles) -> list[str]:
+    """Return the arguments of the interpreter that run a process."""
+    words = [*MODULE, *process.words, "--host", process.host]
+    if process.name == RECORDER:
+        words += ["--out", files.out]
+    words += ["--tls", files.identity] if process.secure else ["--insecure"]
+    if process.secure and process.port is not None:
+        words += ["--access", files.access]
+    argument = files.scenario if process.name == WORLD else process.thing
+    return [*words, "--", argument] if argument is not None else words  # a name may begin with a dash
+
+
+def access_file(process: PlannedProcess) -> str:
+    """Return the file with a listening process's access control, in the certificates folder of its host."""
+    return f"{process.name}.access.json"
+
+
+def on_host(planned: Sequence[PlannedProcess], host: str) -> list[PlannedProcess]:
+    return [process for process in planned if process.host == host]
+
+
+def used_hosts(planned: Sequence[PlannedProcess]) -> list[str]:
+    """Return the hosts on which something runs, in the order of the processes."""
+    return list(dict.fromkeys(process.host for process in planned))
+
+
+# Extras
+
+
+def extras(names: Sequence[str]) -> list[str]:
+    """Return the extras of the distribution that the processes of these names need."""
+    named = {NAMED[name] for name in names if name in NAMED}
+    return sorted(named | {extra for name in names for kind, extra in KINDS.items() if name.startswith(kind)})
+
+
+def known_extras() -> list[str]:
+    """Return the extras of what is installed here."""
+    return sorted(importlib.metadata.metadata(PROJECT).get_all("Provides-Extra") or [])
+
+
+def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, frozenset[str]]:
+    """Return the extras of every host.
+
+    A pattern counts for everything that it can match, since the scenario is not known here. A router needs no extra,
+    nor does a program of the user's own.
+
+    Args:
+        more: extras for every host, beside those of its roles.
+    """
+    extras_by_host: dict[str, set[str]] = {name: set(more) for name in inventory.hosts}
+    for process, host in spread(inventory.roles, NAMED).items():
+        extras_by_host[host].add(NAMED[process])
+    for pattern, hosts in inventory.roles.items():
+        for host in _hosts_of(hosts):
+            extras_by_host[host].update(extra for kind, extra in KINDS.items() if _can_match(pattern, kind))
+    return {name: frozenset(extras) for name, extras in extras_by_host.items()}
+
+
+def _can_match(pattern: str, kind: str) -> bool:
+    """Return whether a pattern can match a name that begins so."""
+    if kind.removesuffix(".") in OF_CAMERAS:
+        return pattern.startswith(kind)  # there are none unless they are named
+    literal = pattern[: min((pattern.find(sign) for sign in "*?[" if sign in pattern), default=len(pattern))]
+    return literal.startswith(kind) or (literal != pattern and kind.startswith(literal))

@@ -1,0 +1,485 @@
+"""`zsim render`: the processes of an inventory and a scenario as systemd units, compose files or Kubernetes manifests.
+
+templates/ has what is written, with `$name` where a value goes. YAML templates are filled as data and dumped again, so
+that every value is quoted as it has to be. Limits of restarts and exit codes are those of the supervisor: a role is
+started again where `zsim run` would start it again.
+
+Zenoh's endpoints and the certificates name the hosts of the inventory, so containers and Pods use the host's network.
+"""
+
+import contextlib
+import hashlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import yaml
+
+from zsim import RELEASE
+from zsim.errors import InventoryError, RunError
+from zsim.scenario import scenario_file
+from zsim.scenario.rights import RECORDER, ROUTER, WORLD
+from zsim.scenario.scenario import Scenario
+from zsim.schema.checker import show
+from zsim_deploy import USER_FAULT
+from zsim_deploy import inventory as inv
+from zsim_deploy.arguments import OTHER_OUT, RUN_ID, file_fault
+from zsim_deploy.inventory import Host, InventoryFile, PlannedProcess, ProcessFiles
+from zsim_deploy.launch.role_launcher import SINGLE_THREADED
+from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED
+
+Rendered = dict[str, str]
+"""Path inside the output folder to text."""
+TEMPLATES = Path(__file__).with_name("templates")
+TARGET = "zsim.target"
+STATE = "/var/lib/zsim"  # StateDirectory=zsim
+CACHE = "/var/cache/zsim"  # CacheDirectory=zsim
+PATH_MAX = 4000  # bytes; Linux takes 4095, and what is in the folder has names too
+STOP_S = 15  # a world that is stopped waits 5 s for byes, and a recorder may have a disk to wait for
+BASE = "python:3.11-slim"  # the oldest Python that zsim runs on
+WHEEL = f"zsim-{RELEASE}-py3-none-any.whl"
+IMAGE = f"zsim:{RELEASE}"
+USER = 1000  # first ordinary user of Debian
+CERTIFICATES, ACCESS, SCENARIO, RUNS = "/certs", "/access/access.json", "/scenario/scenario.yaml", "/runs"
+ENVIRONMENT = {**SINGLE_THREADED, "NUMBA_CACHE_DIR": CACHE}
+NAME_MAX = 63  # RFC 1123 label
+CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
+FINAL_CODES = [USER_FAULT, SUPERSEDED]  # a new start heals neither a wrong call nor a name that another has taken
+
+
+# systemd: a folder per host with a unit per process, and `zsim.target`, which starts and stops them together
+
+
+def systemd(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
+    """Return `HOST/zsim-PROCESS.service`, `HOST/zsim.target`, and the scenario for the world's host.
+
+    The options are those of systemd.exec(5) and systemd.service(5). Left out are MemoryDenyWriteExecute (numba
+    compiles) and ProcSubset (the fingerprint reads /proc/cpuinfo).
+
+    Args:
+        pace: options of the world: `--realtime`, `--rate R`.
+
+    Raises:
+        InventoryError: a process has no place, or a host has no user or no absolute path to its interpreter.
+    """
+    planned, hosts = inv.processes(placed, scenario, pace), placed.inventory.hosts
+    _refuse(placed, [f"hosts.{name}.{text}" for name in inv.used_hosts(planned) for text in _lacks(hosts[name])])
+    texts: Rendered = {}
+    for name in inv.used_hosts(planned):
+        here = inv.on_host(planned, name)
+        texts |= {f"{name}/{_unit(process)}": _service(scenario, process, hosts[name], here) for process in here}
+        values = {"scenario": scenario.name, "host": name, "units": " ".join(map(_unit, here))}
+        texts[f"{name}/{TARGET}"] = _text(TARGET, values, inv.own_programs(placed, scenario, name))
+        if any(process.name == WORLD for process in here):
+            texts[f"{name}/scenario.yaml"] = scenario_file.to_text(scenario)
+    return texts
+
+
+def _lacks(host: Host) -> Iterator[str]:
+    """Yield what a unit needs and a host's entry lacks."""
+    if host.user is None:
+        yield "user is missing; a unit needs the user under which it runs; add it"
+    elif not _home(host.user):
+        yield f"user is {show(host.user)}; must be letters, digits, `_`, `-` and `.`, at most 31"
+    for name, path in (("folder", host.folder), ("python", host.python or "/")):
+        if not path.isprintable():
+            yield f"{name} is {show(path)}; must be of printable characters, as each line of a unit is an option"
+        if (size := len(path.encode(errors="replace"))) > PATH_MAX:
+            yield f"{name} has {size} bytes; must have at most {PATH_MAX}"
+    if host.python is not None and not host.python.startswith("/"):
+        yield f"python is {show(host.python)}; a unit needs an absolute path, or none given"
+
+
+def _home(user: str | None) -> str | None:
+    """Return the usual home of a user; None if it is no user's name (systemd: "User/Group Name Syntax", relaxed)."""
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,30}", user or ""):
+        return None
+    return "/root" if user == "root" else f"/home/{user}"
+
+
+def _absolute(host: Host, path: str) -> str:
+    return path if path.startswith("/") else f"{_home(host.user)}/{path.removeprefix('~/')}"
+
+
+def _unit(process: PlannedProcess) -> str:
+    return f"zsim-{process.name}.service"
+
+
+def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequence[PlannedProcess]) -> str:
+    """Return the unit of a process.
+
+    What is started later is stopped first: the world ends the run for all, and routers go last.
+    """
+    rank = {ROUTER: 0, WORLD: 2}
+    earlier = [_unit(each) for each in here if rank.get(each.role, 1) < rank.get(process.role, 1)]
+    folder = _absolute(host, host.folder)
+    files = ProcessFiles(
+        scenario=f"{folder}/scenario.yaml",
+        identity=f"{folder}/certs/{process.name}",
+        access=f"{folder}/certs/{inv.access_file(process)}",
+        out=f"{STATE}/runs/{scenario.name}-{RUN_ID}",
+    )
+    # ":": no variables are put in. Doubled, a $ would stay one in the arguments and be two in the path of the program
+    words = (f":{_absolute(host, inv.python(host))}", *inv.command(process, files))
+    remarks = []
+    if not host.folder.startswith("/"):
+        remarks.append(f"folder {host.folder} is taken to be in {_home(host.user)}; else give an absolute folder")
+    if process.on_death == "wait":
+        remarks.append("on_death is wait: systemd does not start it again, time stands still until somebody does")
+    values = {
+        "process": process.name,
+        "scenario": scenario.name,
+        "after": " ".join(["network-online.target", *earlier]),
+        "restart_window_s": f"{RESTART_WINDOW_S:g}",
+        "starts_max": RESTARTS_MAX + 1,
+        "user": host.user,
+        "state": STATE,
+        "environment": "\n".join(f"Environment={name}={value}" for name, value in ENVIRONMENT.items()),
+        "command": " ".join(map(_systemd_word, words)),
+        "restart": "on-failure" if process.is_restarted else "no",
+        "final_codes": " ".join(map(str, FINAL_CODES)),
+        "stop_s": STOP_S,
+    }
+    return _text("process.service", values, remarks)
+
+
+def _systemd_word(text: str) -> str:
+    """Return a word as ExecStart= takes it literally."""
+    text = text.replace("%", "%%")
+    if re.fullmatch(r"[^\s\"'\\;]+", text):
+        return text
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+# Docker Compose: a folder per host
+
+
+def compose(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
+    """Return `HOST/compose.yaml`, `HOST/Dockerfile`, and the scenario for the world's host.
+
+    Args:
+        pace: options of the world: `--realtime`, `--rate R`.
+
+    Raises:
+        InventoryError: a process has no place, or nothing matches a pattern.
+    """
+    planned = inv.processes(placed, scenario, pace)
+    head, (project,) = _yaml_template("compose.yaml")
+    service = project["services"]["process"]
+    texts: Rendered = {}
+    for host in inv.used_hosts(planned):
+        here = inv.on_host(planned, host)
+        values = {"project": scenario.federation.replace(".", "-").lstrip("-_") or "zsim"}  # a-z, 0-9, - and _
+        services = {process.name: _compose_service(service, scenario, process) for process in here}
+        remarks = [*_filled(head, {"restarts_max": RESTARTS_MAX}), *_unused(placed, host)]
+        remarks += [f"# {line}" for line in inv.own_programs(placed, scenario, host)]
+        filled = {**_filled({**project, "services": {}}, values), "services": services}
+        texts[f"{host}/compose.yaml"] = _dump(remarks, [filled])
+        texts[f"{host}/Dockerfile"] = _dockerfile(here)
+        if any(process.name == WORLD for process in here):
+            texts[f"{host}/scenario.yaml"] = scenario_file.to_text(scenario)
+    return texts
+
+
+def _compose_service(template: Any, scenario: Scenario, process: PlannedProcess) -> dict[str, Any]:
+    out = f"{RUNS}/${{ZSIM_RUN:-{scenario.name}}}"
+    words = inv.command(process, ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, out))
+    values = {
+        "release": RELEASE,
+        "host": process.host,
+        "words": [word if word == out else word.replace("$", "$$") for word in words],  # for Compose to leave alone
+        "environment": ENVIRONMENT,
+        "user": USER,
+        "cache": CACHE,
+        "scenario": SCENARIO,
+        "runs": RUNS,
+        "certificates": CERTIFICATES,
+        "access": ACCESS,
+        "process": process.name,
+        "access_file": inv.access_file(process),
+        "restart": f"on-failure:{RESTARTS_MAX}" if process.is_restarted else "no",
+        "stop_s": STOP_S,
+    }
+    service, mounted = _filled(template, values), _mounted(process)
+    paths = {"cache": CACHE, "scenario": SCENARIO, "runs": RUNS, "certs": CERTIFICATES, "access": ACCESS}
+    used = [path for name, path in paths.items() if name in mounted]
+    service["volumes"] = [volume for volume in service["volumes"] if volume["target"] in used]
+    return service
+
+
+def _mounted(process: PlannedProcess) -> set[str]:
+    """Return the names of what a process mounts."""
+    uses = {
+        "cache": True,
+        "tmp": True,
+        "scenario": process.name == WORLD,
+        "runs": process.name == RECORDER,
+        "certs": process.secure,
+        "access": process.secure and process.port is not None,
+    }
+    return {name for name, is_used in uses.items() if is_used}
+
+
+def _unused(placed: InventoryFile, host: str) -> list[str]:
+    """Return a remark on the fields of a host that containers do not use."""
+    described = placed.inventory.hosts[host]
+    defaults = Host(address=described.address)
+    names = [name for name in ("folder", "python") if getattr(described, name) != getattr(defaults, name)]
+    return [f"# hosts.{host}: {', '.join(names)} not used, the image has its own"] if names else []
+
+
+def _dockerfile(planned: Sequence[PlannedProcess]) -> str:
+    """Return the Dockerfile of an image with the extras of some processes; the wheel is to be beside it."""
+    extras = inv.extras([process.name for process in planned])
+    wanted = f"[{','.join(extras)}]" if extras else ""
+    values = {"wheel": WHEEL, "base": BASE, "extras": wanted, "cache": CACHE, "runs": RUNS, "user": USER}
+    return _text("Dockerfile", values)
+
+
+# Kubernetes: a run ends, so its roles are Jobs; a router does not, so it is a Deployment
+
+
+def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
+    """Return `namespace.yaml`, `secrets.sh`, `zsim.yaml`, `records.yaml` and a Dockerfile.
+
+    The names of the hosts are those of the nodes.
+
+    Args:
+        pace: options of the world: `--realtime`, `--rate R`.
+        image: where the nodes find what the Dockerfile makes.
+
+    Raises:
+        InventoryError: a process has no place, a name is none that Kubernetes takes, or the scenario is too large.
+    """
+    planned, text = inv.processes(placed, scenario, pace), scenario_file.to_text(scenario)
+    _refuse(placed, _kubernetes_faults(planned, text))
+    shared = {"space": label(scenario.federation), "image": image, "user": USER, "runs": RUNS}
+    head, manifests = _yaml_template("kubernetes/zsim.yaml")
+    by_kind = {manifest["kind"]: manifest for manifest in manifests}
+    world = next(process for process in planned if process.name == WORLD)
+    objects = [
+        _filled(by_kind["ConfigMap"], {**shared, "scenario": text}),
+        _filled(by_kind["Service"], {**shared, "labels": _labels(world), "port": world.port}),
+        *(_role_manifest(by_kind, shared, process) for process in planned),
+    ]
+    address = placed.inventory.hosts[world.host].address
+    certified = f"# The world's certificate is for {address}: over TLS that is its name, and not the Service's."
+    remarks = [*head, *([certified] if world.secure else [])]
+    remarks += [line for host in inv.used_hosts(planned) for line in _unused(placed, host)]
+    remarks += [f"# {line}" for line in inv.own_programs(placed, scenario)]
+    texts = {"namespace.yaml": "", "zsim.yaml": _dump(remarks, objects), "records.yaml": ""}
+    for name in ("namespace.yaml", "records.yaml"):
+        head, lasting = _yaml_template(f"kubernetes/{name}")
+        texts[name] = _dump(head, _filled(lasting, shared))
+    texts["Dockerfile"] = _dockerfile(planned)
+    if not placed.inventory.security.insecure:
+        puts = "\n".join(map(_put_secret, planned))
+        texts["secrets.sh"] = _text("kubernetes/secrets.sh", {**shared, "puts": puts})
+    return texts
+
+
+def _kubernetes_faults(planned: Sequence[PlannedProcess], text: str) -> list[str]:
+    """Return a line for everything that Kubernetes cannot do."""
+    lines = [
+        f"hosts.{host} is no name of a node; must be letters, digits, - and ., as `kubectl get nodes` lists them"
+        for host in inv.used_hosts(planned)
+        if not re.fullmatch(r"[a-z0-9]([a-z0-9.-]*[a-z0-9])?", host)
+    ]
+    first: dict[str, str] = {}
+    for process in planned:
+        other = first.setdefault(label(process.name), process.name)
+        if other != process.name:
+            lines.append(f"{process.name} and {other} have the same name in Kubernetes; rename a drone or cluster")
+    if len(text.encode()) > CONFIG_BYTES_MAX:
+        lines.append(f"the scenario has {len(text.encode())} bytes; a ConfigMap takes {CONFIG_BYTES_MAX}")
+    return lines
+
+
+def label(name: str) -> str:
+    """Return a name as Kubernetes takes it (RFC 1123 label)."""
+    return re.sub(r"[^a-z0-9]+", "-", name).strip("-")[:NAME_MAX].rstrip("-") or "zsim"
+
+
+def _labels(process: PlannedProcess) -> dict[str, str]:
+    about = {"name": "zsim", "component": process.role, "instance": label(process.name)}
+    return {f"app.kubernetes.io/{key}": value for key, value in about.items()}
+
+
+def _role_manifest(by_kind: Mapping[str, Any], shared: Mapping[str, Any], process: PlannedProcess) -> Any:
+    """Return the Job of a role, or the Deployment of a router."""
+    kind, restart = ("Deployment", "Always") if process.role == ROUTER else ("Job", "Never")
+    words = inv.command(process, ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, f"{RUNS}/{RUN_ID}"))
+    values = {
+        **shared,
+        "name": label(process.name),
+        "labels": _labels(process),
+        "restarts": RESTARTS_MAX if process.is_restarted else 0,
+        "final_codes": FINAL_CODES,
+        "restart": restart,
+        "host": process.host,
+        "stop_s": STOP_S,
+        "role": process.role,
+        "words": words,
+        "environment": [{"name": key, "value": value} for key, value in ENVIRONMENT.items()],
+        "cache": CACHE,
+        "certificates": CERTIFICATES,
+        "port": process.port,
+        "secret": f"certs-{label(process.name)}",
+    }
+    _, (template,) = _yaml_template("kubernetes/pod.yaml")
+    pod, mounted = _filled(template, values), _mounted(process)
+    (container,) = pod["spec"]["containers"]
+    for part, key in ((container, "volumeMounts"), (pod["spec"], "volumes")):
+        part[key] = [entry for entry in part[key] if entry["name"] in mounted]
+    if process.port is None:
+        del container["ports"]
+    return _filled(by_kind[kind], {**values, "pod": pod})
+
+
+def _put_secret(process: PlannedProcess) -> str:
+    """Return the line that puts a certificate from where `zsim certs init` left it into the cluster."""
+    files = [f'--from-file="$certs/{process.host}/{process.name}"']
+    if process.port is not None:
+        files.append(f'--from-file=access.json="$certs/{process.host}/{inv.access_file(process)}"')
+    return f"put certs-{label(process.name)} {' '.join(files)}"
+
+
+# Templates
+
+
+def _refuse(placed: InventoryFile, lines: Sequence[str]) -> None:
+    if lines:
+        raise InventoryError([f"{placed.source}: {line}" for line in lines])
+
+
+def _template(name: str) -> tuple[list[str], str]:
+    """Return the comment lines at the head of a template, and what follows them."""
+    lines = (TEMPLATES / name).read_text(encoding="utf-8").splitlines(keepends=True)
+    count = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    return [line.rstrip("\n") for line in lines[:count]], "".join(lines[count:])
+
+
+def _text(name: str, values: Mapping[str, Any], remarks: Sequence[str] = ()) -> str:
+    """Return a template with values put in, and with remarks for a reader at the end of its head."""
+    head, body = _template(name)
+    lines = [*_filled(head, values), *(f"# {line}" for line in remarks)]
+    return "\n".join(lines) + "\n" + Template(body).substitute(values)
+
+
+def _yaml_template(name: str) -> tuple[list[str], list[Any]]:
+    """Return the comment lines at the head of a YAML template, and its documents."""
+    head, body = _template(name)
+    return head, list(yaml.safe_load_all(body))
+
+
+def _filled(node: Any, values: Mapping[str, Any]) -> Any:
+    """Return a part of a template with values put in; a text that is `$name` alone becomes that value as it is."""
+    if isinstance(node, dict):
+        return {key: _filled(value, values) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_filled(each, values) for each in node]
+    if not isinstance(node, str):
+        return node
+    return values[node[1:]] if re.fullmatch(r"\$\w+", node) else Template(node).substitute(values)
+
+
+def _dump(remarks: Sequence[str], documents: Sequence[Any]) -> str:
+    """Return YAML documents in one text, remarks at its head; the same content gives the same text."""
+    options: dict[str, Any] = {"sort_keys": False, "default_flow_style": False, "width": 1000}
+    texts = [yaml.dump(plain, Dumper=_Dumper, **options) for plain in documents]
+    return "".join(f"{line}\n" for line in remarks) + "---\n".join(texts)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes texts of several lines as blocks, and equal lists in full rather than as aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        super().increase_indent(flow, False)
+
+
+def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="|" if "\n" in text else None)
+
+
+_Dumper.add_representer(str, _represent_text)
+
+
+# The output folder
+
+
+def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False) -> list[str]:
+    """Write the texts into a folder; return the files of an earlier rendering for this target that were removed.
+
+    A list beside the files holds their digests, as `sha256sum` prints them: a later rendering removes what an earlier
+    one wrote, and never a file of another origin or one changed since.
+
+    Args:
+        out: the folder, made if it is not there.
+        target: what it is rendered for; each target has a list of its own.
+        texts: by path inside the folder, HOST/FILE or FILE; a host named `..` does not lead out of it.
+        force: overwrite what no rendering wrote, or what was changed since.
+
+    Raises:
+        RunError: it cannot be written, a path leads out of it, or a file in the way was not rendered.
+    """
+    root, record = out.resolve(), out / f".zsim-render-{target}.sha256"
+    for name in texts:
+        if not _is_inside(root, name):
+            raise RunError(f"{name}: leads out of {out}; rename that host in the inventory")
+    former = _digests(record)
+    if not force:
+        for name, text in texts.items():
+            path, known = root / name, (former.get(name, ""), _digest(text.encode()))
+            if path.exists() and not _has_digest(path, known):
+                why = "no rendering wrote it, or it was changed since"
+                raise RunError(f"{path}: {why}; give --out another folder, or --force to replace it")
+    stale = [name for name in former if name not in texts and _is_inside(root, name) and (root / name).is_file()]
+    for name in stale:
+        if not _has_digest(root / name, (former[name],)):
+            why = "an earlier rendering wrote it and it was changed since"
+            raise RunError(f"{root / name}: {why}; remove it, or give --out another folder")
+    for path in (root / name for name in stale):
+        with file_fault(path, "cannot be removed", OTHER_OUT):
+            path.unlink(missing_ok=True)
+        if path.parent != root:
+            with contextlib.suppress(OSError):  # something else is in it
+                path.parent.rmdir()
+    _put(record, "".join(f"{_digest(text.encode())}  {name}\n" for name, text in texts.items()))
+    for name, text in texts.items():
+        _put(root / name, text)
+    return stale
+
+
+def _is_inside(root: Path, name: str) -> bool:
+    path = (root / name).resolve()
+    return root in (path.parent, path.parent.parent)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _has_digest(path: Path, known: Sequence[str]) -> bool:
+    try:
+        return _digest(path.read_bytes()) in known
+    except OSError:
+        return False
+
+
+def _digests(record: Path) -> dict[str, str]:
+    """Return the digests of what was rendered before, by path."""
+    lines: list[str] = []
+    with file_fault(record.parent, "cannot be written", OTHER_OUT), contextlib.suppress(FileNotFoundError):
+        lines = record.read_text(encoding="utf-8", errors="replace").splitlines()
+    return {name: digest for digest, _, name in (line.partition("  ") for line in lines) if name}
+
+
+def _put(path: Path, text: str) -> None:
+    with file_fault(path, "cannot be written", OTHER_OUT):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")

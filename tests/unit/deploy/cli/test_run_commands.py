@@ -1,0 +1,203 @@
+"""What is shown, and with which exit code, when a run is over."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import synthetic_record
+import typer
+from refused import has_terms, without_tags
+from typer.testing import CliRunner
+
+from zsim.contract import keys, run_messages
+from zsim.errors import RecordError
+from zsim.record import RecordWriter
+from zsim_deploy.cli import run_commands
+from zsim_deploy.cli.cli import app
+from zsim_deploy.launch.supervisor import Outcome
+
+INTERRUPTED = Outcome("interrupted by Ctrl-C", interrupted=True)
+DIED = Outcome("the world died", failed=True)
+NO_MESSAGE = RecordError("run.mcap: holds no message")
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    (tmp_path / "run.mcap").touch()
+    return tmp_path
+
+
+def raising(error: BaseException) -> Any:
+    def report(_: Path) -> None:
+        raise error
+
+    return report
+
+
+def test_ctrl_c_before_there_is_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit, match="130"):
+        run_commands.conclude(INTERRUPTED, tmp_path, True)
+    assert capsys.readouterr().err == f"ended: {INTERRUPTED.reason}\n"
+
+
+def test_ctrl_c_in_flight(recorded: Path, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit, match="130"):
+        run_commands.conclude(INTERRUPTED, recorded, True)
+    assert has_terms(capsys.readouterr().err, "record", str(recorded / "run.mcap"))
+
+
+def test_ctrl_c_in_the_report(recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(run_commands, "_report", raising(KeyboardInterrupt()))
+    with pytest.raises(SystemExit, match="130"):
+        run_commands.conclude(Outcome("over"), recorded, True)
+    assert has_terms(capsys.readouterr().err, "interrupted", "record", f"zsim report {recorded}")
+
+
+def test_a_failed_run_of_which_nothing_can_be_reported(
+    recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(run_commands, "_report", raising(NO_MESSAGE))
+    with pytest.raises(typer.Exit) as ended:
+        run_commands.conclude(DIED, recorded, True)
+    assert ended.value.exit_code == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert (str(NO_MESSAGE) in lines, lines[-1]) == (True, f"ended: {DIED.reason}")
+    with pytest.raises(RecordError):
+        run_commands.conclude(Outcome("ended"), recorded, True)
+
+
+# What a record lacks
+
+
+def write(path: Path, missing: range = range(0), gates: int = 50, end: bool = True) -> Path:
+    """Write the record of a run of so many gates that lacks some."""
+    flown = synthetic_record.Flown(duration_s=(gates - 1) * 0.02)
+    with RecordWriter(path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown):
+            if message.t_ns // synthetic_record.GATE_NS not in missing or key == keys.INFO:
+                writer.add_message(key, message, wall_ns)
+        if end:
+            last = gates - 1
+            clock = run_messages.Clock(last * synthetic_record.GATE_NS, gates, "run", last, "stopped", 1.0)
+            writer.add_message(keys.CLOCK, clock, 1)
+    return path
+
+
+class Judged(NamedTuple):
+    """What is shown of a record: the exit code, the terminal's lines, summary.json and the report's head."""
+
+    code: int
+    out: str
+    err: str
+    summary: dict[str, Any]
+    page: str
+
+
+def judged(
+    folder: Path, capsys: pytest.CaptureFixture[str], outcome: Outcome | None = None, report: bool = True
+) -> Judged:
+    code = 0
+    try:
+        run_commands.conclude(outcome or Outcome("the scenario's duration is over"), folder, report)
+    except typer.Exit as ended:
+        code = ended.exit_code
+    shown = capsys.readouterr()
+    if not report:
+        return Judged(code, shown.out, shown.err, {}, "")
+    summary = json.loads((folder / "summary.json").read_text())
+    return Judged(code, shown.out, shown.err, summary["record"], without_tags((folder / "report.html").read_text()))
+
+
+CASES = {
+    "whole": ({}, ("complete", "50")),
+    "gap": ({"missing": range(20, 24)}, ("incomplete", "4", "50", "0.40", "0.46")),
+    "no end": ({"end": False}, ("incomplete", "end", "0.98")),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_summary_page_terminal_and_exit_code_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str):
+    options, terms = CASES[case]
+    shown = judged(write(tmp_path, **options), capsys)
+    assert has_terms(shown.summary["state"], *terms)
+    assert (shown.summary["complete"], shown.code) == ((True, 0) if case == "whole" else (False, 1))
+    assert shown.summary["state"] in shown.page
+    (line,) = [line for line in shown.out.splitlines() if line.startswith("record: ")]
+    assert line.partition(" (")[0] == f"record: {shown.summary['state']}"
+    if case != "whole":
+        assert shown.err.splitlines()[-1].endswith(shown.summary["state"])
+    if case == "gap":
+        assert (shown.summary["gates"], shown.summary["gates_missing"]) == (46, 4)
+        assert shown.summary["gaps"] == [{"gates": 4, "from_s": 0.4, "to_s": 0.46}]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_without_a_report_the_same_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str):
+    options, terms = CASES[case]
+    shown = judged(write(tmp_path, **options), capsys, report=False)
+    assert shown.code == (case != "whole")
+    assert has_terms(shown.out, "record", *terms)
+    assert case == "whole" or has_terms(shown.err.splitlines()[-1], *terms)
+
+
+@pytest.mark.parametrize("outcome", [Outcome("over"), DIED])
+def test_every_run_says_why_it_ended_and_where_its_record_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], outcome: Outcome
+):
+    shown = judged(write(tmp_path), capsys, outcome, report=False)
+    assert has_terms(shown.out, "ended", outcome.reason, "record", str(tmp_path / "run.mcap"))
+
+
+@pytest.mark.parametrize("report", [True, False])
+def test_the_last_line_is_why_a_run_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str], report: bool):
+    (tmp_path / "logs").mkdir()
+    shown = judged(write(tmp_path, end=False), capsys, DIED, report)
+    assert shown.code == 1
+    assert has_terms(shown.err.splitlines()[-1], DIED.reason)
+
+
+def test_a_run_of_which_nothing_was_recorded_has_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    shown = judged(tmp_path, capsys, report=False)
+    assert shown.code == 1
+    assert has_terms(shown.err.splitlines()[-1], "nothing", "recorded")
+
+
+def test_a_rerun_and_a_sweep_that_fail_end_with_why(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setattr("zsim_analysis.rerun.rerun_record", lambda *_: "truth differs")
+    with pytest.raises(typer.Exit) as ended:
+        run_commands.rerun(tmp_path)
+    assert (ended.value.exit_code, capsys.readouterr().err.splitlines()[-1]) == (1, "truth differs")
+    with pytest.raises(typer.Exit) as ended:
+        run_commands._conclude(tmp_path, ["too heavy", "too heavy"], 2, report=False)
+    assert ended.value.exit_code == 1
+    assert has_terms(capsys.readouterr().err.splitlines()[-1], "2", "too heavy")
+
+
+# Formats of figures
+
+
+@pytest.fixture
+def formats(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
+    """Return the formats in which reports are asked for; none is made."""
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(run_commands, "_report", lambda _, wanted=(): asked.append(tuple(wanted)))
+    return asked
+
+
+def report(*arguments: str) -> int:
+    return CliRunner().invoke(app, ["report", *arguments]).exit_code
+
+
+def test_figures_are_asked_for_in_other_formats(recorded: Path, formats: list[tuple[str, ...]]) -> None:
+    assert report(str(recorded)) == report(str(recorded), "--format", "svg") == 0
+    assert report(str(recorded), "--format", "pdf,svg") == 0
+    assert formats == [(), ("svg",), ("pdf", "svg")]
+
+
+@pytest.mark.parametrize("wrong", ["png", "pdf svg", "pdf,", ","])
+def test_formats_that_are_none_are_refused(wrong: str, recorded: Path, formats: list[tuple[str, ...]]) -> None:
+    assert report(str(recorded), "--format", wrong) == 2
+    assert formats == []

@@ -1,0 +1,319 @@
+"""The wheelhouse: what it is keyed by, what pip is asked for, and that nothing is fetched or built twice."""
+
+import asyncio
+import errno
+import importlib.metadata
+import json
+import os
+import platform
+import socket
+import sys
+import sysconfig
+import tarfile
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from refused import has_terms, refused
+
+from zsim.errors import HostsError
+from zsim_deploy.hosts import wheelhouse
+from zsim_deploy.hosts.wheelhouse import (
+    PipError,
+    Wheelhouse,
+    WheelSet,
+    WheelTarget,
+    download_wheels,
+    pip,
+    requirement,
+    wheel_target,
+)
+
+BACKEND = """
+# A build backend without dependencies: a wheel with one module.
+import zipfile
+
+def build_wheel(folder, config_settings=None, metadata_directory=None):
+    with zipfile.ZipFile(f"{{folder}}/{name}-1.0-py3-none-any.whl", "w") as wheel:
+        wheel.writestr("{name}.py", "")
+        wheel.writestr("{name}-1.0.dist-info/METADATA", "Metadata-Version: 2.1\\nName: {name}\\nVersion: 1.0\\n{needs}")
+        wheel.writestr("{name}-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\\nRoot-Is-Purelib: true\\nTag: py3-none-any\\n")
+        wheel.writestr("{name}-1.0.dist-info/RECORD", "{name}.py,,\\n")
+    return "{name}-1.0-py3-none-any.whl"
+"""
+PYPROJECT = """
+[build-system]
+requires = []
+build-backend = "backend"
+backend-path = ["."]
+[tool.hatch.build.targets.wheel]
+packages = ["source"]
+"""
+NEEDS = "Requires-Dist: gadget; extra == 'agents'\\nProvides-Extra: agents\\n"
+ELSEWHERE = WheelTarget((3, 12), "cp312", ("manylinux_2_31_aarch64", "linux_aarch64"))
+
+
+def here() -> WheelTarget:
+    facts = {
+        "version": list(sys.version_info[:2]),
+        "implementation": "cpython",
+        "free_threaded": False,
+        "platform": sysconfig.get_platform(),
+        "libc": list(platform.libc_ver()),
+    }
+    return wheel_target("here", facts)
+
+
+def write_project(folder: Path, name: str, needs: str = "") -> Path:
+    """Write a project that builds itself without an index."""
+    (folder / "source").mkdir(parents=True)
+    texts = {"pyproject.toml": PYPROJECT, "backend.py": BACKEND.format(name=name, needs=needs), "README.md": ""}
+    for file, text in {**texts, "PKG-INFO": f"Name: {name}\n", "source/flight.py": "height_m = 4\n"}.items():
+        (folder / file).write_text(text)
+    return folder
+
+
+def write_wheel(index: Path, name: str) -> None:
+    """Put a wheel of this name into an index."""
+    backend: dict[str, Any] = {}
+    exec(BACKEND.format(name=name, needs=""), backend)
+    backend["build_wheel"](index)
+
+
+@pytest.fixture
+def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that is all that pip knows; in it a wheel of pip 1.0, and gadget 1.0 as sources only."""
+    folder = tmp_path / "index"
+    gadget = write_project(folder / "gadget-1.0", "gadget")
+    with tarfile.open(folder / "gadget-1.0.tar.gz", "w:gz") as archive:
+        archive.add(gadget, gadget.name)
+    write_wheel(folder, "pip")
+    for name in [name for name in os.environ if name.startswith("PIP_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(folder))
+    return folder
+
+
+@pytest.fixture
+def checkout(index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout of a project that needs gadget with its extra agents; there is a wheel of gadget."""
+    write_wheel(index, "gadget")
+    folder = write_project(tmp_path / "checkout", "zsim", NEEDS)
+    monkeypatch.setattr(wheelhouse, "_checkout", lambda: folder)
+    return folder
+
+
+def test_a_wheel_that_does_not_exist_is_what_pip_says(index: Path, tmp_path: Path) -> None:
+    with refused(PipError, "requirement numpy"):
+        asyncio.run(download_wheels(["numpy"], ELSEWHERE, tmp_path / "into", [], tmp_path, print))
+
+
+@pytest.mark.parametrize("aim", [here(), ELSEWHERE], ids=["here", "elsewhere"])
+def test_a_project_without_wheels_is_built_here_also_for_others(index: Path, tmp_path: Path, aim: WheelTarget) -> None:
+    into = tmp_path / "into"
+    assert not asyncio.run(download_wheels(["gadget"], aim, into, [], tmp_path, print))
+    assert [path.name for path in into.iterdir()] == ["gadget-1.0-py3-none-any.whl"]
+
+
+def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: Path, tmp_path: Path) -> None:
+    assert not asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "same", ["gadget==1.0"], tmp_path, print))
+    assert asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "other", ["gadget==0.9"], tmp_path, print))
+
+
+def house(folder: Path, extras: list[str], host: str = "h") -> tuple[WheelSet, list[str]]:
+    """Return a house of the wheelhouse in a folder, and the lines printed on the way."""
+    lines: list[str] = []
+    return asyncio.run(Wheelhouse(folder, lines.append).wheel_set(host, ELSEWHERE, extras)), lines
+
+
+def test_a_house_holds_what_a_host_needs_and_is_gathered_once(checkout: Path, tmp_path: Path) -> None:
+    first, lines = house(tmp_path / "cache", ["agents"])
+    assert [wheel.path.name.partition("-")[0] for wheel in first.wheels()] == ["zsim", "pip", "gadget"]
+    assert first.extras == ("agents",)
+    building, gathering = lines
+    assert has_terms(building, "building", "zsim")
+    assert has_terms(gathering, "gathering", str(ELSEWHERE), "agents")
+    again, lines = house(tmp_path / "cache", ["agents"])
+    assert (again, lines) == (first, [])
+
+
+def test_a_changed_file_builds_the_project_and_nothing_else(checkout: Path, tmp_path: Path) -> None:
+    first, _ = house(tmp_path / "cache", [])
+    (checkout / "source/flight.py").write_text("height_m = 5\n")
+    second, lines = house(tmp_path / "cache", [])
+    (line,) = lines
+    assert has_terms(line, "building", "zsim")
+    assert second.project.path != first.project.path
+    assert second.pip == first.pip
+
+
+def test_a_wheel_that_was_lost_is_gathered_again(checkout: Path, tmp_path: Path) -> None:
+    first, _ = house(tmp_path / "cache", ["agents"])
+    first.others[0].path.unlink()
+    second, lines = house(tmp_path / "cache", ["agents"])
+    (line,) = lines
+    assert has_terms(line, "gathering", str(ELSEWHERE), "agents")
+    assert second.others[0].path.exists()
+
+
+def test_a_missing_wheel_is_a_line_with_host_package_and_system(index: Path, checkout: Path, tmp_path: Path) -> None:
+    (index / "gadget-1.0.tar.gz").unlink()
+    (index / "gadget-1.0-py3-none-any.whl").unlink()
+    with pytest.raises(HostsError) as caught:
+        house(tmp_path / "cache", ["agents"], "onboard1")
+    assert has_terms(str(caught.value), "onboard1", "gadget", str(ELSEWHERE), "PIP_FIND_LINKS")
+
+
+def test_a_project_that_cannot_be_built_is_a_line(checkout: Path, tmp_path: Path) -> None:
+    (checkout / "backend.py").write_text("raise ImportError('no backend')\n")
+    with refused(HostsError, "launcher", "zsim", str(checkout)) as raised:
+        house(tmp_path / "cache", [])
+    assert "\n" not in str(raised.value)
+
+
+@pytest.fixture
+def no_index(index: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An index at which nobody listens, beside the folder."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    monkeypatch.delenv("PIP_NO_INDEX")
+    monkeypatch.setenv("PIP_INDEX_URL", f"http://127.0.0.1:{port}/simple")
+
+
+def test_an_index_that_cannot_be_reached_is_no_missing_wheel(
+    checkout: Path, no_index: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "index/gadget-1.0.tar.gz").unlink()
+    (tmp_path / "index/gadget-1.0-py3-none-any.whl").unlink()
+    calls: list[tuple[str, ...]] = []
+
+    async def counted(*arguments: str, **options: Any) -> None:
+        calls.append(arguments)
+        await pip(*arguments, **options)
+
+    monkeypatch.setattr(wheelhouse, "pip", counted)
+    lines: list[str] = []
+    kept = Wheelhouse(tmp_path / "cache", lines.append)
+    for _ in range(2):
+        with pytest.raises(HostsError) as caught:
+            asyncio.run(kept.wheel_set("h", ELSEWHERE, ["agents"]))
+        remedy = "PIP_NO_INDEX=1", "PIP_FIND_LINKS=FOLDER"
+        assert has_terms(str(caught.value), "launcher", "index", os.strerror(errno.ECONNREFUSED), *remedy)
+    assert [arguments[0] for arguments in calls] == ["wheel", "download"]
+    assert has_terms(lines[-1], "index", os.strerror(errno.ECONNREFUSED), "once more")
+
+
+def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave pip an index at which nobody listens, and no folder."""
+    monkeypatch.delenv("PIP_NO_INDEX", raising=False)
+    monkeypatch.delenv("PIP_FIND_LINKS")
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:1/simple")  # tcpmux; nobody has it
+
+
+def test_wheels_that_are_kept_need_no_index(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where something else has been installed here since, by which the house would be another."""
+    first, _ = house(tmp_path / "cache", ["agents"])
+    nowhere(monkeypatch)
+    monkeypatch.setattr(wheelhouse, "constraints", lambda: ["gadget==1.0", "widget==2.0"])
+    again, lines = house(tmp_path / "cache", ["agents"])
+    assert again == first
+    assert not [line for line in lines if has_terms(line, "index")]
+
+
+@pytest.mark.soak
+def test_what_builds_the_project_is_kept(
+    checkout: Path, index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (checkout / "pyproject.toml").write_text(PYPROJECT.replace("requires = []", 'requires = ["gadget"]'))
+    house(tmp_path / "cache", [])
+    nowhere(monkeypatch)
+    (checkout / "source/flight.py").write_text("height_m = 5\n")
+    _, lines = house(tmp_path / "cache", [])
+    (line,) = lines
+    assert has_terms(line, "building", "zsim")
+
+
+def test_what_is_in_a_folder_needs_no_index(checkout: Path, no_index: None, tmp_path: Path) -> None:
+    assert house(tmp_path / "cache", ["agents"])[0].others
+
+
+@pytest.mark.parametrize(
+    ("shown", "terms"),
+    [
+        ("\"HTTPSConnection(host='a.b', port=443): Failed to resolve 'a.b' ([Errno -2] Name or service not known)\"", ("'a.b'", 'known')),
+        ("'<pip._vendor.urllib3.connection.HTTPSConnection object at 0x7f>, 'Connection to a.b timed out. (connect timeout=15)'", ('a.b', 'timeout=15')),
+        ("'Cannot connect to proxy.', OSError('Tunnel connection failed: 403 Forbidden')", ('403',)),
+    ],
+)  # fmt: skip
+def test_why_an_index_does_not_answer_is_said_without_what_surrounds_it(shown: str, terms: tuple[str, ...]) -> None:
+    assert has_terms(wheelhouse._reason(shown), *terms)
+
+
+class Installed:
+    """A distribution as importlib.metadata returns it."""
+
+    version = "0.1.0"
+
+    def __init__(self, origin: dict[str, object] | None) -> None:
+        self._origin = origin
+
+    def read_text(self, name: str) -> str | None:
+        assert name == "direct_url.json"
+        return json.dumps(self._origin) if self._origin else None
+
+
+@pytest.mark.parametrize(
+    ("origin", "wanted"),
+    [
+        (None, "zsim==0.1.0"),
+        ({"url": "file:///tmp/zsim.whl", "archive_info": {}}, "zsim @ file:///tmp/zsim.whl"),
+        (
+            {"url": "https://host/zsim.git", "vcs_info": {"vcs": "git", "commit_id": "abc"}},
+            "zsim @ git+https://host/zsim.git@abc",
+        ),
+    ],
+)
+def test_an_installed_distribution_is_had_from_where_it_came(origin: dict[str, object] | None, wanted: str) -> None:
+    assert requirement(cast(importlib.metadata.Distribution, Installed(origin))) == wanted
+
+
+# What wheels must fit
+
+SAID = {
+    "version": [3, 12],
+    "implementation": "cpython",
+    "free_threaded": False,
+    "platform": "linux-aarch64",
+    "libc": ["glibc", "2.31"],
+}
+
+
+def test_linux_takes_the_wheels_of_its_glibc_and_of_older_ones() -> None:
+    aim = wheel_target("h", SAID)
+    assert (aim.version, aim.abi) == ((3, 12), "cp312")
+    assert aim.platforms[0] == "manylinux_2_31_aarch64"
+    assert {"manylinux_2_17_aarch64", "manylinux2014_aarch64", "linux_aarch64"} <= set(aim.platforms)
+    assert "manylinux_2_32_aarch64" not in aim.platforms
+    assert has_terms(str(aim), "3.12", "manylinux_2_31_aarch64")
+
+
+def test_a_mac_and_a_free_threaded_python() -> None:
+    mac = wheel_target("h", {**SAID, "platform": "macosx-14.2-arm64", "libc": ["", ""], "free_threaded": True})
+    assert mac.platforms == ("macosx_14_2_arm64",)
+    assert mac.abi == "cp312t"
+
+
+@pytest.mark.parametrize(
+    ("other", "terms"),
+    [
+        ({"implementation": "pypy"}, ("h", "pypy", "CPython")),
+        ({"libc": ["", ""]}, ("h", "linux-aarch64", "glibc", "macOS")),
+        ({"platform": "win-amd64"}, ("h", "win-amd64", "glibc 2.31", "glibc", "macOS")),
+    ],
+)  # fmt: skip
+def test_what_wheels_are_not_made_for_is_a_line(other: dict[str, object], terms: tuple[str, ...]) -> None:
+    with pytest.raises(HostsError) as caught:
+        wheel_target("h", {**SAID, **other})
+    assert has_terms(str(caught.value), *terms)

@@ -1,0 +1,691 @@
+"""The authority and what it issues: purposes, names, times, files, and when a certificate is made anew."""
+
+import base64
+import errno
+import json
+import os
+import re
+import shlex
+import shutil
+import stat
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from refused import has_terms, refused
+from rights_table import KEYS, ROLES, keys_of
+from rights_table import SCENARIO as RIGHTS_SCENARIO
+from typer.testing import CliRunner
+
+from zsim.errors import BadNameError, InventoryError, RunError, ZsimError
+from zsim.scenario import rights, scenario_file
+from zsim.transport.tls import Identity, own_fault
+from zsim_deploy import certificates, inventory
+from zsim_deploy.certificates import (
+    DAYS,
+    CertificateRequest,
+    Enrolment,
+    access_control,
+    certificate_faults,
+    exposed_keys,
+    issue,
+    renewal_reason,
+)
+from zsim_deploy.cli.cli import app
+from zsim_deploy.hosts.doctor import check_hosts
+
+SCENARIO = """
+name: enrolled
+duration_s: 4
+drones:
+  - {name: drone1, position_m: [0, 0, 0]}
+  - {name: drone2, position_m: [2, 0, 0]}
+clusters:
+  - {name: main, drones: [drone1, drone2]}
+"""
+NOW = datetime(2026, 11, 1, 12, tzinfo=UTC)
+ESTIMATOR = CertificateRequest("h1", "estimator.drone1", ("10.0.0.1",))
+
+
+@pytest.fixture
+def signer(tmp_path: Path) -> certificates.Authority:
+    return certificates.authority(tmp_path, NOW)
+
+
+def read(path: Path) -> x509.Certificate:
+    return x509.load_pem_x509_certificate(path.read_bytes())
+
+
+def test_a_certificate_names_process_and_addresses_and_is_good_for_a_month(tmp_path: Path, signer) -> None:
+    made = read(
+        issue(tmp_path, signer, CertificateRequest("h1", "world", ("10.0.0.1", "lab.local")), NOW) / "certificate.pem"
+    )
+    names = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == "world"
+    assert [str(name) for name in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.1", "127.0.0.1", "::1"]
+    assert names.get_values_for_type(x509.DNSName) == ["lab.local", "localhost"]
+    assert made.not_valid_before_utc == NOW - timedelta(days=1)
+    assert made.not_valid_after_utc == NOW + timedelta(days=30)
+
+
+def test_a_certificate_serves_both_ends_of_a_link_and_signs_nothing(tmp_path: Path, signer) -> None:
+    made = read(issue(tmp_path, signer, ESTIMATOR, NOW) / "certificate.pem")
+    purposes = made.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    assert set(purposes) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+    assert not made.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    made.verify_directly_issued_by(signer.certificate)
+
+
+def test_keys_are_p256_their_owner_s_alone_and_never_shared(tmp_path: Path, signer) -> None:
+    places = [issue(tmp_path, signer, CertificateRequest(host, "recorder"), NOW) for host in ("h1", "h2")]
+    keys = [serialization.load_pem_private_key((place / "key.pem").read_bytes(), None) for place in places]
+    for path in (tmp_path / "ca.key", *(place / "key.pem" for place in places)):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert all(isinstance(key, ec.EllipticCurvePrivateKey) and key.curve.name == "secp256r1" for key in keys)
+    assert len({(tmp_path / "ca.key").read_bytes(), *((place / "key.pem").read_bytes() for place in places)}) == 3
+    assert not list(tmp_path.rglob("*.new"))
+
+
+def test_an_authority_is_kept_until_another_is_forced(tmp_path: Path, signer) -> None:
+    issue(tmp_path, signer, ESTIMATOR, NOW)
+    again = certificates.authority(tmp_path, NOW)
+    assert again.certificate == signer.certificate
+    assert renewal_reason(tmp_path, again.certificate, ESTIMATOR, NOW) is None
+    other = certificates.authority(tmp_path, NOW, force=True)
+    assert other.certificate != signer.certificate
+    assert has_terms(renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW), "another", "authority")
+
+
+@pytest.mark.parametrize("missing", ["ca.pem", "ca.key"])
+def test_half_an_authority_is_not_written_over(tmp_path: Path, signer, missing: str) -> None:
+    (tmp_path / missing).unlink()
+    left = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with refused(RunError, str(missing), "missing", "--force"):
+        certificates.authority(tmp_path, NOW)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == left
+
+
+def test_an_authority_of_no_use_is_a_line(tmp_path: Path, signer) -> None:
+    with refused(RunError, "ca.pem", "authority", "expired", "2031-10-31", "--force"):
+        certificates.authority(tmp_path, NOW + timedelta(days=1826))
+    (tmp_path / "ca.key").write_text("nothing")
+    with refused(RunError, "ca.key", "no private key", "--force"):
+        certificates.authority(tmp_path, NOW)
+    other = tmp_path / "other"
+    certificates.authority(other, NOW)
+    shutil.copy(other / "ca.key", tmp_path / "ca.key")
+    with refused(RunError, "ca.key", "not", "key", "ca.pem"):
+        certificates.authority(tmp_path, NOW)
+
+
+def test_a_certificate_is_made_anew_when_it_would_not_do(tmp_path: Path, signer) -> None:
+    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "new"
+    place = issue(tmp_path, signer, ESTIMATOR, NOW)
+    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) is None
+    assert (
+        renewal_reason(tmp_path, signer.certificate, ESTIMATOR._replace(addresses=("10.0.0.2",)), NOW)
+        == "other addresses"
+    )
+    assert (
+        renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW + timedelta(days=DAYS)) == "expired on 2026-12-01"
+    )
+    (place / "certificate.pem").write_text("nothing")
+    assert has_terms(renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW), "read")
+
+
+@pytest.mark.parametrize("left", ["ca.pem", "certificate.pem", "key.pem"])
+def test_files_of_which_some_are_older_are_made_anew_and_shown(tmp_path: Path, signer, left: str) -> None:
+    """As whoever renewed them leaves them when it is stopped in between."""
+    older = (issue(tmp_path, signer, ESTIMATOR, NOW) / left).read_bytes()
+    other = certificates.authority(tmp_path, NOW, force=True)
+    place = issue(tmp_path, other, ESTIMATOR, NOW)
+    assert renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW) is None
+    (place / left).write_bytes(older)
+    fault = "without its key" if left == "key.pem" else "of another authority"
+    assert renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW) == fault
+    assert [each.fault for each in certificates.show(tmp_path, NOW)] == [fault]
+    issue(tmp_path, other, ESTIMATOR, NOW)
+    assert renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW) is None
+
+
+def test_a_certificate_and_the_key_of_another_one_are_made_anew(tmp_path: Path, signer) -> None:
+    key = (issue(tmp_path, signer, ESTIMATOR, NOW) / "key.pem").read_bytes()
+    place = issue(tmp_path, signer, ESTIMATOR, NOW)
+    (place / "key.pem").write_bytes(key)
+    assert has_terms(renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW), "without", "key")
+
+
+def of_no_curve() -> str:
+    """Return a private key on a curve that there is not."""
+    encodings = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    key = ec.generate_private_key(ec.SECP256R1()).private_bytes(serialization.Encoding.DER, *encodings)
+    p256 = bytes.fromhex("2a8648ce3d030107")  # 1.2.840.10045.3.1.7
+    body = base64.b64encode(key.replace(p256, p256[:-1] + b"\x70")).decode()
+    return f"-----BEGIN PRIVATE KEY-----\n{body}\n-----END PRIVATE KEY-----\n"
+
+
+@pytest.mark.parametrize("content", ["", "nothing", "-----BEGIN PRIVATE KEY-----\n", of_no_curve()], ids=range(4))
+def test_a_key_that_is_none_is_made_anew(tmp_path: Path, signer, content: str) -> None:
+    place = issue(tmp_path, signer, ESTIMATOR, NOW)
+    (place / "key.pem").write_text(content)
+    assert has_terms(renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW), "read")
+    (shown,) = certificates.show(tmp_path, NOW)
+    assert has_terms(shown.fault, "read")
+
+
+def test_what_is_there_is_shown(tmp_path: Path, signer) -> None:
+    issue(tmp_path, signer, ESTIMATOR, NOW)
+    issue(tmp_path, signer, CertificateRequest("h1", "world"), NOW, days=-0.5)
+    shown = certificates.show(tmp_path, NOW)
+    assert [(each.process, each.fault) for each in shown] == [
+        ("estimator.drone1", ""),
+        ("world", "expired on 2026-11-01"),
+    ]
+    assert shown[0].addresses == ("10.0.0.1", "localhost", "127.0.0.1", "::1")
+
+
+def test_a_folder_that_cannot_be_written_is_a_line() -> None:
+    with refused(RunError, "/proc/certs/ca.key", "written"):
+        certificates.authority(Path("/proc/certs"), NOW)
+
+
+@pytest.mark.parametrize(
+    ("begin_days", "days", "terms"),
+    [
+        (0.0, 30.0, ()),
+        (0.0, -0.5, ("recorder", "expired")),
+        (2.0, 30.0, ("recorder", "valid")),
+    ],
+)
+def test_a_process_judges_the_time_of_its_own_certificate(
+    tmp_path: Path, begin_days: float, days: float, terms: tuple[str, ...]
+) -> None:
+    now = datetime.now(UTC)
+    signer = certificates.authority(tmp_path, now)
+    folder = issue(tmp_path, signer, CertificateRequest("h1", "recorder"), now + timedelta(days=begin_days), days)
+    fault = own_fault(Identity("h1", folder))
+    assert has_terms(str(fault), *terms) if terms else fault is None
+
+
+# The command, and what a run lacks
+
+
+def prepared(folder: Path, hosts: str) -> Path:
+    """Write inventory and scenario into a new folder."""
+    folder.mkdir()
+    (folder / "hosts.yaml").write_text(hosts)
+    (folder / "scenario.yaml").write_text(SCENARIO)
+    return folder
+
+
+def run(*arguments: str | Path) -> Any:
+    return CliRunner().invoke(app, ["certs", *map(str, arguments)])
+
+
+def init(folder: Path, *options: str) -> Any:
+    """Run `zsim certs init`; errors come as they are."""
+    done = run("init", folder / "hosts.yaml", "--scenario", folder / "scenario.yaml", *options)
+    if isinstance(done.exception, ZsimError):
+        raise done.exception
+    return done
+
+
+LAB_HOSTS = """
+hosts:
+  h1: {address: 127.0.0.1, port: 1}
+  h2: {address: 127.0.0.1, port: 1, router: field}
+routers:
+  field: {host: h2}
+roles: {world: h1, "controller.*": h1, "estimator.*": h2}
+"""
+NAMES = ["world on h1", "recorder on h1", "estimator.drone1 on h2", "estimator.drone2 on h2"]
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    """Return a lab whose name a shell would take for two, with inventory, scenario and no certificates."""
+    return prepared(tmp_path / "our lab", LAB_HOSTS)
+
+
+def lacking(lab: Path, now: datetime | None = None) -> list[str]:
+    """Return what the scenario of a lab lacks, without the lab of the certificates that each line begins with."""
+    placed = inventory.load(lab / "hosts.yaml")
+    places = inventory.placement(placed, scenario_file.load(lab / "scenario.yaml"))
+    found = certificate_faults(placed, places, now or datetime.now(UTC))
+    assert all(line.startswith(f"{lab / 'certs'}: ") and "\n" not in line for line in found)
+    return [line.removeprefix(f"{lab / 'certs'}: ") for line in found]
+
+
+def advised(lab: Path, line: str) -> list[str]:
+    """Return the words after `zsim certs` of the command that a line advises, for the scenario of a lab."""
+    (command,) = re.findall("`(.*)`", line)
+    words = shlex.split(command)
+    assert words[:2] == ["zsim", "certs"]
+    return [str(lab / "scenario.yaml") if word == "FILE" else word for word in words[2:]]
+
+
+def test_nothing_is_lacking_after_init(lab: Path) -> None:
+    assert init(lab).exit_code == 0
+    assert lacking(lab) == []
+
+
+def test_without_certificates_the_advice_works_as_it_is_given(lab: Path) -> None:
+    (line,) = lacking(lab)
+    init_command = f"zsim certs init '{lab}/hosts.yaml' --scenario FILE"
+    assert has_terms(line, "no certificates", init_command, "security.insecure")
+    assert run(*advised(lab, line)).exit_code == 0
+    assert lacking(lab) == []
+
+
+def test_certificates_whose_time_is_over_are_named_and_the_advice_renews_them(lab: Path) -> None:
+    init(lab, "--days", "20")
+    later = datetime.now(UTC) + timedelta(days=20, minutes=1)
+    (line,) = lacking(lab, later)
+    assert re.search(r"expired on \d{4}-\d\d-\d\d: ", line)
+    renew = f"zsim certs init '{lab}/hosts.yaml' --scenario FILE --renew"
+    assert has_terms(line, "expired", ", ".join(NAMES), "2 more", renew)
+    assert run(*advised(lab, line)).exit_code == 0
+    assert lacking(lab, later) == []
+
+
+@pytest.mark.parametrize(
+    ("lost", "terms"),
+    [
+        ("h2/estimator.drone1/key.pem", ("certificate missing", "estimator.drone1", "h2")),
+        ("h2/router.field", ("certificate missing", "router.field", "h2")),
+        ("h1/world.access.json", ("access control missing", "world", "h1")),
+    ],
+)
+def test_what_is_missing_is_named(lab: Path, lost: str, terms: tuple[str, ...]) -> None:
+    init(lab)
+    path = lab / "certs" / lost
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    (line,) = lacking(lab)
+    assert has_terms(line, *terms)
+    assert "--renew" not in line
+    init(lab)
+    assert lacking(lab) == []
+
+
+def test_what_no_process_of_the_run_needs_may_be_missing(lab: Path) -> None:
+    """An estimator has one for every host, so that it can be moved."""
+    init(lab)
+    shutil.rmtree(lab / "certs/h1/estimator.drone1")
+    shutil.rmtree(lab / "certs/operators")
+    assert lacking(lab) == []
+
+
+def test_who_listens_needs_a_certificate_for_its_address_and_a_client_does_not(lab: Path) -> None:
+    init(lab)
+    (lab / "hosts.yaml").write_text(LAB_HOSTS.replace("127.0.0.1", "10.0.0.7"))
+    (line,) = lacking(lab)
+    assert has_terms(line, "other addresses", "world", "h1", "router.field", "h2")
+
+
+@pytest.mark.parametrize("content", ["", "half a key"])
+def test_a_key_that_is_none_is_named_and_init_makes_it_anew(lab: Path, content: str) -> None:
+    init(lab)
+    key = lab / "certs/h1/world/key.pem"
+    key.write_text(content)
+    (line,) = lacking(lab)
+    assert has_terms(line, "certificate", "read", "world", "h1")
+    assert "1 certificates made" in init(lab).stdout
+    assert lacking(lab) == []
+
+
+def test_an_authority_that_is_none_is_a_line(lab: Path) -> None:
+    init(lab)
+    (lab / "certs/ca.pem").write_text("")
+    placed = inventory.load(lab / "hosts.yaml")
+    (line,) = certificate_faults(placed, None, datetime.now(UTC))
+    assert has_terms(line, f"{lab}/certs/ca.pem", "no certificate")
+
+
+def test_an_insecure_inventory_needs_none(lab: Path) -> None:
+    (lab / "hosts.yaml").write_text(LAB_HOSTS + "security: {insecure: true}\n")
+    assert lacking(lab) == []
+
+
+def test_the_doctor_tells_of_certificates_with_and_without_a_scenario(lab: Path) -> None:
+    """Its hosts are none: nobody listens on port 1."""
+    placed = inventory.load(lab / "hosts.yaml")
+    places = inventory.placement(placed, scenario_file.load(lab / "scenario.yaml"))
+    for given in (None, places):
+        assert any(has_terms(line, "no certificates") for line in check_hosts(placed, given).faults)
+    init(lab)
+    (lab / "certs/h1/world/key.pem").chmod(0o644)
+    for given in (None, places):
+        found = check_hosts(placed, given)
+        assert [line for line in found.faults if "certificate" in line] == []
+        assert any(has_terms(line, "read", "others") for line in found.warnings)
+    shutil.rmtree(lab / "certs/h1/world")
+    for given in (None, places):
+        assert any(has_terms(line, "certificate missing", "world", "h1") for line in check_hosts(placed, given).faults)
+
+
+# The commands
+
+
+@pytest.mark.parametrize("days", ["0", "-1", "nan", "inf", "1e-9", "826"])
+def test_a_lifetime_that_is_none_is_refused_in_a_line(lab: Path, days: str) -> None:
+    done = init(lab, "--days", days)
+    assert done.exit_code == 2
+    assert has_terms(done.output, "0.05", "825")
+    assert not (lab / "certs").exists()
+
+
+def test_show_without_certificates_is_a_line(lab: Path) -> None:
+    done = run("show", lab / "hosts.yaml")
+    assert isinstance(done.exception, RunError)
+    assert has_terms(str(done.exception), f"{lab}/certs", "certificates", f"'{lab}/hosts.yaml'", "--scenario", "FILE")
+    assert done.stdout == ""
+
+
+def test_show_advises_a_command_that_mends(lab: Path) -> None:
+    init(lab)
+    now = datetime.now(UTC)
+    signer = certificates.authority(lab / "certs", now)
+    assert run("show", lab / "hosts.yaml").stderr == ""
+    for days, state in ((-0.5, "expired on "), (1.0, "ends soon")):
+        issue(lab / "certs", signer, CertificateRequest("h1", "world", ("127.0.0.1",)), now, days)
+        shown = run("show", lab / "hosts.yaml")
+        (row,) = [line for line in shown.stdout.splitlines() if state in line]
+        assert "world" in row
+        assert has_terms(shown.stderr, "zsim certs init")
+        assert run(*advised(lab, shown.stderr)).exit_code == 0
+        assert run("show", lab / "hosts.yaml").stderr == ""
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640])
+def test_private_keys_that_others_can_read_are_warned_of_in_a_line(lab: Path, mode: int) -> None:
+    assert init(lab).stderr == ""
+    placed = inventory.load(lab / "hosts.yaml")
+    assert exposed_keys(placed) is None
+    for path in ("ca.key", "h1/world/key.pem", "h2/router.field/key.pem"):
+        (lab / "certs" / path).chmod(mode)
+    (lab / "certs/ca.pem").chmod(0o644)
+    assert has_terms(exposed_keys(placed), f"{lab}/certs/ca.key", "2", "read", "-R", "go=", f"'{lab}/certs'")
+    for done in (init(lab), run("show", lab / "hosts.yaml")):
+        assert done.exit_code == 0
+        assert done.stderr == f"warning: {exposed_keys(placed)}\n"
+
+
+HOSTS = """
+hosts:
+  lab: {address: 10.0.0.1}
+  onboard1: {address: 10.1.0.1, router: field}
+  onboard2: {address: 10.1.0.2, router: field}
+  hut: {address: hut.local, router: hill}
+routers:
+  field: {host: lab}
+  hill: {host: hut, upstream: field}
+roles:
+  world: lab
+  controller.main: hut
+  "estimator.*": [onboard1, onboard2]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return prepared(tmp_path / "site", HOSTS)
+
+
+def enrolment(folder: Path, *operators: str) -> Enrolment:
+    return Enrolment(inventory.load(folder / "hosts.yaml"), scenario_file.load(folder / "scenario.yaml"), operators)
+
+
+def test_world_and_routers_have_one_certificate_and_who_may_move_has_one_for_every_host(folder: Path) -> None:
+    wanted = enrolment(folder, "main", "anna@hut").certificates()
+    assert [each for each in wanted if each.process == "world"] == [CertificateRequest("lab", "world", ("10.0.0.1",))]
+    assert [each for each in wanted if each.process == "router.hill"] == [
+        CertificateRequest("hut", "router.hill", ("hut.local",))
+    ]
+    for process in ("recorder", "estimator.drone1", "estimator.drone2", "controller.main"):
+        assert [each for each in wanted if each.process == process] == [
+            CertificateRequest("lab", process, ("10.0.0.1",)),
+            CertificateRequest("onboard1", process, ("10.1.0.1",)),
+            CertificateRequest("onboard2", process, ("10.1.0.2",)),
+            CertificateRequest("hut", process, ("hut.local",)),
+        ]
+    assert [each for each in wanted if each.process.startswith("operator.")] == [
+        CertificateRequest("operators", "operator.main"),
+        CertificateRequest("hut", "operator.anna", ("hut.local",)),
+    ]
+
+
+def test_the_driver_of_an_external_drone_has_a_certificate_and_is_let_in(folder: Path) -> None:
+    """It runs wherever its aircraft can be reached, and the scenario need not expect it."""
+    external = SCENARIO.replace("position_m: [2, 0, 0]", "position_m: [2, 0, 0], body: external")
+    (folder / "scenario.yaml").write_text(external)
+    wanted = [each for each in enrolment(folder).certificates() if each.process.startswith("driver.")]
+    assert [(each.host, each.process) for each in wanted] == [
+        (host, "driver.drone2") for host in ("lab", "onboard1", "onboard2", "hut")
+    ]
+    assert all("driver.drone2" in lets_in(rules) for _, _, rules in enrolment(folder).access())
+    (folder / "scenario.yaml").write_text(SCENARIO)
+    assert not any("driver.drone2" in lets_in(rules) for _, _, rules in enrolment(folder).access())
+
+
+def lets_in(rules: dict[str, Any]) -> set[str]:
+    return {name for subject in rules["subjects"] for name in subject.get("cert_common_names", ())}
+
+
+def publishes(rules: dict[str, Any], name: str) -> set[str]:
+    """Return the drones and clusters about which a common name may publish."""
+    found = [rule for rule in rules["rules"] if rule["id"] == f"{name} ingress put"]
+    keys = [key.split("/") for rule in found for key in rule["key_exprs"]]
+    return {parts[2] for parts in keys if parts[1] in ("drone", "cluster")}
+
+
+def test_each_listening_process_lets_in_who_comes_to_it(folder: Path) -> None:
+    access = {(host, process): rules for host, process, rules in enrolment(folder, "main", "anna@hut").access()}
+    world, field, hill = access["lab", "world"], access["lab", "router.field"], access["hut", "router.hill"]
+    roles = {"recorder", "estimator.drone1", "estimator.drone2", "controller.main"}
+    assert lets_in(world) == {*roles, "operator.main", "router.field"}
+    assert lets_in(field) == {*roles, "router.hill", "world"}
+    assert lets_in(hill) == {*roles, "operator.anna", "router.field"}
+    assert publishes(field, "estimator.drone1") == publishes(hill, "estimator.drone1") == {"drone1"}
+    assert publishes(hill, "controller.main") == {"drone1", "drone2", "main"}
+    assert publishes(field, "router.hill") == {"drone1", "drone2", "main", "*"}
+    assert publishes(world, "router.field") == {"drone1", "drone2", "main", "*"}
+    assert publishes(hill, "router.field") == set()
+
+
+def test_a_router_of_no_host_lets_in_who_comes_from_below_alone(folder: Path) -> None:
+    (folder / "hosts.yaml").write_text(HOSTS.replace(", router: field", ""))
+    access = {process: rules for _, process, rules in enrolment(folder).access()}
+    assert lets_in(access["router.field"]) == {"router.hill", "world"}
+
+
+def test_an_operator_may_be_at_several_places(folder: Path) -> None:
+    found = enrolment(folder, "anna", "anna@hut", "anna")
+    places = [each.host for each in found.certificates() if each.process == "operator.anna"]
+    assert places == ["operators", "hut"]
+    access = {process: rules for _, process, rules in found.access()}
+    assert all("operator.anna" in lets_in(access[process]) for process in ("world", "router.hill"))
+    assert "operator.anna" not in lets_in(access["router.field"])
+
+
+@pytest.mark.parametrize("host", ["moon", ""])
+def test_an_operator_at_no_host_is_a_line(folder: Path, host: str) -> None:
+    with pytest.raises(InventoryError) as caught:
+        enrolment(folder, f"anna@{host}")
+    assert has_terms(str(caught.value), "hosts.yaml", "'anna'", f"'{host}'", "hosts", "onboard1", "onboard2")
+
+
+@pytest.mark.parametrize("name", ["../../../oops", "a" * 33, "Anna", "", "operator.", "operator.a/b"])
+def test_an_operator_whose_name_is_none_is_a_line(folder: Path, name: str) -> None:
+    with refused(BadNameError, "operator", "1", "32", "0-9"):
+        enrolment(folder, name)
+
+
+def test_an_operator_s_longest_name_is_one_of_the_contract_and_of_a_certificate(folder: Path) -> None:
+    init(folder, "--operator", "a" * 32)
+    assert (folder / "certs/operators" / f"operator.{'a' * 32}" / "certificate.pem").is_file()
+
+
+def operators_of(folder: Path, host: str, process: str) -> set[str]:
+    """Return the operators whom the access control of a process that listens lets in."""
+    rules = json.loads((folder / "certs" / host / f"{process}.access.json").read_text())
+    return {name for name in lets_in(rules) if name.startswith("operator.")}
+
+
+def test_operators_who_are_there_stay(folder: Path) -> None:
+    init(folder)
+    assert operators_of(folder, "lab", "world") == {"operator.main"}
+    init(folder, "--operator", "anna@hut")
+    assert operators_of(folder, "lab", "world") == {"operator.main"}
+    assert operators_of(folder, "hut", "router.hill") == {"operator.anna"}
+    assert has_terms(init(folder, "--operator", "ben").stdout, "1", "certificates", "21")
+    assert operators_of(folder, "lab", "world") == {"operator.main", "operator.ben"}
+    assert operators_of(folder, "hut", "router.hill") == {"operator.anna"}
+
+
+def test_an_operator_whose_folder_is_gone_is_let_in_no_more(folder: Path) -> None:
+    init(folder, "--operator", "anna", "--operator", "ben")
+    assert operators_of(folder, "lab", "world") == {"operator.anna", "operator.ben"}
+    shutil.rmtree(folder / "certs/operators/operator.anna")
+    init(folder)
+    assert operators_of(folder, "lab", "world") == {"operator.ben"}
+
+
+def test_access_control_that_cannot_be_written_is_a_line_and_the_former_stays(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    init(folder)
+    former = (folder / "certs/lab/world.access.json").read_bytes()
+    replace = Path.replace
+
+    def full(self: Path, target: Path) -> Path:
+        if target.name == "world.access.json":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", full)
+    with refused(RunError, "world.access.json", "written", os.strerror(errno.ENOSPC)):
+        init(folder, "--operator", "anna")
+    assert (folder / "certs/lab/world.access.json").read_bytes() == former
+
+
+def test_init_makes_everything_once_and_show_lists_it(folder: Path) -> None:
+    assert has_terms(init(folder).stdout, "20", "certificates", "0")
+    made = {path: path.read_bytes() for path in (folder / "certs").rglob("*.pem")}
+    assert has_terms(init(folder).stdout, "0", "certificates", "20")
+    assert {path: path.read_bytes() for path in (folder / "certs").rglob("*.pem")} == made
+    assert (folder / "certs" / "hut" / "router.hill.access.json").is_file()
+    shown = CliRunner().invoke(app, ["certs", "show", str(folder / "hosts.yaml")], catch_exceptions=False).stdout
+    assert len(shown.splitlines()) == 20
+    assert has_terms(init(folder, "--renew").stdout, "20", "certificates", "0")
+    assert (folder / "certs" / "ca.pem").read_bytes() == made[folder / "certs" / "ca.pem"]
+
+
+ACTS = {"r": "reads", "p": "writes", "g": "asks", "a": "answers", "t": "tokens", "w": "watches"}
+# What each act is on the wire at the process that listens: (flow, message); all of them are needed.
+WIRE = {
+    "r": (("ingress", "declare_subscriber"), ("egress", "put")),
+    "p": (("ingress", "put"), ("egress", "declare_subscriber")),
+    "g": (("ingress", "query"), ("egress", "reply")),
+    "a": (("ingress", "declare_queryable"), ("egress", "query"), ("ingress", "reply")),
+    "t": (("ingress", "liveliness_token"),),
+    "w": (
+        ("ingress", "liveliness_query"),
+        ("ingress", "declare_liveliness_subscriber"),
+        ("egress", "liveliness_token"),
+    ),
+}
+TOKENS = tuple(key for key in KEYS if key.startswith("process/") and key.count("/") == 1)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Any:
+    return scenario_file.from_text(RIGHTS_SCENARIO)
+
+
+@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize("act", ACTS)
+def test_the_rights_of_a_role_are_those_of_the_table(scenario: Any, role: str, act: str) -> None:
+    expressions = getattr(rights.of(role, scenario), ACTS[act])
+    asked = TOKENS if act in "tw" else KEYS
+    assert {key for key in asked if rights.permits(expressions, key)} == keys_of(role, act)
+
+
+@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize("act", ACTS)
+def test_zenoh_is_told_what_the_table_says(scenario: Any, role: str, act: str) -> None:
+    rules = access_control(scenario, ROLES, {})
+    asked = TOKENS if act in "tw" else KEYS
+    assert {key for key in asked if allows(rules, role, WIRE[act], key)} == keys_of(role, act)
+
+
+def allows(rules: dict[str, Any], name: str, needed: tuple[tuple[str, str], ...], key: str) -> bool:
+    """Tell whether all that is needed is allowed to a common name on a key, as Zenoh decides it."""
+    subjects = {subject["id"] for subject in rules["subjects"] if name in subject.get("cert_common_names", (name,))}
+    ids = {rule for policy in rules["policies"] if subjects & set(policy["subjects"]) for rule in policy["rules"]}
+    mine = [rule for rule in rules["rules"] if rule["id"] in ids]
+    return all(
+        any(
+            flow in rule["flows"] and message in rule["messages"] and includes(rule["key_exprs"], f"zsim/{key}")
+            for rule in mine
+        )
+        for flow, message in needed
+    )
+
+
+def includes(expressions: list[str], key: str) -> bool:
+    return any(zenoh.KeyExpr(expression).includes(zenoh.KeyExpr(key)) for expression in expressions)
+
+
+def test_what_is_not_granted_is_denied_and_zenoh_takes_the_whole(scenario: Any) -> None:
+    rules = access_control(scenario, ROLES, {"router.site": ["estimator.drone2"]}, ["world"])
+    assert rules["default_permission"] == "deny"
+    assert {rule["permission"] for rule in rules["rules"]} == {"allow"}
+    config = zenoh.Config()
+    config.insert_json5("access_control", json.dumps(rules))
+
+
+def test_a_router_may_do_what_those_behind_it_may_and_no_more(scenario: Any) -> None:
+    rules = access_control(scenario, (), {"router.site": ["estimator.drone1", "controller.main"]})
+    for act in ACTS:
+        asked = TOKENS if act in "tw" else KEYS
+        allowed = {key for key in asked if allows(rules, "router.site", WIRE[act], key)}
+        assert allowed == keys_of("estimator.drone1", act) | keys_of("controller.main", act)
+
+
+def test_who_is_not_named_gets_nothing(scenario: Any) -> None:
+    rules = access_control(scenario, ["estimator.drone1"], {})
+    assert not any(allows(rules, "estimator.drone2", WIRE[act], key) for act in ACTS for key in KEYS)
+
+
+@pytest.mark.parametrize(
+    ("process", "like"),
+    [("my.drone1", "estimator.drone1"), ("fence.main", "controller.main")],
+)
+def test_a_process_that_takes_the_place_of_ours_has_its_rights(scenario: Any, process: str, like: str) -> None:
+    own = {f"{of}/{name}" for of in ("process", "view/estimates") for name in (like, process)}
+
+    def of_others(name: str, act: str) -> set[str]:
+        expressions = getattr(rights.of(name, scenario), ACTS[act])
+        return {expression for expression in expressions if not any(expression.startswith(key) for key in own)}
+
+    assert all(of_others(process, act) == of_others(like, act) for act in ACTS)
+
+
+@pytest.mark.parametrize(
+    "process", ["world.spare", "recorder.spare", "fence.round", "console", "estimator.drone9", "controller.drone1"]
+)
+def test_a_process_about_nothing_known_hears_what_all_are_told(scenario: Any, process: str) -> None:
+    found = rights.of(process, scenario)
+    assert found.reads == ("world/info", "clock", "world/event", "world/faults")
+    assert all(key.startswith(f"process/{process}/") for key in found.writes)
+
+
+def test_the_federation_s_name_stands_before_every_key(scenario: Any) -> None:
+    rules = access_control(scenario_file.from_text(RIGHTS_SCENARIO + "federation: lab2\n"), ROLES, {})
+    assert all(key.startswith("lab2/") for rule in rules["rules"] for key in rule["key_exprs"])
