@@ -16,7 +16,7 @@ from benchmarks import grid
 from zsim.record import RecordWriter
 from zsim.runtime.bus import Bus
 from zsim_analysis.in_process import agents
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 WARM_NS = 1_000_000_000  # simulated, not counted
 

@@ -89,7 +89,7 @@ def page(sheet: Sheet) -> str:
     lines(
         sheet, {"in_process": "everything in one process"}, PICTURES / "bench_e.svg", "Cost of a drone", "drones", "in"
     )
-    picture = "![CPU time per drone-second](pictures/bench_e.svg)"
+    picture = "![CPU time per drone-second](results/bench_e.svg)"
     return "\n\n".join([_growth(sheet), picture, _starts(sheet), _onboards(sheet)])
 
 

@@ -100,7 +100,7 @@ def page(sheet: Sheet) -> str:
     """Return the measured section, and draw its picture."""
     lines(sheet, LABELS, PICTURES / "bench_b.svg", "Drones in the air, no messages", "drones")
     steps = table(["", "step", "leaves out"], [[c.label, c.step, c.lacks] for c in CONTENDERS.values()])
-    picture = "![drone-seconds per CPU second](pictures/bench_b.svg)"
+    picture = "![drone-seconds per CPU second](results/bench_b.svg)"
     return "\n\n".join([ratios(sheet, LABELS, "zsim"), _goals(sheet), steps, picture])
 
 

@@ -79,7 +79,7 @@ def command(contender: Contender, size: int, seconds: float) -> list[str]:
 def page(sheet: Sheet) -> str:
     """Return the measured section, and draw its picture."""
     lines(sheet, LABELS, PICTURES / "bench_a.svg", "Lockstep with nothing to compute", "agents")
-    return "\n\n".join([ratios(sheet, LABELS, "zsim"), _goals(sheet), "![steps per second](pictures/bench_a.svg)"])
+    return "\n\n".join([ratios(sheet, LABELS, "zsim"), _goals(sheet), "![steps per second](results/bench_a.svg)"])
 
 
 def _goals(sheet: Sheet) -> str:

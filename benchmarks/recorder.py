@@ -19,7 +19,7 @@ from benchmarks import grid, run
 from benchmarks.child import RefusedError
 from benchmarks.peers import ROOT
 from benchmarks.progress import Progress
-from benchmarks.run import CLI
+from benchmarks.run import CLI, role_of
 from benchmarks.sheet import Sheet
 from benchmarks.table import figure, spread, table
 from zsim.contract.messages import REFUSALS
@@ -107,7 +107,7 @@ def _looks(launcher: subprocess.Popen[str], record: Path) -> Iterator[tuple[floa
 def _recorder(launcher: int) -> psutil.Process | None:
     try:
         children = psutil.Process(launcher).children()
-        return next((child for child in children if child.cmdline()[3:4] == ["record"]), None)
+        return next((child for child in children if role_of(child) == "record"), None)
     except psutil.NoSuchProcess:
         return None
 

@@ -17,6 +17,7 @@ import psutil
 from benchmarks.child import RefusedError
 from zsim.contract import run_messages
 from zsim.record import RecordReader
+from zsim_deploy.inventory import MODULE
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 TIMEOUT_S = 600.0
@@ -98,18 +99,22 @@ def _cpu_by_role(launcher: int) -> dict[str, float]:
     try:
         parent = psutil.Process(launcher)
         for process in [parent, *parent.children()]:
-            words = [word for word in process.cmdline() if word]  # a role that was forked has empty ones behind it
             times = process.cpu_times()
-            found["launcher" if process.pid == launcher else _role(words)] = times.user + times.system
+            found["launcher" if process.pid == launcher else role_of(process)] = times.user + times.system
     except psutil.NoSuchProcess:
         return found
     return found
 
 
-def _role(words: list[str]) -> str:
-    """Return `role.thing` of a child's command line; that from which roles are forked is the fork server."""
-    if words[2:3] != ["zsim_deploy.cli"]:
+def role_of(process: psutil.Process) -> str:
+    """Return `role.thing` of a process of a run, `forkserver` of the one from which roles are forked.
+
+    Raises:
+        psutil.NoSuchProcess: it has ended.
+    """
+    words = [word for word in process.cmdline() if word]  # a forked role has empty words at the end
+    if words[1 : 1 + len(MODULE)] != [*MODULE]:
         return "forkserver"
-    words = words[3:]
-    thing = words[words.index("--") + 1 :] if "--" in words else []
-    return ".".join([*words[:1], *thing])
+    words = words[1 + len(MODULE) :]
+    things = words[words.index("--") + 1 :] if "--" in words else []
+    return ".".join([*words[:1], *things])

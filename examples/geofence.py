@@ -20,7 +20,7 @@ from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.transport.connection import find_world
 from zsim_analysis.in_process import agents
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 
 class Geofence(Agent):

@@ -19,7 +19,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import ESTIMATORS, Scenario
 from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.formation.controller import Controller
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 DRONE, SETTLED_S = "drone1", 10.0  # errors before are those of the first fixes
 MINE = "my_estimator:MyEstimator"  # beside this file

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadGroupScheduling
 
-from zsim_deploy.roles.priority import lower
+from zsim_deploy.roles.stop_channel import lower_priority
 
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
 LEAST = 3  # workers of which one is quiet
@@ -47,4 +47,4 @@ def pytest_configure(config: pytest.Config) -> None:
     worker = getattr(config, "workerinput", None)
     if worker and sys.platform == "linux" and worker["workerid"] == quiet_one(worker["workercount"]):
         os.setsid()
-        lower(NICE)
+        lower_priority(NICE)

@@ -1,4 +1,4 @@
-"""The agents of a process, made by the table of roles: names and patterns of a command line against a scenario's."""
+"""Makes the agents of a process from names and patterns, and checks the classes and plans of a scenario."""
 
 from collections.abc import Callable, Iterator, Sequence
 from fnmatch import fnmatchcase
@@ -7,8 +7,7 @@ from typing import Any
 
 from zsim.contract.messages import Info
 from zsim.errors import DocumentError, NotTrustedError, RunError, ScenarioError
-from zsim.runtime.agent import Agent
-from zsim.runtime.group import AgentGroup
+from zsim.runtime.agent import Agent, AgentGroup
 from zsim.runtime.inbox import output_hold_ns
 from zsim.scenario.role_table import AGENTS, agent_names
 from zsim.scenario.scenario import Scenario
@@ -18,25 +17,22 @@ NAMED_MAX = 10  # of the known names in a refusal
 
 
 def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Return the known names that are named or that match a pattern such as `drone*`, in their own order.
+    """Return the known names that are listed or match a pattern such as `drone*`, in the order of `known`.
 
     Raises:
-        RunError: a pattern matches none; `what` names in the message what was looked for.
+        RunError: a pattern matches none; `what` says in the message what it is.
     """
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in known):
             how = "match" if any(sign in pattern for sign in "*?[") else "be"
-            raise RunError(f"{what} is {pattern!r}; must {how} one of {_listed(known)}")
+            more = [f"and {len(known) - NAMED_MAX} more"] if len(known) > NAMED_MAX else []
+            listed = ", ".join([*known[:NAMED_MAX], *more]) or "none"
+            raise RunError(f"{what} is {pattern!r}; must {how} one of {listed}")
     return [name for name in known if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 
-def _listed(names: Sequence[str]) -> str:
-    more = [f"and {len(names) - NAMED_MAX} more"] if len(names) > NAMED_MAX else []
-    return ", ".join([*names[:NAMED_MAX], *more]) or "none"
-
-
 def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]:
-    """Return the process names of the agents that are meant, role by role: estimators first.
+    """Return the process names of the agents that match, role by role: estimators first.
 
     Raises:
         RunError: a pattern matches none.
@@ -45,12 +41,12 @@ def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]
 
 
 def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> None:
-    """Refuse a scenario that names a class which cannot be loaded here.
+    """Check that the classes that a scenario names can be loaded here.
 
     Args:
         scenario: resolved.
-        source: opens the line of a fault: the name of its file.
-        elsewhere: the controllers may run on other hosts; spaces and laws need to be there alone.
+        source: name of its file, with which each fault begins.
+        elsewhere: whether the controllers run on other hosts, where alone spaces and laws are needed.
 
     Raises:
         ScenarioError: what is wrong with each name, or with its class, a line each.
@@ -58,17 +54,20 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
     from zsim_agents.estimation.drone_estimator import estimator_class
 
     loads = [partial(estimator_class, scenario.estimation.chosen(), f"{source}: estimation.algorithm")]
-    faults = [
-        fault
-        for load in [*loads, *(() if elsewhere else _formation_classes(scenario, source))]
-        for fault in _faults(load)
-    ]
+    faults = []
+    for load in [*loads, *(() if elsewhere else _formation_classes(scenario, source))]:
+        try:
+            load()
+        except NotTrustedError:
+            continue  # it is there
+        except DocumentError as error:
+            faults += error.faults
     if faults:
         raise ScenarioError(faults)
 
 
 def check_plans(scenario: Scenario, source: str) -> None:
-    """Refuse a scenario with a plan that its controller would refuse: an expression, a name, a template.
+    """Check the plans of a scenario as its controllers would: expressions, names, templates.
 
     A run as processes leaves this to its controllers, which load the mathematics of formations anyway.
 
@@ -90,7 +89,7 @@ def check_plans(scenario: Scenario, source: str) -> None:
 
 
 def _formation_classes(scenario: Scenario, source: str) -> Iterator[Callable[[], Any]]:
-    """Yield what loads each cluster space and control law that is a class of the user's own."""
+    """Yield a function that loads each cluster space and control law that is a user's class."""
     for cluster in scenario.clusters:
         where = f"{source}: cluster {cluster.name!r}"
         for part, space in [(where, cluster.space), *((f"{where}, group {g.name!r}", g.space) for g in cluster.groups)]:
@@ -104,30 +103,20 @@ def _formation_classes(scenario: Scenario, source: str) -> Iterator[Callable[[],
             yield partial(plugin.load, cluster.law, f"{where}: law", ControlLaw)
 
 
-def _faults(load: Callable[[], Any]) -> list[str]:
-    try:
-        load()
-    except NotTrustedError:
-        return []  # it is there
-    except DocumentError as error:
-        return error.faults
-    return []
-
-
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
-    """Return the agents that are meant, of all roles, as one.
+    """Return the agents that match, of all roles, as one.
 
     Raises:
         RunError: a pattern matches none, or the scenario cannot be flown.
     """
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
     by_role = {role: [thing for each, _, thing in split if each == role] for role in AGENTS}
-    members = [agent for role, names in by_role.items() if names for agent in made(role, info, scenario, names)]
+    members = [agent for role, names in by_role.items() if names for agent in make_agents(role, info, scenario, names)]
     return AgentGroup(members, output_hold_ns(info))
 
 
-def made(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> list[Agent]:
-    """Return the agents of one role for drones or clusters, as many as it takes."""
+def make_agents(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> list[Agent]:
+    """Make the agents of one role for drones or clusters: one for all of them, if the role has joint agents."""
     agent = agent_class(role)
     try:
         if AGENTS[role].joint:
@@ -141,5 +130,5 @@ def made(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> lis
 
 
 def agent_class(role: str) -> Callable[..., Agent]:
-    """Return the class of a role's agents; its module is imported here, and not by whoever hosts others."""
+    """Return the class of a role's agents; its module is imported here, so that hosts of other roles need not."""
     return plugin.load(AGENTS[role].agent, role, Agent)

@@ -1,42 +1,48 @@
 """The recorder as a process: every message of every key into `run.mcap`.
 
-It gates nothing, but the world is never farther ahead of what is on disk than its history reaches back: a
-recorder that comes back, or that is started again in the place of one that died, goes on without a gap.
-
-Order of this file: `record`, the process, catching up, what arrives.
+The run does not wait for it gate by gate, but the world is never farther ahead of what is on disk than its history
+reaches back: a recorder that comes back, or that replaces one that died, goes on without a gap.
 """
 
+import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 
 import msgspec
+from msgspec import UNSET
 
 from zsim.contract import keys, messages, run_messages
+from zsim.contract.flight_messages import ClusterState, Command, Estimate
 from zsim.contract.framing import run_key_table
-from zsim.errors import RecordError, RunError, SupersededError
-from zsim.record import RecordWriter
+from zsim.contract.run_messages import Clock, ClusterRequest
+from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
+from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.record.completeness import GateCount
 from zsim.record.record_writer import CHANNELS_MAX
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.participant import ANOTHER_RUN, Participant
+from zsim.transport.connection import read_info
 from zsim.transport.session import ReceivedSample, Session
-from zsim.transport.traffic import Passed, Traffic, samples
-from zsim_agents.known_messages import KnownMessages, is_of_run
-from zsim_agents.missed_messages import MissedMessages
-from zsim_agents.participation import Participation
+from zsim.transport.traffic import Passed, Traffic, replay, samples
 
 NAME = "recorder"
-ANOTHER_RUN = "the world has begun another run"
 PAUSE_S = 0.01  # between two looks into the queue: nobody waits for the recorder, and waking up is what costs
 TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
+JOIN_S = 1.0  # wall time after which a join that has brought no event is repeated: it may have met no world
+SLACK_NS = 4_000_000_000  # how far the world may be ahead of what is on disk; its history has 5 s
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
 STOP_DRAIN_S = 0.5  # after a stop is requested, how long the end of the run is waited for: both may be stopped at once
 QUIET_S = 1.5  # a world whose time stands publishes its clock once a second
+REPLAY_S = 5.0  # a hub answers within milliseconds
 FLUSH_NS = 1_000_000_000  # simulated time after which what was taken is put on disk
 REPEATED_NS = 1_000_000_000  # simulated, after catching up, in which others may repeat what they had published before
+OUTPUTS = (Command, Estimate, ClusterState, ClusterRequest)
+KNOWN_MAX = 2_000_000  # messages remembered: 7 s of 1000 drones
+TAIL_NS = 7_000_000_000  # simulated, at the end of a record; the world's history has 5 s
+Message = tuple[str, bytes]  # key, payload
 
 
 class _Head(msgspec.Struct):
@@ -52,7 +58,16 @@ def record(
     say: Callable[[str], None] = lambda text: None,
     deserted: Callable[[], bool] = lambda: False,
 ) -> str:
-    """Record a run until it ends; return why it ended. Who is `deserted` then leaves without a bye, as one that dies.
+    """Record a run until it ends; return why it ended.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        path: of the record, which may exist already.
+        name: of the process.
+        stopped: tells whether the process is to end.
+        say: called with lines for the user.
+        deserted: asked at the end; True leaves without a bye, as a process that dies.
 
     Raises:
         RunError: the world has begun another run; the record is complete as far as it goes.
@@ -63,7 +78,7 @@ def record(
 
 
 class Recorder:
-    """Writes what passes on `**`."""
+    """Writes everything that passes the hub; see `record`."""
 
     def __init__(
         self,
@@ -75,19 +90,22 @@ class Recorder:
         say: Callable[[str], None] = lambda text: None,
         deserted: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._deserted = deserted
         self._link = link
         self._info = info
         self._name = name
         self._stopped = stopped
         self._print = say
+        self._deserted = deserted
+        self._part = Participant(link, info, name, slack_ns=SLACK_NS, calculates=False)
+        self.health = self._part.health
+        self._joined_s = 0.0
+        self._others: dict[str, int] = {}  # incarnations that have joined and not left, by name
         self._links: deque[bool] = deque()
         self._link_lost = False
         self._must_look = False
-        self._part = Participation(link, name, info.run_id)
-        self._missed = MissedMessages(link, name, info.run_id, self._pauses)
         self._writer = RecordWriter(path, goes_on=is_of_run(path, info.run_id))
         self._head = msgspec.msgpack.Decoder(_Head)
+        self._clock = msgspec.msgpack.Decoder(Clock)
         self._known = KnownMessages()
         self._gates = GateCount()
         self._caught_up = False
@@ -96,21 +114,20 @@ class Recorder:
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
         self._held: list[Passed] = []  # arrived, but not to be written before what was missed
-        self._is_back = False  # whether nothing has shown yet how much a lost link missed in realtime
+        self._is_back = False  # after a lost link in realtime, until it is known how much was missed
         self._quiet_since_s: float | None = None  # since when no clock has come, after a lost link in realtime
-        self._now_ns = 0
         self._on_disk_ns = 0  # when everything taken was put there last
         self._left_out = 0
-        self.health = HealthMeter(NAME, host=link.host, reads=link.reads)
 
     def run(self) -> str:
+        """Record until the run ends; return why it ended."""
         self._traffic = Traffic(self._link, run_key_table(self._info), self._refuse)
         self._beside = [self._link.subscribe(expression) for expression in ("view/**", keys.camera("*", "*"))]
         self._link.declare_process(self._name)
         self._link.on_link(self._on_link)
         if self._writer.has_former:
             self._resume()
-            self._print(f"{self._name}: goes on with {self._writer.path} after t = {self._now_ns / 1e9:.2f} s")
+            self._print(f"{self._name}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
         else:
             self._write_lasting()
         self._catch_up()
@@ -122,7 +139,7 @@ class Recorder:
             self._write_held()
             self._writer.close()
         except RecordError as error:
-            self._part.bye(self._now_ns, str(error))
+            self._part.leave(str(error))
             raise
         finally:
             self._over.set()
@@ -130,30 +147,151 @@ class Recorder:
         if self._left_out:
             why = f"a record holds {CHANNELS_MAX} keys, and theirs are further ones"
             self._print(f"{self._name}: {self._left_out} messages are not on record: {why}")
-        if self._part.successor:
+        if self._part.superseded:
             raise SupersededError(
-                f"{self._name}: another process of this name joined from {self._part.successor}; "
-                f"this one ends, its record is {self._writer.path}"
+                f"{self._name}: {self._part.end_reason}; this one ends, its record is {self._writer.path}"
             )
         if reason == ANOTHER_RUN:
             raise RunError(f"{self._name}: {reason}; the record {self._writer.path} is complete as far as it goes")
         if not self._deserted():
-            self._part.bye(self._now_ns, reason)
+            self._part.leave(reason)
         return reason
+
+    def _loop(self) -> str:
+        while True:
+            arrived = self._traffic.receive()
+            time.sleep(PAUSE_S)
+            arrived += self._traffic.drain()
+            if self._is_another_run():  # before what has arrived: it may have passed after what was missed
+                return ANOTHER_RUN
+            self._write_arrived(arrived)
+            self._fetch_when_quiet()
+            for sample in chain.from_iterable(subscription.drain() for subscription in self._beside):
+                self._write(sample.key, sample.payload)
+            self._writer.tick(time.monotonic_ns())
+            if self._part.now_ns - self._on_disk_ns >= FLUSH_NS:
+                self._put_on_disk()
+            self.health.refused += self._writer.refused - self._left_out  # what the record has no room for
+            self._left_out = self._writer.refused
+            if not self._part.admitted and time.monotonic() - self._joined_s > JOIN_S:
+                self._join()
+            if self._part.superseded:
+                return "superseded"
+            if self._may_stop():
+                return "stopped"
+            if self._ended_s is not None and (not self._others or time.monotonic() - self._ended_s > DRAIN_S):
+                return run_messages.RUN_ENDED
+
+    def _may_stop(self) -> bool:
+        """Tell whether a stop was requested and the run does not end meanwhile."""
+        if not self._stopped() or self._ended_s is not None:
+            return False
+        self._stopped_s = self._stopped_s or time.monotonic()
+        return time.monotonic() - self._stopped_s > STOP_DRAIN_S
+
+    def _put_on_disk(self) -> None:
+        """Write out all that was taken, and let the world go on as far as its history then reaches back to it."""
+        self._writer.flush()
+        self._on_disk_ns = t_ns = self._part.now_ns
+        self._part.done(t_ns)
+
+    def _join(self, again: bool = False) -> None:
+        """Join; from then on the world runs ahead of what is on disk no farther than SLACK_NS."""
+        self._part.join(again)
+        self._joined_s = time.monotonic()
+        self._put_on_disk()
+
+    def _tick(self) -> None:
+        while not self._over.wait(TICK_S):
+            self._traffic.wake()
+            self._part.publish_health()
+
+    def _refuse(self) -> None:
+        self.health.refused += 1
+
+    # Catching up
+
+    def _resume(self) -> None:
+        """Learn what the record of a predecessor has at its end, which may be that of the run."""
+        if last := self._known.add_tail(self._writer.path):
+            self._part.now_ns = last.t_ns
+            clock = self._clock_in(last.payload)
+            self._gates = GateCount(clock)
+            if clock is not None and clock.state == "stopped":
+                self._ended_s = time.monotonic()
+
+    def _write_lasting(self) -> None:
+        """Write which run this is, the newest faults, and how cameras see: a replay has them no longer."""
+        lasting = {keys.INFO: messages.encode(self._info)}
+        for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
+            lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
+        self._write_known(lasting.items())
+
+    def _catch_up(self, before: Clock | None = None) -> None:
+        """Write what was published while this process was not there: the world keeps it for a while.
+
+        The world is asked until it has answered; a message that comes twice then is written once.
+        """
+        self._caught_up = False
+        while True:
+            try:
+                self._write_known(self._replayed(before))
+            except NoWorldError:
+                if self._pauses():
+                    continue
+            break
+        self._caught_up, self._known_until_ns = True, self._part.now_ns + REPEATED_NS
+
+    def _write_known(self, written: Iterable[Message]) -> None:
+        """Write messages, and remember them."""
+        for key, payload in written:
+            self._write(key, payload)
+            self._known.add(key, payload)
+
+    def _replayed(self, before: Clock | None) -> Iterator[Message]:
+        """Yield what the world replays, up to a clock that has arrived: what came after that is on its way as well."""
+        held: list[Message] = []
+        for entry in replay(self._link, self._name, -1, ["**"], REPLAY_S):
+            held.append(entry)
+            clock = self._clock_in(entry[1]) if before is not None and entry[0] == keys.CLOCK else None
+            if before is not None and clock is not None and clock.seq >= before.seq:
+                yield from held[:-1] if clock.seq == before.seq else ()
+                return
+            if before is None or clock is not None:
+                yield from held
+                held.clear()
+
+    def _fetch_missed(self, before: Clock | None = None) -> None:
+        """Write what passed since the newest message on record, or up to a clock, as far as the world still has it."""
+        self._writer.flush()
+        self._known.add_tail(self._writer.path)
+        self._catch_up(before)
+
+    def _pauses(self) -> bool:
+        """Wait a little; return False once nothing is to be waited for any more."""
+        self._over.wait(TICK_S)
+        return not self._stopped()
+
+    def _world_info(self) -> messages.Info | None:
+        """Return the world's `world/info`, for which one that was just started again may need a while."""
+        until_s = time.monotonic() + REPLAY_S
+        while (info := read_info(self._link)) is None and time.monotonic() < until_s and self._pauses():
+            pass
+        return info
 
     def _on_link(self, up: bool) -> None:
         self._links.append(up)
         self._traffic.wake()
 
     def _is_another_run(self) -> bool:
-        """Return whether there is another run at the end of a link that is back; if not, fetch what was missed."""
+        """Tell whether a link that is back leads to another run; if not, fetch what was missed."""
         while self._links:
             up = self._links.popleft()
             if not up:
                 self._print(f"{self._name}: lost the link to the world; waiting for it to come back")
             self._must_look = up and self._link_lost
             self._link_lost = not up
-        info = self._missed.info() if self._must_look else None
+        info = self._world_info() if self._must_look else None
         if info is None:
             return False
         self._must_look = False
@@ -164,184 +302,107 @@ class Recorder:
         else:  # the world may be far ahead of what is on its way
             self._quiet_since_s = time.monotonic()
             self._is_back = True
-        self._join(again=True)
+        if not self._part.superseded:  # as what was missed may have told
+            self._join(again=True)
         return False
 
-    def _loop(self) -> str:
-        while True:
-            arrived = list(self._traffic.receive())
-            time.sleep(PAUSE_S)
-            arrived += self._traffic.drain()
-            if self._is_another_run():  # before what has arrived: it may have passed after what was missed
-                return ANOTHER_RUN
-            self._write_arrived(arrived)
-            self._fetch_when_quiet()
-            for sample in chain.from_iterable(subscription.drain() for subscription in self._beside):
-                self._write(sample.key, sample.payload)
-            self._writer.tick(time.monotonic_ns())
-            if self._now_ns - self._on_disk_ns >= FLUSH_NS:
-                self._put_on_disk()
-            self._count_left_out()
-            if self._part.is_to_be_repeated():
-                self._join()
-            if self._part.successor:
-                return "superseded"
-            if self._may_stop():
-                return "stopped"
-            if self._ended_s is not None and self._all_left():
-                return run_messages.RUN_ENDED
-
-    def _count_left_out(self) -> None:
-        """Count among the refused what the record has no room for."""
-        self.health.refused += self._writer.refused - self._left_out
-        self._left_out = self._writer.refused
-
-    def _may_stop(self) -> bool:
-        """Return whether a stop was requested and the run does not end meanwhile."""
-        if not self._stopped() or self._ended_s is not None:
-            return False
-        self._stopped_s = self._stopped_s or time.monotonic()
-        return time.monotonic() - self._stopped_s > STOP_DRAIN_S
-
-    def _all_left(self) -> bool:
-        """Return whether every process has published bye, or has had the time to."""
-        late = time.monotonic() - (self._ended_s or 0.0) > DRAIN_S
-        return late or self._part.others_left()
-
-    def _put_on_disk(self) -> None:
-        """Write out all that was taken, and let the world go on as far as its history then reaches back to it."""
-        self._writer.flush()
-        self._on_disk_ns = t_ns = self._now_ns
-        self._part.done(t_ns)
-
-    # Catching up
-
-    def _resume(self) -> None:
-        """Learn what the record of the process that died has at its end, which may be that of the run."""
-        if last := self._known.add_tail(self._writer.path):
-            self._now_ns = last.t_ns
-            clock = self._missed.clock_in(last.payload)
-            self._gates = GateCount(clock)
-            if clock is not None and clock.state == "stopped":
-                self._ended_s = time.monotonic()
-
-    def _fetch_missed(self, before: run_messages.Clock | None = None) -> None:
-        """Write what passed since the newest message on record, or up to a clock, as far as the world still has it."""
-        self._writer.flush()
-        self._known.add_tail(self._writer.path)
-        self._catch_up(before)
-
     def _fetch_when_quiet(self) -> None:
-        """Fetch what nothing comes after, as the end of the run, when no clock has come since a link is back."""
+        """Fetch what nothing comes after, such as the end of the run, when no clock has come since a link is back."""
         if self._quiet_since_s is not None and time.monotonic() - self._quiet_since_s > QUIET_S:
             self._quiet_since_s = None
             self._is_back = False
             self._fetch_missed()
             self._write_held()
 
+    # What arrives
+
     def _write_arrived(self, arrived: Iterable[Passed]) -> None:
         """Write what has arrived; where clocks are missing before it, what the world still has since comes first.
 
-        What stands before a clock is held until that is looked at: it may have passed after what is missing. After a
-        lost link in realtime, where time does not stand for this process, what is missing need not be a clock: so it
-        looks at the first one after its own join, which has passed since.
+        What stands before a clock is held until that clock is looked at: it may have passed after what is missing.
+        After a lost link in realtime, where the world does not wait for this process, what is missing need not be a
+        clock: what was missed is then fetched at the first clock after the process's own join.
         """
         for passed in arrived:
             self._held.append(passed)
             if isinstance(passed, ReceivedSample) and passed.key == keys.CLOCK:
-                clock = self._missed.clock_in(passed.payload)
-                if (
-                    clock is not None
-                    and (self._gates.misses(clock) or self._has_joined())
-                    and self._missed.reaches_run()
-                ):
-                    self._is_back = False
-                    self._fetch_missed(clock)
+                clock = self._clock_in(passed.payload)
+                if clock is not None and (self._gates.misses(clock) or self._has_joined()):
+                    info = self._world_info()
+                    if info is not None and info.run_id == self._info.run_id:
+                        self._is_back = False
+                        self._fetch_missed(clock)
                 self._write_held()
         if not self._is_back:
             self._write_held()
 
     def _has_joined(self) -> bool:
         """Tell whether the join that follows a lost link in realtime is among what is held."""
-        events = (each.payload for each in self._held if isinstance(each, ReceivedSample) and each.key == keys.EVENT)
-        return self._is_back and any(map(self._part.is_own_join, events))
-
-    def _pauses(self) -> bool:
-        """Wait a little; return False once nothing is to be waited for any more."""
-        self._over.wait(TICK_S)
-        return not self._stopped()
+        events = (each for each in self._held if isinstance(each, ReceivedSample) and each.key == keys.EVENT)
+        entries = (self._part.entry_in(event.payload) for event in events)
+        return self._is_back and any(entry is not None and self._part.is_own(entry) for entry in entries)
 
     def _write_held(self) -> None:
         for passed in self._held:
-            self._write_passed(passed)
+            if isinstance(passed, ReceivedSample):
+                self._write(passed.key, passed.payload)
+            elif self._known:
+                for key, payload in samples([passed]):
+                    self._write(key, payload)
+            else:
+                self.health.received += len(passed)
+                self._part.now_ns = passed.t_ns
+                self._writer.add_gate(passed, time.time_ns())
         self._held.clear()
-
-    def _catch_up(self, before: run_messages.Clock | None = None) -> None:
-        """Write what was published while this process was not there: the world keeps it for a while."""
-        self._caught_up = False
-        for key, payload in self._missed.messages(before):
-            self._write(key, payload)
-            self._known.add(key, payload)
-        self._caught_up, self._known_until_ns = True, self._now_ns + REPEATED_NS
-
-    def _write_lasting(self) -> None:
-        """Write of what run this is, the newest faults, and how cameras see: the replay has them no longer."""
-        lasting = {keys.INFO: messages.encode(self._info)}
-        for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
-            lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
-        for key, payload in lasting.items():
-            self._write(key, payload)
-            self._known.add(key, payload)
-
-    def _refuse(self) -> None:
-        self.health.refused += 1
-
-    def _write_passed(self, passed: Passed) -> None:
-        if isinstance(passed, ReceivedSample):
-            self._write(passed.key, passed.payload)
-            return
-        if not self._known:
-            self.health.received += len(passed)
-            self._now_ns = passed.t_ns
-            self._writer.add_gate(passed, time.time_ns())
-            return
-        for key, payload in samples([passed]):
-            self._write(key, payload)
 
     def _write(self, key: str, payload: bytes) -> None:
         if self._known and (key, payload) in self._known:
             return
         self.health.received += 1
-        t_ns = self._stamp(payload)
-        self._writer.add(key, payload, messages.encoding(key), t_ns, time.time_ns())
-        if key == keys.CLOCK:
-            self._now_ns = t_ns
-            self._on_clock(payload)
-        elif key == keys.EVENT:
-            if self._part.event_received(payload):
-                self._join(again=True)
-        elif key.startswith("process/"):
-            self._part.passed(key, payload)
-
-    def _stamp(self, payload: bytes) -> int:
-        """Return the message's own time; one that has none is recorded at the world's."""
         try:
-            return max(0, min(self._head.decode(payload).t_ns, 2**62))
+            t_ns = max(0, min(self._head.decode(payload).t_ns, 2**62))
         except messages.REFUSALS:
             self.health.refused += 1
-            return self._now_ns
+            t_ns = self._part.now_ns  # a message without a time is recorded at the world's
+        self._writer.add(key, payload, messages.encoding(key), t_ns, time.time_ns())
+        if key == keys.CLOCK:
+            self._part.now_ns = t_ns
+            self._on_clock(payload)
+        elif key == keys.EVENT:
+            self._part.take_event(payload)
+            if self._part.must_rejoin:
+                self._part.must_rejoin = False
+                self._join(again=True)
+        elif key.startswith("process/"):
+            self._note_process(key, payload)
 
-    def _count(self, payload: bytes) -> run_messages.Clock | None:
-        """Count the gate of a clock of this run, and return it; print at once which gates are missing before it."""
-        clock = self._missed.clock_in(payload)
-        if clock is not None and (gap := self._gates.add(clock)):
-            self._print(f"{self._name}: gates are missing on record, the world has them no longer: {gap}")
-        return clock
+    def _note_process(self, key: str, payload: bytes) -> None:
+        """Note which other processes have joined and not left."""
+        name, kind = keys.thing(key), messages.type_of(key)
+        if name == self._name or kind not in (run_messages.Join, run_messages.Bye):
+            return
+        with contextlib.suppress(DecodeError):  # garbage of somebody else; recorded as it came
+            passed = messages.decode(key, payload)
+            if isinstance(passed, run_messages.Join):
+                self._others[name] = passed.incarnation
+            elif passed.incarnation in (UNSET, self._others.get(name)):
+                self._others.pop(name, None)
+
+    def _clock_in(self, payload: bytes) -> Clock | None:
+        """Return the clock of this run; None for garbage of somebody else on `clock`."""
+        try:
+            clock = self._clock.decode(payload)
+        except messages.REFUSALS:
+            return None
+        return clock if clock.run_id == self._info.run_id else None
 
     def _on_clock(self, payload: bytes) -> None:
-        clock = self._count(payload)
+        """Count the gate of a clock, and tell at once which gates are missing before it."""
+        clock = self._clock_in(payload)
         if clock is None:
             return
+        if gap := self._gates.add(clock):
+            self._print(f"{self._name}: gates are missing on record, the world has them no longer: {gap}")
         if self._quiet_since_s is not None:
             self._quiet_since_s = time.monotonic()
         if clock.state == "stopped" and self._ended_s is None:
@@ -351,13 +412,71 @@ class Recorder:
         elif self._caught_up:
             self._known.keep_outputs()  # whatever passed after a clock that was not replayed was not replayed either
 
-    def _join(self, again: bool = False) -> None:
-        """Join; who records already keeps the world from going on faster than it writes."""
-        self._part.join(self._now_ns, again)
-        self._put_on_disk()
 
-    def _tick(self) -> None:
-        while not self._over.wait(TICK_S):
-            self._traffic.wake()
-            if self.health.due():
-                self._part.publish("health", self.health.message(self._now_ns, self._part.next("health")))
+class KnownMessages:
+    """Messages that are written, so that none is written twice; the oldest are forgotten beyond KNOWN_MAX."""
+
+    def __init__(self) -> None:
+        self._known: dict[Message, None] = {}
+        self._outputs_only = False
+
+    def __bool__(self) -> bool:
+        return bool(self._known)
+
+    def __contains__(self, entry: Message) -> bool:
+        return entry in self._known
+
+    def add(self, key: str, payload: bytes) -> None:
+        """Remember a message."""
+        self._known[key, payload] = None
+        self._outputs_only = False
+        if len(self._known) > KNOWN_MAX:
+            del self._known[next(iter(self._known))]
+
+    def add_tail(self, path: Path) -> Recorded | None:
+        """Remember what stands at the end of a record; return the newest clock there."""
+        with RecordReader(path) as reader:
+            last = reader.last(keys.CLOCK)
+            last_ns = last.t_ns if last else 0
+            for recorded in reader.messages(by_time=False, from_ns=max(0, last_ns - TAIL_NS)):
+                self.add(recorded.key, recorded.payload)
+        return last
+
+    def keep_outputs(self) -> None:
+        """Forget all but outputs of participants, who repeat them after a rejoin; anything else that comes is new."""
+        if not self._outputs_only:
+            self._known = {entry: None for entry in self._known if _is_output(*entry)}
+            self._outputs_only = True
+
+    def clear(self) -> None:
+        """Forget all of them: what passes from now on is new."""
+        self._known.clear()
+
+
+def _is_output(key: str, payload: bytes) -> bool:
+    kind = messages.type_of(key)
+    if kind is None or not issubclass(kind, OUTPUTS):
+        return False
+    try:
+        messages.decode(key, payload)
+    except DecodeError:
+        return False
+    return True
+
+
+def is_of_run(path: Path, run_id: str) -> bool:
+    """Tell whether a file is the record of a run, or one that ends before it says of which run it is.
+
+    Raises:
+        RecordError: it is no record.
+    """
+    if not path.exists() or not path.stat().st_size:
+        return path.exists()
+    with RecordReader(path) as reader:
+        recorded = next(reader.messages([keys.INFO]), None)
+        if recorded is None:
+            return not reader.topics()
+    try:
+        return messages.decode(keys.INFO, recorded.payload).run_id == run_id
+    except DecodeError:
+        return False

@@ -1,4 +1,5 @@
-"""Show a run and translate it: console, gateway, ROS 1, ROS 2, MAVLink, AR.Drone; each a room of its own.
+"""Programs that show a run or translate it: console, gateway, ROS 1, ROS 2, MAVLink and AR.Drone, each by itself.
 
-They never gate. Imports zsim and the mathematics of zsim_agents; of other rooms each uses `vehicle_links` and `web`.
+The world waits for none of them. Imports zsim and the mathematics of zsim_agents; besides its own room each uses
+`vehicle_links` and `web`.
 """

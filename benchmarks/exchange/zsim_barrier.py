@@ -1,8 +1,8 @@
 """zsim's own lockstep with nothing to compute: the real world, barrier, hub and runner over Zenoh.
 
 In: WorldProcess, World, Barrier and MessageHistory, with truth, status and clock of every gate built, encoded, hashed,
-put and kept; in every agent Runner, Inbox and Membership, with status decoded and done encoded and put; joins, tokens,
-health. Out: the fleet (its truth stands still and it has no samples), and the agents' outputs.
+put and kept; in every agent Runner, Inbox and AgentParticipant, with status decoded and done encoded and put; joins,
+tokens, health. Out: the fleet (its truth stands still and it has no samples), and the agents' outputs.
 """
 
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from zsim.transport import zenoh_settings
 from zsim.transport.connection import find_world
 from zsim.transport.session import Session
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.flight import world
+from zsim_world.run import world
 from zsim_world.sensors.sampler import NONE
 from zsim_world.server import world_process
 

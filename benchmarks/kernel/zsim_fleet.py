@@ -15,7 +15,7 @@ from zsim_world.fleet.fleet import NOISE_GATES, Fleet
 
 CLIMB_GATES = 300  # 6 s: taking off is over
 LONG_S = 1e6  # s, simulated: longer than any measurement
-CHARGE_MAH = 1e6  # no battery is empty before the measurement is over
+CHARGE_MAH = 1e5  # 20 h of hovering: no battery is empty before the measurement is over
 
 
 def main() -> None:

@@ -13,12 +13,13 @@ from zsim.errors import RunError, UserCodeError
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
-from zsim.runtime.collector import rare_collections
-from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
+from zsim.runtime.health import rare_collections
+from zsim.runtime.progress import PERIOD_S, HoldReasons, Screen, SlowStart
+from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.role_table import agent_names, lets_drop
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 
 class FlightObserver(Protocol):
@@ -61,7 +62,7 @@ class InProcessFlight:
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)
         for name in set(scenario.expected()) - set(agent_names(scenario)):
             if lets_drop(scenario.processes.on_overdue or {}, name):
-                self.world.losses.expired(name)  # nobody else can come here
+                self.world.expired(name)  # nobody else can come here
         self._agents = agents(self.world)
 
     def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:
@@ -141,7 +142,7 @@ class _Progress:
 
     def __init__(self, scenario: Scenario, screen: Screen) -> None:
         self._screen = screen
-        self._throttle = Throttle()
+        self._throttle = RateLimit(PERIOD_S)
         self._reasons = HoldReasons()
         states = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
@@ -167,7 +168,7 @@ class _Progress:
                 self._screen.say(line)
         elif isinstance(message, run_messages.Event):
             self._screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
-        elif isinstance(message, run_messages.Clock) and self._throttle.passes():
+        elif isinstance(message, run_messages.Clock) and self._throttle.spend():
             self._start.over()
             line = {"t_s": message.t_ns / 1e9, "rate": message.rate, "state": message.state, "phase": self._phase}
             self._screen.clock({**line, "waiting_for": []})

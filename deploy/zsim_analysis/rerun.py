@@ -16,12 +16,13 @@ from zsim.contract import messages
 from zsim.contract.fingerprint import fingerprint
 from zsim.errors import RecordError, RunError
 from zsim.record import RecordReader
-from zsim.runtime.progress import Screen, Throttle
+from zsim.runtime.progress import PERIOD_S, Screen
+from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.fault_check import listed
 from zsim.schema import plugin
 from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, RecordedRun, gates, open_run, recorded_agents
 from zsim_analysis.rerun_bus import RerunBus, TruthComparison
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 Say = Callable[[str], None]
 RecordState = Literal["whole", "cut", "damaged"]
@@ -142,11 +143,11 @@ def _fault(gate: GateInputs, due_ns: int, names: list[str]) -> str:
 @contextmanager
 def _progress(duration_s: float, what: str) -> Iterator[Callable[[int], None]]:
     """Yield a function that shows progress at an instant."""
-    throttle, start_s = Throttle(), time.monotonic()
+    throttle, start_s = RateLimit(PERIOD_S), time.monotonic()
     with Screen(duration_s) as screen:
 
         def show(t_ns: int) -> None:
-            if throttle.passes():
+            if throttle.spend():
                 rate = t_ns / 1e9 / max(1e-9, time.monotonic() - start_s)
                 screen.clock({"t_s": t_ns / 1e9, "rate": rate, "state": what, "phase": "", "waiting_for": []})
 

@@ -14,16 +14,15 @@ from zsim.contract.framing import GateMessages
 from zsim.contract.run_messages import ControlRequest
 from zsim.errors import RunError, RunFailedError
 from zsim.record import Recorded
-from zsim.runtime.agent import Agent, Output
+from zsim.runtime.agent import Agent, AgentGroup, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.group import AgentGroup
 from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
 from zsim.scenario.scenario import Scenario
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
 from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, decode_or_none
-from zsim_world.flight.coordinator import FLIGHT_REQUESTS
-from zsim_world.flight.world import World
+from zsim_world.run.coordinator import FLIGHT_REQUESTS
+from zsim_world.run.world import World
 
 COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # of truth_sha256
 
@@ -293,9 +292,9 @@ class RerunBus(Bus):
             self._admit(_joined(event))
         left = event.kind == "leave" and self._world.barrier.has_farewell(event.subject)
         if (event.kind == "death" or left) and event.subject not in self._rerun:
-            self._world.losses.died(event.subject, 0)
+            self._world.died(event.subject, 0)
         elif event.kind == "overdue" and event.subject not in self._rerun:
-            self._world.losses.expired(event.subject)
+            self._world.expired(event.subject)
         elif event.kind == "control" and event.subject in FLIGHT_REQUESTS and event.data.get("ok"):
             args = event.data.get("args")
             request = ControlRequest(event.subject, args if isinstance(args, dict) else {}, event.source)

@@ -452,7 +452,7 @@ _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
 _DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
 _MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
 ANYONE = "anyone"  # with a certificate of the authority; a subject without conditions matches everybody
-# What anyone may do is to ask what it may do: zsim.transport.permissions.
+# What anyone may do is to ask what it may do: zsim.transport.tls.
 _ASKS_ACCESS = (("ingress", "query"), ("egress", "reply"))
 
 

@@ -15,7 +15,7 @@ from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.vehicle import allocation, lift_shares
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.state.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE
 
 # drones with other numbers of rotors or with aerodynamics have kernels of their own, each a minute's compilation
 pytestmark = pytest.mark.xdist_group("airframes")

@@ -13,9 +13,9 @@ from scipy.linalg import solve_continuous_lyapunov
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.vehicles import observer_gains
-from zsim_world.vehicles.attitude_control import loop_gains
-from zsim_world.vehicles.observer_gains import GAIN
+from zsim_world.vehicles import observer
+from zsim_world.vehicles.firmware import loop_gains
+from zsim_world.vehicles.observer import GAIN
 
 PROPORTIONAL, INTEGRAL = 0.6, 0.05  # 1/s, 1/s^2
 GUST, TAU_S = 0.5, 5.0  # m/s; 10 m over 2 m/s
@@ -39,7 +39,7 @@ def field(sensors, count, seed=1):
 def predicted(sensors):
     """Return the standard deviation of one horizontal axis [m] from the loops' linear model."""
     scenario = field(sensors, 1)
-    row = observer_gains.gain_row(ARDRONE2, scenario.drones[0], scenario.environment)
+    row = observer.gain_row(ARDRONE2, scenario.drones[0], scenario.environment)
     imu, flow = scenario.drones[0].sensors.imu, scenario.drones[0].sensors.flow
     accel_gain, flow_gain = (
         row[GAIN.accel_v : GAIN.flow_v] * 200.0,

@@ -21,7 +21,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import SightingModel
 from zsim_agents.estimation.joint_filter import JointBank
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.sensors.sighting_errors import DIAMETER_NOISE
+from zsim_world.sensors.sightings import DIAMETER_NOISE
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 SIGHTED = ["sensors.front_camera={}", "sensors.sightings={}", "estimation.use_sightings=true"]

@@ -14,8 +14,8 @@ from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics import rigid_body as body
-from zsim_world.physics.rotors import ground_effect
-from zsim_world.state.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.rigid_body import ground_effect
 
 
 def calm(count=1, gust=0.0, seed=1, sensors=None, **drone):

@@ -21,7 +21,7 @@ from zsim.scenario.fault_kinds import KINDS
 from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.formation.controller import Controller
 from zsim_analysis.in_process import agents
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 AT_S, FOR_S, DURATION_S = 6.0, 2.0, 9.0  # the formation of PAIR is engaged from 5 s on

@@ -16,7 +16,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import Array, closest_pair
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_analysis.in_process import agents
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHORT = (  # a good GPS, so that the drones need not stand still first, and a short way up

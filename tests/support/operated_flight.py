@@ -12,7 +12,7 @@ from zsim.runtime.bus import Bus
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import closest_pair
 from zsim_analysis.in_process import agents
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 OPERATOR, PRIORITY = "tester.one", 10
 STEP_LIMIT_S = 90.0  # simulated; of one part of the flight

@@ -22,7 +22,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
 from zsim_agents.cameras.detector import HatDetector, decoded
 from zsim_agents.cameras.rendering.scene import DroneStates
-from zsim_world.sensors.sighting_sampler import SightingSampler
+from zsim_world.sensors.sightings import SightingSampler
 
 Array = NDArray[np.float64]
 RATE_HZ = 10.0  # of the geometric tier's camera; a picture at every gate of 0.1 s

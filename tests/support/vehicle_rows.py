@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.vehicle_catalogue import vehicle_of
-from zsim_world.state.fleet_arrays import PerRotor, rotor_row, vehicle_row
+from zsim_world.physics.fleet_arrays import PerRotor, rotor_row, vehicle_row
 
 
 def rows_of(scenario: Any, i: int = 0) -> tuple[NDArray[np.float64], PerRotor]:

@@ -22,7 +22,7 @@ from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.console_server import Console
-from zsim_bridges.console.server.http_proxy import ListenAddress
+from zsim_bridges.console.page_server import ListenAddress
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 PICTURES_HZ = 100.0  # while the past is performed; each has one point of the plots

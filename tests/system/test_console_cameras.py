@@ -19,8 +19,7 @@ from synthetic_camera import NUMBER_BITS, SETTINGS
 from wire import PATIENCE_S, Client
 
 from zsim.contract import keys, messages
-from zsim_bridges.console.scene.camera_follow import DIRECTIONS, SPARE
-from zsim_bridges.console.scene.page_camera import fit_distance_m
+from zsim_bridges.console.page_cameras import DIRECTIONS, SPARE, fit_distance_m
 
 LOW = {"width": 1000, "height": 480}
 LAPTOP, DESK = {"width": 1280, "height": 720}, {"width": 1600, "height": 1000}

@@ -14,7 +14,7 @@ from console_browser import HOLD_MS, IN_SIGHT, PATIENCE_MS, POLL_MS, SCREENS
 from page_overflow import overflow
 from wire import PATIENCE_S
 
-from zsim_bridges.console.server.run_files import RunFiles
+from zsim_bridges.console.page_server import RunFiles
 
 pytestmark = needs_browser
 

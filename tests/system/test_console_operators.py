@@ -13,7 +13,7 @@ from staged_console import StagedRun, staged_console
 
 from zsim.contract import keys
 from zsim.contract.run_messages import ClusterRequest
-from zsim_bridges.console.page import control_desk
+from zsim_bridges.console import control_desk
 
 pytestmark = [
     needs_browser,

@@ -17,7 +17,7 @@ from refused import has_terms, parts
 from wire import PATIENCE_S
 
 from zsim_bridges.gateway.gateway_server import UNAUTHENTICATED_MAX
-from zsim_bridges.web.http_connections import STRANGERS_MAX
+from zsim_bridges.web.web_server import STRANGERS_MAX
 
 GATE_NS = 20_000_000
 PILOT = "client.pilot"

@@ -15,7 +15,7 @@ from zsim.scenario import scenario_file
 from zsim.transport import connection
 from zsim.transport.link_watch import Awaited
 from zsim_deploy.certificates import access_control
-from zsim_deploy.roles.router_links import RouterLinks
+from zsim_deploy.roles.roles import RouterLinks
 
 ESTIMATOR, GATE_NS = "estimator.drone1", 20_000_000
 

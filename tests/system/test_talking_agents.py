@@ -17,14 +17,13 @@ from federation import ONE, PATIENCE_S, Federation
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState
-from zsim.runtime.agent import Agent, Output
+from zsim.runtime.agent import Agent, AgentGroup, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.group import AgentGroup
 from zsim.runtime.inbox import output_hold_ns
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.transport.connection import find_world
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 NAMES = ("a", "b", "c")
 WAITS_FOR = {"b": "a"}  # whose state closes the gate of whom; the others only read it

@@ -23,7 +23,7 @@ CONTROL = "world/control"
 VIEW_DRONES = "view/drones"
 BATCH = "@batch"  # everything that passed the hub, see zsim.contract.framing
 GATE = "@gate"  # the world's messages about all drones at a gate
-ACCESS = "@access"  # what access control lets a process do, see zsim.transport.permissions
+ACCESS = "@access"  # what access control lets a process do, see zsim.transport.tls
 
 
 def name(text: str, what: str = "name") -> str:

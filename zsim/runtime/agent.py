@@ -1,4 +1,4 @@
-"""An agent: a plain object, inputs in, outputs out, without Zenoh and wall clock.
+"""An agent, alone or in a group: a plain object, inputs in, outputs out, without Zenoh and wall clock.
 
     runner ──receive(key, message)──▶ agent          every input of a gate, in canonical order
     runner ──step(t_ns)────────────▶ agent ──▶ [(key, message), …]
@@ -6,14 +6,18 @@
 Two runners drive it: `zsim.runtime.runner` as a process on Zenoh, `zsim.runtime.bus` on an in-memory bus. Both hand
 over the same inputs in the same order, so that the outputs are the same to the bit.
 
-The world's messages about its drones come as one GateMessages where the transport brings them so: `deliver` takes them
-apart, but for an agent that reads them as arrays (`takes_gates`, `receive_gate`).
+The world's messages about its drones arrive as one GateMessages: `deliver` takes it apart, except for an agent that
+reads it as arrays (`takes_gates`, `receive_gate`).
+
+An `AgentGroup` is several agents that share a process, its name, its join and its done. A process costs more than the
+agents in it; three estimators and a controller in one are about twice as fast.
 """
 
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from typing import Any, NamedTuple
 
 from msgspec import Struct
@@ -21,12 +25,12 @@ from msgspec.structs import replace
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import Info
+from zsim.contract.messages import Info, decode, encode
 from zsim.contract.run_messages import ClusterRequest, ControlAnswer, ControlRequest, Faults
 from zsim.contract.snapshot import State
-from zsim.errors import DecodeError, UserCodeError
+from zsim.errors import DecodeError, RunError, UserCodeError
+from zsim.runtime.inbox import GateRouter, Input, RoutingTable, canonical, is_held
 from zsim.runtime.link_faults import LinkFaults
-from zsim.runtime.routing import GateRouter, Input, RoutingTable, one_by_one
 from zsim.schema import plugin
 
 
@@ -38,7 +42,7 @@ class Output(NamedTuple):
 
 
 class Agent(ABC):
-    """Base of everything that takes part in the lockstep.
+    """Base class of everything that takes part in the lockstep.
 
     Attributes:
         name: process name `role.thing`, e.g. `estimator.drone1`.
@@ -46,11 +50,11 @@ class Agent(ABC):
         reads: key expressions it subscribes to.
         gate_keys: keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status.
         counted: drones of which it reads all sensors, so that what their status counts is waited for.
-        uncounted: keys whose messages belong to no gate: one that comes late is handed over with the next.
+        uncounted: keys whose messages belong to no gate: a late one is handed over with the next gate.
         writes: keys that it publishes at every gate and that others of its process may read.
-        serves: names of processes for which it stands beside its own.
-        takes_gates: whether `receive_gate` is to have the world's messages of a gate as columns and one buffer.
-        repeats: keys of its outputs that carry what was requested of it, for `repeat`.
+        serves: names of processes whose work it does beside its own.
+        takes_gates: whether it takes the world's messages of a gate as columns and one buffer, in `receive_gate`.
+        repeats: keys of its outputs that carry the requests that it took, for `repeat`.
     """
 
     name: str
@@ -84,19 +88,15 @@ class Agent(ABC):
         return any(not keys.is_sensor(key) and key not in self.gate_keys for key in self.reads)
 
     def share_process(self, process: str) -> None:
-        """Publish as a process of this name, in a group, which takes gates apart for those who do not `takes_gates`."""
+        """Publish under the name of a group's process, which also takes gates apart where its members need that."""
         self._process = process
 
     def update_faults(self, info: Info, faults: Faults) -> None:
         """Take the faults injected into the run; called before the first gate in which one of them acts."""
         if self._links is None and faults.faults:
-            self._links = self._link_faults(info)
+            self._links = LinkFaults(info, (self.name, *self.serves))
         if self._links is not None:
             self._links.update(faults)
-
-    def _link_faults(self, info: Info) -> LinkFaults:
-        names, clusters = (self.name, *self.serves), {cluster.name: cluster.drones for cluster in info.clusters}
-        return LinkFaults(names, info.seed, info.gate_ns, clusters)
 
     def answer(self, t_ns: int, inputs: Sequence[Input]) -> Sequence[Output] | None:
         """Take the inputs of a gate; return its outputs, None at a gate at which it does not step.
@@ -153,9 +153,9 @@ class Agent(ABC):
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
         """Take the inputs of a gate in canonical order, as far as faults of the links bring them."""
         if self._links is not None and self._links.act_at(t_ns):
-            inputs = self._links.delivered(t_ns, one_by_one(inputs, self._router))
+            inputs = self._links.delivered(t_ns, self._router.one_by_one(inputs))
         elif not self.takes_gates and not self._process:
-            inputs = one_by_one(inputs, self._router)
+            inputs = self._router.one_by_one(inputs)
         for key, message in inputs:
             if type(message) is GateMessages:
                 self.receive_gate(message)
@@ -182,13 +182,13 @@ class Agent(ABC):
     def views(self, t_ns: int) -> Sequence[Output]:
         """Return what is to be displayed, on `view/**`, as of the gate t_ns, the last that it stepped.
 
-        Asked after some gates only, as often as people can follow, and never where the agents share a process with the
-        world: nothing may depend on it.
+        Called after some gates only, as often as people can follow, and never where the agents share a process with
+        the world: nothing may depend on it.
         """
         return ()
 
     def rehearse(self) -> None:
-        """Load and compile whatever the first step would; called before joining, so that no gate waits for it."""
+        """Load and compile what the first step needs; called before joining, so that no gate waits for it."""
         return
 
     def control_keys(self) -> tuple[str, ...]:
@@ -200,38 +200,38 @@ class Agent(ABC):
         return ControlAnswer(ok=False, error=f"{key}: {self.name} answers no requests")
 
     def warm_start_keys(self) -> tuple[str, ...]:
-        """Return the keys whose last values a restarted incarnation takes over before anything else."""
+        """Return the keys whose last values a restarted process takes over before anything else."""
         return ()
 
     def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - taking over nothing is a choice
-        """Take over the last value that the former incarnation published."""
+        """Take over the last value that the predecessor published."""
 
     def snapshot(self) -> State | None:
-        """Return the whole state after the gate that it stepped last, as plain values; None where it offers none.
+        """Return the whole state after the gate that it stepped last, as plain values; None if that is not supported.
 
-        An agent made anew, with what this returned handed to `restore`, goes on with the same outputs to the bit.
+        A new agent that is given this state by `restore` goes on with the same outputs to the bit.
         """
         return None
 
     def restore(self, state: State) -> None:  # noqa: B027 - an agent without a snapshot is never asked to
-        """Take over the state that another incarnation returned by `snapshot`; whatever is raised, it begins anew."""
+        """Take over the state that a predecessor returned by `snapshot`; if this raises anything, it starts afresh."""
 
     def repeat(self, key: str, message: Any) -> None:  # noqa: B027 - most agents answer no requests
-        """Do again, before the gate of the message, what a former incarnation published on a key of `repeats`."""
+        """Do again, before the gate of the message, what the predecessor published on a key of `repeats`."""
 
     def checkpoint(self) -> State | None:
-        """Return its snapshot with what every agent has beside it: the numbers of its keys, what links keep back."""
+        """Return the snapshot with what every agent has beside it: sequence numbers, and what its links hold back."""
         own = self.snapshot()
         if own is None:
             return None
         return {"own": own, "seq": dict(self._seq), "links": self._links.snapshot() if self._links else None}
 
     def resume(self, info: Info, checkpoint: State) -> None:
-        """Take over a checkpoint; it raises anything for one of another version of this agent."""
+        """Take over a checkpoint; one of another version of this agent may raise anything."""
         self.restore(checkpoint["own"])
         self._seq = defaultdict(int, checkpoint["seq"])
         if checkpoint["links"] is not None:
-            self._links = self._links or self._link_faults(info)
+            self._links = self._links or LinkFaults(info, (self.name, *self.serves))
             self._links.restore(checkpoint["links"])
 
     def next_seq(self, key: str) -> int:
@@ -241,5 +241,185 @@ class Agent(ABC):
         return count
 
     def resume_seq(self, key: str, last: int) -> None:
-        """Go on counting after `last`, so that a restart leaves no doubt about what is new."""
+        """Go on counting after `last`, so that after a restart it is clear what is new."""
         self._seq[key] = last + 1
+
+
+class AgentGroup(Agent):
+    """Steps its members at each gate, one after the other.
+
+        AgentGroup([estimators, controller], output_hold_ns(info))     sensors in, estimates and commands out
+
+    A member receives each message at the gate at which a process of its own would: outputs of others on keys that
+    close its gate (`writes` of theirs, `gate_keys` of its own) at once, all others as the transport brings them back to
+    the group, `hold_ns` after their stamp. The group has the name of its last member, which is also the source of all
+    that its members publish.
+
+    Args:
+        members: in any order, all of one period.
+        hold_ns: `output_hold_ns` of the run.
+
+    Raises:
+        RunError: there are none, their periods differ, or they wait for each other's outputs.
+    """
+
+    def __init__(self, members: Sequence[Agent], hold_ns: int) -> None:
+        super().__init__()
+        _check(members)
+        self._members = _in_order(members)
+        self._hold_ns = hold_ns
+        last = members[-1]
+        self.name, self.period_ns = last.name, last.period_ns
+        served = [name for member in members for name in (member.name, *member.serves)]
+        self.serves = tuple(name for name in served if name != self.name)
+        self.writes = _joined(member.writes for member in members)
+        self._inner = inner = frozenset(self.writes)
+        self._closing = [frozenset(member.gate_keys) for member in self._members]
+        relayed = [inner & closing for closing in self._closing]
+        reads = zip(self._members, relayed, strict=True)
+        self.reads = _joined([key for key in member.reads if key not in own] for member, own in reads)
+        self.gate_keys = tuple(key for key in _joined(member.gate_keys for member in members) if key not in inner)
+        self.counted = _joined(member.counted for member in members)
+        self.uncounted = _joined(member.uncounted for member in members)
+        self.repeats = _joined(member.repeats for member in members)
+        self._waiting: list[list[Input]] = [[] for _ in members]
+        self._held: list[tuple[int, int, Input]] = []  # until when [ns], and for which member
+        self._routes = RoutingTable([member.reads for member in self._members])
+        self._places: dict[str, list[tuple[int, int]]] = {}  # by key, which members receive it, how long after [ns]
+        self._relays = {key: [i for i, closing in enumerate(self._closing) if key in closing] for key in inner}
+        self._whole = [place for place, member in enumerate(self._members) if member.takes_gates]
+        of_single = [() if member.takes_gates else member.reads for member in self._members]
+        self._gates = GateRouter(RoutingTable(of_single))
+        self.takes_gates = True  # and takes them apart for its members that do not
+        for member in members:
+            member.share_process(self.name)
+
+    def update_faults(self, info: Info, faults: Faults) -> None:
+        for member in self._members:  # each has links of its own
+            member.update_faults(info, faults)
+
+    def receive(self, key: str, message: Any) -> None:
+        places = self._places.get(key)
+        for place, hold_ns in self._find_places(key) if places is None else places:
+            if hold_ns:
+                self._held.append((message.t_ns + hold_ns, place, (key, message)))
+            else:
+                self._waiting[place].append((key, message))
+
+    def _find_places(self, key: str) -> list[tuple[int, int]]:
+        """Return which members receive a key from the transport, and how long after its stamp.
+
+        A key that closes the gate of one member may be one that another only reads.
+        """
+        found = []
+        for place in self._routes.readers(key):
+            closing = self._closing[place]
+            if key not in self._inner & closing:  # else it has been relayed
+                held = is_held(key, closing, self._members[place].uncounted)
+                found.append((place, self._hold_ns if held else 0))
+        self._places[key] = found
+        return found
+
+    def receive_gate(self, gate: GateMessages) -> None:
+        for place in self._whole:
+            self._waiting[place].append((keys.GATE, gate))
+        for readers, key, message in self._gates.split(gate):
+            for place in readers:
+                self._waiting[place].append((key, message))
+
+    def step(self, t_ns: int) -> list[Output]:
+        if self._held:
+            for until_ns, place, entry in self._held:
+                if until_ns <= t_ns:
+                    self._waiting[place].append(entry)
+            self._held = [held for held in self._held if held[0] > t_ns]
+        outputs: list[Output] = []
+        for place, member in enumerate(self._members):
+            own = member.answer(t_ns, self._take(place)) or ()
+            for output in own:
+                for reader in self._relays.get(output.key, ()):
+                    self._waiting[reader].append(output)
+            outputs += own
+        return outputs
+
+    def views(self, t_ns: int) -> list[Output]:
+        return [output for member in self._members for output in member.views(t_ns)]
+
+    def _take(self, place: int) -> list[Input]:
+        """Return what a member is to receive, in canonical order."""
+        inputs, self._waiting[place] = self._waiting[place], []
+        if len(inputs) > 1:
+            inputs.sort(key=canonical)
+        return inputs
+
+    def rehearse(self) -> None:
+        for member in self._members:
+            member.rehearse()
+
+    def control_keys(self) -> tuple[str, ...]:
+        return _joined(member.control_keys() for member in self._members)
+
+    def control(self, key: str, request: ControlRequest) -> ControlAnswer:
+        return next(m for m in self._members if key in m.control_keys()).control(key, request)
+
+    def warm_start_keys(self) -> tuple[str, ...]:
+        return _joined(member.warm_start_keys() for member in self._members)
+
+    def warm_start(self, key: str, message: Any) -> None:
+        self._owner(key).warm_start(key, message)
+
+    def resume_seq(self, key: str, last: int) -> None:
+        self._owner(key).resume_seq(key, last)
+
+    def snapshot(self) -> State | None:
+        members = [member.checkpoint() for member in self._members]
+        if None in members:
+            return None
+        waiting = [[[key, encode(message)] for key, message in inputs] for inputs in self._waiting]
+        held = [[until_ns, place, key, encode(message)] for until_ns, place, (key, message) in self._held]
+        return {"members": members, "waiting": waiting, "held": held}
+
+    def resume(self, info: Info, checkpoint: State) -> None:
+        super().resume(info, checkpoint)
+        own = checkpoint["own"]
+        for member, its_own in zip(self._members, own["members"], strict=True):
+            member.resume(info, its_own)
+        self._waiting = [[(key, decode(key, payload)) for key, payload in inputs] for inputs in own["waiting"]]
+        self._held = [(until_ns, place, (key, decode(key, payload))) for until_ns, place, key, payload in own["held"]]
+
+    def repeat(self, key: str, message: Any) -> None:
+        next(member for member in self._members if key in member.repeats).repeat(key, message)
+
+    def _owner(self, key: str) -> Agent:
+        """Return the member that takes over the last value of a key."""
+        return next(member for member in self._members if key in member.warm_start_keys())
+
+
+def _joined(parts: Any) -> tuple[str, ...]:
+    """Return everything that is in any of the parts, once, in order."""
+    return tuple(dict.fromkeys(each for part in parts for each in part))
+
+
+def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
+    """Return the members so that each comes after those whose outputs close its gate.
+
+    Raises:
+        RunError: some wait for each other.
+    """
+    writers = {key: place for place, member in enumerate(members) for key in member.writes}
+    waits_for = {i: [writers[key] for key in m.gate_keys if writers.get(key, i) != i] for i, m in enumerate(members)}
+    try:
+        return tuple(members[place] for place in TopologicalSorter(waits_for).static_order())
+    except CycleError as error:
+        names = ", ".join(members[place].name for place in sorted(set(error.args[1])))
+        found = f"gate_keys of a group's members {names} are outputs of each other"
+        raise RunError(f"{found}; must not wait for each other: leave one of them to `reads` alone") from None
+
+
+def _check(members: Sequence[Agent]) -> None:
+    if not members:
+        raise RunError("a group has no members; must have one at least")
+    periods = {member.name: member.period_ns for member in members}
+    if len(set(periods.values())) > 1:
+        listed = ", ".join(f"{name} {period_ns}" for name, period_ns in periods.items())
+        raise RunError(f"period_ns of a group's members is {listed}; must be the same")

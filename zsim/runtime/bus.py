@@ -7,62 +7,35 @@ import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from msgspec import Struct
+from msgspec import UNSET, Struct
 
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError, UserCodeError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
-from zsim.runtime.routing import RoutingTable
+from zsim.runtime.inbox import NEVER_NS, Inbox, RoutingTable, output_hold_ns
 from zsim.scenario.fault_kinds import PROCESS_KILL
 
-INCARNATION = 0  # of every agent: in one process none comes back
+INCARNATION = 0  # of every agent: in one process none is ever restarted
 GATES_MAX = 10  # of the world in a row, where commands are delayed by as many
 
 
 class SteppedWorld(Protocol):
-    """What the bus needs of a world."""
+    """What the bus needs of a world: see `Coordinator` in zsim_world."""
 
     run_id: str
 
-    def info(self) -> messages.Info:
-        """Return the message of `world/info`."""
-        ...
-
-    def handle(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take a message to the world: join, done, bye, a command."""
-        ...
-
-    def count_output(self, source: str) -> None:
-        """Count an output that is for others."""
-        ...
-
-    def may_advance(self) -> bool:
-        """Tell whether all are done whose answers the next gate needs."""
-        ...
-
-    def advance(self, wall_ns: int) -> None:
-        """Go to the next gate and put its messages into the outbox."""
-        ...
-
-    def publish_end(self) -> None:
-        """Put the end of the run into the outbox: event `end`, clock `stopped`."""
-        ...
-
-    def take_outbox(self) -> Sequence[tuple[str, Any]]:
-        """Return keys and messages to be published, in order, and forget them; on keys.GATE GateMessages."""
-        ...
-
-    def waiting_for(self, wall_ns: int) -> Sequence[run_messages.Waiting]:
-        """Return whom the world waits for."""
-        ...
-
     @property
-    def ended(self) -> str | None:
-        """Return why the run is over, None while it goes on."""
-        ...
+    def ended(self) -> str | None: ...
+    def info(self) -> messages.Info: ...
+    def handle(self, key: str, message: Any, wall_ns: int) -> None: ...
+    def count_output(self, source: str) -> None: ...
+    def may_advance(self) -> bool: ...
+    def advance(self, wall_ns: int) -> None: ...
+    def publish_end(self) -> None: ...
+    def take_outbox(self) -> Sequence[tuple[str, Any]]: ...
+    def waiting_for(self, wall_ns: int) -> Sequence[run_messages.Waiting]: ...
 
 
 Sink = Callable[[str, Any], None]
@@ -70,7 +43,13 @@ GateSink = Callable[[GateMessages], None]
 
 
 class _Route(NamedTuple):
-    """Where the messages of a key go: who reads them, whether the world counts them, and whether it acts on them."""
+    """Where the messages of a key go.
+
+    Attributes:
+        inboxes: of the agents that read them.
+        is_counted: whether the world counts them among the outputs of their sender.
+        is_relayed: whether that is all that it does with them.
+    """
 
     inboxes: tuple[Inbox, ...]
     is_counted: bool
@@ -82,10 +61,10 @@ class Bus:
 
     Args:
         coordinator: the world of the run.
-        agents: in the order in which they are asked.
+        agents: in the order in which they are stepped.
         wall_ns: monotonic wall time.
         sink: takes every message in order of publication.
-        gate_sink: takes the world's messages of a gate in place of the sink, which then is not given each one decoded.
+        gate_sink: takes the world's messages of a gate; without it the sink is given each one decoded.
     """
 
     def __init__(
@@ -103,14 +82,14 @@ class Bus:
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted, uncounted=agent.uncounted)) for agent in agents]
         self._readers = RoutingTable([agent.reads for agent in agents])
         self._routes: dict[str, _Route] = {}
-        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and who reads of it
+        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and who reads any
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
         self._info: messages.Info | None = None
         self._failures: dict[str, UserCodeError] = {}  # by the agent that cannot go on, the first one first
 
     def join(self) -> None:
-        """Let every agent make ready and join the run."""
+        """Let every agent get ready and join the run."""
         for agent, _ in self._agents:
             agent.rehearse()
             seq, host, run_id = agent.next_seq("join"), socket.gethostname(), self._coordinator.run_id
@@ -128,10 +107,12 @@ class Bus:
         processor's caches.
 
         Raises:
-            RunError: the world waits for somebody who is not on this bus.
+            RunError: the world waits for a process that is not on this bus.
         """
         if not self._coordinator.may_advance():
-            self._refuse_to_wait()
+            names = ", ".join(waiting.name for waiting in self._coordinator.waiting_for(self._wall_ns()))
+            if self._coordinator.ended is None and names:
+                raise RunError(f"the world waits for {names}, not run in-process; see `processes.expect`")
             return False
         gates = 0
         while gates < GATES_MAX and self._coordinator.may_advance():
@@ -142,11 +123,6 @@ class Bus:
             pass
         return True
 
-    def _refuse_to_wait(self) -> None:
-        names = ", ".join(waiting.name for waiting in self._coordinator.waiting_for(self._wall_ns()))
-        if self._coordinator.ended is None and names:
-            raise RunError(f"the world waits for {names}, not run in-process; see `processes.expect`")
-
     def _round(self) -> bool:
         """Let every agent take all its complete gates, then publish its outputs; return whether any had one."""
         stepped = False
@@ -156,30 +132,26 @@ class Bus:
                 self._publish(agent, t_ns, outputs)
             stepped = stepped or bool(steps)
             if agent.name in self._failures and inbox.taken_ns != NEVER_NS:
-                self._leave_failed(agent, inbox)
+                inbox.start_after(NEVER_NS)  # it is handed nothing any more
+                self._leave(agent, str(self._failures[agent.name]), failed=True)
         return stepped
 
-    def _leave_failed(self, agent: Agent, inbox: Inbox) -> None:
-        """Let an agent leave that cannot go on; it is handed nothing any more."""
-        inbox.start_after(NEVER_NS)
-        reason, seq = str(self._failures[agent.name]), agent.next_seq("bye")
-        bye = run_messages.Bye(self._t_ns, seq, reason, True, self._coordinator.run_id, INCARNATION)
+    def _leave(self, agent: Agent, reason: str, failed: bool = False) -> None:
+        seq, of = agent.next_seq("bye"), (self._coordinator.run_id, INCARNATION)
+        bye = run_messages.Bye(self._t_ns, seq, reason, failed or UNSET, *of)
         self._to_world(keys.process(agent.name, "bye"), bye)
 
     def end(self) -> None:
         """Let every agent leave, and publish the world's last messages.
 
         Raises:
-            UserCodeError: a user's class could not go on before the end; all has been published nevertheless.
+            UserCodeError: a user's class failed before the end; everything has been published nevertheless.
         """
         self._coordinator.publish_end()
         self._spread()
         for agent, _ in self._agents:
-            if agent.name in self._failures:
-                continue
-            seq, of = agent.next_seq("bye"), {"run_id": self._coordinator.run_id, "incarnation": INCARNATION}
-            bye = run_messages.Bye(self._t_ns, seq, run_messages.RUN_ENDED, **of)
-            self._to_world(keys.process(agent.name, "bye"), bye)
+            if agent.name not in self._failures:
+                self._leave(agent, run_messages.RUN_ENDED)
         self._spread()
         for failure in self._failures.values():
             raise failure
@@ -188,7 +160,10 @@ class Bus:
         for key, message in self._coordinator.take_outbox():
             if type(message) is GateMessages:
                 self._gate_sink(message)
-                for inbox in self._gate_readers(message.table):
+                if message.table is not self._gate_route[0]:
+                    readers = self._readers.readers_of_any(message.table)
+                    self._gate_route = (message.table, tuple(self._agents[reader][1] for reader in readers))
+                for inbox in self._gate_route[1]:
                     inbox.put(key, message)
                 continue
             self._sink(key, message)
@@ -254,10 +229,3 @@ class Bus:
             is_counted = messages.is_output(key)
             route = self._routes[key] = _Route(inboxes, is_counted, is_counted and not keys.is_command(key))
         return route
-
-    def _gate_readers(self, table: Sequence[str]) -> tuple[Inbox, ...]:
-        """Return the inboxes of those who read messages of gates with this table of keys."""
-        if table is not self._gate_route[0]:
-            readers = self._readers.readers_of_any(table)
-            self._gate_route = (table, tuple(self._agents[reader][1] for reader in readers))
-        return self._gate_route[1]

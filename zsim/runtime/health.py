@@ -1,18 +1,21 @@
-"""The health of a process: counters, published once a wall second."""
+"""The health of a process: counters, published once a wall second, and a garbage collector that disturbs no gate."""
 
+import gc
 import os
 import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 from zsim.contract.run_messages import Health
+from zsim.runtime.rate_limit import RateLimit
 
 PERIOD_S = 1.0  # contract: 1 Hz wall
 STEPS_KEPT = 1000
-READS_MAX = 8  # expressions that are listed of one that reads many
+READS_MAX = 8  # expressions that are listed of a process that reads many
+ALLOCATIONS = 50_000  # between two collections, chosen: a gate allocates hundreds of objects and leaves no cycle
 
 
 class HealthMeter:
@@ -21,11 +24,11 @@ class HealthMeter:
     Args:
         role: of the process.
         wall_s: monotonic wall time.
-        host: the name of its host; None: as the system has it.
+        host: the name of its host; None for the system's.
         reads: the expressions that it subscribes to, as its session keeps them.
 
     Attributes:
-        received, refused, dropped: messages taken in, not decodable, and gates given up.
+        received, refused, dropped: messages taken in, messages not decodable, and gates given up.
         lag_ns: how far the newest gate is ahead of the one just handled.
         link_lost: whether the world cannot be reached now.
     """
@@ -40,12 +43,10 @@ class HealthMeter:
         self._role = role
         self._host = host or socket.gethostname()
         self._reads = reads
-        self._wall_s = wall_s
         self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
-        self._last_s = wall_s()
-        self.received = 0
-        self.refused = 0
-        self.dropped = 0
+        self._limit = RateLimit(PERIOD_S, now=wall_s)
+        self._limit.spend()  # the first is due in a second
+        self.received = self.refused = self.dropped = 0
         self.lag_ns = 0
         self.link_lost = False
 
@@ -55,11 +56,7 @@ class HealthMeter:
 
     def due(self) -> bool:
         """Tell, once a wall second, that it is time to publish."""
-        now_s = self._wall_s()
-        if now_s - self._last_s < PERIOD_S:
-            return False
-        self._last_s = now_s
-        return True
+        return self._limit.spend()
 
     def message(self, t_ns: int, seq: int) -> Health:
         """Return the message of `process/{p}/health`."""
@@ -81,8 +78,25 @@ class HealthMeter:
 
 
 def resident_bytes() -> int:
-    """Return the resident memory of this process; 0 where the system does not give it."""
+    """Return the resident memory of this process; 0 where the system does not tell."""
     if sys.platform == "linux":
         with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # no file may be left to open
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0
+
+
+@contextmanager
+def rare_collections() -> Iterator[None]:
+    """Collect garbage rarely, and never look through what was there before.
+
+    By default Python collects after 700 allocations, every few gates, and now and then looks through all objects.
+    """
+    gc.collect()
+    gc.freeze()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(ALLOCATIONS, *thresholds[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()

@@ -1,4 +1,4 @@
-"""The inputs of an agent, sorted by gate: what has come, what is missing, what came twice.
+"""What an agent reads: its inputs sorted by gate (`Inbox`), and which reader reads which key (`RoutingTable`).
 
 Arrival order is never trusted: a gate is complete when each of its closing keys has a message stamped with it
 and every counted sensor message is there. A gate of which nothing has come is known by the gap that it leaves in
@@ -6,19 +6,23 @@ the numbers of a status.
 """
 
 from bisect import bisect_right, insort
-from collections.abc import Container, Sequence
+from collections import defaultdict
+from collections.abc import Container, Iterable, Iterator, Sequence
 from operator import itemgetter
 from typing import Any
 
 from zsim.contract import keys, messages
-from zsim.contract.framing import GateMessages
+from zsim.contract.framing import GateMessages, PerPattern
 from zsim.contract.messages import Info
-from zsim.runtime.routing import canonical
+from zsim.errors import DecodeError
 
 GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
 UNHEARD_NS = ALWAYS_NS - 1  # before whatever was taken last
+KEYS_MAX = 200_000  # whose readers are remembered; 1000 drones have about 15 000, other processes may make up any
+Input = tuple[str, Any]
+"""A key and a message; or `keys.GATE` and a GateMessages."""
 
 
 def output_hold_ns(info: Info) -> int:
@@ -34,6 +38,12 @@ def is_held(key: str, gate_keys: Container[str], uncounted: Container[str]) -> b
     return key not in gate_keys and key not in uncounted and messages.is_output(key)
 
 
+def canonical(entry: Input) -> tuple[int, str, int]:
+    """Return what inputs are sorted by: time, key and number."""
+    key, message = entry
+    return message.t_ns, key, message.seq
+
+
 class Inbox:
     """Collects messages until the gate that they belong to is complete.
 
@@ -43,12 +53,12 @@ class Inbox:
         counted: drones of which all `sensor/*` keys are read.
         keep_late: hand out what comes after its gate was taken, once, with the next gate: in realtime an old input
             is better than none.
-        uncounted: keys of which everything that comes late is handed out with the next gate in any case: it belongs to
-            no gate, as what a detector finds in a picture.
+        uncounted: keys of which everything that comes late is handed out with the next gate in any case, since it
+            belongs to no gate, such as what a detector finds in a picture.
+        sparse: closing keys whose publishers may skip gates, such as the driver of an external drone: a key is waited
+            for only as long as it comes at every gate.
         hold_ns: after which an agent's output on a key that closes no gate is handed out, as if stamped so much later:
             command delay and a gate, when it has come wherever the world may be, so that no order of arrival counts.
-        sparse: closing keys whose publishers may skip gates, as the driver of an external drone: one is waited for only
-            as long as it comes at every gate.
 
     Attributes:
         duplicates: messages that came again before their gate was taken.
@@ -69,31 +79,32 @@ class Inbox:
         self._sparse = dict.fromkeys(sparse, (UNHEARD_NS, UNHEARD_NS))  # with the stamps of its last two messages
         of_world = {key for key in gate_keys if keys.is_status(key) and key not in self._sparse}
         self._beside = dict.fromkeys(key for key in gate_keys if key not in of_world)  # not closed by GateMessages
-        self._meters = {keys.status(drone): _Meter() for drone in counted}
-        self._came_of: dict[str, list[int] | None] = {}
-        self._waiting: dict[int, dict[tuple[str, int], tuple[str, Any]]] = {}
+        self._pulse = next((key for key in gate_keys if key in of_world), None)
+        self._waiting: dict[int, dict[tuple[str, int], Input]] = {}  # by stamp, then by key and number
         self._stamps: list[int] = []
-        self._lacking: dict[int, dict[str, None]] = {}
+        self._lacking: dict[int, dict[str, None]] = {}  # by gate, the closing keys that have not come
         self._gates: list[int] = []
         self._expected_from_ns: dict[str, int] = {}
-        self._pulse = next((key for key in gate_keys if key in of_world), None)
-        self._beats: dict[int, int] = {}
+        self._meters = {keys.status(drone): _Meter() for drone in counted}
+        self._came_of: dict[str, list[int] | None] = {}
+        self._beats: dict[int, int] = {}  # by gate, the number of the pulse
         self._last_beat: tuple[int, int] | None = None
         self.taken_ns = self._former_ns = -1  # the gates that were taken last
-        self._keep_late = keep_late
-        self._uncounted = frozenset(uncounted)
         self.hold_ns = hold_ns
         self._hold_of: dict[str, int] = {}
         self._holds = False
-        self._belated: dict[tuple[str, int], tuple[str, Any]] = {}
+        self._keep_late = keep_late
+        self._uncounted = frozenset(uncounted)
+        self._belated: dict[tuple[str, int], Input] = {}
         self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
-        self.duplicates = 0
-        self.late = 0
+        self.duplicates = self.late = 0
 
     @property
     def may_skip(self) -> bool:
         """Tell whether all closing keys are of publishers that may skip gates."""
         return len(self._sparse) == len(self._closing)
+
+    # What comes
 
     def put(self, key: str, message: Any) -> bool:
         """Keep one message, or GateMessages on `keys.GATE`; return False for a duplicate or one that is too late."""
@@ -124,14 +135,6 @@ class Inbox:
             self._close_all(message)
         return True
 
-    def _put_late(self, key: str, message: Any) -> bool:
-        """Keep a late message, of a counted key unless a newer one of it, or itself, has been handed out."""
-        is_old = not self._keep_late or message.t_ns <= self._newest.get(key, ALWAYS_NS)
-        if is_old and key not in self._uncounted:
-            return False
-        self._belated[key, message.seq] = (key, message)
-        return True
-
     def _find_hold(self, key: str) -> int:
         held = is_held(key, self._closing, self._uncounted)
         self._hold_of[key] = hold_ns = self.hold_ns if held else 0
@@ -140,10 +143,29 @@ class Inbox:
 
     def _find_came(self, key: str) -> list[int] | None:
         """Return the list of what has come of the counted drone that a sensor key belongs to."""
-        parent, _, _ = key.rpartition("/")
-        meter = self._meters.get(f"{parent}/status")
+        meter = self._meters.get(f"{key.rpartition('/')[0]}/status")
         self._came_of[key] = came = meter.came if meter else None
         return came
+
+    def _put_late(self, key: str, message: Any) -> bool:
+        """Keep a late message, of a counted key unless a newer one of it, or itself, has been handed out."""
+        is_old = not self._keep_late or message.t_ns <= self._newest.get(key, ALWAYS_NS)
+        if is_old and key not in self._uncounted:
+            return False
+        self._belated[key, message.seq] = (key, message)
+        return True
+
+    def _close(self, key: str, message: Any) -> None:
+        t_ns = message.t_ns
+        lacking = self._lacking.get(t_ns)
+        if lacking is None:
+            lacking = self._lacking[t_ns] = self._closing.copy()
+            _insert(self._gates, t_ns)
+        lacking.pop(key, None)
+        if key == self._pulse:
+            self._beats[t_ns] = message.seq
+        if key in self._meters:
+            self._meters[key].count(message)
 
     def _close_all(self, gate: GateMessages) -> None:
         """Close a gate for the drones whose messages have come as one: none of them can be missing."""
@@ -156,19 +178,7 @@ class Inbox:
         if self._pulse is not None:
             self._beats[t_ns] = gate.seq
 
-    def _lacking_at(self, t_ns: int) -> dict[str, None]:
-        lacking = self._lacking.get(t_ns)
-        if lacking is None:
-            lacking = self._lacking[t_ns] = self._closing.copy()
-            _insert(self._gates, t_ns)
-        return lacking
-
-    def _close(self, key: str, message: Any) -> None:
-        self._lacking_at(message.t_ns).pop(key, None)
-        if key == self._pulse:
-            self._beats[message.t_ns] = message.seq
-        if key in self._meters:
-            self._meters[key].count(message)
+    # What is complete, and what is missing
 
     def next_gate_ns(self) -> int | None:
         """Return the earliest gate that is not taken, judged by closing messages."""
@@ -193,26 +203,24 @@ class Inbox:
     def missing(self, t_ns: int) -> str | None:
         """Return a key that the gate still lacks, None when it is complete."""
         for key in self._lacking.get(t_ns, self._closing):
-            if self._expects(key, t_ns) and self._comes_along(key):
+            if self._waits_for(key, t_ns):
                 return key
         for key, meter in self._meters.items():
-            if meter.counts and meter.short(t_ns) and self._expects(key, t_ns):
+            if meter.counts and meter.short(t_ns) and t_ns >= self._expected_from_ns.get(key, ALWAYS_NS):
                 return key
         return None
 
-    def missing_last(self, t_ns: int) -> str | None:
-        """Return the missing key that is last among the closing keys: a thread that waits for it wakes up once."""
-        for key in reversed(self._lacking.get(t_ns, self._closing)):
-            if self._expects(key, t_ns) and self._comes_along(key):
-                return key
-        return self.missing(t_ns)
+    def last_missing(self) -> str | None:
+        """Return the last of the closing keys that the next gate waits for: a thread that waits for it wakes up once.
 
-    def awaited_last(self) -> str | None:
-        """Return the last of the closing keys that the next gate is going to wait for, None if it waits for none."""
-        t_ns = self.taken_ns + 1
-        return next(
-            (key for key in reversed(self._closing) if self._expects(key, t_ns) and self._comes_along(key)), None
-        )
+        A message that a status counts is named where no closing key is missing; None where nothing is waited for.
+        """
+        next_ns = self.next_gate_ns()
+        t_ns = self.taken_ns + 1 if next_ns is None else next_ns
+        for key in reversed(self._lacking.get(t_ns, self._closing)):
+            if self._waits_for(key, t_ns):
+                return key
+        return self.missing(t_ns) if next_ns is not None else None
 
     def lost(self, t_ns: int) -> str | None:
         """Return a missing key whose message will not come any more: its publisher has gone on without it."""
@@ -221,17 +229,29 @@ class Inbox:
             return key
         return key if any(key not in self._lacking[gate] for gate in self._gates if gate > t_ns) else None
 
-    def _expects(self, key: str, t_ns: int) -> bool:
-        return t_ns >= self._expected_from_ns.get(key, ALWAYS_NS)
+    def _waits_for(self, key: str, t_ns: int) -> bool:
+        """Tell whether a gate waits for a closing key.
 
-    def _comes_along(self, key: str) -> bool:
-        """Tell whether a message of a key has come for both of the gates that were taken last, if it may skip any."""
+        A key whose publisher may skip gates is waited for if a message came for both of the gates taken last.
+        """
+        if t_ns < self._expected_from_ns.get(key, ALWAYS_NS):
+            return False
         former_ns, newest_ns = self._sparse.get(key, (NEVER_NS, NEVER_NS))
         return newest_ns >= self.taken_ns and former_ns >= self._former_ns
 
-    def take(self, t_ns: int) -> list[tuple[str, Any]]:
+    def ignore(self, key: str) -> None:
+        """Wait for a key no longer: its publisher is dropped from the run."""
+        self._expected_from_ns[key] = NEVER_NS
+
+    def expect(self, key: str, from_ns: int = ALWAYS_NS) -> None:
+        """Wait for a key again, from the gate `from_ns` on."""
+        self._expected_from_ns[key] = from_ns
+
+    # What is handed out
+
+    def take(self, t_ns: int) -> list[Input]:
         """Return all inputs stamped up to t_ns in order of (t_ns, key, seq), and forget them."""
-        ready: list[tuple[str, Any]] = []
+        ready: list[Input] = []
         for stamp in _cut(self._stamps, t_ns):
             stamped = self._waiting.pop(stamp)
             ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
@@ -249,28 +269,20 @@ class Inbox:
         self._former_ns, self.taken_ns = self.taken_ns, t_ns
         return _once(ready) if len(ready) > 1 else ready
 
-    def _with_belated(self, ready: list[tuple[str, Any]]) -> list[tuple[str, Any]]:
+    def _with_belated(self, ready: list[Input]) -> list[Input]:
         """Put what came late in front, and note what is handed out."""
-        belated = sorted(self._belated.values(), key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq))
+        ready = sorted(self._belated.values(), key=canonical) + ready
         self._belated.clear()
-        for key, message in (*belated, *ready):
+        for key, message in ready:
             self._newest[key] = max(self._newest.get(key, ALWAYS_NS), message.t_ns)
-        return [*belated, *ready]
-
-    def ignore(self, key: str) -> None:
-        """Wait for a key no longer: its publisher is dropped from the run."""
-        self._expected_from_ns[key] = NEVER_NS
-
-    def expect(self, key: str, from_ns: int = ALWAYS_NS) -> None:
-        """Wait for a key again, from the gate `from_ns` on."""
-        self._expected_from_ns[key] = from_ns
+        return ready
 
     def start_after(self, t_ns: int) -> None:
         """Ignore everything up to and including t_ns; the next gate is counted in full."""
         self.take(t_ns)
 
 
-def _once(ready: list[tuple[str, Any]]) -> list[tuple[str, Any]]:
+def _once(ready: list[Input]) -> list[Input]:
     """Leave out the sensor messages that are there a second time, in a GateMessages: a replay brings them singly."""
     gates = [message for _, message in ready if type(message) is GateMessages]
     if not gates or not any(keys.is_sensor(key) for key, _ in ready):
@@ -332,3 +344,108 @@ def _cut(stamps: list[int], t_ns: int) -> list[int]:
     taken = stamps[:place]
     del stamps[:place]
     return taken
+
+
+class RoutingTable:
+    """The readers of every key, found once per key.
+
+        routes = RoutingTable([["drone/*/truth"], ["drone/drone1/sensor/imu", "**"]])
+        routes.readers("drone/drone1/truth")      (0, 1)
+
+    Comparing every expression with every key takes readers times keys, which is what a process of 1000 drones would do
+    most of its time. Here an expression is filed under its own text: those with wildcards for whole chunks are found
+    by putting the wildcards into the key, and only those with `**` or `$*` are compared one by one.
+
+    Args:
+        expressions: key expressions of each reader; a reader is known by its place.
+    """
+
+    def __init__(self, expressions: Sequence[Sequence[str]]) -> None:
+        self._filed: defaultdict[str, list[int]] = defaultdict(list)  # without wildcards, or with * only
+        self._starred: dict[int, set[tuple[int, ...]]] = {}  # by number of chunks, where the wildcards stand
+        self._compared: list[tuple[str, int]] = []
+        self._known: dict[str, tuple[int, ...]] = {}
+        for reader, own in enumerate(expressions):
+            for expression in own:
+                self._file(expression, reader)
+
+    def _file(self, expression: str, reader: int) -> None:
+        chunks = expression.split("/")
+        if "**" in chunks or "$*" in expression:
+            self._compared.append((expression, reader))
+            return
+        self._filed[expression].append(reader)
+        starred = tuple(place for place, chunk in enumerate(chunks) if chunk == "*")
+        if starred:
+            self._starred.setdefault(len(chunks), set()).add(starred)
+
+    def readers(self, key: str) -> tuple[int, ...]:
+        """Return the places of those who read a key, in order."""
+        readers = self._known.get(key)
+        if readers is None:
+            readers = tuple(sorted(set(self._find(key))))
+            if len(self._known) < KEYS_MAX:
+                self._known[key] = readers
+        return readers
+
+    def readers_of_any(self, of: Iterable[str]) -> tuple[int, ...]:
+        """Return the places of those who read one of some keys at least, in order."""
+        return tuple(sorted({reader for key in of for reader in self.readers(key)}))
+
+    def _find(self, key: str) -> Iterator[int]:
+        yield from self._filed.get(key, ())
+        chunks = key.split("/")
+        for starred in self._starred.get(len(chunks), ()):
+            if not any(chunks[place].startswith("@") for place in starred):  # which no wildcard takes
+                masked = ["*" if place in starred else chunk for place, chunk in enumerate(chunks)]
+                yield from self._filed.get("/".join(masked), ())
+        for expression, reader in self._compared:
+            if keys.matches(expression, key):
+                yield reader
+
+
+class GateRouter:
+    """Takes apart the messages of gates: of each only what somebody reads, decoded once for all its readers.
+
+    Args:
+        routes: of the readers.
+    """
+
+    def __init__(self, routes: RoutingTable) -> None:
+        self._routes = routes
+        self._read = PerPattern(self._read_of)
+
+    def _read_of(self, gate: GateMessages) -> list[tuple[tuple[int, ...], str, int]]:
+        """Return, of each message that is read, its readers, its key, and its place in the gate."""
+        which, readers_of = gate.which.tolist(), self._routes.readers
+        if not which or min(which) < 0 or max(which) >= len(gate.table):
+            return []
+        keys_of = map(gate.table.__getitem__, which)
+        return [(readers, key, place) for place, key in enumerate(keys_of) if (readers := readers_of(key))]
+
+    def split(self, gate: GateMessages) -> Iterator[tuple[tuple[int, ...], str, Any]]:
+        """Yield the readers, key and message of what is read, in order of publication.
+
+        A message that is not of its key's type is left out, and so is a gate whose columns lead outside of its table.
+        """
+        for readers, key, place in self._read.of(gate):
+            try:
+                message = messages.decode(key, gate.payload(place))
+            except DecodeError:
+                continue  # not written by the world: as good as lost
+            yield readers, key, message
+
+    def one_by_one(self, inputs: Sequence[Input]) -> Sequence[Input]:
+        """Return inputs with the messages of gates one by one, as far as they are read, in canonical order."""
+        if GateMessages not in map(type, map(_message, inputs)):
+            return inputs
+        single: list[Input] = []
+        for key, message in inputs:
+            if type(message) is GateMessages:
+                single += [(name, each) for _, name, each in self.split(message)]
+            else:
+                single.append((key, message))
+        return sorted(single, key=canonical)
+
+
+_message = itemgetter(1)  # of an input

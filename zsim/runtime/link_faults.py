@@ -1,4 +1,4 @@
-"""What faults of the links make of the messages of a gate, in their receiver: now, later, or never. Pure.
+"""What faults of the links do to the messages of a gate, in their receiver: now, later, or never. Pure.
 
     inbox ──all messages of a gate──▶ LinkFaults ──▶ agent
 
@@ -14,14 +14,15 @@ from typing import Any
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate
+from zsim.contract.messages import Info
 from zsim.contract.run_messages import Fault, Faults
 from zsim.contract.snapshot import State
-from zsim.runtime.routing import Input, canonical
+from zsim.runtime.inbox import Input, canonical
 from zsim.scenario import fault_kinds
 
 WORLD, RADIO = "world", "radio"
 KINDS = frozenset(name for name, kind in fault_kinds.KINDS.items() if kind.strikes in ("link", RADIO))
-NEVER = None  # as a delay: the message does not come
+NEVER = None  # as a delay: the message is lost
 Point = Sequence[float]
 Where = Callable[[str], Point | None]
 """Returns where a drone is in W [m], None where that is not known."""
@@ -38,9 +39,9 @@ def uniform(seed: int, link: str, fault: Fault, key: str, t_ns: int, seq: int) -
 
 
 def senders(key: str, message: Any) -> tuple[str, ...]:
-    """Return the names of who has sent a message.
+    """Return the names of the processes that count as the sender of a message.
 
-    Estimators and controllers may share a process and be published by one of them: they go by what the key is about.
+    Estimators and controllers may share a process, under one name: they are named after the thing of the key.
     """
     kind, whose, what = keys.parts(key)
     if kind == "drone" and what.startswith("cmd/"):
@@ -53,13 +54,13 @@ def senders(key: str, message: Any) -> tuple[str, ...]:
 
 
 def _doing(role: str, source: str) -> tuple[str, ...]:
-    """Return a role, and who else does its work."""
+    """Return the name of a process, and that of another process that does its work."""
     shared = source.partition(".")[0] in ("estimator", "controller")
     return (role,) if shared or not source else (role, source)
 
 
 def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
-    """Tell whether a fault is of the link from one of some names to another."""
+    """Tell whether a fault concerns the link from one of some senders to a receiver."""
     first, _, second = fault.target.partition("/")
     if second == to and first in froms:
         return True
@@ -81,7 +82,7 @@ def place_of(process: str, places: Mapping[str, Any], where: Where) -> Point | N
 
 
 def delay_ns(fault: Fault, draw: float, distance_m: float | None = None) -> int | None:
-    """Return by how much a message comes later for a fault that acts on it; NEVER if it does not.
+    """Return how much later a message comes because of a fault that acts on it; NEVER if it is lost.
 
     Args:
         draw: its number of the link's stream.
@@ -108,7 +109,7 @@ def total_delay_ns(
     message: Any,
     distance_m: Callable[[Fault], float | None] = lambda fault: None,
 ) -> int | None:
-    """Return by how much a message comes later for several faults [ns]; NEVER if one of them loses it.
+    """Return how much later a message comes because of several faults [ns]; NEVER if one of them loses it.
 
     Args:
         faults: that act on its link.
@@ -133,26 +134,17 @@ def distance_between(a: Point | None, b: Point | None) -> float | None:
 
 
 class LinkFaults:
-    """Keeps back, of the messages that one receiver is handed at a gate, what its links do not bring yet or ever.
+    """Holds back, of the messages of a gate for one receiver, what its links deliver later or never.
 
     Args:
+        info: of the run.
         names: of the receiver; an estimator of several drones has the name of each one's.
-        seed: of the scenario.
-        gate_ns: the interval of the gates.
-        clusters: name and drones of each.
     """
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        seed: int,
-        gate_ns: int,
-        clusters: Mapping[str, Sequence[str]],
-    ) -> None:
+    def __init__(self, info: Info, names: Sequence[str]) -> None:
         self._names = tuple(names)
-        self._seed = seed
-        self._gate_ns = gate_ns
-        self._clusters = clusters
+        self._seed, self._gate_ns = info.seed, info.gate_ns
+        self._clusters = {cluster.name: cluster.drones for cluster in info.clusters}
         self._list: Faults | None = None  # the newest
         self._faults: list[Fault] = []
         self._later: list[tuple[int, str, Any]] = []  # the gate at which it comes, key, message
@@ -163,13 +155,14 @@ class LinkFaults:
         if self._list and faults.seq <= self._list.seq:
             return
         self._list = faults
-        self._faults = [fault for fault in faults.faults if fault.kind in KINDS and self._concerns(fault)]
 
-    def _concerns(self, fault: Fault) -> bool:
-        return fault.kind == RADIO or any(name in fault.target.split("/") for name in self._names)
+        def concerned(fault: Fault) -> bool:
+            return fault.kind == RADIO or any(name in fault.target.split("/") for name in self._names)
+
+        self._faults = [fault for fault in faults.faults if fault.kind in KINDS and concerned(fault)]
 
     def act_at(self, t_ns: int) -> bool:
-        """Tell whether the inputs of a gate may be other ones than have come."""
+        """Tell whether the inputs of a gate may differ from those that have come."""
         return bool(self._later) or any(fault_kinds.acts(fault, t_ns) for fault in self._faults)
 
     def delivered(self, t_ns: int, inputs: Sequence[Input]) -> list[Input]:
@@ -180,7 +173,8 @@ class LinkFaults:
         """
         acting = [fault for fault in self._faults if fault_kinds.acts(fault, t_ns)]
         if acting:
-            self._note_positions(inputs)
+            positions = {keys.thing(key): message.position_m for key, message in inputs if type(message) is Estimate}
+            self._positions |= positions
         coming = [entry for entry in self._later if entry[0] <= t_ns]
         self._later = [entry for entry in self._later if entry[0] > t_ns]
         handed = [(key, message) for _, key, message in coming]
@@ -188,26 +182,23 @@ class LinkFaults:
         return sorted(handed, key=canonical)
 
     def snapshot(self) -> State:
-        """Return its faults, what it keeps back, and where drones were."""
+        """Return its faults, what it holds back, and where drones were."""
         later = [[gate_ns, key, messages.encode(message)] for gate_ns, key, message in self._later]
         positions = {drone: list(place) for drone, place in self._positions.items()}
         return {"later": later, "positions": positions, "list": messages.encode(self._list) if self._list else None}
 
     def restore(self, state: State) -> None:
-        """Take over what another incarnation of the receiver kept back."""
+        """Take over the state of the receiver's predecessor."""
         if state["list"]:
             self.update(messages.decode(keys.FAULTS, state["list"]))
         self._later = [(gate_ns, key, messages.decode(key, payload)) for gate_ns, key, payload in state["later"]]
         self._positions = state["positions"]
 
-    def _note_positions(self, inputs: Sequence[Input]) -> None:
-        for key, message in inputs:
-            if type(message) is Estimate:
-                self._positions[keys.thing(key)] = message.position_m
-
     def _comes_now(self, t_ns: int, key: str, message: Any, acting: Sequence[Fault]) -> bool:
         """Tell whether a message is handed over at once; keep it if it comes later."""
-        late_ns = self._delay_ns(key, message, acting)
+        froms, to = senders(key, message), self._receiver(key)
+        faults = (f for f in acting if (self._on_the_air(f, key, to) if f.kind == RADIO else joins(f, froms, to)))
+        late_ns = total_delay_ns(faults, self._seed, to, key, message, lambda fault: self._distance_m(fault, key, to))
         if late_ns is None:
             return False
         gate_ns = -(-(message.t_ns + late_ns) // self._gate_ns) * self._gate_ns
@@ -216,18 +207,13 @@ class LinkFaults:
         self._later.append((gate_ns, key, message))
         return False
 
-    def _delay_ns(self, key: str, message: Any, acting: Sequence[Fault]) -> int | None:
-        froms, to = senders(key, message), self._receiver(key)
-        faults = (f for f in acting if (self._on_the_air(f, key, to) if f.kind == RADIO else joins(f, froms, to)))
-        return total_delay_ns(faults, self._seed, to, key, message, lambda fault: self._distance_m(fault, key, to))
-
     def _receiver(self, key: str) -> str:
-        """Return the name under which the receiver takes a key: of several estimators, that of the drone's."""
+        """Return the name of the receiver of a key: of several estimators, that of the drone of the key."""
         stock = f"estimator.{keys.thing(key)}" if keys.is_sensor(key) else ""
         return stock if stock in self._names else self._names[0]
 
     def _on_the_air(self, fault: Fault, key: str, to: str) -> bool:
-        """Tell whether a message is sent by a drone of the fault's to a process that is not on it."""
+        """Tell whether a message is sent by one of the fault's drones to a process that is not on that drone."""
         kind, drone, _ = keys.parts(key)
         drones = self._clusters.get(fault.target)
         return kind == "drone" and to != f"estimator.{drone}" and (drones is None or drone in drones)

@@ -8,7 +8,6 @@ import math
 import re
 import sys
 import threading
-import time
 from collections.abc import Callable
 from typing import Any, Protocol, Self
 
@@ -20,22 +19,22 @@ from zsim.contract.flight_messages import ClusterState
 from zsim.errors import printable
 
 PERIOD_S = 0.2  # wall time between two updates
-SLOW_S = 3.0  # wall time; what is compiled is loaded within two, unless the machine is busy
+SLOW_S = 3.0  # wall time; what is compiled already is loaded within two, unless the machine is busy
 SLOW_NOTICE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
 REPEATED_S = 10.0  # simulated time; as often as the clock is a line where there is no live one
 REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
 _NUMBER = re.compile(r"-?[0-9][0-9.]*")
-DRIVERS, COMINGS = "driver.", ("join", "leave")  # they are started by hand, and whoever does so looks here
+DRIVERS, COMINGS = "driver.", ("join", "leave")  # they are started by hand, by people who look here
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
 def cell(text: str) -> Text:
-    """Return a text for rich: its brackets are no markup, and codes that a terminal acts on are written out."""
+    """Return a text for rich: its brackets are not markup, and control codes are written out."""
     return Text(printable(text))
 
 
 class ProgressSink(Protocol):
-    """Whoever takes progress."""
+    """Shows progress: a `Screen` or `JsonProgress`."""
 
     def clock(self, line: dict[str, Any]) -> None: ...
     def event(self, line: dict[str, Any]) -> None: ...
@@ -48,42 +47,28 @@ class SlowStart:
 
     Args:
         say: shows it, from a thread of its own.
+        text: the line.
     """
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._timer = threading.Timer(SLOW_S, say, args=(SLOW_NOTICE,))
+    def __init__(self, say: Callable[[str], None], text: str = SLOW_NOTICE) -> None:
+        self._timer = threading.Timer(SLOW_S, say, args=(text,))
         self._timer.daemon = True
         self._timer.start()
 
     def over(self) -> None:
-        """Say nothing any more: it has started, or will not."""
+        """Show nothing any more: it has started, or failed to."""
         self._timer.cancel()
 
 
-class Throttle:
-    """Lets one in PERIOD_S pass."""
-
-    def __init__(self, period_s: float = PERIOD_S) -> None:
-        self._period_s = period_s
-        self._last_s = 0.0
-
-    def passes(self) -> bool:
-        now_s = time.monotonic()
-        if now_s - self._last_s < self._period_s:
-            return False
-        self._last_s = now_s
-        return True
-
-
 class HoldReasons:
-    """Reasons for which clusters wait, each shown once when it lasts."""
+    """Why clusters wait: each reason is shown once, if it lasts."""
 
     def __init__(self) -> None:
         self._since: dict[str, tuple[str, int]] = {}
         self._shown: set[tuple[str, str]] = set()
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
-        """Return the line for a state: its reason if that has been the same, but for its numbers, for REASON_NS."""
+        """Return a line with the reason of a state if it has been the same, but for its numbers, for REASON_NS."""
         shape = _NUMBER.sub("#", state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
@@ -96,10 +81,10 @@ class HoldReasons:
 
 
 class RepeatedEvents:
-    """Events that come again and again: the first is a line at once, equal ones are one line with their count."""
+    """Events that repeat: the first is shown at once, equal ones follow as one line with their count."""
 
     def __init__(self) -> None:
-        # by kind and text: simulated times [s] of the first and the last, and how many
+        # by kind and text: simulated times [s] of the first and the last, and their number
         self._counted: dict[tuple[str, str], tuple[float, float, int]] = {}
 
     def lines(self, t_s: float, kind: str, text: str) -> list[str]:
@@ -144,7 +129,7 @@ class JsonProgress:
 
 
 class PipedConsole(Console):
-    """A console whose reader may go: what nobody reads is dropped, and nothing ends because of it."""
+    """A console whose reader may go away: what nobody reads is dropped, and nothing fails because of it."""
 
     def on_broken_pipe(self) -> None:
         """Write nothing more."""
@@ -152,7 +137,7 @@ class PipedConsole(Console):
 
 
 class Screen:
-    """Shows progress on a terminal; on anything else, a line every ten simulated seconds and events.
+    """Shows progress live on a terminal; elsewhere, as a line every ten simulated seconds and events.
 
     Args:
         duration_s: simulated time of the end.
@@ -188,7 +173,7 @@ class Screen:
         self.console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     def hang_up(self) -> None:
-        """Show lines only from now on, the terminal being gone; callable from a signal handler, which draws nothing."""
+        """Show only lines from now on, as the terminal is gone; draws nothing, so a signal handler may call it."""
         self._is_live = False
         self.console.quiet = True
 
@@ -212,11 +197,11 @@ class Screen:
                 self.say(text)
 
     def health(self, line: dict[str, Any]) -> None:
-        """One live line has no room for it; `zsim up` has a table."""
+        """Do nothing: the one live line has no room for it; `zsim up` has a table."""
 
 
 def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> str:
-    """Return the live line: simulated time, real-time factor, phase, who is waited for."""
+    """Return the live line: simulated time, real-time factor, phase, and which processes are waited for."""
     span_s = duration_s - from_s
     share = min(1.0, max(0.0, line["t_s"] - from_s) / span_s) if span_s > 0.0 else 0.0
     filled = int(20 * share)

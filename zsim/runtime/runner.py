@@ -4,22 +4,28 @@ Lockstep and realtime are one loop: in lockstep an incomplete gate is waited for
 the next one is there.
 """
 
+import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from operator import itemgetter
+from typing import Any
 
-from zsim.contract import keys, messages, run_messages
+from msgspec import UNSET
+
+from zsim.contract import flight_messages, keys, messages, run_messages, world_events
+from zsim.contract.framing import GateMessages, run_key_table
 from zsim.contract.run_messages import ControlAnswer
 from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
-from zsim.runtime.collector import rare_collections
-from zsim.runtime.health import HealthMeter
-from zsim.runtime.membership import Membership
-from zsim.runtime.runner_inputs import RunnerInputs
+from zsim.runtime.health import HealthMeter, rare_collections
+from zsim.runtime.inbox import Inbox, RoutingTable, output_hold_ns
+from zsim.runtime.participant import AgentParticipant
 from zsim.scenario.fault_kinds import PROCESS_KILL
 from zsim.schema import plugin
-from zsim.transport.session import Query, Session
+from zsim.transport.session import Query, RawSample, ReceivedSample, Session, Subscription
 
 TICK_S = 0.1  # how often a stop, and what the world has not answered, is looked for while nothing arrives
 DRAIN_S = 1.0  # how long the last gates are waited for once the run has ended
@@ -35,7 +41,8 @@ class Runner:
         agent: what to run.
         stopped: asked every TICK_S; True ends the process with a bye.
         say: called with lines for the user.
-        deserted: asked at the end; True leaves without a bye, as one that dies, so that the world waits for a new one.
+        deserted: asked at the end; True leaves without a bye, as a process that dies, so that the world waits for a
+            successor.
         snapshot_ns: simulated time between two snapshots of the agent; 0 for none.
 
     Attributes:
@@ -58,16 +65,16 @@ class Runner:
         self._stopped = stopped
         self._say = say
         self._deserted = deserted
-        self.health = HealthMeter(agent.role, host=link.host, reads=link.reads)
+        self._member = AgentParticipant(link, info, agent, self._take_in, say, stopped=stopped)
+        self.health = self._member.health
         self._inputs = RunnerInputs(link, info, agent, self.health, say)
         self._inbox = self._inputs.inbox
-        self._member = Membership(link, info, agent, self._inputs.take_in, say, stopped=stopped)
         self._snapshot_ns = snapshot_ns
         self._snapshot_due_ns = 0
         self._resumed_ns: int | None = None
         self._list_seq = -1
         self._kills: dict[int, run_messages.Fault] = {}  # by id
-        self._lives_after_ns: int | None = None  # what was to die up to this gate was an earlier one of its name
+        self._lives_after_ns: int | None = None  # faults up to this gate were to kill a predecessor
         self._lacks = False
         self._view_wall_s = 0.0
         self._end_ns: int | None = None
@@ -116,6 +123,9 @@ class Runner:
             self._member.leave(self._leave)
         return self._leave
 
+    def _take_in(self, sample: ReceivedSample) -> None:
+        self._inputs.take_in(sample)
+
     # One turn
 
     def _turn(self) -> None:
@@ -130,13 +140,10 @@ class Runner:
         if self._leave is None:
             self._look_for_end()
         if self._leave is None and not stepped:
-            self._wait()
-
-    def _wait(self) -> None:
-        try:
-            self._inputs.wait()
-        except SessionError:
-            self._leave = self._leave or "session closed"
+            try:
+                self._inputs.wait()
+            except SessionError:
+                self._leave = self._leave or "session closed"
 
     def _ready_gate(self) -> int | None:
         """Return the gate to step now, None if it must be waited for."""
@@ -146,9 +153,12 @@ class Runner:
             return None
         if self._inbox.missing(t_ns) is None:
             return t_ns
-        if self._info.mode == "realtime":
-            return self._give_up(t_ns)
-        return self._find_lost(t_ns)
+        if self._info.mode == "lockstep":
+            return self._find_lost(t_ns)
+        if self._inbox.latest_gate_ns() == t_ns:
+            return None
+        self.health.dropped += 1  # the next gate is there: this one is stepped with what has come
+        return t_ns
 
     def _reaches_back(self, t_ns: int) -> bool:
         """Tell whether, after a snapshot, the gate that follows it is there, which the world brings again."""
@@ -172,13 +182,6 @@ class Runner:
         self._lacks = self._inbox.missing(t_ns) is not None
         return None if self._lacks else t_ns
 
-    def _give_up(self, t_ns: int) -> int | None:
-        """In realtime an incomplete gate is stepped with what there is once the next one is there."""
-        if self._inbox.latest_gate_ns() == t_ns:
-            return None
-        self.health.dropped += 1
-        return t_ns
-
     def _step(self, t_ns: int) -> None:
         start_ns = time.perf_counter_ns()
         self._update_faults(t_ns)
@@ -187,43 +190,35 @@ class Runner:
         outputs = self._agent.answer(t_ns, self._inbox.take(t_ns))
         if outputs is None:
             return
-        self._member.publish(t_ns, outputs)
-        self._take_snapshot(t_ns)
-        self._show(t_ns)
-        self._die(t_ns)
-        self.health.step(time.perf_counter_ns() - start_ns)
-        newest_ns = self._inbox.latest_gate_ns()
-        self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
-
-    def _take_snapshot(self, t_ns: int) -> None:
+        self._member.publish_gate(t_ns, outputs)
         if self._snapshot_ns and t_ns >= self._snapshot_due_ns and t_ns > self._member.published_ns:
             self._snapshot_due_ns = t_ns + self._snapshot_ns
             self._member.publish_snapshot(t_ns)
-
-    def _show(self, t_ns: int) -> None:
-        """Publish what is to be displayed, as often as people can follow."""
         now_s = time.monotonic()
         if now_s - self._view_wall_s >= VIEW_PERIOD_S:
             self._view_wall_s = now_s
             for key, message in self._agent.views(t_ns):
                 self._link.put(key, message)
+        self._die(t_ns)
+        self.health.step(time.perf_counter_ns() - start_ns)
+        newest_ns = self._inbox.latest_gate_ns()
+        self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
 
     def _update_faults(self, t_ns: int) -> None:
-        """Take the lists of faults that the world published before a gate."""
+        """Take the lists of faults that the world published before a gate.
+
+        A list may have forgotten a kill that a late process has still to die of; one that has not begun when a list
+        is published, and is not on it, has been cleared.
+        """
         for faults in self._inputs.fault_lists_before(t_ns):
             self._agent.update_faults(self._info, faults)
             if faults.seq > self._list_seq:
                 self._list_seq = faults.seq
-                self._update_kills(faults)
-
-    def _update_kills(self, faults: run_messages.Faults) -> None:
-        """Note which kills are its own: a list may have forgotten one that a late process has still to die of.
-
-        One that has not begun when a list is published, and is not on it, is cleared.
-        """
-        names, t_ns = (self._agent.name, *self._agent.serves), faults.t_ns
-        begun = {n: kill for n, kill in self._kills.items() if kill.until_ns is not None and kill.until_ns <= t_ns}
-        self._kills = begun | {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
+                kills = self._kills.values()
+                begun = {f.id: f for f in kills if f.until_ns is not None and f.until_ns <= faults.t_ns}
+                names = self._agent.name, *self._agent.serves
+                listed = {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
+                self._kills = begun | listed
 
     def _die(self, t_ns: int) -> None:
         """End, if a fault kills it in one of the gates that it has lived; their outputs still go out."""
@@ -233,8 +228,6 @@ class Runner:
         for fault in self._kills.values():
             if lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
                 self._leave, self.killed = f"killed by fault {fault.id}", True
-
-    # Beginning and end
 
     def _look_for_end(self) -> None:
         if self._stopped():
@@ -250,10 +243,7 @@ class Runner:
         while not self._over.wait(TICK_S):
             if self._stopped() or self._end_ns is not None or self._lacks or self._member.owes:
                 self._inputs.wake()
-            if self.health.due():
-                seq = self._agent.next_seq("health")
-                health = self.health.message(max(0, self._member.done_ns), seq)
-                self._link.put(keys.process(self._agent.name, "health"), health)
+            self._member.publish_health()
 
     def _serve_rare(self) -> None:
         while self._inputs.notices:
@@ -274,7 +264,7 @@ class Runner:
         elif read.kind in ("drop", "leave"):
             self._inputs.ignore_estimates(read.subject)
         elif isinstance(read.data, ProcessEntry) and read.subject == self._agent.name:
-            self._member.taken_in(read.data)
+            self._member.take_entry(read.data)
         elif isinstance(read.data, ProcessEntry) and read.kind == "join":
             self._inputs.expect_estimates(read.subject, read.data.from_ns)
 
@@ -296,3 +286,202 @@ class Runner:
         except DecodeError as error:
             answer = ControlAnswer(ok=False, error=str(error))
         query.answer(answer)
+
+
+class RunnerInputs:
+    """The subscriptions of one agent, sorted into its inbox, and what other threads of Zenoh bring.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        agent: whose inputs they are.
+        health: counts what is received and refused.
+        say: called with a line for the user.
+
+    Attributes:
+        inbox: the agent's inputs, by gate.
+        notices, links, queries: what has come from other threads and is to be served in turn.
+    """
+
+    def __init__(
+        self, link: Session, info: messages.Info, agent: Agent, health: HealthMeter, say: Callable[[str], None]
+    ) -> None:
+        self._link = link
+        self._agent = agent
+        self._health = health
+        self._say = say
+        self._is_realtime, self._gate_ns = info.mode == "realtime", info.gate_ns
+        self._blocking: Subscription | None = None  # where `wait` waits
+        self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
+        of_drivers = [key for key in agent.gate_keys if keys.parts(key)[1] in self._external]
+        self.inbox = Inbox(
+            agent.gate_keys, agent.counted, self._is_realtime, agent.uncounted, of_drivers, output_hold_ns(info)
+        )
+        estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
+        self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
+        self._estimated_by: dict[str, str] = {}
+        self._subscriptions: dict[str, Subscription] = {}
+        self._expressions = RoutingTable([[expression] for expression in agent.reads])
+        self._table = run_key_table(info)
+        self._gate_key = self._choose_gate_key()
+        self.notices: deque[WorldEvent] = deque()
+        self.queries: deque[Query] = deque()
+        self.links: deque[bool] = deque()
+        self._fault_lists: deque[run_messages.Faults] = deque()
+        self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and number
+
+    def _choose_gate_key(self) -> str:
+        """Return the key on which the agent takes the sensors of a gate as GateMessages; empty for none.
+
+        Sensors of external drones come on their own keys, from drivers.
+        """
+        of_world = [drone for drone in self._agent.counted if drone not in self._external]
+        if of_world and len(self._agent.counted) > 1:
+            return keys.GATE
+        return keys.gate(of_world[0]) if of_world and self._agent.takes_gates else ""
+
+    def subscribe(self) -> None:
+        """Subscribe to all that the agent reads, answer its requests, and show that the process lives."""
+        closing = [self._agent.reads[place] for place in self._expressions.readers_of_any(self._agent.gate_keys)]
+        for expression in dict.fromkeys([*closing, *self._agent.reads]):
+            of_world = keys.is_sensor(expression) and keys.thing(expression) not in self._external
+            subscribed = self._gate_key if self._gate_key and of_world else expression
+            if subscribed not in self._subscriptions:
+                self._subscriptions[subscribed] = self._link.subscribe(subscribed)
+        self._link.declare_subscriber(keys.EVENT, self._on_event)
+        self._link.declare_subscriber(keys.FAULTS, lambda sample: self._on_faults(sample.payload))
+        if self._is_realtime:
+            self._link.declare_subscriber(keys.CLOCK, self._on_clock)
+        self._link.on_link(self._on_link)
+        for key in (*self._agent.control_keys(), keys.process(self._agent.name, "outputs")):
+            self._link.declare_queryable(key, self._on_query)
+        self._link.declare_process(self._agent.name)
+
+    def wait(self) -> None:
+        """Wait for what completes the next gate, or until woken.
+
+        Raises:
+            SessionError: the session was closed meanwhile.
+        """
+        self._blocking = self._subscriptions[self._blocking_expression()]
+        sample = self._blocking.receive()
+        self._blocking = None
+        if sample is not None:
+            self._open(sample)
+
+    def _blocking_expression(self) -> str:
+        """Return the subscription from which the next missing message comes."""
+        wanted = self.inbox.last_missing() or self._agent.gate_keys[-1]
+        expression = self._agent.reads[self._expressions.readers(wanted)[0]]
+        return expression if expression in self._subscriptions else self._gate_key
+
+    def wake(self) -> None:
+        """Let a `wait` of another thread return."""
+        for subscription in list(self._subscriptions.values()):
+            subscription.wake()
+
+    def take_in_all(self) -> None:
+        """Take in what has arrived: first what closes a gate, so that what came before it is found too."""
+        for subscription in self._subscriptions.values():
+            for sample in subscription.drain():
+                self._open(sample)
+
+    def _open(self, sample: ReceivedSample) -> None:
+        """Take in a message, or the messages of a gate."""
+        if sample.key != self._gate_key:
+            self.take_in(sample)
+            return
+        try:
+            gate = GateMessages.unpack(sample.payload, self._table)
+            if not self._agent.takes_gates:
+                gate.check()
+        except DecodeError as error:
+            self._refuse(error)
+            return
+        self._health.received += len(gate)
+        self.inbox.put(keys.GATE, gate)
+
+    def take_in(self, sample: ReceivedSample) -> None:
+        """Take in one message."""
+        if sample.key == keys.FAULTS:
+            self._on_faults(sample.payload)
+            return
+        self._health.received += 1
+        try:
+            message = messages.decode(sample.key, sample.payload)
+        except DecodeError as error:
+            self._refuse(error)
+            return
+        if sample.key in self._agent.repeats:
+            self._repeated.setdefault(message.t_ns, {})[sample.key, message.seq] = message
+            return
+        if type(message) is flight_messages.Estimate:
+            self._estimated_by[sample.key] = message.source
+        self.inbox.put(sample.key, message)
+
+    def _refuse(self, error: DecodeError) -> None:
+        self._health.refused += 1
+        if self._health.refused == 1:
+            self._say(str(error))
+
+    def fault_lists_before(self, t_ns: int) -> list[run_messages.Faults]:
+        """Return the lists of faults that were published before a gate, and forget them; an older one is of no use."""
+        if not self._fault_lists:
+            return []
+        lists = [self._fault_lists.popleft() for _ in range(len(self._fault_lists))]
+        self._fault_lists.extend(faults for faults in lists if faults.t_ns >= t_ns)
+        return sorted((faults for faults in lists if faults.t_ns < t_ns), key=lambda faults: faults.seq)
+
+    def repeated(self, t_ns: int) -> Iterator[tuple[str, Any]]:
+        """Yield, and forget, the requests that the predecessor took before a gate."""
+        if self._repeated:
+            for (key, _), request in sorted(self._repeated.pop(t_ns, {}).items(), key=itemgetter(0)):
+                yield key, request
+
+    def ignore_estimates(self, process: str) -> None:
+        """Wait no longer for the estimates of a process: those that it published last, or has the name for."""
+        for key, stock in self._stock.items():
+            if process == (self._estimated_by.get(key) or stock):
+                self.inbox.ignore(key)
+
+    def expect_estimates(self, process: str, from_ns: int) -> None:
+        """Wait again for the estimates of a process, from the gate `from_ns` on."""
+        for key, stock in self._stock.items():
+            if process in (self._estimated_by.get(key), stock):
+                self.inbox.expect(key, from_ns)
+
+    # In threads of Zenoh
+
+    def _on_event(self, sample: RawSample) -> None:
+        try:
+            read = world_events.read(sample.payload)
+        except DecodeError:
+            self._health.refused += 1  # of somebody else; the world's own events can be read
+            return
+        if read is not None:
+            self.notices.append(read)
+            self.wake()
+
+    def _on_clock(self, sample: RawSample) -> None:
+        """In realtime, end a wait for a gate that the world has left behind: what it lacks may never come."""
+        blocking = self._blocking
+        if blocking is None:
+            return
+        with contextlib.suppress(DecodeError):
+            clock: run_messages.Clock = messages.decode(keys.CLOCK, sample.payload)
+            if clock.t_ns >= self.inbox.taken_ns + 2 * self._gate_ns:
+                blocking.wake()
+
+    def _on_faults(self, payload: bytes) -> None:
+        try:
+            self._fault_lists.append(messages.decode(keys.FAULTS, payload))
+        except DecodeError:
+            self._health.refused += 1
+
+    def _on_link(self, up: bool) -> None:
+        self.links.append(up)
+        self.wake()
+
+    def _on_query(self, query: Query) -> None:
+        self.queries.append(query)
+        self.wake()

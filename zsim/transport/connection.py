@@ -1,6 +1,6 @@
-"""How a process comes into a federation: the hub listens, a router passes on, everybody else connects to one of them.
+"""How a process joins a federation: the hub listens, a router forwards, all other processes connect to one of them.
 
-`find_world` connects, reads `world/info`, and waits with progress while there is no world yet.
+`find_world` connects and reads `world/info`; while there is no world yet it waits, and says so.
 """
 
 import errno
@@ -8,19 +8,18 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError, NoWorldError, SessionError
 from zsim.transport import tls, zenoh_settings
-from zsim.transport.permissions import Permissions, permissions_of
 from zsim.transport.session import Query, Session, config_of, open_session
-from zsim.transport.tls import Identity
+from zsim.transport.tls import Identity, Permissions, permissions_of
 from zsim.transport.zenoh_settings import Mode, Settings
 
 ATTEMPT_S = 1.0  # one try to connect, so that waiting can be shown and interrupted
-PAUSE_S = 0.1  # between two questions to a hub where no world answers: another federation's, or one on its way up
+PAUSE_S = 0.1  # between two queries to a hub where no world answers: another federation's, or one that is starting
 ANSWER_S = 1.0  # a hub that is there answers within milliseconds, unless it still compiles
 _OS_ERROR = re.compile(r"(?:os error |code: )(\d+)")
 _OTHER = "another is given by --listen, and to the other commands by --connect"
@@ -51,7 +50,7 @@ def listen(
     A peer would do for clients, but carries nothing between two routers that both connect to it.
 
     Raises:
-        SessionError: an endpoint is taken or malformed, or the identity is of no use.
+        SessionError: an endpoint is taken or malformed, or the identity cannot be used.
     """
     with _listening(endpoints, federation, mode, identity or Identity(), zenoh_settings.hub(mode)) as session:
         session.use(mode)
@@ -62,10 +61,10 @@ def listen(
 def route(
     endpoint: str, upstream: str, federation: str, mode: Mode = "lockstep", identity: Identity | None = None
 ) -> Iterator[Session]:
-    """Open a router: it listens on an endpoint, and tries for ever to reach the world, or another router, upstream.
+    """Open a router: it listens on an endpoint, and keeps trying to reach the world, or another router, upstream.
 
     Raises:
-        SessionError: an endpoint is taken or malformed, or the identity is of no use.
+        SessionError: an endpoint is taken or malformed, or the identity cannot be used.
     """
     identity = identity or Identity()
     with _listening([endpoint], federation, mode, identity, zenoh_settings.upstream(upstream, identity)) as session:
@@ -86,10 +85,10 @@ def connect(
     Args:
         endpoint: e.g. "tcp/192.168.1.2:7447".
         federation: prefix of all keys.
-        mode: of the run, where it is known already.
+        mode: of the run, if it is known already.
         wait_s: how long to try; None tries once.
-        reader: it does not gate; in lockstep too, a silence of LEASE_READER_MS is its death.
-        identity: host and certificate; without, this host's name and no TLS.
+        reader: whether it never gates; then a silence of LEASE_READER_MS counts as its death, in lockstep too.
+        identity: host and certificate; by default this host's name and no TLS.
 
     Raises:
         SessionError: nobody listens there within `wait_s`, or a certificate, here or there, is refused.
@@ -136,7 +135,7 @@ def no_listening(endpoints: Sequence[str], error: str) -> str:
 
 
 def _answer_permissions(session: Session, identity: Identity) -> None:
-    """Answer everybody what its certificate lets it do here; a router answers for itself, not the world behind it."""
+    """Tell every process what its certificate permits here; a router answers for itself, not the world behind it."""
     rules = zenoh_settings.read_access(identity)
 
     def answer(query: Query) -> None:
@@ -165,21 +164,48 @@ def find_world(
         endpoint: where the world (or a router) listens.
         federation: its name.
         wait_s: how long to wait for a world; None waits for ever.
-        say: called at growing intervals with whom it waits for.
-        stopped: asked while waiting.
-        reader: it does not gate; see `connect`.
+        say: called at growing intervals with what is waited for.
+        stopped: tells whether to wait no longer.
+        reader: see `connect`.
         run_id: of the only run to take part in; None takes any.
         identity: see `connect`.
 
     Raises:
         NoWorldError: no world answered within `wait_s`, or `stopped` returned true.
-        SessionError: what no waiting mends: a malformed endpoint, a certificate that is refused, or not let in.
+        SessionError: waiting would not help: the endpoint is malformed, or the certificate refused or not admitted.
         BadNameError: the federation's name is outside the contract.
     """
     keys.name(federation, "federation")
+    dial = partial(connect, endpoint, federation, reader=reader, identity=identity)
+    limit_s = float("inf") if wait_s is None else wait_s
+    start_s, next_say_s = time.monotonic(), 0.0
+    link: Session | None = None
+    info: messages.Info | None = None
     with ExitStack() as stack:
-        dial = partial(connect, endpoint, federation, reader=reader, identity=identity)
-        link, info = _search(stack, dial, endpoint, federation, wait_s, say, stopped, run_id, identity)
+        while link is None or info is None:
+            if stopped():
+                raise NoWorldError(f"stopped while waiting for a world on {endpoint}")
+            waited_s = time.monotonic() - start_s
+            try:
+                if link is None:
+                    attempt_s = max(0.05, min(ATTEMPT_S, limit_s - waited_s))
+                    link = stack.enter_context(dial(wait_s=attempt_s))
+                if link.process and link.permissions is None:
+                    link.permissions = read_permissions(link)
+                info = read_info(link)
+                if info is not None and run_id in (None, info.run_id):
+                    break
+                info = None
+                time.sleep(PAUSE_S)
+            except SessionError as error:
+                if "nobody listens" not in str(error) or "not supported" in str(error):
+                    raise  # no waiting mends it
+            if waited_s >= limit_s:
+                why = _no_answer(link, identity) if link is not None else _no_link(endpoint)
+                raise NoWorldError(f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s{why}")
+            if waited_s >= next_say_s:
+                next_say_s = max(2 * next_say_s, 1.0)
+                say(f"waiting for a world of {federation!r} on {endpoint} ({waited_s:.0f} s)")
         if info.mode == "realtime":
             permissions = link.permissions
             stack.pop_all().close()
@@ -189,51 +215,8 @@ def find_world(
         yield link, info
 
 
-def _search(
-    stack: ExitStack,
-    dial: Callable[..., AbstractContextManager[Session]],
-    endpoint: str,
-    federation: str,
-    wait_s: float | None,
-    say: Callable[[str], None],
-    stopped: Callable[[], bool],
-    run_id: str | None,
-    identity: Identity | None,
-) -> tuple[Session, messages.Info]:
-    start_s, next_say_s = time.monotonic(), 0.0
-    link: Session | None = None
-    while not stopped():
-        waited_s = time.monotonic() - start_s
-        left_s = float("inf") if wait_s is None else wait_s - waited_s
-        try:
-            if link is None:
-                attempt_s = max(0.05, min(ATTEMPT_S, left_s))
-                link = stack.enter_context(dial(wait_s=attempt_s))
-            if link.process and link.permissions is None:
-                link.permissions = read_permissions(link)
-            info = read_info(link)
-            if info is not None and run_id in (None, info.run_id):
-                return link, info
-            time.sleep(PAUSE_S)
-        except SessionError as error:
-            _refuse_lasting(error)
-        if waited_s >= (wait_s if wait_s is not None else float("inf")):
-            why = _no_answer(link, identity) if link is not None else _no_link(endpoint)
-            raise NoWorldError(f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s{why}")
-        if waited_s >= next_say_s:
-            next_say_s = max(2 * next_say_s, 1.0)
-            say(f"waiting for a world of {federation!r} on {endpoint} ({waited_s:.0f} s)")
-    raise NoWorldError(f"stopped while waiting for a world on {endpoint}")
-
-
-def _refuse_lasting(error: SessionError) -> None:
-    """Raise again what no waiting mends."""
-    if "nobody listens" not in str(error) or "not supported" in str(error):
-        raise error
-
-
 def _no_answer(link: Session, identity: Identity | None) -> str:
-    """Return why a hub that is there may not answer; one of another version or federation lets nobody ask for it."""
+    """Return why a hub that is there may not answer; one of another version or federation does not let us ask."""
     may_be = ", but somebody listens there: another federation, a world on its way up, a router without one"
     if identity is None or identity.tls is None or link.permissions is not None:
         return f"{may_be}; correct --federation, or wait longer"
@@ -244,14 +227,14 @@ def _no_answer(link: Session, identity: Identity | None) -> str:
 
 
 def _no_link(endpoint: str) -> str:
-    """Return why there is no session; a port that opens nevertheless has another protocol, or TLS."""
+    """Return why there is no session; a port that opens nevertheless speaks another protocol, or TLS."""
     if not _opens(endpoint):
         return "; start one with `zsim world`"
     return ", but who listens there refuses us; if it is a world with TLS, say tls/ and give --tls FOLDER"
 
 
 def _opens(endpoint: str) -> bool:
-    """Tell whether anybody takes a connection to an endpoint without TLS."""
+    """Tell whether an endpoint without TLS accepts connections."""
     protocol, _, place = endpoint.partition("/")
     if protocol != "tcp":
         return False
@@ -264,7 +247,7 @@ def _opens(endpoint: str) -> bool:
 
 
 def read_permissions(link: Session) -> Permissions | None:
-    """Return what access control at the other end lets us do, None where nobody answers that.
+    """Return what access control at the other end permits us, None where nobody answers that.
 
     Raises:
         SessionError: it does not let us in.

@@ -1,21 +1,33 @@
-"""Bounds what one link of the hub holds back: who takes nothing, and is waited for by nobody, loses its link.
+"""Bounds what one link of the hub holds back: a reader that takes nothing, and that nobody waits for, loses its link.
 
 Zenoh knows two ways for a full link: drop what is for it, or block the sender and with it everybody, for all readers of
 a key alike. Participants must lose nothing, so everything blocks; a reader that nobody waits for is therefore cut off
 before its link is full, or at once if it comes back and does so again.
+
+Order of this file: the watch, which session stands for which process, the TCP connections of this process, and the
+processes of this machine at their far ends.
 """
 
+import os
+import socket
+import stat
+import struct
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
-from zsim.transport.link_sockets import LinkSockets
-from zsim.transport.peer_process import command, local_socket, owner
+from zsim.contract import keys
 from zsim.transport.session import FarEnd, Session
-from zsim.transport.session_tokens import SessionTokens
+
+if sys.platform == "linux":
+    import fcntl
+    import termios
 
 LOOK_S = 0.05  # wall time between two looks
 # Zenoh's thread that closes links is also the one that passes on what participants publish. Once that is blocked by a
@@ -26,8 +38,15 @@ ROUND_TRIPS = 3.0  # … so many of its round trips
 HELD_BYTES, HELD_S = 1 << 20, 1.0  # one that takes something all the time, but never catches up
 FRESH_S = 0.2  # between two looks at who is at which far end
 SPARED, SPARED_S = 3, 60.0  # times within so long that the link of a session is closed before it is kept out …
-TOLD_S = 10.0  # between two reports of one session
 KEPT_OUT_S = 30.0  # … for so long
+TOLD_S = 10.0  # between two reports of one session
+
+OWN_FILES = "/proc/self/fd"
+TCP_INFO = struct.Struct("68xI48xQ")  # tcpi_rtt [µs] and tcpi_bytes_acked in struct tcp_info, linux/tcp.h
+RESET, IN_BACKGROUND = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)  # struct linger, socket(7)
+QUEUED = struct.Struct("i")  # of SIOCOUTQ, linux/sockios.h: bytes that the far end has not acknowledged
+TABLES = ("/proc/net/tcp", "/proc/net/tcp6")
+COMMAND_MAX = 80  # characters of a command line that are shown
 
 
 class Awaited(NamedTuple):
@@ -75,7 +94,7 @@ class LinkWatch:
     Args:
         link: the listening session.
         tokens: of all processes.
-        awaited: returns who takes part in a way that they must not lose anything.
+        awaited: returns the participants that must not lose anything.
         sockets: of this process.
         wall_s: monotonic.
 
@@ -86,9 +105,9 @@ class LinkWatch:
     def __init__(
         self,
         link: Session,
-        tokens: SessionTokens,
+        tokens: "SessionTokens",
         awaited: Callable[[], list[Awaited]],
-        sockets: LinkSockets | None = None,
+        sockets: "LinkSockets | None" = None,
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._link = link
@@ -133,6 +152,12 @@ class LinkWatch:
         full = sorted(standing, key=lambda address: -queued.get(address, 0))
         return [" ".join((*self._who(address), f"at {address}")) for address in full]
 
+    def _who(self, address: str) -> tuple[str, ...]:
+        """Return the processes at a far end, or else what is known of it."""
+        far = self._far_ends.get(address)
+        names = self._tokens.processes(far.session) if far else ()
+        return names or ("a router" if far and far.is_router else "somebody",)
+
     def _holds_up(self, address: str, held_bytes: int, now_s: float) -> bool:
         if held_bytes < STALL_BYTES:
             self._backlogs.pop(address, None)
@@ -152,8 +177,14 @@ class LinkWatch:
         far = self._far_end(address, now_s)
         return far is not None and now_s < self._kept_out_s.get(far.session, now_s)
 
+    def _far_end(self, address: str, now_s: float) -> FarEnd | None:
+        if now_s - self._refreshed_s >= FRESH_S:
+            self._refreshed_s = now_s
+            self._far_ends = self._link.far_ends()
+        return self._far_ends.get(address)
+
     def _judge(self, address: str, held_bytes: int, now_s: float) -> None:
-        """Close a link, unless somebody is, or may be, behind it who must lose nothing."""
+        """Close a link, unless a participant that must lose nothing is, or may be, behind it."""
         far, inode = self._far_end(address, now_s), local_socket(address)
         if far is None or far.is_router or self._may_be_awaited(far, inode):
             return
@@ -164,16 +195,11 @@ class LinkWatch:
         times.append(now_s)
         if len(times) >= SPARED and now_s - times[-SPARED] < SPARED_S:
             self._kept_out_s[far.session] = now_s + KEPT_OUT_S
-        if self._is_told(far.session, held_bytes, now_s):
+        # a link that held nothing back, as of a session that is kept out, is not worth a report
+        if held_bytes >= STALL_BYTES and now_s - self._told_s.get(far.session, -TOLD_S) >= TOLD_S:
+            self._told_s[far.session] = now_s
             names = self._tokens.processes(far.session)
             self.closed.append(ClosedLink(address, command(pid), names, held_bytes, len(times)))
-
-    def _is_told(self, session: str, held_bytes: int, now_s: float) -> bool:
-        """Tell whether to report a link: not one that held nothing back, as of a session that is kept out."""
-        if held_bytes < STALL_BYTES or now_s - self._told_s.get(session, -TOLD_S) < TOLD_S:
-            return False
-        self._told_s[session] = now_s
-        return True
 
     def _may_be_awaited(self, far: FarEnd, inode: str) -> bool:
         """Tell whether a far end is waited for: by its tokens, or else by its pid, if that can be known."""
@@ -184,14 +210,180 @@ class LinkWatch:
         pid = owner(inode) if unknown else ""
         return int(pid) in unknown if pid else bool(unknown)
 
-    def _who(self, address: str) -> tuple[str, ...]:
-        """Return the processes at a far end, or else what is known of it."""
-        far = self._far_ends.get(address)
-        names = self._tokens.processes(far.session) if far else ()
-        return names or ("a router" if far and far.is_router else "somebody",)
 
-    def _far_end(self, address: str, now_s: float) -> FarEnd | None:
-        if now_s - self._refreshed_s >= FRESH_S:
-            self._refreshed_s = now_s
-            self._far_ends = self._link.far_ends()
-        return self._far_ends.get(address)
+Sessions = frozenset[str]  # by Zenoh's names of them: hexadecimal digits
+
+
+class SessionTokens:
+    """Which sessions stand for which process: by liveliness tokens, kept up to date in threads of Zenoh.
+
+    A token `process/{p}` says that a process lives, but not whose it is: Zenoh names no holder, and its admin space,
+    which would, can stop a router for good when it is asked (eclipse-zenoh/zenoh#2619). So each process also declares
+    `process/{p}/session/{session}`.
+
+    Args:
+        link: the listening session.
+    """
+
+    def __init__(self, link: Session) -> None:
+        self._link = link
+        self._sessions: dict[str, Sessions] = {}  # by process
+        self._alive: set[str] = set()
+
+    def watch(self) -> None:
+        """Keep up with the tokens from now on; those that are there are known at once."""
+        self._link.on_token(keys.token("**"), self._on_token)
+
+    def sessions(self, process: str) -> Sessions:
+        """Return the sessions that stand for a process; none for one that does not say so."""
+        return self._sessions.get(process, Sessions())
+
+    def shown(self) -> list[str]:
+        """Return the processes of which sessions are known."""
+        return list(self._sessions)
+
+    def is_alive(self, process: str) -> bool:
+        """Tell whether any session has a token of a process."""
+        return process in self._alive or process in self._sessions
+
+    def processes(self, session: str) -> tuple[str, ...]:
+        """Return the processes that a session stands for."""
+        return tuple(process for process, sessions in list(self._sessions.items()) if session in sessions)
+
+    def _on_token(self, key: str, alive: bool) -> None:
+        _, process, what = keys.parts(key)
+        if not what:
+            (self._alive.add if alive else self._alive.discard)(process)
+        elif session := keys.session_of(key):
+            others = self.sessions(process) - {session}
+            present = others | {session} if alive else others
+            if present:
+                self._sessions[process] = present
+            else:
+                self._sessions.pop(process, None)
+
+
+class Progress(NamedTuple):
+    """How many bytes a far end has acknowledged so far, -1 if it is gone, and how long that takes [s]."""
+
+    acknowledged: int
+    round_trip_s: float
+
+
+class LinkSockets:
+    """The TCP connections of this process, by the address of their far end; callable from any thread.
+
+    Zenoh does not show them, and lets its sockets linger for 10 s when it closes them itself, as that of a process
+    that is stopped in realtime: meanwhile the thread that closes, which also passes on what others publish, does
+    nothing else. So no socket lingers that was seen once. Only Linux shows connections; elsewhere there are none.
+    """
+
+    def __init__(self) -> None:
+        self._far: dict[tuple[int, int], str] = {}  # address by file and inode; empty for what is no connection
+
+    def queued(self) -> dict[str, int]:
+        """Return how many bytes wait for each far end in the kernel."""
+        if sys.platform != "linux":
+            return {}
+        waiting = {}
+        for file, address in self._connections().items():
+            with suppress(OSError):
+                waiting[address] = QUEUED.unpack(fcntl.ioctl(file, termios.TIOCOUTQ, bytes(QUEUED.size)))[0]
+        return waiting
+
+    def progress(self, address: str) -> Progress:
+        """Return how far a far end has come."""
+        with suppress(OSError), self._open(address) as connection:
+            info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO.size)
+            round_trip_us, acknowledged = TCP_INFO.unpack(info)
+            return Progress(acknowledged, round_trip_us / 1e6)
+        return Progress(-1, 0.0)
+
+    def close(self, address: str) -> None:
+        """Close a connection and drop what it holds back; Zenoh takes it for lost."""
+        with suppress(OSError), self._open(address) as connection:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+            connection.shutdown(socket.SHUT_RDWR)
+
+    def _open(self, address: str) -> socket.socket:
+        """Return a connection as a socket of our own.
+
+        Raises:
+            OSError: it is gone.
+        """
+        for file, far in self._connections().items():
+            if far == address:
+                duplicate = socket.socket(fileno=os.dup(file))
+                if _far_end(duplicate) == address:
+                    return duplicate
+                duplicate.close()
+        raise OSError(f"{address}: no connection")
+
+    def _connections(self) -> dict[int, str]:
+        found = {}
+        for name in os.listdir(OWN_FILES):
+            with suppress(OSError):
+                status = os.fstat(int(name))
+                if stat.S_ISSOCK(status.st_mode):
+                    found[int(name), status.st_ino] = ""
+        self._far = {key: self._far[key] if key in self._far else _first_seen(key[0]) for key in found}
+        return {file: address for (file, _), address in self._far.items() if address}
+
+
+def _first_seen(file: int) -> str:
+    """Return the far end of a file, empty where it is no connection, and see to it that it does not linger."""
+    try:
+        with socket.socket(fileno=os.dup(file)) as duplicate:
+            if address := _far_end(duplicate):
+                duplicate.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, IN_BACKGROUND)
+            return address
+    except OSError:
+        return ""
+
+
+def _far_end(connection: socket.socket) -> str:
+    """Return the far end of a TCP connection as Zenoh writes it, empty for any other socket."""
+    if connection.family not in (socket.AF_INET, socket.AF_INET6) or connection.type != socket.SOCK_STREAM:
+        return ""
+    try:
+        host, port, *_ = connection.getpeername()
+    except OSError:
+        return ""  # it listens
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def local_socket(address: str) -> str:
+    """Return the inode of the socket whose end has an address; empty if it is not on this machine, or not on Linux."""
+    host, _, port = address.rpartition(":")
+    host = host.strip("[]")
+    packed = socket.inet_pton(socket.AF_INET6 if ":" in host else socket.AF_INET, host)
+    words = struct.unpack(f"={len(packed) // 4}I", packed)  # as the tables have it: 32-bit words in the machine's order
+    end = "".join(f"{word:08X}" for word in words) + f":{int(port):04X}"
+    for table in TABLES:
+        with suppress(OSError), open(table, encoding="ascii") as lines:
+            for line in lines:
+                fields = line.split()
+                if fields[1] == end and fields[9] != "0":
+                    return fields[9]
+    return ""
+
+
+def owner(inode: str) -> str:
+    """Return the pid of the process that has a socket open; empty if there is none, or we may not know."""
+    for pid in filter(str.isdigit, os.listdir("/proc")) if inode else ():
+        with suppress(OSError), os.scandir(f"/proc/{pid}/fd") as files:
+            for file in files:
+                with suppress(OSError):  # closed meanwhile
+                    if os.readlink(file.path) == f"socket:[{inode}]":
+                        return pid
+    return ""
+
+
+def command(pid: str) -> str:
+    """Return pid and command of a process; empty without a pid."""
+    if not pid:
+        return ""
+    with suppress(OSError):
+        line = (Path("/proc") / pid / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        return f"pid {pid} ({' '.join(line.split())[:COMMAND_MAX]})"
+    return f"pid {pid}"

@@ -1,7 +1,7 @@
-"""One process's access to a federation: what it publishes, subscribes to, queries, answers, and its liveliness.
+"""One process's access to a federation: publications, subscriptions, queries, requests, liveliness and links.
 
 Keys are given without the federation's prefix; the session adds and removes it. This is the only file that imports
-zenoh, which is why it is as long as it is.
+zenoh.
 """
 
 import re
@@ -18,12 +18,10 @@ from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
 from zsim.transport import tls, zenoh_settings
-from zsim.transport.open_files import SESSION_FILES, require_files
-from zsim.transport.permissions import Act, Permissions
-from zsim.transport.tls import Identity
-from zsim.transport.zenoh_settings import Mode, Settings
+from zsim.transport.tls import Act, Identity, Permissions
+from zsim.transport.zenoh_settings import SESSION_FILES, Mode, Settings, require_files
 
-QUEUE_MAX = 1_000_000  # messages; a subscription that is not read blocks the whole link once it is full
+QUEUE_MAX = 1_000_000  # messages; a subscription that is not read blocks the whole link once its queue is full
 
 
 class ReceivedSample(NamedTuple):
@@ -60,8 +58,8 @@ class RawSample(NamedTuple):
     attachment: bytes = b""
 
 
-def raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
-    """Return a sample of Zenoh's; `prefix` is taken off its key."""
+def _raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
+    """Return a sample of Zenoh; `prefix` is removed from its key."""
     return RawSample(
         kind="PUT" if sample.kind == zenoh.SampleKind.PUT else "DELETE",
         key=str(sample.key_expr).removeprefix(prefix),
@@ -72,26 +70,26 @@ def raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
     )
 
 
-def raw_reply(reply: zenoh.Reply, prefix: str) -> RawSample:
-    """Return the sample in a reply, or its refusal; `prefix` is taken off its key."""
+def _raw_reply(reply: zenoh.Reply, prefix: str) -> RawSample:
+    """Return the sample in a reply, or its refusal; `prefix` is removed from its key."""
     if reply.ok is not None:
-        return raw_sample(reply.ok, prefix)
+        return _raw_sample(reply.ok, prefix)
     assert reply.err is not None
     return RawSample("ERROR", "", reply.err.payload.to_bytes(), str(reply.err.encoding), None)
 
 
 def check_expression(expression: str) -> None:
-    """Refuse what is no key expression.
+    """Check that a text is a key expression.
 
     Raises:
-        SessionError: with what was found and what is allowed.
+        SessionError: it is none; says what was found and what is allowed.
     """
-    with key_errors(expression):
+    with _key_errors(expression):
         zenoh.KeyExpr(expression)
 
 
 @contextmanager
-def key_errors(expression: str) -> Iterator[None]:
+def _key_errors(expression: str) -> Iterator[None]:
     """Turn Zenoh's refusal of a key into a SessionError in the contract's words."""
     try:
         yield
@@ -99,22 +97,22 @@ def key_errors(expression: str) -> Iterator[None]:
         stripped = re.sub("//+", "/", expression.strip("/"))
         allowed = "must be names with / between them, * for any name, ** for any number of them"
         instead = f"must be {stripped}, without / at its ends" if stripped not in (expression, "") else allowed
-        raise SessionError(f"key is {expression!r} ({first_sentence(error).split('`: ')[-1]}); {instead}") from error
+        raise SessionError(f"key is {expression!r} ({_first_sentence(error).split('`: ')[-1]}); {instead}") from error
 
 
-def first_sentence(error: BaseException) -> str:
+def _first_sentence(error: BaseException) -> str:
     """Return the first sentence of a Zenoh error without its source location."""
     return str(error).split(" at ", 1)[0].split("\n", 1)[0][:240]
 
 
 class Subscription:
-    """Everything that others publish on one expression, in the order of its arrival on this session.
+    """Everything that is published on one expression, in order of arrival at this session.
 
     Args:
         raw: the session.
         prefix: of its keys.
-        expression: what to take.
-        without: beginnings of keys to leave out; then pictures and what this session itself publishes are left out too.
+        expression: the keys to receive.
+        without: prefixes of keys to leave out; if given, pictures and this session's own messages are left out too.
     """
 
     def __init__(self, raw: zenoh.Session, prefix: str, expression: str, without: tuple[str, ...] = ()) -> None:
@@ -152,10 +150,10 @@ class Subscription:
         try:
             self._raw.put(self._wake_key, b"", allowed_destination=zenoh.Locality.SESSION_LOCAL)
         except zenoh.ZError:
-            return  # closed: nobody waits any more
+            return  # closed: nobody waits any longer
 
     def undeclare(self) -> None:
-        """Take no more; a waiting `receive` raises SessionError."""
+        """Receive nothing more; a waiting `receive` raises SessionError."""
         self._subscriber.undeclare()
 
     def _take(self, raw: zenoh.Sample) -> ReceivedSample | None:
@@ -163,7 +161,7 @@ class Subscription:
         if self._without and (key.startswith(self._without) or keys.is_picture(key)):
             return None
         payload = raw.payload.to_bytes()
-        return ReceivedSample(key, payload) if payload else None  # empty: a wake, or a deletion; no message is
+        return ReceivedSample(key, payload) if payload else None  # empty: a wake or a deletion, never a message
 
 
 class Query:
@@ -182,7 +180,11 @@ class Query:
         self.attachment = raw.attachment.to_bytes() if raw.attachment is not None else b""
 
     def request(self) -> ControlRequest:
-        """Return the request in it; DecodeError if it is none."""
+        """Return the request in it.
+
+        Raises:
+            DecodeError: it holds none.
+        """
         return messages.decode_as(ControlRequest, self.payload, self.expression)
 
     def reply(self, key: str, payload: bytes) -> None:
@@ -191,7 +193,7 @@ class Query:
             self._raw.reply(self._prefix + key, payload, encoding=zenoh.Encoding(messages.encoding(key)))
 
     def reply_raw(self, key: str, payload: bytes, attachment: bytes) -> None:
-        """Reply with a payload that is no message of the contract, and end the query."""
+        """Reply with a payload that is not a message of the contract, and end the query."""
         if self._raw is not None:
             self._raw.reply(self._prefix + key, payload, attachment=attachment)
         self.end()
@@ -211,18 +213,18 @@ class Query:
 
 
 class Unanswered(ControlAnswer, frozen=True):
-    """In place of an answer where none came: why."""
+    """Takes the place of an answer that did not come, and says why."""
 
 
 class Session:
-    """A Zenoh session, open until whoever opened it closes it.
+    """A Zenoh session; `open_session` opens and closes it.
 
     Attributes:
         federation: prefix of all keys.
         host: the name of this process's host, as its messages give it.
         process: the name in its certificate; empty without one.
-        guarded: whether access control decides here who may do what.
-        permissions: what access control at the other end lets this process do; None where it has none, or is not asked.
+        guarded: whether access control is enforced here.
+        permissions: what access control at the other end permits this process; None where it has none, or is not asked.
         reads: the expressions that it has subscribed to so far.
     """
 
@@ -242,11 +244,11 @@ class Session:
         self._realtime = False
 
     def use(self, mode: Mode) -> None:
-        """Choose what a full link does to sensors: BLOCK in lockstep, DROP in realtime."""
+        """Choose what happens to sensor messages on a full link: BLOCK in lockstep, DROP in realtime."""
         self._realtime = mode == "realtime"
 
     def unprefixed(self) -> "Session":
-        """Return the same session by whole keys, the federation's name included, for bridges to other federations."""
+        """Return the same session with whole keys, prefix included, for bridges to other federations."""
         session = Session(self._raw, "", Identity(host=self.host))
         self._declared[id(session)] = session.undeclare_all
         return session
@@ -256,7 +258,7 @@ class Session:
         return str(self._raw.info.zid())
 
     def undeclare_all(self) -> None:
-        """Undeclare everything: what is declared when a Zenoh session closes keeps files and memory of it for ever."""
+        """Undeclare everything: what is still declared when a Zenoh session closes holds files and memory for ever."""
         for undeclare in list(self._declared.values()):
             with suppress(zenoh.ZError):  # undeclared already, or its session is gone
                 undeclare()
@@ -267,7 +269,7 @@ class Session:
         return declared
 
     def _refusal(self, act: Act, expression: str) -> str | None:
-        """Return why access control at the other end would drop what we do, None if it would not."""
+        """Return why access control at the other end would drop what we do, None if it permits it."""
         if self.permissions is None:
             return None
         wanted = zenoh.KeyExpr(self._prefix + expression)
@@ -276,8 +278,8 @@ class Session:
         return self.permissions.denial(act, expression, self._prefix)
 
     def _check(self, act: Act, expression: str) -> None:
-        """Refuse what access control at the other end would drop without a reason."""
-        with key_errors(expression):
+        """Refuse what access control at the other end would drop silently."""
+        with _key_errors(expression):
             if fault := self._refusal(act, expression):
                 raise SessionError(fault)
 
@@ -287,7 +289,7 @@ class Session:
         """Publish a message on its key.
 
         Raises:
-            SessionError: our certificate does not let us publish there.
+            SessionError: our certificate does not permit us to publish there.
         """
         self.put_raw(key, messages.encode(message))
 
@@ -305,27 +307,21 @@ class Session:
     def _declare(self, key: str) -> zenoh.Publisher:
         self._check("publish", key)
         view = key.startswith("view/") or keys.is_picture(key)
-        drop = view or (self._realtime and keys.may_drop(key))
-        # A queue of its own: in one with others, a view that the hub passes on would wait behind a put that blocks.
-        priority = zenoh.Priority.DATA_LOW if view else zenoh.Priority.DATA
-        with key_errors(key):
-            publisher = self._raw.declare_publisher(
-                self._prefix + key,
-                encoding=zenoh.Encoding(messages.encoding(key)),
-                congestion_control=zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,
-                priority=priority,
-            )
+        flow = _flow(view, view or (self._realtime and keys.may_drop(key)))
+        with _key_errors(key):
+            encoding = zenoh.Encoding(messages.encoding(key))
+            publisher = self._raw.declare_publisher(self._prefix + key, encoding=encoding, **flow)
         self._publishers[key] = self._keep(publisher)
         return publisher
 
     def has_subscribers(self, key: str) -> bool:
         """Tell whether anybody subscribes to a key of ours."""
         if key not in self._matching:
-            self._listen_for_subscribers(key)
+            self._follow_subscribers(key)
         return self._matching[key]
 
-    def _listen_for_subscribers(self, key: str) -> None:
-        """Keep up to date whether a key is subscribed to: asked at each gate, Zenoh takes long for it."""
+    def _follow_subscribers(self, key: str) -> None:
+        """Keep up to date whether a key has subscribers: Zenoh takes too long to be asked at each gate."""
         publisher = self._publishers.get(key) or self._declare(key)
 
         def note(status: Any) -> None:
@@ -334,7 +330,7 @@ class Session:
         self._matching[key] = False
         self._keep(publisher.declare_matching_listener(zenoh.handlers.Callback(note, indirect=False)))
         status: Any = publisher.matching_status  # the stub says bool; it is an object that has one
-        if status.matching:  # no more than that: the listener's thread may have noted a subscriber since it was asked
+        if status.matching:  # and never False: the listener's thread may have noted a subscriber meanwhile
             self._matching[key] = True
 
     def put_sample(self, key: str, payload: bytes, encoding: str) -> None:
@@ -344,44 +340,37 @@ class Session:
             SessionError: it is no key.
         """
         picture = keys.is_picture(key)
-        control = zenoh.CongestionControl.DROP if picture else zenoh.CongestionControl.BLOCK
-        priority = zenoh.Priority.DATA_LOW if picture else zenoh.Priority.DATA
-        with key_errors(key):
-            self._raw.put(
-                self._prefix + key,
-                payload,
-                encoding=zenoh.Encoding(encoding),
-                congestion_control=control,
-                priority=priority,
-            )
+        with _key_errors(key):
+            self._raw.put(self._prefix + key, payload, encoding=zenoh.Encoding(encoding), **_flow(picture, picture))
 
     def declare_publisher(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
-        """Return what publishes (payload, attachment) on one key, again and again; a full link loses it.
+        """Return a function that publishes (payload, attachment) on one key; a full link drops it.
 
         Raises:
-            SessionError: it is no key, or our certificate does not let us publish there.
+            SessionError: it is no key, or our certificate does not permit us to publish there.
         """
         self._check("publish", key)
-        whole_key, drop = self._prefix + key, zenoh.CongestionControl.DROP
-        with key_errors(key):
+        with _key_errors(key):
             publisher = self._raw.declare_publisher(
-                whole_key, encoding=zenoh.Encoding(encoding), congestion_control=drop
+                self._prefix + key,
+                encoding=zenoh.Encoding(encoding),
+                congestion_control=zenoh.CongestionControl.DROP,
             )
         self._keep(publisher)
         return lambda payload, attachment: publisher.put(payload, attachment=attachment)
 
     def put_cached(self, key: str, payload: bytes, encoding: str = "", attachment: bytes = b"") -> None:
-        """Publish a payload, and keep it for later subscribers that query it (Zenoh's advanced subscribers do).
+        """Publish a payload, and keep it for later subscribers that query it, as Zenoh's advanced subscribers do.
 
         Raises:
             SessionError: it is no key.
         """
-        with key_errors(key):
+        with _key_errors(key):
             publisher = self._cached_publishers.get(key) or self._declare_cached(key, encoding)
             publisher.put(payload, attachment=attachment)
 
     def _declare_cached(self, key: str, encoding: str) -> zenoh.ext.AdvancedPublisher:
-        """Return a publisher that keeps its last sample; it numbers them, since no session here stamps times."""
+        """Return a publisher that keeps its last sample; samples are numbered, since no session here stamps them."""
         publisher = zenoh.ext.declare_advanced_publisher(
             self._raw,
             self._prefix + key,
@@ -399,7 +388,7 @@ class Session:
         Raises:
             SessionError: it is no key.
         """
-        with key_errors(key):
+        with _key_errors(key):
             self._raw.delete(self._prefix + key)
 
     # Subscribing
@@ -408,17 +397,17 @@ class Session:
         """Return a subscription to everything that others publish on an expression, in order.
 
         Raises:
-            SessionError: it is no key expression, or our certificate does not let us read it.
+            SessionError: it is no key expression, or our certificate does not permit us to read it.
         """
         self._check("read", expression)
         self.reads.append(expression)
-        with key_errors(expression):
+        with _key_errors(expression):
             return self._keep(Subscription(self._raw, self._prefix, expression))
 
     def subscribe_remote(self, without: tuple[str, ...]) -> Subscription:
-        """Return a subscription to everything that other sessions publish, but pictures and keys that begin so.
+        """Return a subscription to all that other sessions publish, except pictures and keys with these prefixes.
 
-        Nothing wakes who waits for it.
+        A waiting `receive` cannot be woken.
         """
         self.reads.append("**")
         return self._keep(Subscription(self._raw, self._prefix, "**", without))
@@ -427,13 +416,13 @@ class Session:
         """Call back, in a thread of Zenoh's, for everything on an expression until the returned function is called.
 
         Raises:
-            SessionError: it is no key expression, or our certificate does not let us read it.
+            SessionError: it is no key expression, or our certificate does not permit us to read it.
         """
         self._check("read", expression)
         self.reads.append(expression)
-        with key_errors(expression):
+        with _key_errors(expression):
             subscriber = self._raw.declare_subscriber(
-                self._prefix + expression, lambda sample: callback(raw_sample(sample, self._prefix))
+                self._prefix + expression, lambda sample: callback(_raw_sample(sample, self._prefix))
             )
         self._keep(subscriber)
 
@@ -449,19 +438,19 @@ class Session:
     def query(
         self, expression: str, parameters: str = "", payload: bytes = b"", encoding: str = "", timeout_s: float = 2.0
     ) -> list[RawSample]:
-        """Return everything that is replied to a query, refusals too.
+        """Return all replies to a query, refusals among them.
 
         Raises:
             SessionError: it is no key expression.
         """
         body: dict[str, Any] = {"payload": payload, "encoding": zenoh.Encoding(encoding)} if payload else {}
-        with key_errors(expression):
+        with _key_errors(expression):
             selector = zenoh.Selector(self._prefix + expression, parameters)
             replies = self._raw.get(selector, timeout=timeout_s, **body)
-        return [raw_reply(reply, self._prefix) for reply in replies]
+        return [_raw_reply(reply, self._prefix) for reply in replies]
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample]:
-        """Return the last values that are replied on an expression.
+        """Return the last values of the keys of an expression.
 
         Raises:
             SessionError: it is no key expression.
@@ -470,7 +459,7 @@ class Session:
         return [ReceivedSample(reply.key, reply.payload) for reply in replies if reply.kind != "ERROR"]
 
     def get_surely(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample] | None:
-        """Return the last values that are replied on an expression; None if somebody did not reply in time.
+        """Return the last values of the keys of an expression; None if a process did not reply in time.
 
         Raises:
             SessionError: it is no key expression.
@@ -483,17 +472,17 @@ class Session:
     def request(
         self, key: str, op: str, source: str, args: dict[str, Any] | None = None, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Send a request to `key` and return its answer; without one, or where we may not ask, `Unanswered`.
+        """Send a request to `key` and return its answer; `Unanswered` if none comes, or we may not ask there.
 
         Raises:
-            SessionError: it is no key, or something among the arguments fits into no message.
+            SessionError: it is no key, or the arguments cannot be encoded.
         """
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
         except (OverflowError, UnicodeEncodeError) as error:
             allowed = "must hold whole numbers of 64 bits, and text in UTF-8"
             raise SessionError(f"{key}: {op} cannot be sent ({error}); {allowed}") from error
-        with key_errors(key):
+        with _key_errors(key):
             if fault := self._refusal("ask", key):
                 return Unanswered(ok=False, error=fault)
         start_s = time.monotonic()
@@ -510,7 +499,7 @@ class Session:
         Args:
             expression: what is answered on.
             callback: takes each query.
-            complete: whether nobody else need be asked about it.
+            complete: whether no other process need be asked about it.
         """
         queryable = self._raw.declare_queryable(
             self._prefix + expression, lambda query: callback(Query(query, self._prefix)), complete=complete
@@ -525,11 +514,11 @@ class Session:
         self.declare_token(keys.token(name))
 
     def declare_token(self, key: str) -> None:
-        """Show that what a key is about lives; the token goes with this session."""
+        """Show that the subject of a key lives; the token disappears with this session."""
         self._keep(self._raw.liveliness().declare_token(self._prefix + key))
 
     def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:
-        """Call back with (key, alive) whenever a token appears or goes, and for those that are there."""
+        """Call back with (key, alive) whenever a token appears or disappears, and for those that exist already."""
 
         def forward(sample: zenoh.Sample) -> None:
             alive = sample.kind == zenoh.SampleKind.PUT
@@ -538,7 +527,7 @@ class Session:
         self._keep(self._raw.liveliness().declare_subscriber(self._prefix + expression, forward, history=True))
 
     def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
-        """Return the keys of the tokens that are there now."""
+        """Return the keys of the tokens that exist now."""
         replies = self._raw.liveliness().get(self._prefix + expression, timeout=timeout_s)
         return [str(r.ok.key_expr).removeprefix(self._prefix) for r in replies if r.ok is not None]
 
@@ -570,7 +559,7 @@ def open_session(
     """Open a session of Zenoh, and close it with everything that it has declared.
 
     Args:
-        explain: makes of Zenoh's error the line that the user reads.
+        explain: turns Zenoh's error into the line that the user reads.
 
     Raises:
         SessionError: it cannot be opened, or the process may not open as many files as it needs.
@@ -579,19 +568,30 @@ def open_session(
     config = config_of(settings, identity)
     try:
         raw = zenoh.open(config)
-    except zenoh.ZError as error:
-        raise SessionError(explain(first_sentence(error))) from error
     except BaseException as error:
-        if type(error).__name__ != "PanicException":  # of Rust, which no module exports: no thread, no memory
+        # a panic of Rust, whose class no module exports: no thread, no memory
+        if not isinstance(error, zenoh.ZError) and type(error).__name__ != "PanicException":
             raise
-        raise SessionError(explain(first_sentence(error))) from error
+        raise SessionError(explain(_first_sentence(error))) from error
     session = Session(raw, federation, identity)
     try:
         yield session
     finally:
         session.undeclare_all()
-        with suppress(zenoh.ZError):  # somebody at a far end is stopped, and does not take what is left for it
+        with suppress(zenoh.ZError):  # a process at a far end is stopped, and does not take what is left for it
             raw.close()
+
+
+def _flow(view: bool, drop: bool) -> dict[str, Any]:
+    """Return what Zenoh does with a message on a full link.
+
+    Views have a queue of their own: in one with others, a view that the hub forwards would wait behind a put that
+    blocks.
+    """
+    return {
+        "congestion_control": zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,
+        "priority": zenoh.Priority.DATA_LOW if view else zenoh.Priority.DATA,
+    }
 
 
 def config_of(settings: Settings, identity: Identity) -> zenoh.Config:

@@ -1,7 +1,11 @@
-"""The identity of a process on the network, and why a TLS link fails: Zenoh reports only that it could not connect.
+"""The identity of a process on the network, why a TLS link fails, and what a certificate permits.
 
-Python's ssl does the same handshake with the same files and gets the reason. Dates are checked here, so that an expired
-certificate can still be read and named.
+Zenoh reports only that it could not connect. Python's ssl does the same handshake with the same files and gets the
+reason. Dates are checked here, so that an expired certificate can still be read and named.
+
+What access control does not permit Zenoh drops without telling the sender. So a process that listens answers a get on
+`@access/NAME` with `Permissions`, to everybody with a certificate of its authority, and a client refuses before it
+sends.
 """
 
 import contextlib
@@ -10,8 +14,11 @@ import re
 import socket
 import ssl
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
+
+from msgspec import Struct
 
 CERTIFICATES = AUTHORITY, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"  # in a folder of `zsim certs init`
 DAYS = 30.0  # how long a certificate is good for, as it lies on its host
@@ -22,6 +29,10 @@ NETWORKED = ("tcp", "udp", "ws")  # of what Zenoh's wheel has without encryption
 MEND = "make new ones with zsim certs init"
 RENEW = f"{MEND} --renew"
 ADDRESS_MEND = f"name that in the hosts file and {MEND}, or connect to another address"
+Act = Literal["publish", "read", "ask"]
+MESSAGES: dict[Act, str] = {"publish": "put", "read": "declare_subscriber", "ask": "query"}  # Zenoh's, by act
+SHOWN_MAX = 4  # names or expressions in a line
+OTHER_CERTIFICATE = "take that of a process that may, or of an operator (zsim certs init --operator NAME)"
 
 _ENDPOINT = re.compile(r"(?:tls|quic)/\[?(?P<host>[^\]]*?)\]?:(?P<port>\d+)(?:[?#].*)?")
 _UNRELATED = (18, 19, 20, 21)  # X509_V_ERR_ self-signed, self-signed in chain, no issuer here, signature unverified
@@ -29,12 +40,12 @@ _MISNAMED = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISM
 
 
 class Identity(NamedTuple):
-    """The identity that a process is started with: its host, its certificate, and whom it lets in.
+    """The identity that a process is started with: its host, its certificate, and whom it admits.
 
     Attributes:
         host: the name that its messages give.
         tls: folder with ca.pem, certificate.pem and key.pem; None goes without TLS.
-        access: file with Zenoh's access control, for a process that listens; None lets everybody in.
+        access: file with Zenoh's access control, for a process that listens; None admits everybody.
         insecure: whether links may leave the machine without TLS.
         process: name that the certificate must have; empty for any.
     """
@@ -64,12 +75,12 @@ class Identity(NamedTuple):
 
 
 def is_tls(endpoint: str) -> bool:
-    """Return whether a link of an endpoint is encrypted."""
+    """Tell whether a link of an endpoint is encrypted."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
 def leaves_machine(endpoint: str) -> bool:
-    """Return whether a link of an endpoint goes over a network; False for a malformed endpoint."""
+    """Tell whether a link of an endpoint goes over a network; False for a malformed endpoint."""
     protocol, _, place = endpoint.partition("/")
     host = (place.rpartition(":")[0] or place).strip("[]")
     if protocol not in NETWORKED or host == "localhost":
@@ -81,7 +92,7 @@ def leaves_machine(endpoint: str) -> bool:
 
 
 def own_fault(identity: Identity) -> str | None:
-    """Return what is wrong with a process's own files, None if nothing is."""
+    """Return what is wrong with a process's own files, None if they are good."""
     assert identity.tls is not None
     for name in CERTIFICATES:
         try:
@@ -96,34 +107,30 @@ def own_fault(identity: Identity) -> str | None:
         certificate = _read_own(identity)
     except (ssl.SSLError, ValueError) as error:
         return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not go together ({_reason(error)}); {MEND}"
-    return _date_fault(certificate) or _name_fault(identity, certificate)
-
-
-def own_name(identity: Identity) -> str:
-    """Return the name in a process's own certificate, of which `own_fault` has found nothing wrong."""
-    return _name(_read_own(identity))
-
-
-def _name_fault(identity: Identity, certificate: dict[str, Any]) -> str | None:
-    """Return whether a certificate is another process's: access control would drop whatever ours sends."""
+    if fault := _date_fault(certificate):
+        return fault
     found, wanted = _name(certificate), identity.process
     if wanted in ("", found):
-        return None
+        return None  # else access control would drop whatever this process sends
     return f"{identity.tls}: the certificate is for {found}; must be for {wanted}; give --tls the folder of that"
 
 
+def own_name(identity: Identity) -> str:
+    """Return the name in a process's own certificate, in which `own_fault` has found nothing wrong."""
+    return _name(_read_own(identity))
+
+
 def no_link(identity: Identity, endpoint: str, error: str) -> str:
-    """Return why a client did not come in, in a line; `error` is Zenoh's text."""
-    fault = peer_fault(identity, endpoint)
-    if fault:
+    """Return in a line why a client could not connect; `error` is Zenoh's text."""
+    if fault := peer_fault(identity, endpoint):
         return f"cannot connect to {endpoint}: {fault}"
     return f"nobody listens on {endpoint}; start a world there ({error})"
 
 
 def peer_fault(identity: Identity, endpoint: str) -> str | None:
-    """Return why a handshake with whoever listens on an endpoint fails.
+    """Return why a handshake with the process that listens on an endpoint fails.
 
-    None where it does not fail, and where nobody listens or answers: that may change by waiting.
+    None where it does not fail, and where nobody listens or answers, which may change by waiting.
     """
     place = _ENDPOINT.fullmatch(endpoint)
     if identity.tls is None or place is None:
@@ -149,13 +156,17 @@ def _shake(identity: Identity, plain: socket.socket, place: re.Match[str], endpo
                     link.recv(1)
             return fault
     except ssl.SSLCertVerificationError as error:
-        return _misnamed(identity, place) if error.verify_code in _MISNAMED else _unverified(error)
+        if error.verify_code in _MISNAMED:
+            return _misnamed(identity, place)
+        if error.verify_code in _UNRELATED:
+            return f"the certificate of who listens there is of another authority than ours; {MEND} and use one set"
+        return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
     except ssl.SSLError as error:
         return _words(error, endpoint)
 
 
 def _misnamed(identity: Identity, place: re.Match[str]) -> str:
-    """Return for which addresses the certificate of who listens is, which is not the one that we connect to."""
+    """Return for which addresses the other certificate is valid: not for the one that we connect to."""
     context = _client(identity)
     context.check_hostname = False
     with _dial(place) as plain, context.wrap_socket(plain) as link:
@@ -172,15 +183,8 @@ def _client(identity: Identity) -> ssl.SSLContext:
     return context
 
 
-def _unverified(error: ssl.SSLCertVerificationError) -> str:
-    """Return in words why we refuse the certificate of who listens."""
-    if error.verify_code in _UNRELATED:
-        return f"the certificate of who listens there is of another authority than ours; {MEND} and use one set"
-    return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
-
-
 def _words(error: ssl.SSLError, endpoint: str) -> str | None:
-    """Return an error of the handshake in words; None where it may be gone at the next try."""
+    """Return an error of the handshake in words; None if the next attempt may succeed."""
     reason = error.reason or ""
     if "EXPIRED" in reason:
         return f"our certificate has expired by the clock of who listens there; {RENEW}"
@@ -199,7 +203,7 @@ def _reason(error: Exception) -> str:
 
 
 def _date_fault(certificate: dict[str, Any]) -> str | None:
-    """Return whether a certificate's time is over, or not yet come."""
+    """Return that a certificate has expired, or is not valid yet; None if it is valid now."""
     if not certificate:
         return None
     now_s = time.time()
@@ -237,3 +241,64 @@ def _read_own(identity: Identity) -> dict[str, Any]:
         with contextlib.suppress(ssl.SSLWantReadError):
             side.do_handshake()
     return client.getpeercert() or {}
+
+
+class Permissions(Struct, frozen=True):
+    """What one process may do at the process that listens; expressions include the federation's name.
+
+    Attributes:
+        listener: name of the process that listens.
+        process: name in the certificate.
+        allowed: expressions by act; empty for a process that is not admitted.
+        known: names that are admitted, where this one is not.
+    """
+
+    listener: str
+    process: str
+    allowed: dict[Act, tuple[str, ...]] = {}
+    known: tuple[str, ...] = ()
+
+    def refusal(self) -> str | None:
+        """Return why the process is not admitted, None if it is."""
+        if self.allowed:
+            return None
+        return (
+            f"certificate for {self.process} is not let in by {self.listener}; must be for one of "
+            f"{_shown(self.known)}; let it in with zsim certs init, and start {self.listener} again"
+        )
+
+    def denial(self, act: Act, expression: str, prefix: str) -> str:
+        """Return in a line that the process may not do something; its keys are without the federation's prefix."""
+        kind = expression.partition("/")[0]
+        allowed = [each.removeprefix(prefix) for each in self.allowed.get(act, ())]
+        alike_first = sorted(allowed, key=lambda each: each.partition("/")[0] != kind)
+        permitted = f"only {_shown(alike_first)}; {OTHER_CERTIFICATE}"
+        return f"certificate for {self.process} may not {act} {expression}: {permitted}"
+
+
+def permissions_of(access: Mapping[str, Any], listener: str, process: str) -> Permissions:
+    """Return what Zenoh's access control at a listening process permits another process by its certificate.
+
+    Args:
+        access: the content of an access.json, which Zenoh has accepted.
+        listener: name of the process that listens.
+        process: name in the certificate.
+    """
+    subjects = {each["id"] for each in access.get("subjects", ()) if process in each.get("cert_common_names", ())}
+    policies = (each for each in access.get("policies", ()) if subjects & set(each["subjects"]))
+    ids = {rule for policy in policies for rule in policy["rules"]}
+    granted = [rule for rule in access.get("rules", ()) if rule["id"] in ids and rule["permission"] == "allow"]
+    inbound = [rule for rule in granted if "ingress" in rule.get("flows", ("ingress",))]
+    allowed: dict[Act, tuple[str, ...]] = {
+        act: tuple(dict.fromkeys(key for rule in inbound if message in rule["messages"] for key in rule["key_exprs"]))
+        for act, message in MESSAGES.items()
+    }
+    if any(allowed.values()):
+        return Permissions(listener, process, allowed)
+    named = (name for subject in access.get("subjects", ()) for name in subject.get("cert_common_names", ()))
+    return Permissions(listener, process, known=tuple(named))
+
+
+def _shown(names: Sequence[str]) -> str:
+    more = len(names) - SHOWN_MAX
+    return (", ".join(names[:SHOWN_MAX]) or "nothing") + (f" and {more} more" if more > 0 else "")

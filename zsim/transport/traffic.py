@@ -1,4 +1,4 @@
-"""Everything that passes the hub, taken in by one subscription, or once more: batches are taken apart here alone.
+"""Everything that passes the hub, received by one subscription, or replayed: batches are taken apart here alone.
 
 traffic = Traffic(link, run_key_table(info))
 for entry in traffic.receive(): ...     ReceivedSample(key, payload), or GateMessages of the world's drones
@@ -15,7 +15,7 @@ Passed = ReceivedSample | GateMessages
 
 
 class Traffic:
-    """What others and the world publish, in the order in which it passed the hub; views do not pass it.
+    """What the world and others publish, in the order in which it passed the hub, except views.
 
     Args:
         link: an open session.
@@ -33,7 +33,7 @@ class Traffic:
         self._subscription.wake()
 
     def close(self) -> None:
-        """Take no more; a waiting `receive` raises SessionError."""
+        """Receive nothing more; a waiting `receive` raises SessionError."""
         self._subscription.undeclare()
 
     def receive(self) -> list[Passed]:
@@ -93,7 +93,7 @@ def replay(
         timeout_s: how long each page is waited for.
 
     Raises:
-        NoWorldError: the world does not answer, or not with a replay; what was yielded until then is good.
+        NoWorldError: the world does not answer, or not with a replay; what was yielded until then is valid.
     """
     page: int | None = 0
     while page is not None:

@@ -1,9 +1,12 @@
-"""Settings of a session, as {path in Zenoh's configuration: JSON5}; reasons in docs/decisions/0002.
+"""What a session needs: Zenoh's settings, and how many files the process may have open.
 
-Order of this file: link and timing, TLS, access control.
+Settings are {path in Zenoh's configuration: JSON5}; reasons in docs/decisions/0002. The limit of open files
+(RLIMIT_NOFILE, `ulimit -n`) is checked in advance: Zenoh panics, or waits without end, where a socket or a thread's
+event queue cannot be opened.
 """
 
 import json
+import sys
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -13,7 +16,7 @@ from zsim.transport.tls import Identity
 
 LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
 LEASE_REALTIME_MS = 1_000
-# Nobody waits for one that only reads: nobody would name it when it is stopped, nor need it be missed within a second.
+# Nobody waits for a process that only reads, so its loss need not be noticed within a second.
 LEASE_READER_MS = 10_000
 CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
 # A stopped reader (a recorder, `zsim echo`) fills its link and then holds up the hub and everybody; it loses its link.
@@ -30,6 +33,14 @@ _CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_clo
 _TLS = "transport/link/tls"
 ACCESS = "access_control"
 
+SESSION_FILES = 32  # of a process with a session; 22 measured, and room for what is read while it loads
+CLIENT_FILES = 3  # of a hub, for each process that connects; 2.2 measured, more while many connect at once
+ROLE_FILES = 2  # of a launcher, for each process that it starts: its standard input and its log
+HOST_FILES = 2  # of a launcher, for each host: its ssh connection, and a file that is copied there
+WORKER_FILES = 4  # of a sweep, for each worker: both ends of its pipe and what ends with it
+SERVER_FILES = 256  # of a gateway or console: a session, and 100 connections each of HTTP and lines that make room
+SPARE_CLIENTS = 4  # of a hub, for who comes beside the processes of the run: a console, `zsim echo`
+
 Mode = Literal["lockstep", "realtime"]
 Settings = dict[str, str]
 
@@ -40,7 +51,7 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
     Args:
         mode: Zenoh's: client, peer or router.
         timing: of the run.
-        reader: it does not gate.
+        reader: whether the process never gates.
     """
     lease = LEASE_READER_MS if reader else LEASE_REALTIME_MS if timing == "realtime" else LEASE_LOCKSTEP_MS
     return {
@@ -56,10 +67,10 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
 
 
 def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
-    """Return what a hub or a router has beside it: it needs its port, and gives up on who takes nothing.
+    """Return what a hub or a router has in addition: it needs its port, and gives up on a reader that takes nothing.
 
     Raises:
-        SessionError: endpoints and identity do not go together, or a file of the identity is of no use.
+        SessionError: endpoints and identity do not go together, or a file of the identity cannot be used.
     """
     return {
         "listen/endpoints": json.dumps(list(endpoints)),
@@ -73,7 +84,7 @@ def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
 
 
 def connecting(endpoint: str, identity: Identity, wait_s: float) -> Settings:
-    """Return what a client has beside it; it tries for `wait_s`.
+    """Return what a client has in addition; it tries to connect for `wait_s`.
 
     Raises:
         SessionError: as for `listening`.
@@ -86,19 +97,19 @@ def connecting(endpoint: str, identity: Identity, wait_s: float) -> Settings:
 
 
 def hub(timing: Mode) -> Settings:
-    """Return what the hub has beside it: nobody is above it, so opening waits for none to be found.
+    """Return what the hub has in addition: nothing is upstream of it, so opening does not wait for a peer.
 
     In lockstep its queues are as long as Zenoh allows, so that a link is closed before it is full (see link_watch); in
-    realtime, where less passes, they would make what passes a slow link stale.
+    realtime, where less passes, long queues would make what passes a slow link stale.
 
-    A router keeps Zenoh's half a second, in which it learns from the one above who answers there.
+    A router keeps Zenoh's half a second, in which it learns from its upstream who answers there.
     """
     queue = {"transport/link/tx/queue/size/data": str(QUEUE_LOCKSTEP)} if timing == "lockstep" else {}
     return {"scouting/delay": "0", **queue}
 
 
 def upstream(endpoint: str, identity: Identity) -> Settings:
-    """Return what a router has beside it: it tries for ever to reach what is above it."""
+    """Return what a router has in addition: it keeps trying to reach its upstream."""
     return connecting(endpoint, identity, 0.0) | {"connect/exit_on_failure": "false", "connect/timeout_ms": "-1"}
 
 
@@ -125,7 +136,7 @@ def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Setti
 
 
 def refusal(path: str, value: str, identity: Identity) -> str:
-    """Return the error for a setting that Zenoh refuses: only endpoints and access control come from a person."""
+    """Return the error for a setting that Zenoh refuses: only endpoints and access control come from the user."""
     if path == ACCESS:
         return f"{identity.access}: is no access control of Zenoh's; must be an access.json of zsim certs init"
     endpoints = ", ".join(map(repr, json.loads(value)))
@@ -133,7 +144,7 @@ def refusal(path: str, value: str, identity: Identity) -> str:
 
 
 def _agree(identity: Identity, endpoints: Sequence[str]) -> None:
-    """Refuse what would be less secure than it looks."""
+    """Refuse a combination that would be less secure than it looks."""
     for endpoint in endpoints:
         secure = tls.is_tls(endpoint)
         if secure and identity.tls is None:
@@ -150,7 +161,7 @@ def _agree(identity: Identity, endpoints: Sequence[str]) -> None:
 
 
 def read_access(identity: Identity) -> Any:
-    """Return the access control of a file; Zenoh judges its content.
+    """Return the access control in a file; Zenoh checks its content.
 
     Raises:
         SessionError: it cannot be read, or is not JSON.
@@ -166,3 +177,52 @@ def read_access(identity: Identity) -> Any:
         raise SessionError(
             f"{identity.access}: is not JSON ({error}); must be an access.json of zsim certs init"
         ) from error
+
+
+def hub_files(clients: int) -> int:
+    """Return how many files a hub needs for a number of processes that connect to it."""
+    return SESSION_FILES + CLIENT_FILES * (clients + SPARE_CLIENTS)
+
+
+def launcher_files(roles: int, names: int) -> int:
+    """Return how many files the process of a run that needs most of them needs.
+
+    Args:
+        roles: processes that are started, the world among them.
+        names: of processes that the world waits for: more than are started, where one does the work of many.
+    """
+    return max(hub_files(max(roles - 1, names)), SESSION_FILES + ROLE_FILES * roles)
+
+
+def host_launcher_files(roles: int, hosts: int) -> int:
+    """Return how many files the launcher of a run on several hosts needs."""
+    return SESSION_FILES + ROLE_FILES * roles + HOST_FILES * hosts
+
+
+def require_files(needed: int, what: str) -> None:
+    """Raise the soft limit to what is needed, where it is lower.
+
+    Args:
+        needed: number of files open at once.
+        what: what needs them, for the error: "12 processes".
+
+    Raises:
+        SessionError: the hard limit does not allow it.
+    """
+    allowed = allow_files(needed)
+    if allowed is not None and allowed < needed:
+        raise SessionError(f"open files are {allowed} at most; must be {needed} for {what}: `ulimit -n {needed}`")
+
+
+def allow_files(wanted: int) -> int | None:
+    """Raise the soft limit to what is wanted, as far as the hard one allows; return it, None where there is none."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= wanted:
+        return None if soft == resource.RLIM_INFINITY else soft
+    soft = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    return soft

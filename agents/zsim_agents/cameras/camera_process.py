@@ -20,13 +20,14 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED
 from zsim.errors import DecodeError
 from zsim.math.interpolation import pose_between
+from zsim.runtime.participant import Participant
 from zsim.scenario.external_bodies import moved_on, truth_fault
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import camera_matrix, camera_pose, lens_of
 from zsim.transport.session import Query, RawSample, ReceivedSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
-from zsim_agents.cameras.process import Participant, RunProcess
+from zsim_agents.cameras.process import RunProcess
 from zsim_agents.cameras.rendering.renderer import Renderer
 from zsim_agents.cameras.rendering.scene import DroneStates, scene_of
 

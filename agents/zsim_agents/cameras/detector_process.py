@@ -11,12 +11,13 @@ from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo, Sightings
 from zsim.errors import DecodeError
 from zsim.math.frames import rotation_matrix
+from zsim.runtime.participant import Participant
 from zsim.sensors.camera import CAMERAS
 from zsim.sensors.camera_model import CameraPose, Lens, folds
 from zsim.sensors.jpeg_header import PictureError
 from zsim.transport.session import RawSample, Session
 from zsim_agents.cameras.detector import PIXELS_MAX, HatDetector, decoded, rehearse
-from zsim_agents.cameras.process import Participant, RunProcess
+from zsim_agents.cameras.process import RunProcess
 
 ASK_S = 2.0  # wall; how often a camera is asked what its pixels mean, while that is unknown
 REPORTS_MAX = 5  # lines about refused pictures; health has the count

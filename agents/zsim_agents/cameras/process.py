@@ -1,29 +1,12 @@
 """What the processes of cameras and of detectors share: their place in a run, and waiting for messages."""
 
 import threading
-from typing import Protocol
 
 from zsim.contract import keys
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
 
 TICK_S = 0.1  # how often a stop is looked for while nothing arrives
-
-
-class Participant(Protocol):
-    """The process in one run; see zsim_bridges.observer_process."""
-
-    name: str
-    now_ns: int
-    health: HealthMeter
-    end_reason: str
-
-    @property
-    def gates(self) -> bool: ...
-    def announce(self) -> None: ...
-    def update_clock(self, payload: bytes) -> object: ...
-    def tick(self) -> None: ...
-    def done(self, t_ns: int) -> None: ...
 
 
 class RunProcess:

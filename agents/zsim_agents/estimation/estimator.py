@@ -13,7 +13,7 @@ from zsim.contract.views import ViewEstimates, estimate_view
 from zsim.errors import RunError
 from zsim.math.compiled import COMPILES
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.routing import Input
+from zsim.runtime.inbox import Input
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import EstimatorSet, estimator_class
 from zsim_agents.estimation.estimator_bank import EstimatorBank

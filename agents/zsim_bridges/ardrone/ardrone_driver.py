@@ -5,11 +5,11 @@ import math
 from collections.abc import Callable
 
 from zsim.contract.messages import Info
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges.ardrone.drive.aircraft_session import AircraftSession, AircraftSettings
 from zsim_bridges.ardrone.drive.navdata_readings import NavdataReadings
-from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_run
 from zsim_bridges.vehicle_links.driver_process import DriverProcess
 
@@ -17,7 +17,7 @@ from zsim_bridges.vehicle_links.driver_process import DriverProcess
 def drive(
     link: Session,
     info: Info,
-    observer: ObserverProcess,
+    observer: Participant,
     stopped: Callable[[], bool],
     say: Callable[[str], None],
     options: DriverOptions,

@@ -13,104 +13,26 @@ from zsim.contract import flight_messages, keys, messages
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import ZsimError
 from zsim.transport.session import Session, Unanswered
-from zsim_bridges.console.monitoring.view_buffer import ViewBuffer, arguments_text
-
-Task = Callable[[], None]
-
-
-@dataclass
-class _DroneTasks:
-    """Tasks of one drone: how many run, and which wait for them."""
-
-    busy: int = 0
-    waiting: deque[Task] = field(default_factory=deque)
-
-
-class DroneQueue:
-    """Runs tasks in order of submission for each drone, in `pool`, urgent ones in `urgent`; drones do not wait."""
-
-    def __init__(self, pool: Executor, urgent: Executor) -> None:
-        self._pool = pool
-        self._urgent = urgent
-        self._tasks: dict[str, _DroneTasks] = {}
-        self._lock = threading.Lock()
-        self._closed = False
-
-    def close(self) -> None:
-        """Start no more tasks."""
-        with self._lock:
-            self._closed = True
-            self._tasks.clear()
-
-    def submit(self, name: str, act: Task) -> None:
-        """Run a task after all that were submitted for that name before.
-
-        Raises:
-            RuntimeError: closed.
-        """
-        with self._lock:
-            line = self._tasks_of(name)
-            if line.busy:
-                line.waiting.append(act)
-            else:
-                self._start(self._pool, name, act)
-
-    def submit_urgent(self, name: str, act: Task) -> None:
-        """Run a task without waiting for earlier ones; later ones wait for it.
-
-        Raises:
-            RuntimeError: closed.
-        """
-        with self._lock:
-            self._tasks_of(name)
-            self._start(self._urgent, name, act)
-
-    def _tasks_of(self, name: str) -> _DroneTasks:
-        if self._closed:
-            raise RuntimeError("closed")
-        return self._tasks.setdefault(name, _DroneTasks())
-
-    def _start(self, pool: Executor, name: str, act: Task) -> None:
-        def done() -> None:
-            try:
-                act()
-            finally:
-                self._end(name)
-
-        pool.submit(done)
-        self._tasks[name].busy += 1
-
-    def _end(self, name: str) -> None:
-        with self._lock:
-            line = self._tasks.get(name)
-            if line is None:
-                return  # closed
-            line.busy -= 1
-            if line.busy:
-                return
-            if line.waiting:
-                self._start(self._pool, name, line.waiting.popleft())
-            else:
-                del self._tasks[name]
-
+from zsim_bridges.console.view_buffer import ViewBuffer, arguments_text
 
 PRIORITY = 10  # contract: of operators
 PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
-THREADS_PER_POOL = 8  # in each pool: requests without an answer must not delay modes
+THREADS_PER_POOL = 8  # separate pools: unanswered requests must not delay modes
 ANSWER_TIMEOUT_S = 5.0  # the world and controllers answer within a gate
-EMERGENCY_TIMEOUT_S = 1.0  # of a drone that is taken to stop it: after this the mode is sent without an answer
+EMERGENCY_TIMEOUT_S = 1.0  # for acquiring a drone to stop it; after this the mode is sent all the same
+ACCEPTANCE_TIMEOUT_S = 1.0  # for the world to accept a command before the drone is released
 OVERTAKEN = "an emergency was asked for after it"
-ACCEPTANCE_TIMEOUT_S = 1.0  # how long the world may take to accept a command, before the drone is released
+Task = Callable[[], None]
 
 
 class RequestOutcome(NamedTuple):
-    """A request in words, and why it was refused; empty where it was not.
+    """A described request, and why it was refused; empty if it was not.
 
     Attributes:
         subject: the formation or drone; empty for the run.
-        op, args: what was asked of it.
-        order: id of the order that it is an attempt at; empty for none.
-        unanswered: whether it is not known what became of it, so that it may be carried out yet.
+        op, args: the request.
+        order: id of the order of which it is an attempt; empty for none.
+        unanswered: whether it may still be carried out, since nobody has answered.
     """
 
     request: str
@@ -123,7 +45,7 @@ class RequestOutcome(NamedTuple):
 
 
 class NoAnswer(str):
-    """Why nobody has answered a request."""
+    """A refusal for want of an answer."""
 
     __slots__ = ()
 
@@ -140,10 +62,9 @@ class CommandClient:
     """Sends requests in the console's name.
 
     Args:
-        link: an open session.
         name: of the console's process.
-        views: receives when a command has been accepted.
-        now_ns: simulated time for a stamp; may ask for it.
+        views: know which commands have been answered.
+        now_ns: simulated time for a stamp; may poll the world.
         report: called with the outcome of each request, in any thread.
     """
 
@@ -162,8 +83,8 @@ class CommandClient:
         self._report = report
         self._seqs: Counter[str] = Counter()  # messages sent on each key
         self._modes: Counter[str] = Counter()  # modes requested of each drone
-        self._cluster_requests: Counter[str] = Counter()  # made of each formation
-        self._emergencies: Counter[str] = Counter()  # emergencies requested of each drone
+        self._emergencies: Counter[str] = Counter()  # those of them that are emergencies
+        self._cluster_requests: Counter[str] = Counter()  # by formation
         self._lock = threading.RLock()
         self._pools = [
             ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"console-{kind}")
@@ -173,7 +94,7 @@ class CommandClient:
         self._queue = DroneQueue(modes, stops)
 
     def close(self) -> None:
-        """Give up requests that wait."""
+        """Drop waiting requests."""
         self._queue.close()
         for pool in self._pools:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -184,11 +105,16 @@ class CommandClient:
         self._submit(self._requests.submit, what, self._request, keys.CONTROL, op, args)
 
     def seek(self, t_s: float, step: bool) -> None:
-        """Request a replay to go on from an instant, and to play the gate there if it stands still."""
-        self._submit(self._requests.submit, RequestOutcome(f"seek {t_s:g} s", ""), self._seek, t_s, step)
+        """Let a replay continue from an instant; `step`: play one gate there, if it is paused."""
+
+        def act() -> str:
+            refusal = self._request(keys.CONTROL, "seek", {"t_s": t_s})
+            return refusal or (self._request(keys.CONTROL, "step", {"gates": 1}) if step else "")
+
+        self._submit(self._requests.submit, RequestOutcome(f"seek {t_s:g} s", ""), act)
 
     def timeline(self) -> dict[str, Any]:
-        """Return the timeline of a replay, empty where nobody answers."""
+        """Return the timeline of a replay, empty without an answer."""
         with suppress(ZsimError):
             answer = self._link.request(keys.CONTROL, "timeline", self._name, {}, ANSWER_TIMEOUT_S)
             if answer.ok and isinstance(answer.result, dict) and "to_s" in answer.result:
@@ -196,7 +122,7 @@ class CommandClient:
         return {}
 
     def read(self, act: Task) -> bool:
-        """Let something be read in another thread; return whether it will be."""
+        """Run a task that reads in another thread; return whether it will be run."""
         try:
             self._requests.submit(act)
         except RuntimeError:  # closed
@@ -204,7 +130,7 @@ class CommandClient:
         return True
 
     def past_views(self, from_s: float, to_s: float, every_s: float) -> list[PastInstant]:
-        """Return the views of instants on record, of a replay; empty where they are not answered."""
+        """Return views of a replay's record; empty without an answer."""
         args = {"from_s": from_s, "to_s": to_s, "every_s": every_s}
         found: dict[int, PastInstant] = {}
         with suppress(ZsimError, LookupError, TypeError, ValueError):
@@ -220,21 +146,21 @@ class CommandClient:
         return list(found.values())
 
     def request_cluster(self, cluster: str, op: str, shown: str = "", order: str = "", **args: Any) -> None:
-        """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""
+        """Request an operation of a formation's controller; `shown` describes the arguments as the page shows them."""
         self._cluster_requests[cluster] += 1
         text = f"{cluster}: {op} {shown or arguments_text(args)}".strip()
         what = RequestOutcome(text, "", cluster, op, args, order)
         self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
 
     def requests_to(self, cluster: str) -> int:
-        """Return how many requests were made of a formation so far."""
+        """Return the number of requests made of a formation so far."""
         return self._cluster_requests[cluster]
 
     def send_mode(self, drones: Sequence[str], mode: str, order: str = "") -> None:
         """Let drones take off, land, stop at once or leave the emergency, whoever commands them.
 
-        Modes of one drone are sent in the order of the requests; an emergency waits for none of them, and none that
-        was requested before it is sent after it.
+        Modes of one drone are sent in the order of the requests, except for an emergency: it waits for none of them,
+        and none that was requested before it is sent after it.
         """
         for drone in drones:
             self._modes[drone] += 1
@@ -248,21 +174,21 @@ class CommandClient:
                 self._submit(turn, what, self._acquire_and_send, drone, mode, stops)
 
     def modes_requested(self, drone: str) -> int:
-        """Return how many modes were requested of a drone so far."""
+        """Return the number of modes requested of a drone so far."""
         return self._modes[drone]
 
     def take(self, drone: str, done: Callable[[str], None]) -> None:
-        """Acquire a drone with an operator's priority; `done` receives why that is refused, empty where it is not."""
+        """Acquire a drone with an operator's priority; `done` receives why that is refused, otherwise an empty text."""
         with suppress(RuntimeError):  # closed; the run has ended
             self._requests.submit(lambda: done(_refusal_of(self._acquire, drone, PRIORITY)))
 
     def give_back(self, drone: str) -> None:
-        """Release a drone that was taken: it hovers, until somebody else flies it."""
+        """Release a drone: it hovers until somebody else flies it."""
         with suppress(RuntimeError):
             self._releases.submit(_refusal_of, self._request, keys.CONTROL, "release", {"drone": drone})
 
     def send_velocity(self, drone: str, velocity_m_s: tuple[float, float, float], yaw_rate_rad_s: float) -> None:
-        """Command a drone that was taken: a velocity in its heading frame."""
+        """Command a velocity, in its heading frame, of an acquired drone."""
         key, v = keys.command(drone, "velocity"), velocity_m_s
         with suppress(ZsimError):  # the link is lost: the world lets the drone hover
             message = flight_messages.Velocity(self._now_ns(), self._next_seq(key), self._name, v, yaw_rate_rad_s)
@@ -290,12 +216,8 @@ class CommandClient:
         refusal = "" if answer.ok else answer.error or "refused without a reason"
         return NoAnswer(refusal) if isinstance(answer, Unanswered) else refusal
 
-    def _seek(self, t_s: float, step: bool) -> str:
-        refusal = self._request(keys.CONTROL, "seek", {"t_s": t_s})
-        return refusal or (self._request(keys.CONTROL, "step", {"gates": 1}) if step else "")
-
     def _acquire_and_send(self, drone: str, mode: str, stops: int) -> str:
-        """Acquire a drone and send the mode, unless more emergencies were requested meanwhile."""
+        """Acquire a drone and send the mode, unless more emergencies than `stops` were requested meanwhile."""
         if self._emergencies[drone] > stops:
             return OVERTAKEN
         return self._acquire(drone, PRIORITY) or self._send(drone, mode, stops)
@@ -319,22 +241,93 @@ class CommandClient:
                 key = keys.command(drone, "mode")
                 message = flight_messages.Mode(now_ns, self._next_seq(key), self._name, mode)  # type: ignore[arg-type]
                 self._link.put(key, message)
-        with suppress(RuntimeError):  # closed: who leaves a run gives back what it has
+        with suppress(RuntimeError):  # closed: leaving a run releases all drones
             self._releases.submit(self._release, drone, before)
         return OVERTAKEN if overtaken else ""
 
     def _release(self, drone: str, before: int) -> None:
-        """Release a drone, once the world has the mode that was sent with an operator's priority."""
+        """Release a drone once the world has the mode that was sent with an operator's priority."""
         self._views.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
 
 
 def _refusal_of(act: Callable[..., str], *args: Any) -> str:
-    """Return why something was not done; empty where it was."""
+    """Return why something was not done; empty if it was."""
     try:
         return act(*args)
     except ZsimError as error:
         return str(error)
     except Exception as error:  # a pool's thread reports no exception itself
         return f"{type(error).__name__}: {error}"
+
+
+@dataclass
+class _DroneTasks:
+    """Number of running tasks of one drone, and those that wait for them."""
+
+    busy: int = 0
+    waiting: deque[Task] = field(default_factory=deque)
+
+
+class DroneQueue:
+    """Runs the tasks of each drone in order of submission in `pool`, urgent ones in `urgent`.
+
+    Tasks of different drones do not wait for each other. Submitting raises RuntimeError once closed.
+    """
+
+    def __init__(self, pool: Executor, urgent: Executor) -> None:
+        self._pool = pool
+        self._urgent = urgent
+        self._tasks: dict[str, _DroneTasks] = {}
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def close(self) -> None:
+        """Start no more tasks."""
+        with self._lock:
+            self._closed = True
+            self._tasks.clear()
+
+    def submit(self, name: str, act: Task) -> None:
+        """Run a task after all that were submitted for that name before."""
+        with self._lock:
+            tasks = self._tasks_of(name)
+            if tasks.busy:
+                tasks.waiting.append(act)
+            else:
+                self._start(self._pool, name, act)
+
+    def submit_urgent(self, name: str, act: Task) -> None:
+        """Run a task without waiting for earlier ones; later ones wait for it."""
+        with self._lock:
+            self._tasks_of(name)
+            self._start(self._urgent, name, act)
+
+    def _tasks_of(self, name: str) -> _DroneTasks:
+        if self._closed:
+            raise RuntimeError("closed")
+        return self._tasks.setdefault(name, _DroneTasks())
+
+    def _start(self, pool: Executor, name: str, act: Task) -> None:
+        def run() -> None:
+            try:
+                act()
+            finally:
+                self._end(name)
+
+        pool.submit(run)
+        self._tasks[name].busy += 1
+
+    def _end(self, name: str) -> None:
+        with self._lock:
+            tasks = self._tasks.get(name)
+            if tasks is None:
+                return  # closed
+            tasks.busy -= 1
+            if tasks.busy:
+                return
+            if tasks.waiting:
+                self._start(self._pool, name, tasks.waiting.popleft())
+            else:
+                del self._tasks[name]

@@ -1,30 +1,33 @@
-"""Orders of operators that must not get lost: each is sent until the world has carried it out or refused it.
+"""Requests of operators, followed until they have had their effect.
 
-An order has an id of the page that gave it. A page repeats an order that it has no answer to; the console carries out
-each id once, and repeats towards the world what the world has not confirmed: after an answer that did not come, a radio
-that lost the command, a stamp that grew old while a process stood still.
+Orders must not get lost: each is sent until the world has carried it out or refused it. Its page chooses its id, and
+repeats it until it is answered; the console carries out each id once, and repeats towards the world whatever the world
+has not confirmed: after a missing answer, a command lost by a radio, or a stamp that grew old while a process stalled.
+Other requests are made once; `PendingRequests` tells when an accepted one is done.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 from uuid import uuid4
 
 from msgspec import Meta, Struct
 
-from zsim.contract import keys
 from zsim.contract.run_messages import Event
+from zsim.contract.views import ViewCluster
+from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.view_buffer import commanded_drone
 
-REPEAT_S = 1.0  # wall; without an effect for so long an order is sent to the world again: it answers within a gate
-KEPT = 200  # orders whose ids are known: at one click a second those of three minutes
-SHOWN_S = 20.0  # wall; for which pages show an order that is over
-ID_MAX, NAME_MAX = 64, 64  # characters
+REPEAT_S = 1.0  # wall; an order without an effect for so long is sent again: the world answers within a gate
+KEPT = 200  # orders whose ids are remembered: at one click a second those of three minutes
+SHOWN_S = 20.0  # wall; for which pages show a settled order
+NAME_MAX = 64  # characters
 REASONS_MAX = 2  # that are named of an order
-STALE_STAMP = "age is "  # begins the world's refusal of a command whose stamp is too old: to be stamped anew
-
+STALE_STAMP = "age is "  # begins the world's refusal of a command with too old a stamp, which is then stamped anew
 OrderState = Literal["sent", "confirmed", "refused", "replaced"]
 _CARRIED_OUT = {
     "emergency": frozenset({"emergency"}),
@@ -33,21 +36,35 @@ _CARRIED_OUT = {
 }
 """States of drones, and phases of formations, that show an order's effect."""
 _WORST_FIRST: tuple[OrderState, ...] = ("sent", "refused", "replaced", "confirmed")
+PHASES_DONE = {
+    "takeoff": frozenset({"assembling", "engaged"}),
+    "engage": frozenset({"engaged"}),
+    "hold": frozenset({"held"}),
+    "rejoin": frozenset({"engaged"}),
+    "land": frozenset({"idle"}),
+}
+STATES_DONE = {
+    "takeoff": frozenset({"hovering", "flying"}),
+    "land": frozenset({"landed"}),
+    "emergency": frozenset({"emergency"}),
+    "reset": frozenset({"landed"}),
+}
+THERE_M, THERE_RAD = 0.2, 0.05  # of a variable at its target; chosen: about as close as the paper's formations
 
 Name = Annotated[str, Meta(max_length=NAME_MAX)]
 
 
 class OrderRequest(Struct, frozen=True, forbid_unknown_fields=True):
-    """What a page orders, by a button that must not get lost; to be repeated with its id until it is confirmed."""
+    """An order of a page, to be repeated with its id until it is confirmed."""
 
     op: Literal["emergency", "land", "hold", "acknowledge"]
-    id: Annotated[str, Meta(max_length=ID_MAX)] = ""
-    """Of the page's choice; an order is carried out once for each. Empty: the order is not to be repeated."""
+    id: Name = ""
+    """Chosen by the page; carried out once. Empty: the order will not be repeated."""
     run: Name = ""
     """The run for which it was given; refused in any other one. Empty: whichever is shown."""
     drone: Name = ""
     cluster: Name = ""
-    """Whom it concerns; all where both are empty."""
+    """What it concerns; all where both are empty."""
 
 
 @dataclass
@@ -55,13 +72,12 @@ class _Target:
     """A drone or formation that an order concerns.
 
     Attributes:
-        state: see `OrderState`.
         reason: why it is refused, or not confirmed.
-        busy: whether an attempt is under way.
-        attempts: so many were made.
+        busy: whether an attempt is in progress.
+        attempts: number of attempts.
         sent_s: when the last one began [s; wall].
-        modes: requested of a drone, with those of this order; further ones replace it.
-        accepted: whether the world has the last command, and is to carry it out.
+        modes: number of modes requested of a drone up to this order's; a further one replaces it.
+        accepted: whether the world has accepted the last command.
     """
 
     is_drone: bool
@@ -76,7 +92,7 @@ class _Target:
 
 @dataclass
 class _Order:
-    """An order, its targets by name, and when it was given and over [s; wall]."""
+    """An order, its targets by name, and when it was given and settled [s; wall]."""
 
     id: str
     op: Any
@@ -98,18 +114,14 @@ class _Order:
 
 
 class OrderBook:
-    """Carries out orders of one run, and follows each until the world has confirmed or refused it.
+    """Carries out orders of one run; thread-safe.
 
     Args:
-        client: sends to the world.
-        run_id: of the run.
         members: drones of each formation.
-        drones: names of all.
-        refusal: returns why nobody can be flown at all; empty where somebody can. Not a world that is silent.
+        refusal: returns why nothing can be flown at all, apart from a silent world; otherwise empty.
         now_ns: returns the simulated time of the newest clock.
         silent_s: returns for how long the world has not answered [s; wall].
-        external: drones whose modes the world only hands on: what their states show counts.
-        wall_s: monotonic.
+        external: drones whose modes the world only forwards; their states alone show an effect.
     """
 
     def __init__(
@@ -138,13 +150,14 @@ class OrderBook:
         self._lock = threading.RLock()
 
     def place(self, request: OrderRequest) -> dict[str, Any]:
-        """Carry out an order, unless one of its id was carried out before; return it as plain data."""
+        """Carry out an order, unless one of its id was carried out already; return it as plain data."""
         order_id = request.id or uuid4().hex
         with self._lock:
             order = self._orders.get(order_id)
             if order is None:
                 order = self._orders[order_id] = self._new(order_id, request)
-                self._forget_old()
+                for settled in [key for key, each in self._orders.items() if each.over_s is not None][:-KEPT]:
+                    del self._orders[settled]
                 if not order.refusal:
                     self._replace_earlier(order)
                     for name in order.targets:
@@ -152,7 +165,7 @@ class OrderBook:
             return self._row(order)
 
     def note(self, outcome: RequestOutcome) -> bool:
-        """Take the outcome of an attempt; return whether operators are to be told of it, each outcome once."""
+        """Take the outcome of an attempt; return whether operators are to be notified, once for each target."""
         with self._lock:
             order = self._orders.get(outcome.order)
             target = order.targets.get(outcome.subject) if order else None
@@ -166,7 +179,7 @@ class OrderBook:
                 return False
             if not target.is_drone:
                 self._settle(order, target, "refused" if outcome.refusal else "confirmed", outcome.refusal)
-            elif outcome.refusal and order.op != "emergency":  # an emergency is sent even where it is refused the drone
+            elif outcome.refusal and order.op != "emergency":  # which is sent even if the drone could not be acquired
                 self._settle(order, target, "refused", outcome.refusal)
             is_new = outcome.subject not in order.told
             order.told.add(outcome.subject)
@@ -174,9 +187,9 @@ class OrderBook:
 
     def on_event(self, event: Event) -> None:
         """Take an event of the world about a command of this console."""
+        subject = commanded_drone(event)
         with self._lock:
-            for order in [each for each in self._orders.values() if each.over_s is None]:
-                subject = keys.thing(event.subject) if "/" in event.subject else event.subject
+            for order in self._open():
                 target = order.targets.get(subject)
                 if target is None or not target.is_drone or target.state != "sent":
                     continue
@@ -190,27 +203,30 @@ class OrderBook:
                         self._settle(order, target, "refused", target.reason)
 
     def update(self, states: Mapping[str, str], t_ns: int, *, paused: bool) -> None:
-        """Look which orders have had their effect, and send again those that have not.
+        """Settle orders that have had their effect, and repeat those that have not.
 
         Args:
             states: of drones, and phases of formations, by name.
-            t_ns: simulated, of which they are.
-            paused: whether the run stands still: what the world has taken has no effect before it goes on.
+            t_ns: their simulated time.
+            paused: whether the run stands still, so that accepted commands have no effect yet.
         """
         with self._lock:
             self._paused = paused
-            ended, silent = self._refusal(), self._silent_s() > 0.0
-            for order in [each for each in self._orders.values() if each.over_s is None]:
+            ended, silent, wall_s = self._refusal(), self._silent_s() > 0.0, self._wall_s()
+            for order in self._open():
                 for name, target in order.targets.items():
                     if target.state != "sent":
                         continue
+                    # A formation's controller answers: its phase counts only after a request without an answer.
+                    has_effect = states.get(name) in _CARRIED_OUT[order.op] and (target.is_drone or target.attempts > 1)
+                    waits = target.busy or silent or (paused and target.accepted)
                     if ended:
                         self._settle(order, target, "refused", ended)
-                    elif t_ns > order.since_ns and self._has_effect(order, name, target, states):
+                    elif t_ns > order.since_ns and has_effect:
                         self._settle(order, target, "confirmed", t_ns=t_ns)
                     elif target.is_drone and self._client.modes_requested(name) > target.modes:
                         self._settle(order, target, "replaced")
-                    elif not (target.busy or silent or (paused and target.accepted)) and self._is_due(target):
+                    elif not waits and wall_s - target.sent_s >= REPEAT_S:
                         self._send(order, name)
 
     def rows(self) -> list[dict[str, Any]]:
@@ -219,6 +235,9 @@ class OrderBook:
         with self._lock:
             shown = [o for o in self._orders.values() if o.over_s is None or wall_s - o.over_s < SHOWN_S]
             return [self._row(order) for order in reversed(shown)]
+
+    def _open(self) -> list[_Order]:
+        return [order for order in self._orders.values() if order.over_s is None]
 
     def _new(self, order_id: str, request: OrderRequest) -> _Order:
         targets = {name: _Target(is_drone=name in self._drones) for name in self._concerned(request)}
@@ -245,12 +264,12 @@ class OrderBook:
         return [*self._members, *single]
 
     def _replace_earlier(self, order: _Order) -> None:
-        """Let earlier orders go that a new one contradicts: an emergency, all of its drones and their formations."""
+        """Settle earlier orders that a new one contradicts; an emergency, all of its drones and their formations."""
         concerned = set(order.targets)
         if order.op == "emergency":
             concerned |= {name for name, drones in self._members.items() if concerned.issuperset(drones)}
-        for earlier in [each for each in self._orders.values() if each.over_s is None and each is not order]:
-            if earlier.op == "emergency" and order.op != "emergency":
+        for earlier in self._open():
+            if earlier is order or (earlier.op == "emergency" and order.op != "emergency"):
                 continue
             for name in concerned & set(earlier.targets):
                 if earlier.targets[name].state == "sent":
@@ -266,22 +285,10 @@ class OrderBook:
         else:
             self._client.request_cluster(name, order.op, order=order.id)
 
-    def _is_due(self, target: _Target) -> bool:
-        return self._wall_s() - target.sent_s >= REPEAT_S
-
-    def _has_effect(self, order: _Order, name: str, target: _Target, states: Mapping[str, str]) -> bool:
-        """Return whether a drone or formation shows the effect; a formation's controller answers, so before it has
-        left a request without an answer its phase does not count."""
-        return states.get(name) in _CARRIED_OUT[order.op] and (target.is_drone or target.attempts > 1)
-
     def _settle(self, order: _Order, target: _Target, state: OrderState, reason: str = "", t_ns: int = 0) -> None:
         target.state, target.reason = state, reason
         if all(each.state != "sent" for each in order.targets.values()):
             order.over_s, order.confirmed_ns = self._wall_s(), t_ns or self._now_ns()
-
-    def _forget_old(self) -> None:
-        for order_id in [key for key, order in self._orders.items() if order.over_s is not None][:-KEPT]:
-            del self._orders[order_id]
 
     def _row(self, order: _Order) -> dict[str, Any]:
         found = {name: target for name, target in order.targets.items() if target.state == order.state}
@@ -303,3 +310,49 @@ class OrderBook:
             "waiting": list(found) if order.state == "sent" else [],
             "reason": order.refusal or reason,
         }
+
+
+class PendingRequest(NamedTuple):
+    """A request of a formation or drone, described by its text."""
+
+    subject: str
+    op: str
+    text: str
+    values: Mapping[str, float] = {}
+
+
+class PendingRequests:
+    """Keeps the last accepted request of each drone and formation until it is done, or replaced by another."""
+
+    def __init__(self) -> None:
+        self._pending: dict[str, PendingRequest] = {}
+
+    def accept(self, subject: str, op: str, text: str, args: Mapping[str, Any]) -> bool:
+        """Keep a request; return whether its end can be observed."""
+        known = op in PHASES_DONE or op in STATES_DONE or (op == "target" and bool(args.get("values")))
+        if known:
+            self._pending[subject] = PendingRequest(subject, op, text, args.get("values", {}))
+        return known
+
+    def pop_done(self, clusters: Mapping[str, ViewCluster], drones: Mapping[str, str]) -> list[PendingRequest]:
+        """Return and remove the requests that are done."""
+        done = [each for each in list(self._pending.values()) if _is_done(each, clusters, drones)]
+        for each in done:
+            self._pending.pop(each.subject, None)
+        return done
+
+
+def _is_done(request: PendingRequest, clusters: Mapping[str, ViewCluster], drones: Mapping[str, str]) -> bool:
+    view = clusters.get(request.subject)
+    if view is None:
+        return drones.get(request.subject) in STATES_DONE.get(request.op, ())
+    if request.op != "target":
+        return view.phase in PHASES_DONE[request.op]
+    flown = dict(zip(view.names, view.value, strict=True))
+    return all(name in flown and _is_there(name, flown[name] - value) for name, value in request.values.items())
+
+
+def _is_there(name: str, away: float) -> bool:
+    if unit(name) == "rad":
+        return abs(math.remainder(away, math.tau)) < THERE_RAD
+    return abs(away) < THERE_M

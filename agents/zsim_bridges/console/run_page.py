@@ -1,9 +1,9 @@
-"""One run on the page: draws its views as pictures, tables and plots, and sends the operator's requests."""
+"""One run on the page: draws its views as pictures, tables and plots, and sends the operators' requests."""
 
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -14,51 +14,37 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
 from zsim.contract.views import EstimateView, ViewCluster
 from zsim.errors import DocumentError, RunError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
-from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import Hats
 from zsim.sensors.sensor_catalogue import own_rates
 from zsim.transport.session import Session
-from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
-from zsim_bridges.console.cameras.camera_feed import CameraFeed
+from zsim_bridges.console.camera_feed import CameraFeed
 from zsim_bridges.console.command_client import CommandClient, PastInstant, RequestOutcome
+from zsim_bridges.console.console_page import ConsolePage, PageForms
 from zsim_bridges.console.console_tables import TableRows
-from zsim_bridges.console.flying.page_flying import PageFlying
-from zsim_bridges.console.monitoring.flight_figures import FlightFigures
-from zsim_bridges.console.monitoring.run_monitor import RunMonitor
-from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
-from zsim_bridges.console.monitoring.view_buffer import ViewBuffer
+from zsim_bridges.console.control_desk import RUN, ControlDesk
 from zsim_bridges.console.orders import OrderBook, OrderRequest
-from zsim_bridges.console.page.console_page import ConsolePage
-from zsim_bridges.console.page.control_desk import RUN, ControlDesk
-from zsim_bridges.console.page.page_forms import PageForms
-from zsim_bridges.console.record_player import KEPT_S, RecordPlayer
-from zsim_bridges.console.run_state import console_state
-from zsim_bridges.console.scene.camera_follow import CameraFollow
-from zsim_bridges.console.scene.camera_frustums import CameraFrustums
-from zsim_bridges.console.scene.picture import DronePoses, FormationShape, drone_poses
-from zsim_bridges.console.scene.picture_rate import picture_rate_hz
-from zsim_bridges.console.scene.run_scene import RunScene
-from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.page_flying import PageFlying
+from zsim_bridges.console.picture import DronePoses, FormationShape, drone_poses
+from zsim_bridges.console.run_condition import ShownRun
+from zsim_bridges.console.run_monitor import RunMonitor
+from zsim_bridges.console.scene import RunScene
+from zsim_bridges.console.time_monitor import KEPT_S, RecordPlayer, TimeMonitor
+from zsim_bridges.console.view_buffer import ViewBuffer
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
 STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
 TOLD_S = 2.0  # wall; a slider that is dragged is refused many times
-NOTICE_S = 8.0  # wall; how long a refusal stays in the corner
-
-
-def _spaces(scenario: Scenario) -> dict[str, ClusterSpace]:
-    """Return the cluster spaces of a scenario by cluster.
-
-    Raises:
-        RunError: a space of the user's refuses its robots.
-    """
-    try:
-        return {cluster.name: scenario_space(scenario, cluster) for cluster in scenario.clusters}
-    except (ValueError, DocumentError) as error:
-        raise RunError(f"console: {error}") from error
+NOTICE_S = 8.0  # wall; how long a notification stays in the corner
+EVENTS_MAX = 20  # in `state`
+SILENT = "silent"  # in place of the clock's state, when the world does not answer
+FEW_DRONES = 20  # drones from which on pictures come half as often
+RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
+FAST_RATE = 4.0  # × real time; from then on the picture rate is halved, too: the run needs the processors
 
 
 class RunPage:
@@ -66,21 +52,21 @@ class RunPage:
 
     Args:
         server: viser's; what another run has left on it is removed.
-        link: an open session.
-        info: of the run.
-        observer: of the console in it.
         camera_follow: moves the page's cameras that follow the formation.
         frustums: of the drones' cameras, on the pages where they are chosen.
-        rate_hz: pictures a second; None: fewer where there are many drones, or time flies.
+        rate_hz: pictures a second; None: by the number of drones and the rate of the run.
         world: where the run is, in words.
 
     Attributes:
         views: the newest of everything.
         cameras: of the drones.
-        record: what is played, of a replay.
+        record: what a replay plays.
         flying: what pages may do with single drones.
-        orders: of the operators, until they are confirmed.
+        orders: of the operators, until they are settled.
         desk: which page is in control.
+
+    Raises:
+        RunError: a user's cluster space refuses its robots.
     """
 
     def __init__(
@@ -88,61 +74,62 @@ class RunPage:
         server: viser.ViserServer,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         camera_follow: CameraFollow,
         frustums: CameraFrustums,
         rate_hz: float | None,
         world: str = "",
     ) -> None:
+        scenario = scenario_file.from_text(info.scenario)
+        try:
+            spaces = {cluster.name: scenario_space(scenario, cluster) for cluster in scenario.clusters}
+        except (ValueError, DocumentError) as error:
+            raise RunError(f"console: {error}") from error
+        self._run = run = ShownRun(info, scenario, spaces)
         self._server = server
-        self._info = info
         self._observer = observer
-        self._scenario = scenario_file.from_text(info.scenario)
-        names = tuple(drone.name for drone in info.drones)
-        self._rate_hz = rate_hz
-        self._spaces = _spaces(self._scenario)
-        variables = {name: space.names for name, space in self._spaces.items()}
-        age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
-        self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
-        told = partial(self._on_foreign_request, bool(info.replay_of))
-        self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command, asked=told)
-        self._monitor = RunMonitor(self.views, self._time_monitor, self._scenario, bool(info.replay_of), world)
-        self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
-        members = {cluster.name: tuple(cluster.drones) for cluster in self._scenario.clusters}
-        unflyable, silent_s = self._monitor.unflyable, lambda: self._time_monitor.silent_s
-        whose = self._client, info.run_id, members, names
-        self.orders = OrderBook(*whose, unflyable, lambda: observer.now_ns, silent_s, self.views.external)
-        self.views.on_own_event = self.orders.on_event
-        self.record = RecordPlayer(self._client, self._time_monitor, bool(info.replay_of), len(names))
-        hats = self._scenario.environment.hats
-        self.cameras = CameraFeed(link, observer, names, (Hats() if hats is UNSET else hats).diameter_m)
         self._frustums = frustums
-        self._names = names
-        rates = {drone.name: own_rates(drone) for drone in self._scenario.drones}
-        self._table_rows = TableRows(self.views, rates, self._monitor.board.severity_of)
+        self._rate_hz = rate_hz
+        self._names, self._members = run.names, run.members
         self._table_s = self._monitor_s = 0.0
-        self._scene = RunScene(server, info, self._scenario, self._spaces, self.views, camera_follow)
-        self._scene.nodes.on_click(self._on_click)
-        show = self._scene.nodes.show
-        self._page = ConsolePage(
-            server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones,
-            self._scene.trails.choose_length, replayed=bool(info.replay_of),
-            request_return=lambda cluster: self.flying.returns.request_formation(cluster),
-            show_preview=self._scene.preview,
+        self._told_s: dict[int, float] = {}  # when a page was last told that it is not in control [s; wall]
+
+        variables = {name: space.names for name, space in spaces.items()}
+        age_s = scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
+        self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
+        self.views = ViewBuffer(
+            link, info, observer, variables, self._on_refused_command, asked=self._on_foreign_request
+        )
+        self._monitor = RunMonitor(self.views, self._time_monitor, run, world)
+        hats = scenario.environment.hats
+        self.cameras = CameraFeed(link, observer, self._names, (Hats() if hats is UNSET else hats).diameter_m)
+        rates = {drone.name: own_rates(drone) for drone in scenario.drones}
+        self._table_rows = TableRows(self.views, rates, self._monitor.board.severity_of)
+
+        self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
+        self.orders = OrderBook(
+            self._client, info.run_id, self._members, self._names, self._monitor.unflyable, lambda: observer.now_ns,
+            lambda: self._time_monitor.silent_s, self.views.external,
         )  # fmt: skip
-        page = self._page
-        self.desk = ControlDesk(list(self._spaces), self._tell)
-        self._told_s: dict[int, float] = {}  # wall; when a page was last told that it is not in control
-        self._members = {cluster.name: cluster.drones for cluster in self._scenario.clusters}
-        folders = page.control_folder, page.drone_folder, page.figure_folder, page.event_folder, page.theme_folder
-        control = self.desk, self.part_of, page.parts
+        self.views.on_own_event = self.orders.on_event
+        self.record = RecordPlayer(self._client, self._time_monitor, run.is_replay, len(self._names))
+
+        self._scene = RunScene(server, run, self.views, camera_follow)
+        self._scene.nodes.on_click(self._on_click)
+        self._page = ConsolePage(
+            server.gui, run, self._client, self._on_outcome, self._scene.nodes.show,
+            self._scene.trails.choose_length, lambda cluster: self.flying.returns.request_formation(cluster),
+            self._scene.preview,
+        )  # fmt: skip
+        self.desk = ControlDesk(list(spaces), partial(self._tell, "Control", "orange"))
         self._page_forms = PageForms(
-            server, self._client, list(names), self._scene.nodes.radii_m, *control, *folders, self._return_drones
-        )
-        seen = self.views, self._time_monitor, self._monitor, self._scene, self._page_forms
+            server, self._client, self._page, self._names, self._scene.nodes.radii_m, self.desk, self.part_of,
+            lambda drones: self.flying.returns.request_drones(drones),
+        )  # fmt: skip
         self.flying = PageFlying(
-            info, self._scenario, self._spaces, self._client, observer.name, *seen, self._note_return
-        )
+            run, self._client, observer.name, self.views, self._time_monitor, self._monitor, self._scene,
+            self._page_forms, self._note_return,
+        )  # fmt: skip
 
     def close(self) -> None:
         """Send nothing any more."""
@@ -162,7 +149,7 @@ class RunPage:
             self._monitor.record_s = timeline["from_s"], timeline["to_s"]
         pause = threading.Event()
         next_s = time.monotonic()
-        with self._time_monitor.polling(), self.flying.running():
+        with self._time_monitor.polling(), self.flying.control.running():
             while not self._observer.end_reason and not stopped():
                 self._update(time.monotonic())
                 next_s = max(next_s + self._period_s(), time.monotonic())
@@ -170,68 +157,71 @@ class RunPage:
         self._draw_end()
 
     def end(self, reason: str) -> None:
-        """Show that the run is over; to be called after `run`, which shows that by itself where it learns of it."""
+        """Show that the run is over, after `run`, which may not have learnt of it."""
         self._monitor.end(reason)
         self._monitor.update(time.monotonic())
         with self._server.atomic():
             self._update_tables(time.monotonic())
 
     def state(self) -> dict[str, Any]:
-        """Return what is shown, as plain data: for programs, and for tests."""
-        state = console_state(self._info.run_id, self.views, self._time_monitor, dict(self._scene.shapes))
+        """Return what is shown as plain data for programs and tests."""
+        state = console_state(self._run.info.run_id, self.views, self._time_monitor, dict(self._scene.shapes))
         return {**state, "cameras": self.cameras.state(), "timeline": self.record.state(self._monitor.condition)}
+
+    def head(self) -> dict[str, Any]:
+        """Return the head of the page as plain data."""
+        head, stall = self._monitor.head(time.monotonic()), self._time_monitor.stall
+        stood = stall and {"lasted_s": stall.lasted_s, "ago_s": time.monotonic() - stall.ended_s}
+        ages = {"heard_s": self._time_monitor.heard_s, "stall": stood}
+        return {**head, **ages, "run_id": self._run.info.run_id, "orders": self.orders.rows()}
+
+    def command(self, request: OrderRequest) -> dict[str, Any]:
+        """Carry out an order of a page; return its progress as plain data with its `state`."""
+        if request.op == "acknowledge":
+            self._monitor.board.acknowledge()
+            return {"id": request.id, "op": request.op, "state": "confirmed", "reason": ""}
+        return self.orders.place(request)
 
     def part_of(self, drone: str) -> str:
         """Return what a page must be in control of to let a drone take off, or to fly it."""
         return next((name for name, drones in self._members.items() if drone in drones), RUN)
 
     def permits(self, client_id: int, control: str) -> bool:
-        """Return whether a page may use a control of all pages; tell it why where it may not."""
+        """Return whether a page may use a shared control; tell it why if not."""
         part = self._page.parts.get(control)
         refusal = "" if part is None else self.desk.use(client_id, part)
         if refusal and time.monotonic() - self._told_s.get(client_id, -math.inf) > TOLD_S:
             self._told_s[client_id] = time.monotonic()
-            self._tell(client_id, f"Refused: {refusal}")
+            self._tell("Control", "orange", client_id, f"Refused: {refusal}")
         return not refusal
 
-    def head(self) -> dict[str, Any]:
-        """Return the head of the page, as plain data."""
-        head, stall = self._monitor.head(time.monotonic()), self._time_monitor.stall
-        stood = stall and {"lasted_s": stall.lasted_s, "ago_s": time.monotonic() - stall.ended_s}
-        ages = {"heard_s": self._time_monitor.heard_s, "stall": stood}
-        return {**head, **ages, "run_id": self._info.run_id, "orders": self.orders.rows()}
-
-    def command(self, request: OrderRequest) -> dict[str, Any]:
-        """Do what a button of the page asks for; return what becomes of it, as plain data with its `state`."""
-        if request.op == "acknowledge":
-            self._monitor.board.acknowledge()
-            return {"id": request.id, "op": request.op, "state": "confirmed", "reason": ""}
-        return self.orders.place(request)
-
-    # A picture
+    # Pictures
 
     def _period_s(self) -> float:
-        """Return the time from one to the next [wall]."""
+        """Return the time from one picture to the next [wall]."""
         rate = self._time_monitor.clock.rate if self._time_monitor.clock is not None else 0.0
         return 1.0 / (self._rate_hz or picture_rate_hz(len(self._names), rate))
 
     def _update(self, wall_s: float) -> None:
         self._observer.tick()
-        new = self.views.update()
+        new = self.views.update() and self.views.drones is not None
         if new and self.views.drones is not None:
             self._monitor.flight.update(self.views.drones)
         if wall_s - self._monitor_s >= TABLE_S:
             self._monitor_s = wall_s
-            if self._info.replay_of and self._scene.drones is not None:
+            if self._run.is_replay and self._scene.drones is not None:
                 self._keep_past(self._scene.drones.t_ns / 1e9)
-            self._update_monitor(wall_s)
+            for done in self._monitor.update(wall_s):
+                self._note("done", done.subject, f"{done.text}: done")
+            self._update_orders()
         self._fill_past(self.record.take())
         self.cameras.update()
         self.flying.returns.tick()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
-            self._store_unseen(new)
+            if new and self.views.drones is not None:  # for pages that are opened later
+                self._add_newest_points(self._scene.store(self.views.drones))
             return
         with self._server.atomic():
             if new:
@@ -241,25 +231,10 @@ class RunPage:
                 self._table_s = wall_s
                 self._update_tables(wall_s)
 
-    def _return_drones(self, drones: Sequence[str]) -> None:
-        self.flying.returns.request_drones(drones)
-
-    def _update_monitor(self, wall_s: float) -> None:
-        """Keep up with the run's condition and with orders, and note what is done that was accepted before."""
-        for done in self._monitor.update(wall_s):
-            self._note("done", done.subject, f"{done.text}: done")
-        self._update_orders()
-
     def _update_orders(self) -> None:
         run, drones = self._monitor.condition, self.views.drones
         states = {**run.drones, **{name: phase for name, (phase, _) in run.phases.items()}}
         self.orders.update(states, drones.t_ns if drones else -1, paused=run.clock != "running")
-
-    def _on_click(self, event: viser.SceneClickEvent) -> None:
-        drone = self._scene.clicked(event)
-        if drone is not None:
-            self._page_forms.choose(event.client_id, drone)
-            self._frustums.click(event.client_id, drone)
 
     def _draw_end(self) -> None:
         """Draw the end of the run, for pages that are opened between two runs."""
@@ -273,33 +248,37 @@ class RunPage:
                 self._draw()
             self._update_tables(time.monotonic())
 
-    def _store_unseen(self, new: bool) -> None:
-        """Store what pages show of the time before they were opened."""
-        if new and self.views.drones is not None:
-            self._add_newest_points(self._scene.store(self.views.drones))
-
-    def _fill_past(self, instants: list[PastInstant]) -> None:
-        """Add what was read of a record to trails and plots."""
-        for past in instants:
-            drones = drone_poses(past.drones, self._names)
-            self._scene.trails.add(drones.t_ns / 1e9, drones.p_W)
-            known = {n: v for n, v in past.clusters.items() if n in self._spaces and v.names == self._spaces[n].names}
-            self._add_points(drones, self._scene.shapes_of(drones), known, past.estimates)
-        self._scene.trails.number += bool(instants)
-
-    def _keep_past(self, t_s: float) -> None:
-        """Let the record be read around the instant that a replay shows, and forget what is far from it."""
-        self.record.fill(t_s)
-        kept = t_s - KEPT_S, t_s + KEPT_S
-        self._scene.trails.keep(*kept)
-        for history in (self._page.flights.history, *(plots.history for plots in self._page.plots.values())):
-            history.keep(*kept)
-
     def _draw(self) -> None:
         assert self.views.drones is not None
         drones = self._scene.draw(self.views.drones, self._period_s(), self._page.chosen)
         self._page_forms.move_rings(drones)
         self._add_newest_points(drones)
+
+    def _on_click(self, event: viser.SceneClickEvent) -> None:
+        drone = self._scene.clicked(event)
+        if drone is not None:
+            self._page_forms.choose(event.client_id, drone)
+            self._frustums.click(event.client_id, drone)
+
+    # Trails and plots
+
+    def _fill_past(self, instants: list[PastInstant]) -> None:
+        """Add what was read of a record to trails and plots."""
+        spaces = self._run.spaces
+        for past in instants:
+            drones = drone_poses(past.drones, self._names)
+            self._scene.trails.add(drones.t_ns / 1e9, drones.p_W)
+            known = {n: view for n, view in past.clusters.items() if n in spaces and view.names == spaces[n].names}
+            self._add_points(drones, self._scene.shapes_of(drones), known, past.estimates)
+        self._scene.trails.number += bool(instants)
+
+    def _keep_past(self, t_s: float) -> None:
+        """Read the record around the instant that a replay shows, and drop what is far from it."""
+        self.record.fill(t_s)
+        kept = t_s - KEPT_S, t_s + KEPT_S
+        self._scene.trails.keep(*kept)
+        for history in (self._page.flights.history, *(plots.history for plots in self._page.plots.values())):
+            history.keep(*kept)
 
     def _add_newest_points(self, drones: DronePoses) -> None:
         estimates = {name: each.estimate for name, each in self.views.estimates().items() if each.fresh}
@@ -321,13 +300,17 @@ class RunPage:
                 self._page.plots[name].history.add(t_s, view.desired, view.value, true_c)
         self._page.flights.add(drones, estimates)
 
-    # Tables
+    # Controls and tables
 
     def _update_tables(self, wall_s: float) -> None:
-        page = self._page
-        flown = self._monitor.flight.figures
-        self._update_controls(flown)
-        page.phases.content = console_tables.formation_lines(self._monitor.condition.phases)
+        page, run, flown = self._page, self._monitor.condition, self._monitor.flight.figures
+        page.refresh(run)
+        self.desk.release_lost()
+        self._page_forms.refresh(run, page.chosen)
+        instruments_of = lambda drone: console_tables.figure_lines(flown.get(drone))  # noqa: E731
+        self._page_forms.show_figures(instruments_of, self._table_rows.sensor_table)
+        self._page_forms.show_events(self.views.log.rows())
+        page.phases.content = console_tables.formation_lines(run.phases)
         self._page_forms.show_drones(self._table_rows.drone_rows(), flown)
         watch = self._monitor.fault_watch
         page.faults.content = console_tables.fault_lines(watch.lines(), watch.lines(is_over=True))
@@ -336,20 +319,10 @@ class RunPage:
             page.plots[page.chosen].draw(self._scene.drones.t_ns / 1e9 if self._scene.drones else 0.0)
         self._scene.draw_trails()
 
-    def _update_controls(self, flown: Mapping[str, FlightFigures]) -> None:
-        """Grey out what would be refused, and show on each page the drone that it has chosen."""
-        self._page.refresh(self._monitor.condition)
-        self.desk.release_lost()
-        self._page_forms.refresh(self._monitor.condition, self._page.chosen)
-        self._page_forms.show_figures(
-            lambda drone: console_tables.figure_lines(flown.get(drone)), self._table_rows.sensor_table
-        )
-        self._page_forms.show_events(self.views.log.rows())
-
     def _on_outcome(self, outcome: RequestOutcome) -> None:
-        """Show the outcome of a request: a refusal in the corner of every page, and among the events.
+        """Show the outcome of a request: a refusal in the corner of every page, and either among the events.
 
-        The world publishes an event of what it has done, but not of requests to formations, which are only accepted.
+        The world publishes events of what it does, but not of requests to formations, which are only accepted.
         """
         if outcome.order and not self.orders.note(outcome):
             return
@@ -359,7 +332,7 @@ class RunPage:
             self._notify(outcome.request, outcome.refusal)
             return
         known = self._monitor.pending.accept(outcome.subject, outcome.op, outcome.request, outcome.args)
-        if known or outcome.subject in self._spaces:
+        if known or outcome.subject in self._run.spaces:
             self._note("accepted", outcome.subject, f"{outcome.request}: accepted")
 
     def _note_return(self, subject: str, text: str) -> None:
@@ -367,24 +340,78 @@ class RunPage:
         self._notify(f"return of {subject}", text)
 
     def _note(self, kind: str, subject: str, text: str) -> None:
-        """Add an event of the console's own to those that are shown."""
+        """Log an event of the console's own."""
         self.views.log.add(Event(self._observer.now_ns, 0, kind, self._observer.name, subject, text))
 
     def _on_refused_command(self, event: Event) -> None:
         """Show that the world has refused a command of the console's."""
         self._notify(event.subject, str(event.data.get("reason", event.text)))
 
-    def _on_foreign_request(self, replayed: bool, cluster: str, text: str) -> None:
-        """Tell every page that somebody else has asked a formation for something: the last word must be seen."""
-        for client_id in () if replayed else self._server.get_clients():
-            self._tell(client_id, text)
-
-    def _tell(self, client_id: int, line: str) -> None:
-        """Tell one page about who is in control."""
-        client = self._server.get_clients().get(client_id)
-        if client is not None:
-            client.add_notification("Control", line, color="orange", auto_close_seconds=NOTICE_S)
+    def _on_foreign_request(self, cluster: str, text: str) -> None:
+        """Tell every page of a request that somebody else made of a formation, since the last one counts."""
+        for client_id in () if self._run.is_replay else self._server.get_clients():
+            self._tell("Control", "orange", client_id, text)
 
     def _notify(self, what: str, refusal: str) -> None:
-        for client in self._server.get_clients().values():
-            client.add_notification(f"Refused: {what}", refusal, color="red", auto_close_seconds=NOTICE_S)
+        for client_id in self._server.get_clients():
+            self._tell(f"Refused: {what}", "red", client_id, refusal)
+
+    def _tell(self, title: str, colour: Any, client_id: int, line: str) -> None:
+        """Show a notification in the corner of one page."""
+        client = self._server.get_clients().get(client_id)
+        if client is not None:
+            client.add_notification(title, line, color=colour, auto_close_seconds=NOTICE_S)
+
+
+def picture_rate_hz(drones: int, rate: float) -> float:
+    """Return a suitable number of pictures a second for so many drones at a rate [× real time]."""
+    return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ
+
+
+def console_state(
+    run_id: str, views: ViewBuffer, time_monitor: TimeMonitor, shapes: Mapping[str, FormationShape | None]
+) -> dict[str, Any]:
+    """Return what is shown of a run as plain data; called in another thread than the one that draws.
+
+    `shapes` are the formations' true shapes.
+    """
+    view, clock, silent_s = views.drones, time_monitor.clock, time_monitor.silent_s
+    sigmas = {name: received.sigma_m for name, received in views.estimates().items() if received.fresh}
+    clusters = []
+    for name, cluster in dict(views.clusters).items():
+        shape = shapes.get(name)
+        clusters.append(
+            {
+                "name": name,
+                "phase": cluster.phase,
+                "reason": cluster.reason,
+                "desired": dict(zip(cluster.names, cluster.desired, strict=True)),
+                "value": dict(zip(cluster.names, cluster.value, strict=True)),
+                "true": {} if shape is None else dict(zip(cluster.names, shape.c.tolist(), strict=True)),
+            }
+        )
+    return {
+        "run_id": run_id,
+        "t_s": view.t_ns / 1e9 if view else 0.0,
+        "clock": SILENT if silent_s else clock.state if clock else None,
+        "silent_s": silent_s,
+        "drones": [
+            {"name": d.name, "position_m": list(d.position_m), "state": d.state, "sigma_m": sigmas.get(d.name)}
+            for d in (view.drones if view else ())
+        ],
+        "clusters": clusters,
+        "faults": [
+            {
+                "id": fault.id,
+                "kind": fault.kind,
+                "target": fault.target,
+                "from_s": fault.from_ns / 1e9,
+                "until_s": None if fault.until_ns is None else fault.until_ns / 1e9,
+            }
+            for fault in views.faults
+        ],
+        "events": [
+            {"t_s": event.t_ns / 1e9, "kind": event.kind, "text": event.text}
+            for event in list(views.log.newest)[:EVENTS_MAX]
+        ],
+    }

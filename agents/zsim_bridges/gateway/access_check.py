@@ -1,7 +1,5 @@
 """Who may send HTTP requests, how many, and from which page; and the responses to errors."""
 
-import time
-from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterable
 from urllib.parse import urlsplit
 
@@ -9,46 +7,26 @@ import msgspec
 from aiohttp import web
 
 from zsim.errors import DecodeError, NoWorldError, SessionError, ZsimError
+from zsim.runtime.rate_limit import RateLimit
 from zsim_bridges.gateway.client_messages import ForbiddenError, MethodError, TooManyError, UnknownError
-from zsim_bridges.web.loopback import is_loopback_authority
+from zsim_bridges.web import is_loopback_authority
 from zsim_bridges.web.web_server import tokens_match
 
 HTTP_RATE_HZ = 5_000.0  # requests per wall second of one address: 500 clients that ask ten times a second
 HTTP_BURST = 10_000.0
-ADDRESSES_MAX = 10_000  # remembered
 METHODS = "GET, POST, PUT, PATCH, DELETE, OPTIONS"
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
-class TokenBucket:
-    """Lets `rate_hz` requests through on average, `burst` at once.
+def count_request(limit: RateLimit, address: str = "") -> None:
+    """Count a request of an address.
 
-    Args:
-        rate_hz: requests per wall second.
-        burst: tokens that it holds.
-        wall_s: monotonic wall time.
+    Raises:
+        TooManyError: there have been too many, with how long to wait.
     """
-
-    def __init__(self, rate_hz: float, burst: float, wall_s: Callable[[], float]) -> None:
-        self._rate_hz = rate_hz
-        self._burst = burst
-        self._wall_s = wall_s
-        self._tokens = burst
-        self._last_s = wall_s()
-
-    def spend(self) -> None:
-        """Spend a token.
-
-        Raises:
-            TooManyError: there is none, with how long to wait.
-        """
-        now_s = self._wall_s()
-        self._tokens = min(self._burst, self._tokens + (now_s - self._last_s) * self._rate_hz)
-        self._last_s = now_s
-        if self._tokens < 1.0:
-            wait_s = (1.0 - self._tokens) / self._rate_hz
-            raise TooManyError(f"more than {self._rate_hz:g} requests a second; wait {wait_s:.3f} s")
-        self._tokens -= 1.0
+    if not limit.spend(address):
+        wait_s = limit.wait(address)
+        raise TooManyError(f"more than {1 / limit.period:g} requests a second; wait {wait_s:.3f} s")
 
 
 class ConnectionLimit:
@@ -106,7 +84,7 @@ class AccessCheck:
     def __init__(self, token: str | None, report: Callable[[str], None]) -> None:
         self._token = token
         self._report = report
-        self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
+        self._limit = RateLimit(1 / HTTP_RATE_HZ, HTTP_BURST)
 
     @property
     def needs_token(self) -> bool:
@@ -130,7 +108,7 @@ class AccessCheck:
             allowed = {"Access-Control-Allow-Methods": METHODS, "Access-Control-Allow-Headers": "*"}
             return web.Response(status=204, headers=allowed)
         try:
-            self._bucket(request.remote or "").spend()
+            count_request(self._limit, request.remote or "")
             self._check_access(request)
             return await handler(request)
         except ZsimError as error:
@@ -152,14 +130,6 @@ class AccessCheck:
             raise MissingTokenError("no token, or a wrong one; send Authorization: Bearer TOKEN, or ?token=TOKEN")
         if not self.needs_token and not _is_from_this_machine(request):
             raise ForbiddenError("a page of another server may not ask here; give the gateway a token, and ask with it")
-
-    def _bucket(self, address: str) -> TokenBucket:
-        bucket = self._buckets.get(address)
-        if bucket is None:
-            bucket = self._buckets[address] = TokenBucket(HTTP_RATE_HZ, HTTP_BURST, time.monotonic)
-            if len(self._buckets) > ADDRESSES_MAX:
-                self._buckets.popitem(last=False)
-        return bucket
 
 
 def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.Response:

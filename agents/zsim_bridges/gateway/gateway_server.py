@@ -13,9 +13,11 @@ from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED
 from zsim.errors import NoWorldError, RunError, ZsimError
+from zsim.runtime.participant import ANOTHER_RUN, Participant
+from zsim.runtime.rate_limit import RateLimit
 from zsim.runtime.runner import Runner
 from zsim.transport.session import Session
-from zsim_bridges.gateway.access_check import AccessCheck, ConnectionLimit, TokenBucket
+from zsim_bridges.gateway.access_check import AccessCheck, ConnectionLimit
 from zsim_bridges.gateway.client_messages import TooManyError
 from zsim_bridges.gateway.client_streams import LINE_MAX, LineServer, Outbox
 from zsim_bridges.gateway.http_routes import application
@@ -24,7 +26,6 @@ from zsim_bridges.gateway.lockstep_session import LockstepSession
 from zsim_bridges.gateway.publications import SharedSubscriptions
 from zsim_bridges.gateway.run_access import RunAccess
 from zsim_bridges.gateway.stream_client import Client
-from zsim_bridges.observer_process import ANOTHER_RUN, ObserverProcess
 from zsim_bridges.web.picture_streams import PictureFeeds
 from zsim_bridges.web.web_server import (
     ServedSite,
@@ -174,7 +175,7 @@ class Gateway:
         self,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         stopped: Callable[[], bool],
         say: Callable[[str], None],
     ) -> None:
@@ -299,8 +300,8 @@ class Gateway:
         await site.cleanup()
 
     def _new_client(self, outbox: Outbox, authenticated: bool) -> Client:
-        bucket = TokenBucket(STREAM_RATE_HZ, STREAM_BURST, time.monotonic)
-        client = Client(self, outbox, f"client.{secrets.token_hex(3)}", authenticated, bucket)
+        limit = RateLimit(1 / STREAM_RATE_HZ, STREAM_BURST)
+        client = Client(self, outbox, f"client.{secrets.token_hex(3)}", authenticated, limit)
         if not authenticated:
             self._make_room()
         try:

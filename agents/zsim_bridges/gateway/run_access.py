@@ -11,6 +11,7 @@ from zsim.contract.framing import GateMessages, run_key_table
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
+from zsim.runtime.participant import Participant
 from zsim.scenario import rights, scenario_file
 from zsim.sensors.camera import CAMERAS
 from zsim.transport.session import RawSample, ReceivedSample, Session, check_expression
@@ -27,7 +28,6 @@ from zsim_bridges.gateway.client_messages import (
     json_to_payload,
 )
 from zsim_bridges.gateway.publications import LastValues
-from zsim_bridges.observer_process import ObserverProcess
 
 TICK_S = 0.1  # how often health is published and a stop is noticed while nothing arrives
 REQUESTS_MAX = 64  # requests under way at once; each has a thread that waits for Zenoh
@@ -48,7 +48,7 @@ class RunAccess:
         required_processes: (process, drone or cluster that it serves) of all without which the run does not start.
     """
 
-    def __init__(self, link: Session, info: Info, observer: ObserverProcess, secured: bool) -> None:
+    def __init__(self, link: Session, info: Info, observer: Participant, secured: bool) -> None:
         self.link = link
         self.info = info
         self.values = LastValues(run_key_table(info))

@@ -8,9 +8,10 @@ import msgspec
 
 from zsim.contract import keys
 from zsim.errors import DecodeError, NoWorldError, ZsimError
+from zsim.runtime.rate_limit import RateLimit
 from zsim.transport.session import RawSample, check_expression
 from zsim_bridges.gateway import stream_requests
-from zsim_bridges.gateway.access_check import TokenBucket
+from zsim_bridges.gateway.access_check import count_request
 from zsim_bridges.gateway.client_messages import (
     ForbiddenError,
     MessageDefaults,
@@ -72,7 +73,7 @@ class Client:
         outbox: of the connection.
         source: name under which it publishes until it gives its own.
         authenticated: whether it has shown the token already, or needs none.
-        bucket: limits its requests.
+        limit: of its requests.
 
     Attributes:
         source: name under which it publishes.
@@ -80,13 +81,11 @@ class Client:
         commanded: (source, drone) of the drones that it has commanded, outside of a lockstep session, in this run.
     """
 
-    def __init__(
-        self, gateway: GatewayApi, outbox: Outbox, source: str, authenticated: bool, bucket: TokenBucket
-    ) -> None:
+    def __init__(self, gateway: GatewayApi, outbox: Outbox, source: str, authenticated: bool, limit: RateLimit) -> None:
         self._gateway = gateway
         self._outbox = outbox
         self.authenticated = authenticated
-        self._bucket = bucket
+        self._limit = limit
         self._defaults = MessageDefaults(source)
         self._subscriptions: dict[str, Callable[[], None]] = {}
         self.commanded: set[tuple[str, str]] = set()
@@ -99,7 +98,7 @@ class Client:
         """Execute the request in a line; an error is an answer."""
         request: StreamRequest | None = None
         try:
-            self._bucket.spend()
+            count_request(self._limit)
             if line.isspace():
                 return
             request = stream_requests.decode_request(line)

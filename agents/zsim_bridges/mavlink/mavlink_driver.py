@@ -4,10 +4,10 @@ import asyncio
 from collections.abc import Callable
 
 from zsim.contract.messages import Info
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges.mavlink.drive.autopilot_session import AutopilotSession
-from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_run
 from zsim_bridges.vehicle_links.driver_process import DriverProcess
 from zsim_bridges.vehicle_links.vehicle_session import UdpChannel
@@ -16,7 +16,7 @@ from zsim_bridges.vehicle_links.vehicle_session import UdpChannel
 def drive(
     link: Session,
     info: Info,
-    observer: ObserverProcess,
+    observer: Participant,
     stopped: Callable[[], bool],
     say: Callable[[str], None],
     options: DriverOptions,

@@ -9,14 +9,13 @@ from zsim.contract import keys, messages
 from zsim.contract.camera_messages import CameraImage, CameraInfo
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError, RunError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
-from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.picture_intake import PictureIntake
+from zsim_bridges.intake import PictureIntake, TrafficIntake
 from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics, ros1_name
 from zsim_bridges.ros1.node import Ros1Node
-from zsim_bridges.traffic_intake import TrafficIntake
 from zsim_bridges.vehicle_links import onboard_state
 
 POLL_S = 0.1  # how often a stop is looked for
@@ -31,7 +30,7 @@ class NodeShutdownError(RunError):
 def serve(
     link: Session,
     info: Info,
-    observer: ObserverProcess,
+    observer: Participant,
     stopped: Callable[[], bool],
     say: Say,
     master_uri: str,
@@ -63,7 +62,7 @@ def serve(
 class Ros1Bridge:
     """One run in one ROS graph."""
 
-    def __init__(self, link: Session, info: Info, observer: ObserverProcess, node: Ros1Node, say: Say) -> None:
+    def __init__(self, link: Session, info: Info, observer: Participant, node: Ros1Node, say: Say) -> None:
         self._link = link
         self._info = info
         self._observer = observer

@@ -17,12 +17,12 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Mode, Velocity
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError, SessionError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport import connection
 from zsim.transport.session import RawSample, Session
 from zsim.transport.tls import Identity
-from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
 from zsim_bridges.ros2.drone_cameras import DRIVER, DroneCameras
 from zsim_bridges.ros2.rmw_zenoh import Ros2Node, RosContext, ros_names
@@ -62,7 +62,7 @@ class RosCommands:
         response: class of std_srvs/Trigger_Response.
     """
 
-    def __init__(self, link: Session, observer: ObserverProcess, response: Any) -> None:
+    def __init__(self, link: Session, observer: Participant, response: Any) -> None:
         self._link = link
         self._observer = observer
         self._response = response
@@ -128,9 +128,7 @@ class Ros2Bridge:
         wall_ns: time since 1970.
     """
 
-    def __init__(
-        self, link: Session, info: Info, observer: ObserverProcess, say: Say, wall_ns: Callable[[], int]
-    ) -> None:
+    def __init__(self, link: Session, info: Info, observer: Participant, say: Say, wall_ns: Callable[[], int]) -> None:
         self._link = link
         self._observer = observer
         self._say = say
@@ -259,7 +257,7 @@ class Ros2Bridge:
 def serve(
     link: Session,
     info: Info,
-    observer: ObserverProcess,
+    observer: Participant,
     stopped: Callable[[], bool],
     say: Say,
     network: RosNetwork,

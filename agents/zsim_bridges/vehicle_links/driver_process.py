@@ -16,10 +16,10 @@ from zsim.contract.flight_messages import Connection
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import RUN_ENDED, ControlAnswer
 from zsim.errors import DecodeError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import Query, RawSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
-from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links.aircraft_socket import AircraftSocket
 from zsim_bridges.vehicle_links.aircraft_state import AircraftState
 from zsim_bridges.vehicle_links.clock_offset import DriverClock
@@ -51,7 +51,7 @@ class DriverProcess:
         self,
         link: Session,
         info: Info,
-        observer: ObserverProcess,
+        observer: Participant,
         options: DriverOptions,
         session: VehicleSession,
         say: Say,

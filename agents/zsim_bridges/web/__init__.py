@@ -1,4 +1,24 @@
-"""What web servers share: listening on a thread of their own, who may come in, connections, streams of pictures.
+"""What web servers share: listening on a thread of their own, access, connections, streams of pictures.
 
-Console and gateway serve HTTP by it. Imports aiohttp, and asks who is on this machine alone without it.
+Console and gateway serve HTTP by it. This file imports no aiohttp, since other bridges use it, too.
 """
+
+from ipaddress import ip_address
+from urllib.parse import urlsplit
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host name or address is this machine alone."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def is_loopback_authority(authority: str) -> bool:
+    """Return whether a Host header, or the host and port of an origin, name this machine alone.
+
+    Raises:
+        ValueError: it cannot be parsed.
+    """
+    return is_loopback(urlsplit(f"//{authority}").hostname or "")

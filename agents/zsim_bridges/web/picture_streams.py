@@ -1,7 +1,6 @@
-"""The pictures of cameras as HTTP streams: one subscription a camera, however many look at it. Imports aiohttp.
+"""Pictures of cameras as HTTP streams, with one subscription for all clients of a camera.
 
-A client that does not read is behind by pictures that it never gets: for each there is the newest picture, and what
-its connection holds.
+A client that reads slowly misses pictures: it is sent the newest one each time, beside what its connection holds.
 """
 
 import asyncio
@@ -16,8 +15,8 @@ from zsim.contract.camera_messages import CameraImage
 from zsim.errors import DecodeError
 from zsim.transport.session import RawSample
 
-ALIVE_S = 10.0  # wall time after which a picture is sent again: time stands, and the client may be gone
-LINGER_S = 10.0  # wall time that a subscription outlives its last client: some ask for one picture after the other
+ALIVE_S = 10.0  # wall time after which a picture is sent again: in a paused run the client may have gone
+LINGER_S = 10.0  # wall time that a subscription outlives its last client: some request single pictures
 BOUNDARY = "zsim-picture"
 HEADERS = {"Cache-Control": "no-store", "Access-Control-Allow-Origin": "*"}
 Unsubscribe = Callable[[], None]
@@ -25,14 +24,14 @@ Subscribe = Callable[[str, Callable[[RawSample], None]], Unsubscribe]
 
 
 class NumberedPicture(NamedTuple):
-    """A picture, and how many came before it."""
+    """A picture, and the number of those before it."""
 
     number: int
     image: CameraImage
 
 
 class PictureFeed:
-    """The newest picture of a camera; all on one loop.
+    """The newest picture of a camera, for clients on one loop.
 
     Args:
         key: of its pictures.
@@ -40,7 +39,7 @@ class PictureFeed:
 
     Attributes:
         newest: None before the first.
-        watchers: who look at it now.
+        watchers: number of clients.
         stop: ends its subscription.
     """
 
@@ -54,7 +53,7 @@ class PictureFeed:
         self.stop: Unsubscribe = lambda: None
 
     def take(self, sample: RawSample) -> None:
-        """Take what was published on the key."""
+        """Take a sample of the key."""
         try:
             image: CameraImage = messages.decode(self._key, sample.payload)
         except DecodeError as error:
@@ -66,7 +65,7 @@ class PictureFeed:
         arrived.set()
 
     async def after(self, number: int, within_s: float) -> NumberedPicture | None:
-        """Return the newest picture if it is later than a number, otherwise the next; None where none comes in time."""
+        """Return the newest picture if its number is greater, otherwise the next; None if none arrives in time."""
         if self.newest is None or self.newest.number <= number:
             try:
                 await asyncio.wait_for(self._arrived.wait(), within_s)
@@ -76,12 +75,7 @@ class PictureFeed:
 
 
 class PictureFeeds:
-    """The cameras at which somebody looks, or did until LINGER_S ago.
-
-    Args:
-        subscribe: subscribes to a key.
-        refuse: see PictureFeed.
-    """
+    """The feeds of all cameras with clients, at present or within LINGER_S."""
 
     def __init__(self, subscribe: Subscribe, refuse: Callable[[str], None]) -> None:
         self._subscribe = subscribe
@@ -90,7 +84,7 @@ class PictureFeeds:
 
     @contextmanager
     def watched(self, key: str) -> Iterator[PictureFeed]:
-        """Yield the feed of a key; to be called on the loop."""
+        """Yield the feed of a key, on the loop."""
         feed = self._feeds.get(key) or self._open(key)
         feed.watchers += 1
         try:
@@ -101,7 +95,7 @@ class PictureFeeds:
                 asyncio.get_running_loop().call_later(LINGER_S, self._close_unwatched, key)
 
     def forget(self) -> None:
-        """Forget the newest pictures: another run begins."""
+        """Drop the newest pictures: another run begins."""
         for feed in self._feeds.values():
             feed.newest = None
 
@@ -119,7 +113,7 @@ class PictureFeeds:
 
 
 async def stream_pictures(request: web.Request, feed: PictureFeed) -> web.StreamResponse:
-    """Send every picture that the client has the time for, until it leaves: multipart/x-mixed-replace."""
+    """Send pictures as multipart/x-mixed-replace, as fast as the client reads, until it leaves."""
     kind = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
     response = web.StreamResponse(headers={**HEADERS, "Content-Type": kind})
     try:
@@ -137,7 +131,7 @@ async def stream_pictures(request: web.Request, feed: PictureFeed) -> web.Stream
 
 
 def part(image: CameraImage) -> bytes:
-    """Return a picture as a part with the boundary behind it: browsers show a part only when they have read that."""
+    """Return a picture as a part followed by the boundary, which browsers read before they show the part."""
     head = f"Content-Type: image/jpeg\r\nContent-Length: {len(image.data)}\r\nX-Timestamp: {_seconds(image)}\r\n\r\n"
     return b"%b%b\r\n--%b\r\n" % (head.encode(), image.data, BOUNDARY.encode())
 
@@ -149,5 +143,5 @@ def as_file(image: CameraImage) -> web.Response:
 
 
 def _seconds(image: CameraImage) -> str:
-    """Return the simulated time of a picture's exposure, as a header says it [s]."""
+    """Return the simulated time of a picture's exposure for a header [s]."""
     return f"{image.t_sample_ns / 1e9:.6f}"

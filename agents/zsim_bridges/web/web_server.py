@@ -1,25 +1,36 @@
-"""What the web servers of console and gateway share: event loop thread, listening, and who may reach them."""
+"""What the web servers of console and gateway share: event loop thread, listening, access, and bounded connections.
+
+aiohttp waits for the end of a request without a limit, and keeps what has arrived of its body; a thousand connections
+that never end theirs would take all the files that a process may open, and a gigabyte. A connection is a stranger until
+one of its requests has been answered without an error, or is being answered; strangers never take the places of others.
+"""
 
 import asyncio
 import errno
 import hmac
 import logging
 import threading
-from collections.abc import Callable, Coroutine, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from typing import Any, NamedTuple, TypeVar
 
 from aiohttp import web
 
 from zsim.errors import RunError
-from zsim_bridges.web.http_connections import HttpConnections
-from zsim_bridges.web.loopback import is_loopback
+from zsim_bridges.web import is_loopback
 
+STRANGERS_MAX = 100  # connections at once; the oldest makes room for the next
+REQUEST_S = 5.0  # wall time for a request to arrive with its body; a browser on a bad link takes 1 s
+SMALL_BYTES = 16_384  # of a body that is always accepted; commands and requests have a few hundred
+BODY_BYTES_MAX = 16_000_000  # of all larger bodies at once; 16 of the largest that the gateway accepts
+CONNECTIONS_MAX = 1000  # twice the gateway's clients
+REFUSED_FROM = 400  # HTTP status
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 ANY_PORT = 0  # of the kernel's choice
 BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own
 READ_BYTES = 16_384  # of a body that no handler has read yet; a connection holds twice as many
 Resource = TypeVar("Resource")
-_NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, not logged
+_NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests other than HTTP are answered, not logged
 
 
 class ServedSite(NamedTuple):
@@ -30,11 +41,10 @@ class ServedSite(NamedTuple):
 
     @property
     def port(self) -> int:
-        """Return the port on which it is served."""
         return self.listener.sockets[0].getsockname()[1]
 
     async def cleanup(self) -> None:
-        """Stop listening, and end what is under way."""
+        """Stop listening, and end requests in progress."""
         self.listener.close()
         await self.runner.cleanup()
 
@@ -45,8 +55,8 @@ async def start_site(app: web.Application, host: str, ports: Sequence[int], shut
     Args:
         app: the application.
         host: on whose address.
-        ports: the first of them that is not taken; ANY_PORT for one that is not.
-        shutdown_s: how long what is under way may take at the end [wall].
+        ports: the first of them that is free; ANY_PORT for any free one.
+        shutdown_s: how long requests in progress may take at the end [wall].
 
     Raises:
         OSError: none of them can be opened.
@@ -75,29 +85,6 @@ async def _listen(protocol: Callable[[], asyncio.Protocol], host: str, ports: Se
     return await _listen(protocol, host, ports[1:])
 
 
-def check_token(process: str, host: str, token: str | None) -> None:
-    """Refuse to listen where others could connect without a token.
-
-    Raises:
-        RunError: the token is empty, or there is none and the host is not loopback.
-    """
-    if token == "":
-        raise RunError(f"{process}: the token is empty; give it one, or leave ZSIM_TOKEN and --token away")
-    if token is None and not is_loopback(host):
-        remedy = "set ZSIM_TOKEN (or --token, which everybody on this machine can read), or --listen 127.0.0.1"
-        raise RunError(f"{process}: {host} can be reached by others; {remedy}")
-
-
-def tokens_match(received: str, token: str) -> bool:
-    """Compare in constant time; what was received may hold any bytes of a header."""
-    return hmac.compare_digest(received.encode(errors="surrogatepass"), token.encode(errors="surrogatepass"))
-
-
-def url_host(host: str) -> str:
-    """Return a host as URLs write it: an IPv6 address in brackets."""
-    return f"[{host}]" if ":" in host else host
-
-
 @contextmanager
 def open_on_thread(
     loop: asyncio.AbstractEventLoop,
@@ -107,10 +94,7 @@ def open_on_thread(
 ) -> Iterator[None]:
     """Run an event loop on a thread of its own, open a resource on it, and close both at the end.
 
-    Args:
-        loop: is closed at the end.
-        name: of the thread.
-        enter, leave: open and close the resource; exceptions of `enter` are raised here.
+    Exceptions of `enter`, which opens the resource, are raised here.
     """
     thread = threading.Thread(target=loop.run_forever, name=name, daemon=True)
     thread.start()
@@ -128,8 +112,227 @@ def open_on_thread(
 
 
 async def cancel_other_tasks() -> None:
-    """Cancel all other tasks of the loop and wait for them: a loop that closes over a task complains of it."""
+    """Cancel all other tasks of the loop and wait for them, since asyncio warns of tasks pending at the end."""
     others = asyncio.all_tasks() - {asyncio.current_task()}
     for task in others:
         task.cancel()
     await asyncio.gather(*others, return_exceptions=True)
+
+
+def check_token(process: str, host: str, token: str | None) -> None:
+    """Refuse to listen where other machines could connect without a token.
+
+    Raises:
+        RunError: the token is empty, or there is none and the host is not loopback.
+    """
+    if token == "":
+        raise RunError(f"{process}: the token is empty; give it one, or leave ZSIM_TOKEN and --token away")
+    if token is None and not is_loopback(host):
+        remedy = "set ZSIM_TOKEN (or --token, which everybody on this machine can read), or --listen 127.0.0.1"
+        raise RunError(f"{process}: {host} can be reached by others; {remedy}")
+
+
+def tokens_match(received: str, token: str) -> bool:
+    """Compare in constant time; the received one may hold any bytes of a header."""
+    return hmac.compare_digest(received.encode(errors="surrogatepass"), token.encode(errors="surrogatepass"))
+
+
+def url_host(host: str) -> str:
+    """Return a host as written in URLs: an IPv6 address in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+class HttpConnections:
+    """Counts the connections of a server, and closes those that must make room.
+
+    Args:
+        strangers_max, connections_max: at once.
+        request_s: wall time for a request to arrive, from its first byte; and for a stranger's head, from the opening
+            of the connection or its last answer.
+        body_bytes_max: of all bodies beyond SMALL_BYTES at once; further ones wait within their time.
+    """
+
+    def __init__(
+        self,
+        strangers_max: int = STRANGERS_MAX,
+        connections_max: int = CONNECTIONS_MAX,
+        request_s: float = REQUEST_S,
+        body_bytes_max: int = BODY_BYTES_MAX,
+    ) -> None:
+        self._strangers_max = strangers_max
+        self._connections_max = connections_max
+        self._request_s = request_s
+        self._body_bytes_max = body_bytes_max
+        self._body_bytes = 0
+        self._body_gone = asyncio.Condition()
+        self._open: dict[asyncio.BaseTransport, HttpConnection] = {}
+        self._strangers: dict[HttpConnection, None] = {}  # an ordered set, by when they began to wait
+        self._idle: dict[HttpConnection, None] = {}  # likewise, of known ones without a request
+
+    def protocol(self, http: asyncio.Protocol) -> "HttpConnection":
+        """Return the protocol of a new connection; `http` speaks HTTP on it."""
+        return HttpConnection(http, self)
+
+    @web.middleware
+    async def observe(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Keep a connection while its request is answered; to be the innermost middleware, after checks of access."""
+        connection = self._open.get(request.transport) if request.transport else None
+        if connection is None:
+            return await handler(request)
+        since_s = connection.since_s
+        self._forget(connection)
+        try:
+            async with AsyncExitStack() as room:
+                await self._receive(request, connection, since_s, room)
+                connection.is_whole = True
+                response = await handler(request)
+            connection.known = connection.known or response.status < REFUSED_FROM
+            return response
+        finally:
+            if connection.is_open:
+                self._wait(connection)
+
+    async def _receive(
+        self, request: web.Request, connection: "HttpConnection", since_s: float | None, room: AsyncExitStack
+    ) -> None:
+        """Receive the body of a request before the handler; `room` is kept for it until that is done.
+
+        Raises:
+            HTTPRequestTimeout: it did not arrive in time, or there was no room for it.
+            HTTPRequestEntityTooLarge: it is longer than the application accepts.
+        """
+        if not request.can_read_body:
+            return
+        longest = request.client_max_size
+        size = longest if request.content_length is None else min(request.content_length, longest)
+        until_s = (asyncio.get_running_loop().time() if since_s is None else since_s) + self._request_s
+        try:
+            async with asyncio.timeout_at(until_s):
+                if size > SMALL_BYTES:
+                    await room.enter_async_context(self._body_room(size))
+                await request.read()
+        except TimeoutError:
+            connection.known = False  # what it sends next is waited for as for a stranger's
+            raise web.HTTPRequestTimeout(text=f"a request must be whole within {self._request_s:g} s") from None
+
+    @asynccontextmanager
+    async def _body_room(self, size: int) -> AsyncIterator[None]:
+        """Wait until a body has room beside the others, and keep it."""
+        async with self._body_gone:
+            await self._body_gone.wait_for(lambda: self._body_bytes + size <= self._body_bytes_max)
+            self._body_bytes += size
+        try:
+            yield
+        finally:
+            self._body_bytes -= size
+            async with self._body_gone:
+                self._body_gone.notify_all()
+
+    def enter(self, connection: "HttpConnection", transport: asyncio.Transport) -> bool:
+        """Accept a new connection; False if there is no room, since all others have a request in progress."""
+        if len(self._open) >= self._connections_max and not self._make_room(self._strangers, self._idle):
+            return False
+        if len(self._strangers) >= self._strangers_max:
+            self._make_room(self._strangers)
+        self._open[transport] = connection
+        self._wait(connection)
+        return True
+
+    def leave(self, connection: "HttpConnection", transport: asyncio.BaseTransport) -> None:
+        """Remove a closed connection."""
+        self._open.pop(transport, None)
+        self._forget(connection)
+
+    def _make_room(self, *groups: "dict[HttpConnection, None]") -> bool:
+        """Close the connection that has waited longest, of the first group that is not empty."""
+        for group in groups:
+            if group:
+                next(iter(group)).cut()
+                return True
+        return False
+
+    def _wait(self, connection: "HttpConnection") -> None:
+        """Let a connection wait for its next request; aiohttp itself closes idle ones that are known."""
+        (self._idle if connection.known else self._strangers)[connection] = None
+        if not connection.known:
+            connection.timer = asyncio.get_running_loop().call_later(self._request_s, connection.cut)
+        if connection.has_more:
+            self.begin(connection)
+        connection.is_whole = connection.has_more = False
+
+    def begin(self, connection: "HttpConnection") -> None:
+        """Take the first bytes of a request on a connection that waits for one."""
+        if connection.since_s is not None or not (connection in self._idle or connection in self._strangers):
+            return
+        loop = asyncio.get_running_loop()
+        connection.since_s = loop.time()
+        connection.timer = connection.timer or loop.call_later(self._request_s, connection.cut)
+
+    def _forget(self, connection: "HttpConnection") -> None:
+        self._strangers.pop(connection, None)
+        self._idle.pop(connection, None)
+        connection.since_s = None
+        if connection.timer is not None:
+            connection.timer.cancel()
+            connection.timer = None
+
+
+class HttpConnection(asyncio.Protocol):
+    """One connection, between its transport and the protocol that speaks HTTP.
+
+    Attributes:
+        known: whether one of its requests was answered without an error.
+        since_s: when the first byte of its next request arrived [s, of the loop]; None before.
+        timer: closes it when the time for that request is over.
+        is_whole: whether the request in progress has arrived.
+        has_more: whether something of the next one has arrived meanwhile.
+    """
+
+    def __init__(self, http: asyncio.Protocol, connections: HttpConnections) -> None:
+        self._http = http
+        self._connections = connections
+        self._transport: asyncio.Transport | None = None
+        self.known = self.is_whole = self.has_more = False
+        self.since_s: float | None = None
+        self.timer: asyncio.TimerHandle | None = None
+
+    @property
+    def is_open(self) -> bool:
+        return self._transport is not None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        if not self._connections.enter(self, transport):
+            transport.abort()
+            return
+        self._transport = transport
+        self._http.connection_made(transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._transport is not None:
+            self._connections.leave(self, self._transport)
+            self._transport = None
+            self._http.connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        if self._transport is None:
+            return
+        self.has_more = self.has_more or self.is_whole
+        self._connections.begin(self)
+        self._http.data_received(data)
+
+    def eof_received(self) -> bool | None:
+        return self._http.eof_received() if self._transport is not None else None
+
+    def pause_writing(self) -> None:
+        self._http.pause_writing()
+
+    def resume_writing(self) -> None:
+        self._http.resume_writing()
+
+    def cut(self) -> None:
+        """Close it at once, without an answer."""
+        if self._transport is not None:
+            transport = self._transport
+            self._connections.leave(self, transport)
+            transport.abort()

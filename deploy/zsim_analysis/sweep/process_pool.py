@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING
 
 from zsim.errors import RunError
-from zsim.transport.open_files import SESSION_FILES, WORKER_FILES, require_files
+from zsim.transport.zenoh_settings import SESSION_FILES, WORKER_FILES, require_files
 
 if TYPE_CHECKING:
     from zsim_analysis.sweep.sweep_run import Row, Task

@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from zsim.runtime.progress import Throttle, cell
+from zsim.runtime.progress import cell
+from zsim.runtime.rate_limit import RateLimit
 from zsim_analysis.sweep.design import SweepPlan
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
 from zsim_analysis.sweep.sweep_folder import SweepFolder, locked
@@ -41,7 +42,7 @@ class SweepScreen:
         self._unmeasured = 0
         self._now_s = now_s
         self._start_s = now_s()
-        self._throttle = Throttle(PLAIN_S)
+        self._throttle = RateLimit(PLAIN_S)
         self._live = Live(console=self.console, get_renderable=self._text, refresh_per_second=5, transient=True)
 
     def __enter__(self) -> "SweepScreen":
@@ -64,7 +65,7 @@ class SweepScreen:
         """Count a run."""
         self._done += 1
         self._failed += failed
-        if not self.console.is_terminal and self._done < self._total and self._throttle.passes():
+        if not self.console.is_terminal and self._done < self._total and self._throttle.spend():
             self.say(self.line())
 
     def unmeasured(self, run: int, reason: str) -> None:

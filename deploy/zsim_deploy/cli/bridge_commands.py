@@ -79,11 +79,10 @@ def console(
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
     require("console", opt.CONSOLE_NEEDS)
     from zsim.runtime.progress import JsonProgress
-    from zsim.transport.open_files import SERVER_FILES, require_files
+    from zsim.transport.zenoh_settings import SERVER_FILES, require_files
     from zsim_bridges.console.console_server import Console
-    from zsim_bridges.console.server.http_proxy import ListenAddress
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import log_printer
+    from zsim_bridges.console.page_server import ListenAddress
+    from zsim_deploy.roles.roles import log_printer, process_name
 
     # Of normal priority: an operator's emergency goes through it, and one that gave way would be reported as silent.
     own_name = process_name("console", name, reach.who, "*")
@@ -109,12 +108,11 @@ def gateway(
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     require("gateway", GATEWAY_NEEDS)
     from zsim.transport.connection import find_world
-    from zsim.transport.open_files import SERVER_FILES, allow_files, require_files
+    from zsim.transport.zenoh_settings import SERVER_FILES, allow_files, require_files
     from zsim_bridges.gateway.gateway_server import CLIENTS_MAX, Gateway, GatewayPorts
-    from zsim_bridges.web.http_connections import CONNECTIONS_MAX
-    from zsim_deploy.roles.priority import lower_priority
-    from zsim_deploy.roles.process_identity import process_name
-    from zsim_deploy.roles.roles import log_printer
+    from zsim_bridges.web.web_server import CONNECTIONS_MAX
+    from zsim_deploy.roles.roles import log_printer, process_name
+    from zsim_deploy.roles.stop_channel import lower_priority
 
     lower_priority()  # before its threads are started
     own_name = process_name("gateway", name, reach.who)
@@ -279,7 +277,7 @@ def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
     """Return the address of HOST:PORT."""
     from socket import gaierror, gethostbyname
 
-    from zsim_bridges.web.loopback import is_loopback
+    from zsim_bridges.web import is_loopback
 
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) <= opt.PORT_MAX:

@@ -111,7 +111,7 @@ def up(
     --only and --sort are of the table that is shown; every role is started whatever they are.
     """
     require("up", UP_NEEDS | (opt.REPORT_NEEDS if report else {}))
-    from zsim.transport.open_files import host_launcher_files, require_files
+    from zsim.transport.zenoh_settings import host_launcher_files, require_files
     from zsim_deploy import inventory
     from zsim_deploy.cli.run_commands import conclude
     from zsim_deploy.hosts.host_run import HostRun

@@ -14,7 +14,7 @@ from zsim_deploy.arguments import require
 
 if TYPE_CHECKING:
     from zsim.transport.tls import Identity
-    from zsim_deploy.roles.camera_roles import Drones as Chosen
+    from zsim_deploy.roles.roles import Drones as Chosen
     from zsim_deploy.roles.roles import Serve
 
 SOME_DRONES = "Drones, or patterns: 'drone*'; all that have cameras if not given."
@@ -59,9 +59,9 @@ def _agent_command(name: str, role: Role) -> Callable[..., None]:
     several_help = f"{about.capitalize()}s, or patterns: '{about}*'."
 
     def start(things: list[str], reach: opt.WorldAccess) -> None:
-        from zsim_deploy.roles import process_identity, roles
+        from zsim_deploy.roles import roles
 
-        roles.agent(roles.agent_of(name, things), reach, process_identity.process_of(name, things))
+        roles.agent(roles.agent_of(name, things), reach, roles.process_of(name, things))
 
     def several(
         reach: opt.WorldAccess,
@@ -108,7 +108,7 @@ def record(
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
-    from zsim_deploy.roles.priority import lower_priority
+    from zsim_deploy.roles.stop_channel import lower_priority
 
     lower_priority()
     roles.recorder(out, reach)
@@ -140,10 +140,10 @@ def camera(
 ) -> None:
     """Draw what the cameras of one drone see, or of several in one process, as JPEG."""
     require("camera", opt.CAMERA_NEEDS)
-    from zsim_deploy.roles import camera_roles
+    from zsim_deploy.roles import roles
 
-    serve = partial(camera_roles.camera, names=drones or ())
-    _serve_pictures("camera", serve, camera_roles.of_camera, reach, drones, name)
+    serve = partial(roles.camera, names=drones or ())
+    _serve_pictures("camera", serve, roles.of_camera, reach, drones, name)
 
 
 @app.command(rich_help_panel=opt.ROLES)
@@ -158,18 +158,17 @@ def detect(
 ) -> None:
     """Find magenta hats in the pictures of one drone, or of several in one process."""
     require("detect", opt.CAMERA_NEEDS)
-    from zsim_deploy.roles import camera_roles
+    from zsim_deploy.roles import roles
 
-    serve = partial(camera_roles.detector, names=drones or (), diameter_m=diameter)
-    _serve_pictures("detector", serve, camera_roles.of_detector, reach, drones, name)
+    serve = partial(roles.detector, names=drones or (), diameter_m=diameter)
+    _serve_pictures("detector", serve, roles.of_detector, reach, drones, name)
 
 
 def _serve_pictures(
     role: str, serve: "Serve", chosen: "Chosen", reach: opt.WorldAccess, drones: Sequence[str] | None, name: str
 ) -> None:
     """Serve as a camera or a detector, named after its drone if one alone is named."""
-    from zsim_deploy.roles.camera_roles import slack_ns, stands_for
-    from zsim_deploy.roles.process_identity import PATTERN
+    from zsim_deploy.roles.roles import PATTERN, slack_ns, stands_for
 
     one = drones[0] if drones and len(drones) == 1 else ""
     thing = one if one and not set(one) & set(PATTERN) else "main"
@@ -195,8 +194,8 @@ def serve_as(
         does: what more `serve_runs` is given.
     """
     from zsim_deploy.roles import roles
-    from zsim_deploy.roles.priority import lower_priority
-    from zsim_deploy.roles.process_identity import process_name
+    from zsim_deploy.roles.roles import process_name
+    from zsim_deploy.roles.stop_channel import lower_priority
 
     if lowered:
         lower_priority()

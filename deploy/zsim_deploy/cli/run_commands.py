@@ -451,7 +451,7 @@ def replay(
     from zsim.schema import plugin
     from zsim_deploy.launch.console_process import console_beside
     from zsim_deploy.roles.world_role import ReplayOptions, play
-    from zsim_world.playback.playback import PlaybackRange
+    from zsim_world.run.playback import PlaybackRange
 
     opt.check_range(from_, to)
     to_ns = None if to is None else round(to * 1e9)

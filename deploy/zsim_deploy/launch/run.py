@@ -23,8 +23,8 @@ from zsim.scenario.external_bodies import driver_lines
 from zsim.scenario.rights import watched
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import BottomCamera, FrontCamera
-from zsim.transport.open_files import launcher_files, require_files
 from zsim.transport.tls import Identity
+from zsim.transport.zenoh_settings import launcher_files, require_files
 from zsim_agents.hosting import agents_of
 from zsim_deploy.arguments import OTHER_OUT, changed_options, file_fault, load_scenario, pace_options
 from zsim_deploy.inventory import COMMANDS

@@ -1,4 +1,7 @@
-"""Output that nobody reads any more, or that nobody can take: a closed terminal, the end of a pipe, a full disk."""
+"""Output that nobody reads any more, or that cannot be written: a closed terminal, a broken pipe, a full disk.
+
+It imports nothing that opens files: `renew_streams` is called before anything else.
+"""
 
 import contextlib
 import io
@@ -15,7 +18,7 @@ CLOSED = "the terminal was closed"
 
 
 class _Output(io.FileIO):
-    """A standard stream that loses what its file does not take; only that nobody is at the end of a pipe is raised."""
+    """A standard stream that loses what its file does not take; only a broken pipe is raised."""
 
     _lost = False
 
@@ -38,9 +41,9 @@ def write_error(text: str) -> None:
 
 
 def renew_streams() -> None:
-    """Open Python's standard streams anew, so that nothing ends because one of them is closed, or its disk full.
+    """Reopen Python's standard streams, so that nothing fails because one of them is closed, or its disk full.
 
-    To be called before any file is opened: it would take the number of a stream that is closed, and then also what a
+    To be called before any file is opened: the file would take the number of a closed stream, and receive what a
     library prints.
     """
     for number in (0, *STREAMS):
@@ -60,7 +63,7 @@ def renew_streams() -> None:
 
 
 def is_unread(stream: int) -> bool:
-    """Tell whether a stream is a pipe at the end of which nobody is."""
+    """Tell whether a stream is a broken pipe."""
     with contextlib.suppress(OSError):
         if stat.S_ISFIFO(os.fstat(stream).st_mode) and hasattr(select, "poll"):  # not on Windows
             poller = select.poll()
@@ -70,7 +73,7 @@ def is_unread(stream: int) -> bool:
 
 
 def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
-    """Send to a file what is written from now on to a terminal or a pipe, which may take nothing any more."""
+    """Send to a file what is written from now on to a terminal or a pipe that may be gone."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
     try:
         into = os.open(log, flags, 0o644)
@@ -85,7 +88,7 @@ def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOS
 
 
 def _is_file(stream: int) -> bool:
-    """Tell whether a stream is a file already, or is not open at all."""
+    """Tell whether a stream is a file already, or not open at all."""
     try:
         return stat.S_ISREG(os.fstat(stream).st_mode)
     except OSError:

@@ -3,9 +3,10 @@
 A launched process has a pipe from its launcher as standard input. The launcher writes "stop REASON"; when it dies,
 the pipe ends. So nothing outlives its launcher, on any system, also after kill -9. A launcher on another host writes
 "orphan-after SECONDS" and then a "beat" every second: a host that vanishes closes no pipe. A launched process that is
-sent SIGTERM instead ends in order, too, but counts as dead: its launcher did not ask for it.
+sent SIGTERM instead also ends in order, but counts as dead: its launcher did not ask for it.
 
-With the process ends the lease of the private key that `zsim up` has copied to its host.
+When the process ends, so does the lease of the private key that `zsim up` has copied to its host. This file also holds
+the priority of processes that no gate waits for.
 """
 
 import atexit
@@ -30,64 +31,19 @@ TWICE_INTERRUPTED = "interrupted twice, nobody was waited for"
 TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
 GRACE_S = 4.0  # a role that hangs after a request to stop is ended; the world waits 5 s for byes only if unstopped
 FOLDER = "identity"  # in the folder of a run on a host; the certificates of its processes are below
-
-
-@contextmanager
-def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Hand these signals to a function, and afterwards to whom they went before."""
-    former = {number: signal.signal(number, handler) for number in REASONS}
-    try:
-        yield
-    finally:
-        for number, before in former.items():
-            signal.signal(number, before)
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """Raise KeyboardInterrupt at these signals, also where a library in between loses it and fails in another way."""
-    asked = False
-
-    def on_signal(*_: object) -> None:
-        nonlocal asked
-        asked = True
-        raise KeyboardInterrupt
-
-    with handled_by(on_signal):
-        try:
-            yield
-        except Exception as error:
-            if asked:
-                raise KeyboardInterrupt from error
-            raise
-
-
-class KeyLease:
-    """A key that was copied to this host for this process; it is removed when the process ends, for whatever reason.
-
-    Args:
-        folder: with the key.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._key = folder / KEY
-        self._stamp = _stamp(self._key)
-        atexit.register(self.release)
-
-    def release(self) -> None:
-        """Remove the key, but not a newer one at its path: that is of the process that takes over."""
-        with contextlib.suppress(OSError):
-            if _stamp(self._key) == self._stamp:
-                self._key.unlink(missing_ok=True)
+NICE = 5  # of processes for which no gate waits
+AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
+TRIES = 5
+AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
 
 
 class StopChannel:
     """The reason to stop, once there is one.
 
     Args:
-        launched: run of which the process is a part. Then standard input is its launcher's pipe, and Ctrl-C is left to
+        launched: run that the process is part of. Then standard input is its launcher's pipe, and Ctrl-C is left to
             the launcher. None if it was started by hand.
-        identity: whose key is removed as soon as the launcher is gone, if it is leased.
+        identity: its key is removed as soon as the launcher is gone, if it is leased.
     """
 
     def __init__(self, launched: str | None = None, identity: Identity | None = None) -> None:
@@ -101,7 +57,9 @@ class StopChannel:
             threading.Thread(target=self._read, name="stop channel", daemon=True).start()
         else:
             handlers = {signal.SIGTERM: self._on_term, signal.SIGINT: self._on_interrupt}
-            handlers |= dict.fromkeys(filter(_is_nobodys, HANGUP), self._on_hangup)
+            # neither ignored, as under nohup, nor handled already
+            fatal = (number for number in HANGUP if signal.getsignal(number) is signal.SIG_DFL)
+            handlers |= dict.fromkeys(fatal, self._on_hangup)
         for number, handler in handlers.items():
             signal.signal(number, handler)
 
@@ -110,24 +68,24 @@ class StopChannel:
         return self._reason
 
     def stopped(self) -> bool:
-        """Return whether to stop."""
+        """Tell whether to stop."""
         return self._reason is not None
 
     def orphaned(self) -> bool:
-        """Return whether the launcher is gone, or does not want this end: for all others it is a death, no leave."""
+        """Tell whether the launcher is gone, or did not ask for this end: others then see a death, not a leave."""
         return self._orphaned
 
     def exit_if_terminated(self) -> None:
-        """Tell the launcher, by the exit code, that somebody else has ended this process; to be called last.
+        """Report to the launcher, by the exit code, that it was not the one that ended this process; to be called last.
 
         Raises:
-            SystemExit: that is so.
+            SystemExit: another process has sent SIGTERM.
         """
         if self._terminated:
             raise SystemExit(TERMINATED)
 
     def restore_signals(self) -> None:
-        """Take no signals any more: what is left to do may be interrupted as anything."""
+        """Handle no signals any longer: what is left to do may be interrupted like any other work."""
         for number, handler in self._former.items():
             signal.signal(number, handler)
 
@@ -143,7 +101,7 @@ class StopChannel:
         self._stop(REASONS[signal.SIGTERM])
 
     def _on_hangup(self, *_: object) -> None:
-        """End as after SIGTERM, and write nothing more to what may be gone."""
+        """End as after SIGTERM, and write nothing more to a terminal that may be gone."""
         redirect_output(Path(os.devnull))
         self._stop(CLOSED)
 
@@ -179,6 +137,25 @@ class StopChannel:
         os._exit(1)
 
 
+class KeyLease:
+    """A key that was copied to this host for this process, and is removed when the process ends for whatever reason.
+
+    Args:
+        folder: with the key.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._key = folder / KEY
+        self._stamp = _stamp(self._key)
+        atexit.register(self.release)
+
+    def release(self) -> None:
+        """Remove the key, but not a newer one at its path, which belongs to the process that takes over."""
+        with contextlib.suppress(OSError):
+            if _stamp(self._key) == self._stamp:
+                self._key.unlink(missing_ok=True)
+
+
 def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
     """Return the lease of the key that the launcher of a run has copied here; None if the key is this host's own."""
     folder = identity.tls
@@ -187,15 +164,60 @@ def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
     return KeyLease(folder)
 
 
-def _is_nobodys(number: int) -> bool:
-    """Return whether a signal would end this process at once: neither ignored, as under nohup, nor taken."""
-    return signal.getsignal(number) is signal.SIG_DFL
-
-
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """Return what distinguishes a file from a newer one at its path."""
+    """Return a mark that distinguishes a file from a newer one at its path; None if there is none."""
     try:
         status = path.stat()
     except OSError:
         return None
     return status.st_ino, status.st_ctime_ns
+
+
+@contextmanager
+def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Handle interrupts and SIGTERM by a function, and restore the former handlers afterwards."""
+    former = {number: signal.signal(number, handler) for number in REASONS}
+    try:
+        yield
+    finally:
+        for number, before in former.items():
+            signal.signal(number, before)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise KeyboardInterrupt at an interrupt or SIGTERM, even if a library loses it and fails in another way."""
+    asked = False
+
+    def on_signal(*_: object) -> None:
+        nonlocal asked
+        asked = True
+        raise KeyboardInterrupt
+
+    with handled_by(on_signal):
+        try:
+            yield
+        except Exception as error:
+            if asked:
+                raise KeyboardInterrupt from error
+            raise
+
+
+def lower_priority(niceness: int = NICE) -> None:
+    """Let the world go first: make this process nicer, and the session that it leads, if it leads one.
+
+    Where Linux shares processors between sessions, niceness counts within each of them only.
+    """
+    if hasattr(os, "nice"):
+        os.nice(niceness)
+    if sys.platform != "linux" or os.getsid(0) != os.getpid():
+        return
+    for _ in range(TRIES):
+        try:
+            AUTOGROUP.write_text(str(niceness))
+        except BlockingIOError:
+            time.sleep(AGAIN_S)
+        except OSError:
+            return  # not shared that way here, or not ours to set
+        else:
+            return

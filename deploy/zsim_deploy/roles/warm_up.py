@@ -1,9 +1,9 @@
-"""Compile what flies, once on a machine, so that a run starts at once there.
+"""Compiles what a run needs, once on a machine, so that runs start at once there.
 
-python -m zsim_deploy.roles.warm_up EXTRA...    what the roles run that need these extras; `zsim push` runs it on a host
+    python -m zsim_deploy.roles.warm_up EXTRA...    for the roles that need these extras; `zsim push` runs it on a host
 
-Where numba is missing nothing is compiled, and there is nothing to do. As a program it prints the name of
-each function before it compiles it: nothing where all is compiled already.
+Without numba nothing is compiled, and there is nothing to do. As a program it prints the name of each function before
+it compiles it, and nothing where all is compiled already.
 """
 
 import importlib.util
@@ -19,7 +19,7 @@ from zsim.errors import printable
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 
-SIZES = {"pair": 2, "triad": 3, "template": 5}  # drones of the kinds of cluster: each has code of its own
+SIZES = {"pair": 2, "triad": 3, "template": 5}  # drones of each kind of cluster; each kind has code of its own
 ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}  # as good as many
 NESTED = ("groups", 2, 3)  # name, groups, drones of each
 WITH_WORLD = {"world", "sweep", "all", "dev"}  # extras that bring it …
@@ -29,38 +29,26 @@ APART_M = 4.0  # on circles, so that no formation stands in a line
 
 
 def main(extras: Collection[str]) -> None:
-    """Build the world and one of each agent, as far as they need the extras, and let them compile."""
+    """Build the world and one agent of each kind, as far as these extras need them, and let them compile."""
     if importlib.util.find_spec("numba") is None:
         return
     if WITH_WORLD & {*extras}:
-        _build_world()
+        from zsim_world.run.world import World
+
+        World(scenario_file.resolve(ALONE), "lockstep", 0.0, time.monotonic_ns, None)
     if WITH_AGENTS & {*extras}:
-        _rehearse_agents()
+        from zsim_agents.hosting import hosted
+
+        scenario = scenario_file.resolve(formations())
+        hosted(_info(scenario), scenario, ["*"]).rehearse()
     if WITH_CAMERAS & {*extras}:
-        _rehearse_detector()
+        from zsim_agents.cameras import detector
 
-
-def _build_world() -> None:
-    from zsim_world.flight.world import World
-
-    World(scenario_file.resolve(ALONE), "lockstep", 0.0, time.monotonic_ns, None)
-
-
-def _rehearse_agents() -> None:
-    from zsim_agents.hosting import hosted
-
-    scenario = scenario_file.resolve(formations())
-    hosted(_info(scenario), scenario, ["*"]).rehearse()
-
-
-def _rehearse_detector() -> None:
-    from zsim_agents.cameras import detector
-
-    detector.rehearse()
+        detector.rehearse()
 
 
 def _info(scenario: Scenario) -> Info:
-    """Return what agents are made of without a world, whose kernel a host of agents does not need compiled."""
+    """Return the `world/info` from which agents are made without a world: their host needs no compiled kernel."""
     return Info(
         t_ns=0,
         seq=0,
@@ -89,17 +77,16 @@ def formations() -> dict[str, Any]:
     names = {kind: [f"{kind}{i}" for i in range(count)] for kind, count in (SIZES | {nested: groups * size}).items()}
     clusters: list[dict[str, Any]] = [{"name": kind, "drones": drones} for kind, drones in names.items()]
     clusters[-1]["groups"] = [{"name": f"g{i}", "size": size} for i in range(groups)]
-    places = [(name, _place(i, row)) for row, each in enumerate(names.values()) for i, name in enumerate(each)]
-    drones = [{"name": name, "position_m": place} for name, place in places]
+    drones = [
+        {"name": name, "position_m": [APART_M * math.cos(i), APART_M * math.sin(i) + 4 * APART_M * row, 0.0]}
+        for row, each in enumerate(names.values())
+        for i, name in enumerate(each)
+    ]
     return {"name": "warm-up", "duration_s": 1, "drones": drones, "clusters": clusters}
 
 
-def _place(i: int, row: int) -> list[float]:
-    return [APART_M * math.cos(i), APART_M * math.sin(i) + 4 * APART_M * row, 0.0]
-
-
 def _show_compilation() -> None:
-    """Print a line whenever a function called from Python is about to be compiled, not when it is loaded from disk."""
+    """Print a line whenever a function called from Python is compiled, but not if it is loaded from disk."""
     from numba.core import event
 
     class Shown(event.Listener):

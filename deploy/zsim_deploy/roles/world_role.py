@@ -1,11 +1,8 @@
 """The process that holds the run: the world of a scenario, or a record played back in its place."""
 
 import gc
-import threading
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,24 +10,24 @@ import msgspec
 
 from zsim.contract import keys, run_messages
 from zsim.errors import RunError, RunFailedError
-from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
+from zsim.runtime.progress import PERIOD_S, QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, SlowStart
+from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport import connection
-from zsim.transport.open_files import hub_files, require_files
 from zsim.transport.session import check_expression
 from zsim.transport.tls import Identity
+from zsim.transport.zenoh_settings import hub_files, require_files
 from zsim_deploy.roles.stop_channel import StopChannel
 
 if TYPE_CHECKING:
     from zsim.record import RecordReader
-    from zsim_world.playback.playback import PlaybackRange
+    from zsim_world.run.playback import PlaybackRange
 
-SLOW_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
 SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
-HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more
-VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # why a run ends, and who is lost or doubled
+HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more often
+VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # why a run ends, and what is lost or doubled
 
 
 def world(
@@ -45,19 +42,21 @@ def world(
     all_died: bool = False,
     changed: Sequence[str] | None = None,
 ) -> None:
-    """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it.
+    """Run the world of a scenario on the endpoints until the scenario ends or the process is stopped.
 
     Args:
-        journal: folder of it.
-        all_died: whether, when the run goes on from there, all who took part in it have to be started again.
-        changed: as of `World`.
+        journal: its folder.
+        all_died: whether all participants of the run have to be started again too, when it goes on from its journal.
+        changed: see `World`.
 
     Raises:
         RunError: the journal is of another run.
-        SessionError: an endpoint is taken, or the identity is of no use.
+        SessionError: an endpoint is taken, or the identity cannot be used.
     """
-    from zsim_world.flight.world import World
-    from zsim_world.journal.run_journal import RunJournal, journaled_run
+    from zsim.math.compiled import is_kept
+    from zsim_world.fleet.kernel import advance
+    from zsim_world.run.world import World
+    from zsim_world.server.run_journal import RunJournal, journaled_run
     from zsim_world.server.world_process import run
 
     clients = {*scenario.expected(), *(expect or ())}
@@ -65,9 +64,15 @@ def world(
     identity = identity._replace(process=WORLD)
     connection.check_listening(endpoints, identity)  # before anything is compiled
     stop = StopChannel(launched, identity)
-    with _slow_start_notice(JsonProgress() if launched else None):
+    text = "compiling the world's kernel; later runs on this machine find it compiled"
+    if is_kept(advance):
+        text = "loading the world's kernel; this machine is busy"
+    start = SlowStart(JsonProgress().say if launched else print, text)
+    try:
         run_id = launched or (journaled_run(journal) if journal else None)
         run_world = World(scenario, mode, rate, time.monotonic_ns, run_id, changed)
+    finally:
+        start.over()
     run_world.is_launched = launched is not None
     for name in expect or ():
         run_world.barrier.expect(name)
@@ -89,49 +94,40 @@ def world(
         raise RunFailedError("; ".join(run_world.left_early))
 
 
-@contextmanager
-def _slow_start_notice(progress: JsonProgress | None) -> Iterator[None]:
-    """Show what takes so long the first time that a machine runs the world."""
-    from zsim.math.compiled import is_kept
-    from zsim_world.fleet.kernel import advance
-
-    text = "compiling the world's kernel; later runs on this machine find it compiled"
-    if is_kept(advance):
-        text = "loading the world's kernel; this machine is busy"
-    timer = threading.Timer(SLOW_S, progress.say if progress else print, args=(text,))
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-
-
 def world_progress(show: ProgressSink) -> Callable[[str, Any, str], None]:
     """Return what the world calls with its clocks, its events, and what passes it."""
-    throttle, reasons = Throttle(), HoldReasons()
-    shown = [0]
-    links: dict[str, str] = {}  # states by drone
-    healths: defaultdict[str, Throttle] = defaultdict(lambda: Throttle(HEALTH_PERIOD_S))
+    return _WorldProgress(show).show
 
-    def show_line(kind: str, message: Any, about: str) -> None:
-        if kind == "clock" and (throttle.passes() or message.state == "stopped"):
-            show.clock(_clock_line(message, about))
-        elif kind == "state" and (line := reasons.line(about, message)):
-            show.say(line)
-        elif kind == "health" and healths[about].passes():
-            show.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
+
+class _WorldProgress:
+    """Chooses what of a run is shown, and how often."""
+
+    def __init__(self, sink: ProgressSink) -> None:
+        self._sink = sink
+        self._clocks = RateLimit(PERIOD_S)
+        self._healths = RateLimit(HEALTH_PERIOD_S)
+        self._reasons = HoldReasons()
+        self._shown = 0
+        self._links: dict[str, str] = {}  # states by drone
+
+    def show(self, kind: str, message: Any, about: str) -> None:
+        sink = self._sink
+        if kind == "clock" and (self._clocks.spend() or message.state == "stopped"):
+            sink.clock(_clock_line(message, about))
+        elif kind == "state" and (line := self._reasons.line(about, message)):
+            sink.say(line)
+        elif kind == "health" and self._healths.spend(about):
+            sink.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
         elif kind == "link":
-            if message.state != links.get(about) and shown[0] < SHOWN_EVENTS:
-                shown[0] += 1
-                show.say(f"  {message.t_ns / 1e9:8.2f} s  link of {about}: {message.state}, {message.peer}")
-            links[about] = message.state
+            if message.state != self._links.get(about) and self._shown < SHOWN_EVENTS:
+                self._shown += 1
+                sink.say(f"  {message.t_ns / 1e9:8.2f} s  link of {about}: {message.state}, {message.peer}")
+            self._links[about] = message.state
         elif kind == "resumed":
-            show.say(f"{about}: goes on at t = {message / 1e9:.2f} s")
-        elif kind == "event" and (message.kind in VITAL or message.data.get("fails") or shown[0] < SHOWN_EVENTS):
-            shown[0] += message.kind not in QUIET
-            show.event(_event_line(message))
-
-    return show_line
+            sink.say(f"{about}: goes on at t = {message / 1e9:.2f} s")
+        elif kind == "event" and (message.kind in VITAL or message.data.get("fails") or self._shown < SHOWN_EVENTS):
+            self._shown += message.kind not in QUIET
+            sink.event(_event_line(message))
 
 
 def _clock_line(clock: run_messages.Clock, phase: str) -> dict[str, Any]:
@@ -163,10 +159,10 @@ class ReplayOptions(NamedTuple):
     """How a record is to be played.
 
     Attributes:
-        choice: what of it.
+        choice: which part of it.
         rate: simulated per wall seconds; 0 = as fast as possible.
         expect: names of the processes that are waited for.
-        endpoints: on which others come in.
+        endpoints: on which others connect.
         federation: None for that of the record.
     """
 
@@ -178,15 +174,15 @@ class ReplayOptions(NamedTuple):
 
 
 def play(place: Path, options: ReplayOptions, who: Identity) -> None:
-    """Play a record until it is over or somebody stops it.
+    """Play a record until it is over or the process is stopped.
 
     Raises:
         RunError, RecordError: there is no record, or nothing in it to play.
-        SessionError: an endpoint is taken, a key is no expression, or the identity is of no use.
+        SessionError: an endpoint is taken, a key is no expression, or the identity cannot be used.
     """
     from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run
-    from zsim_world.playback.playback import Playback
+    from zsim_world.run.playback import Playback
     from zsim_world.server.world_process import run
 
     for expression in options.choice.keys:
@@ -213,7 +209,7 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
 
 
 def _check(expressions: Sequence[str], reader: "RecordReader") -> None:
-    """Refuse to play nothing."""
+    """Check that each expression matches a key on record."""
     on_record = reader.topics()
     for expression in expressions:
         if not any(keys.matches(expression, key) for key in on_record):

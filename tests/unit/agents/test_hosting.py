@@ -7,13 +7,13 @@ import pytest
 from refused import has_terms, refused
 
 from zsim.errors import RunError, ScenarioError
-from zsim.runtime.group import AgentGroup
+from zsim.runtime.agent import AgentGroup
 from zsim.scenario import rights, scenario_file
 from zsim.scenario.role_table import AGENTS, Role
 from zsim.transport.tls import Identity
-from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, made
-from zsim_deploy.roles import process_identity, roles
-from zsim_world.flight.world import World
+from zsim_agents.hosting import agents_of, check_classes, check_plans, chosen, hosted, make_agents
+from zsim_deploy.roles import roles
+from zsim_world.run.world import World
 
 STEP = scenario_file.load(Path(__file__).parents[3] / "scenarios" / "step.yaml")
 ESTIMATORS = ["estimator.drone1", "estimator.drone2", "estimator.drone3"]
@@ -93,8 +93,8 @@ def test_a_certificate_is_for_one_process(tmp_path: Path):
         r"controller\.main: a certificate is for one process, and this one stands for estimator\.drone1, .*; run each"
     )
     with pytest.raises(RunError, match=pattern):
-        process_identity.check_certificate(group, Identity(tls=tmp_path))
-    process_identity.check_certificate(group, Identity())
+        roles.check_certificate(group, Identity(tls=tmp_path))
+    roles.check_certificate(group, Identity())
 
 
 def test_every_class_that_a_scenario_names_is_loaded_before_it_flies():
@@ -126,7 +126,7 @@ def test_a_plan_that_a_controller_refuses_is_refused_in_the_same_words(assignmen
     scenario = scenario_file.load(Path(__file__).parents[3] / "scenarios" / "trajectory.yaml", [path])
     info = SimpleNamespace(gate_ns=20_000_000)
     with pytest.raises(RunError) as refusal:
-        made("controller", info, scenario, ["main"])  # type: ignore[arg-type]
+        make_agents("controller", info, scenario, ["main"])  # type: ignore[arg-type]
     with pytest.raises(ScenarioError) as raised:
         check_plans(scenario, "trajectory.yaml")
     assert raised.value.faults == [f"trajectory.yaml: {refusal.value}"]

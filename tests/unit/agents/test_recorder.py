@@ -22,7 +22,7 @@ from zsim.errors import RecordError
 from zsim.record import Completeness, RecordReader, RecordWriter, completeness
 from zsim.record.completeness import GateGap
 from zsim.record.mcap_layout import places
-from zsim_agents import known_messages, recorder
+from zsim_agents import recorder
 from zsim_agents.recorder import record
 
 GATE_NS = 20_000_000
@@ -139,7 +139,7 @@ def _packed(b: GateMessages) -> bytes:
 
 
 def test_the_newest_of_a_long_replay_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(known_messages, "KNOWN_MAX", 6)
+    monkeypatch.setattr(recorder, "KNOWN_MAX", 6)
     found = recorded(tmp_path / "run.mcap", [page(gates(*range(10)))], gates(8, 9, 10))
     assert stamps(found, IMU) == list(range(11))
 
@@ -223,10 +223,19 @@ def test_what_its_last_chunk_lacks_is_asked_for(tmp_path: Path, cut: int):
 
 def test_news_of_a_join_of_its_own_process_that_it_did_not_publish_are_answered_by_a_newer_one(tmp_path: Path):
     link = FakeLink()
-    news = {"incarnation": 7, "host": link.host, "pid": os.getpid(), "former_pid": os.getpid()}
-    superseded = pair(keys.EVENT, Event(0, 0, "superseded", "recorder", "recorder", "", news))
+
+    def entry(number: int, incarnation: int) -> Pair:
+        news = {"incarnation": incarnation, "host": link.host, "pid": os.getpid(), "from_ns": 0}
+        return pair(keys.EVENT, Event(0, number, "superseded", "recorder", "recorder", "", news))
+
+    def admit(key: str, payload: bytes) -> None:
+        joins = link.published_on("process/recorder/join")
+        if key == "process/recorder/join" and len(joins) == 1:
+            admitted = [entry(0, joins[0].incarnation), entry(1, 7)]
+            link.deliver(keys.BATCH, encode_batch([*admitted, clock(1), clock(2, "stopped")]))
+
+    link.on_publish = admit
     link.on_request = lambda key, args: page([])
-    link.deliver(keys.BATCH, encode_batch([superseded, clock(1), clock(2, "stopped")]))
     record(link, INFO, tmp_path / "run.mcap")  # type: ignore[arg-type]
     assert len({join.incarnation for join in link.published_on("process/recorder/join")} - {7}) == 2
 
@@ -354,7 +363,7 @@ def test_what_passed_before_a_link_was_back_is_asked_for_in_realtime_though_no_c
             link.cut(False)
             link.cut(True)
         elif key == "process/recorder/join":
-            data = {"incarnation": joins[-1].incarnation, "host": link.host, "pid": os.getpid()}
+            data = {"incarnation": joins[-1].incarnation, "host": link.host, "pid": os.getpid(), "from_ns": 0}
             back = pair(keys.EVENT, Event(0, 2, "superseded", "recorder", "recorder", "", data))
             link.deliver(keys.BATCH, encode_batch([back]))
             link.deliver(keys.BATCH, encode_batch([*gates(1, 2), clock(3, "stopped")]))

@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from refused import has_terms, refused
@@ -10,8 +11,10 @@ from refused import has_terms, refused
 from benchmarks import grid, lockstep, page, peers
 from benchmarks.child import RefusedError, Server, result
 from benchmarks.exchange.lap import Lap
+from benchmarks.run import role_of
 from benchmarks.sheet import Sheet, Spread, exponent, read
 from benchmarks.table import figure, ratios, spread
+from zsim_deploy.launch import role_launcher
 
 ECHO = """
 import json, sys
@@ -145,3 +148,20 @@ def test_drones_stand_apart_in_clusters_of_three(count: int, clusters: int) -> N
 def test_a_world_and_one_agent_exchange_steps(name: str) -> None:
     found = result(lockstep.command(lockstep.CONTENDERS[name], 1, 0.5), 60.0)
     assert found["steps"] > 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "role"),
+    [
+        (["record", "--out", "run", ""], "record"),
+        (["estimator", "--connect", "tcp/127.0.0.1:1", "--", "drone1", ""], "estimator.drone1"),
+        (None, "forkserver"),
+    ],
+)
+def test_a_role_is_known_by_the_command_line_that_the_launcher_gives_it(arguments: list[str] | None, role: str) -> None:
+    command = (
+        [*role_launcher.COMMAND, *arguments]
+        if arguments
+        else [sys.executable, "-P", "-m", "zsim_deploy.cli.forkserver"]
+    )
+    assert role_of(SimpleNamespace(cmdline=lambda: command)) == role  # pyright: ignore[reportArgumentType]

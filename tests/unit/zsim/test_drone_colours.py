@@ -12,7 +12,7 @@ from zsim.drone_colours import drone_colours, rgb
 
 HOME = Path(__file__).parents[3]
 DRAWN_IN = (
-    "agents/zsim_bridges/console/scene/scene_nodes.py",
+    "agents/zsim_bridges/console/scene.py",
     "deploy/zsim_analysis/export/foxglove_scene.py",
     "deploy/zsim_analysis/report/figures/plan_view.py",
     "deploy/zsim_analysis/report/figures/drone_panels.py",

@@ -12,7 +12,7 @@ from zsim.output_folder import no_locks, take_lock
 from zsim.record import RecordWriter
 from zsim.record.record_writer import is_being_written
 from zsim_deploy.hosts import control_socket, on_host
-from zsim_world.journal.run_journal import RunJournal
+from zsim_world.server.run_journal import RunJournal
 
 LOCKLESS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # as Lustre, FUSE and some of NFS answer
 

@@ -11,7 +11,7 @@ import pytest
 import zsim
 from zsim.contract.fingerprint import join_of
 from zsim.scenario import scenario_file
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 ROOT = Path(__file__).parents[3]
 WHO = ("-c", "user.name=me", "-c", "user.email=me@localhost", "-c", "init.defaultBranch=main")

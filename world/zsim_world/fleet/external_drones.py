@@ -1,25 +1,25 @@
-"""External drones, as their drivers publish them: where each is, in which state, and what it can be asked. No clock.
+"""External drones, as their drivers publish them: pose, state, and which commands they accept. No clock.
 
-A driver publishes a pose for a gate now and then. Between two of them the drone is moved on with its velocity, as long
-as a pose may be trusted; then it stands where that led to.
+A driver publishes a pose for a gate now and then. Between two poses the drone moves on with its velocity, for as long
+as a pose is trusted; then it stands still.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState, Status, Truth
-from zsim.contract.snapshot import State
 from zsim.contract.state_rules import state_refusal
 from zsim.scenario.external_bodies import POSE_AGE_MAX_NS, moved_on, truth_fault
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.state.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE
+from zsim_world.run_state import Saved
 
 
 class Pose(NamedTuple):
-    """A row of a fleet's states, and the gate that it is of [ns]."""
+    """A row of a fleet's states, and its gate [ns]."""
 
     t_ns: int
     row: NDArray[np.float64]  # (STATE.size + rotors of the drone,)
@@ -29,8 +29,10 @@ class ExternalDrones:
     """The external drones of a fleet; `i` counts them among all its drones.
 
     Args:
-        fleet: is led by their poses.
+        fleet: follows their poses.
     """
+
+    SAVED: ClassVar[Saved] = {"_poses": dict[int, Pose], "_statuses": dict[int, Status]}
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -44,18 +46,6 @@ class ExternalDrones:
     @property
     def names(self) -> frozenset[str]:
         return frozenset(self._index)
-
-    def snapshot(self) -> State:
-        """Return what the drivers have published last."""
-        poses = {i: [pose.t_ns, pose.row] for i, pose in self._poses.items()}
-        return {"poses": poses, "statuses": {i: [*_fields(status)] for i, status in self._statuses.items()}}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._poses = {i: Pose(t_ns, row.copy()) for i, (t_ns, row) in state["poses"].items()}
-        self._statuses = {i: Status(*fields) for i, fields in state["statuses"].items()}
-
-    # What a driver publishes
 
     def take(self, drone: str, message: Any, now_ns: int) -> str | None:
         """Take a message of a driver; return why it is refused.
@@ -88,7 +78,7 @@ class ExternalDrones:
         return fault
 
     def _row(self, i: int, truth: Truth) -> NDArray[np.float64]:
-        """Return a truth as a state: a unit quaternion, and rotors within what the drone's have."""
+        """Return a truth as a row of state: a unit quaternion, and rotor speeds within the drone's limits."""
         row = np.empty(STATE.size + len(truth.rotor_rad_s))
         row[STATE.p_WB : STATE.p_WB + 3], row[STATE.v_WB : STATE.v_WB + 3] = truth.position_m, truth.velocity_m_s
         row[STATE.q_WB : STATE.q_WB + 4] = np.divide(truth.orientation_wxyz, math.hypot(*truth.orientation_wxyz))
@@ -97,24 +87,20 @@ class ExternalDrones:
         row[STATE.size :] = np.clip(truth.rotor_rad_s, 0.0, most)
         return row
 
-    # Time
-
     def lead(self) -> None:
-        """Put every drone whose driver has published a pose where it is now, before the fleet goes on."""
+        """Move every drone whose driver has published a pose to the present, before the fleet advances."""
         now_ns = self._fleet.t_ns
         for i, pose in self._poses.items():
             self._fleet.lead(i, ahead(pose, now_ns))
-
-    # What it can be asked
 
     def status(self, i: int) -> Status | None:
         """Return the newest status, None before the first."""
         return self._statuses.get(i)
 
     def command_refusal(self, i: int, kind: str, message: Any) -> str | None:
-        """Return why a command is not handed on to the driver, None if it is.
+        """Return why a command is not passed on to the driver, None if it is.
 
-        A stop of the rotors is always handed on; all else is judged by the state that the driver has published last.
+        A stop of the rotors always is; everything else depends on the state that the driver has published last.
         """
         name, asked = self._fleet.names[i], message.mode if kind == "mode" else "setpoint"
         if asked == "emergency":
@@ -122,23 +108,19 @@ class ExternalDrones:
         if i not in self._statuses:
             return f"{name} has no state: its driver has published none; start driver.{name}"
         state: DroneState = self._statuses[i].state
-        return state_refusal(name, state, asked) or self._setpoint_fault(i, kind, message)
-
-    def _setpoint_fault(self, i: int, kind: str, message: Any) -> str | None:
-        if kind == "rotors":
-            return self._fleet.rotors_fault(i, message.speed_rad_s)
-        return self._fleet.orientation_fault(i, message.orientation_wxyz) if kind == "attitude" else None
+        refusal = state_refusal(name, state, asked)
+        if refusal is None and kind == "rotors":
+            refusal = self._fleet.rotors_fault(i, message.speed_rad_s)
+        if refusal is None and kind == "attitude":
+            refusal = self._fleet.orientation_fault(i, message.orientation_wxyz)
+        return refusal
 
 
 def ahead(pose: Pose, t_ns: int) -> NDArray[np.float64]:
-    """Return the state at t_ns of what was at a pose: at constant velocity, at rest once the pose is too old."""
+    """Return the state at t_ns extrapolated from a pose: at constant velocity, at rest once the pose is too old."""
     row, age_ns = pose.row.copy(), t_ns - pose.t_ns
     p, v = slice(STATE.p_WB, STATE.p_WB + 3), slice(STATE.v_WB, STATE.v_WB + 3)
     row[p] = moved_on(row[p].tolist(), row[v].tolist(), age_ns)
     if age_ns >= POSE_AGE_MAX_NS:
         row[v] = row[STATE.w_WB_B : STATE.w_WB_B + 3] = 0.0
     return row
-
-
-def _fields(status: Status) -> tuple[Any, ...]:
-    return tuple(getattr(status, name) for name in Status.__struct_fields__)

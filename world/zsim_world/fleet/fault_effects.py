@@ -1,25 +1,26 @@
-"""What faults do to the arrays of a fleet: sensors, rotors and the air. Without any, the arrays are as at the start."""
+"""The effects of faults on the arrays of a fleet: sensors, rotors and wind. Without faults they are as at the start."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from zsim.contract.run_messages import Fault
-from zsim.contract.snapshot import State
 from zsim.scenario.fault_kinds import sensor_parts
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics.air import WIND
+from zsim_world.physics.fleet_arrays import STATE, Arrays
+from zsim_world.run_state import Saved
 from zsim_world.sensors import sensor_set as ss
 from zsim_world.sensors.sensor_set import CONFIG, FAULT, FleetSensors
-from zsim_world.state.fleet_arrays import STATE, Arrays
 from zsim_world.vehicles.simd_firmware import ACTUATOR, sound_actuators
 
 
 class Impairment:
-    """The faults of a fleet's drones and of its air.
+    """Applies faults to a fleet's drones and to its wind.
 
     Args:
         arrays: of the fleet, before its first gate.
@@ -29,6 +30,8 @@ class Impairment:
     Attributes:
         rotors: names of the rotors of each drone.
     """
+
+    SAVED: ClassVar[Saved] = {"_held": dict[int, tuple[float, ...]], "_gusts": tuple[Fault, ...], "_calm": bool}
 
     def __init__(
         self, arrays: Arrays, drones: Sequence[str], vehicles: Sequence[Vehicle], sensors: FleetSensors
@@ -41,19 +44,9 @@ class Impairment:
         self._steady = arrays.wind[WIND.steady : WIND.steady + 3].copy()
         self.rotors = {name: vehicle.rotor_names for name, vehicle in zip(drones, vehicles, strict=True)}
         self._sound = sound_actuators(len(drones), len(arrays.bodies.each))
-        self._held: dict[int, tuple[float, ...]] = {}  # by fault: at which speed the rotors of its drone turned
+        self._held: dict[int, tuple[float, ...]] = {}  # by fault: the speeds at which the rotors of its drone are held
         self._gusts: tuple[Fault, ...] = ()
         self._calm = True
-
-    def snapshot(self) -> State:
-        """Return what acts beside the arrays of the fleet."""
-        return {"held": self._held, "gusts": [fault.id for fault in self._gusts], "calm": self._calm}
-
-    def restore(self, state: State, faults: Mapping[int, Fault]) -> None:
-        """Take over what `snapshot` returned; `faults` are those of the run, by id."""
-        self._held = {number: tuple(speeds) for number, speeds in state["held"].items()}
-        self._gusts = tuple(faults[number] for number in state["gusts"])
-        self._calm = state["calm"]
 
     def strike(self, acting: Sequence[Fault]) -> None:
         """Let these faults act from now on, and no others; those that have acted before go on."""
@@ -84,7 +77,12 @@ class Impairment:
             self._impair_rotors(fault, i, how)
             return
         if how in ("dropout", "stuck"):
-            self._impair_sensor(fault, i, self._sensor[what], stuck)
+            row = self._w.senses.config[i, self._sensor[what]]
+            if how == "stuck":
+                row[CONFIG.faulty] = 1.0
+                stuck.add((i, self._sensor[what]))
+            else:
+                row[CONFIG.drop] = dropped(row[CONFIG.drop], fault.parameters["probability"])
             return
         part = self._parts[what]
         s = self._sensor[part.sensor]
@@ -94,19 +92,11 @@ class Impairment:
         else:
             row[CONFIG.faulty] = 1.0
             offset = self._w.senses.fault[i, s, FAULT.offset + first : FAULT.offset + first + part.channel.width]
-            offset += np.multiply(_bias(fault), part.channel.to_si)
-
-    def _impair_sensor(self, fault: Fault, i: int, s: int, stuck: set[tuple[int, int]]) -> None:
-        """Let a sensor lose samples, or get stuck."""
-        row = self._w.senses.config[i, s]
-        if fault.kind.endswith("_stuck"):
-            row[CONFIG.faulty] = 1.0
-            stuck.add((i, s))
-        else:
-            row[CONFIG.drop] = dropped(row[CONFIG.drop], fault.parameters["probability"])
+            (bias,) = fault.parameters.values()  # one number or vector, whatever its unit
+            offset += np.multiply(bias, part.channel.to_si)
 
     def _release(self, stuck: Iterable[tuple[int, int]]) -> None:
-        """Let sensors that have just got stuck keep their next sample, and free those that are no longer."""
+        """Let sensors that have just got stuck hold their next sample, and release those that no longer are."""
         hold = self._w.senses.fault[:, :, FAULT.hold]
         kept = {(i, s) for i, s in stuck if hold[i, s] == ss.HOLDING}
         hold[:] = ss.FREE
@@ -121,24 +111,14 @@ class Impairment:
                 if how == "efficiency":  # thrust is as the speed squared
                     row[ACTUATOR.size + r] *= math.sqrt(fault.parameters["value"])
                 else:
-                    row[ACTUATOR.size + count + r] = self._held_speed(fault, i)[r]
-
-    def _held_speed(self, fault: Fault, i: int) -> tuple[float, ...]:
-        """Return at which speed each rotor is held [rad/s]: as speed_rad_s, or as it turned when the fault began."""
-        if fault.id not in self._held:
-            speed_rad_s, speeds = fault.parameters["speed_rad_s"], self._w.bodies.state[i, STATE.size :].tolist()
-            self._held[fault.id] = tuple(speeds) if speed_rad_s is None else (speed_rad_s,) * len(speeds)
-        return self._held[fault.id]
-
-
-def _bias(fault: Fault) -> float | Sequence[float]:
-    """Return the one number or vector of a fault, whatever its unit."""
-    (value,) = fault.parameters.values()
-    return value
+                    if fault.id not in self._held:  # at speed_rad_s, or at the speed at which each turned at the start
+                        speed, speeds = fault.parameters["speed_rad_s"], self._w.bodies.state[i, STATE.size :].tolist()
+                        self._held[fault.id] = tuple(speeds) if speed is None else (speed,) * len(speeds)
+                    row[ACTUATOR.size + count + r] = self._held[fault.id][r]
 
 
 def dropped(limit: float, probability: float) -> float:
-    """Return below which standard normal number a sample is lost, where it is so below `limit` already."""
+    """Return the standard normal number below which a sample is lost, where `limit` is that without the fault."""
     if probability == 1.0:
         return math.inf
     return float(ndtri(1.0 - (1.0 - ndtr(limit)) * (1.0 - probability)))

@@ -1,6 +1,7 @@
-"""The fleet: all drones of a scenario, one gate at a time. The only thing that the rest of the world uses.
+"""The fleet: all drones of a scenario, one gate at a time, from standing on the ground with their rotors still.
 
-An external drone has a row as every other, so that it is run into and blows on those below; it is led, not integrated.
+An external drone has a row as well, so that others collide with it and it blows on those below; its pose is set, not
+integrated.
 
 Heights: `baro` altitude_m is the height over the origin of W (zeroed at the field, as the aircraft does at power-up),
 and pressure_pa is that of the standard atmosphere at `environment.height_m` + altitude_m.
@@ -8,7 +9,7 @@ and pressure_pa is that of the standard atmosphere at `environment.height_m` + a
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 from msgspec import UNSET
@@ -16,35 +17,59 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import RotorInfo
-from zsim.contract.snapshot import State
 from zsim.contract.state_rules import state_refusal
 from zsim.errors import RunError
 from zsim.math.compiled import hold
+from zsim.math.frames import quaternion_from_heading, quaternion_from_rpy
+from zsim.scenario import obstacle
 from zsim.scenario.scenario import Drone, Scenario
-from zsim.sensors.gps import GpsConfig
 from zsim.sensors.sensor import noise_sigma
 from zsim.vehicles.vehicle import Vehicle
 from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
-from zsim_world.fleet.flight_watch import FlightWatch, Incident
-from zsim_world.fleet.initial_state import arrays
+from zsim_world.fleet.flight_watch import SEEN, FlightWatch, Incident
+from zsim_world.physics import rigid_body
 from zsim_world.physics.air import WIND
+from zsim_world.physics.fleet_arrays import (
+    CLOCK,
+    EXPOSED,
+    ROTOR,
+    STATE,
+    VEHICLE,
+    Arrays,
+    Boards,
+    Bodies,
+    KernelTime,
+    NearPairs,
+    NoiseRows,
+    Senses,
+    Watched,
+    aero_row,
+    rotor_row,
+    rotor_slots,
+    state_arrays,
+    vehicle_row,
+)
+from zsim_world.physics.simd import body_blocks
+from zsim_world.physics.surfaces import BALLS, SLOTS_MAX, contact_points, obstacle_rows
+from zsim_world.run_state import IN_PLACE, PART, Saved
+from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import WHOSE, Sampled, Sampler, SensorSample, with_more
-from zsim_world.sensors.sensor_set import fleet_sensors
-from zsim_world.sensors.sighting_sampler import PictureSightings, SightingSampler
-from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, state_arrays
-from zsim_world.vehicles import firmware
-from zsim_world.vehicles.firmware import MEMORY, SETPOINT
-from zsim_world.vehicles.firmware_settings import SETTING
-from zsim_world.vehicles.observer import BELIEF
+from zsim_world.sensors.sensor_set import FleetSensors, fleet_sensors
+from zsim_world.sensors.sightings import PictureSightings, SightingSampler
+from zsim_world.vehicles import firmware, observer
+from zsim_world.vehicles.firmware import MEMORY, SETPOINT, SETTING
+from zsim_world.vehicles.observer import BELIEF, CALIBRATION, DEVICE
+from zsim_world.vehicles.simd_firmware import board_blocks, sound_actuators
 
 GPS_FIX = 3  # NMEA: a three-dimensional fix
 GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
 TAKEOFF_CHARGE = 2.0  # of the charge at which it lands: below, it does not take off
 UPRIGHT_COSINE = 0.87  # 30 deg, beyond which it does not take off
 QUATERNION_SQUARE_MIN = 1e-6  # shorter, a quaternion has no direction
+ON_ROOF_M = 0.01  # m, chosen: so near to an obstacle a drone starts upon it
 NOISE_GATES = 8  # gates between two refills of the noise: that of 100 drones then fits a cache of 1 MB
 
 
@@ -89,6 +114,16 @@ class Fleet:
         touching: whether a drone's hull touched another's in the last gate, (N,).
     """
 
+    SAVED: ClassVar[Saved] = {
+        "_tick": int,
+        "_gates": int,
+        "_least": float,
+        "touching": IN_PLACE,
+        "arrays": IN_PLACE,
+        "_streams": IN_PLACE,
+        "_sampler": PART,
+        "_sightings": PART,
+    }
     sampled: Sampled
 
     def __init__(self, scenario: Scenario) -> None:
@@ -96,13 +131,15 @@ class Fleet:
 
         Raises:
             DivergedError: the scenario's numbers cannot be integrated.
+            DocumentError: the model of a drone is a module that is not installed here.
         """
         self.names = [drone.name for drone in scenario.drones]
-        vehicles = [_vehicle(index, drone) for index, drone in enumerate(scenario.drones)]
+        vehicles = [vehicle_of(drone.model, f"drones[{i}].model") for i, drone in enumerate(scenario.drones)]
         self.rotors = [len(vehicle.rotors) for vehicle in vehicles]
         self.count = len(self.names)
         self.external = {i: e for e, i in enumerate(i for i, d in enumerate(scenario.drones) if d.is_external)}
-        self.gps_sigma_m = [_gps_sigma(drone.sensors.gps) for drone in scenario.drones]
+        fixes = [drone.sensors.gps for drone in scenario.drones]
+        self.gps_sigma_m = [noise_sigma(gps.position_m, gps.rate_hz) for gps in fixes]
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
         self._ticks = round(scenario.time.gate_ms / scenario.time.physics_dt_ms)
         self._tick = 0
@@ -110,9 +147,12 @@ class Fleet:
         self.sensors = fleet_sensors(scenario)
         self.environment = scenario.environment
         self._noise = NoiseTable(scenario, NOISE_GATES)
-        self._w = arrays(scenario, vehicles, self.sensors, self._noise)
+        self._streams = self._noise.streams
+        self._w = initial_arrays(scenario, vehicles, self.sensors, self._noise)
         self._sampler = Sampler(scenario, self.sensors, self._w.senses)
-        self._sightings = _sighting_sampler(scenario, self._w.bodies.vehicle[:, VEHICLE.hull_radius])
+        has_some = any(drone.sensors.sightings is not UNSET and not drone.is_external for drone in scenario.drones)
+        hulls = self._w.bodies.vehicle[:, VEHICLE.hull_radius]
+        self._sightings = SightingSampler(scenario, hulls.copy()) if has_some else None
         self.sightings: dict[int, PictureSightings] = {}
         self._held = hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
@@ -121,10 +161,7 @@ class Fleet:
         self._hull_m = float(self.bodies.vehicle[:, VEHICLE.hull_radius].max())
         self._integrate(0)
         self._watch = FlightWatch(self._w, self.names, [each.name for each in scenario.environment.obstacles])
-        self._rehearse()
-
-    def _rehearse(self) -> None:
-        """Load or compile what the first command needs: in realtime no gate may wait for it."""
+        # loads or compiles what the first command needs: in realtime no gate may wait for it
         kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
 
     @property
@@ -162,37 +199,16 @@ class Fleet:
         self._gates += 1
         self._integrate(self._ticks)
 
-    def snapshot(self) -> State:
-        """Return all from which the flight goes on to the same bits."""
-        return {
-            "tick": self._tick,
-            "gates": self._gates,
-            "least_m": self._least,
-            "touching": self.touching,
-            "arrays": list(state_arrays(self._w)),
-            "streams": self._noise.streams,
-            "sampler": self._sampler.snapshot(),
-            **({"sightings": self._sightings.snapshot()} if self._sightings else {}),
-        }
+    @property
+    def arrays(self) -> list[NDArray]:
+        """All arrays of the kernel but the near pairs of drones."""
+        return list(state_arrays(self._w))
 
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` of a fleet of the same scenario returned.
-
-        Raises:
-            ValueError: it is of another scenario.
-        """
-        self._tick, self._gates, self._least = state["tick"], state["gates"], state["least_m"]
-        self.touching[:] = state["touching"]
-        for array, saved in zip(state_arrays(self._w), state["arrays"], strict=True):
-            array[...] = saved
+    def restored(self) -> None:
         self.bodies.near.origin.fill(math.inf)  # the near pairs are found anew
-        self._noise.streams[:] = state["streams"]
-        self._sampler.restore(state["sampler"])
-        if self._sightings:
-            self._sightings.restore(state["sightings"])
 
     def samples(self) -> list[SensorSample]:
-        """Return what fell due for publication in the last gate but sightings, by (t_ns, drone, sensor)."""
+        """Return the samples published in the last gate, without sightings, by (t_ns, drone, sensor)."""
         numbers = self.sampled.whose[:, WHOSE.sensor] < len(self.sensors.names)
         return Sampled(self.sampled.whose[numbers], self.sampled.values[numbers]).each(self.sensors)
 
@@ -202,7 +218,7 @@ class Fleet:
         return TrueState(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], accel, s[:, STATE.size :])
 
     def lead(self, i: int, pose: NDArray[np.float64]) -> None:
-        """Let an external drone be where a pose says, (STATE.size + its rotors,), and move on with its velocity."""
+        """Move an external drone to a pose, (STATE.size + its rotors,), from which it continues with its velocity."""
         self.bodies.pose[self.external[i], : len(pose)] = pose
         self.bodies.state[i, : len(pose)] = pose
 
@@ -216,11 +232,11 @@ class Fleet:
         return self._least
 
     def collisions(self) -> list[tuple[int, int]]:
-        """Return the pairs whose hulls began to touch in the last gate."""
+        """Return the pairs of drones whose hulls began to touch in the last gate."""
         return self._began
 
     def bumps(self) -> list[tuple[int, int]]:
-        """Return who began to touch which obstacle in the last gate."""
+        """Return the pairs of drone and obstacle that began to touch in the last gate."""
         if not self.bodies.obstacle.size:
             return []
         return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
@@ -230,7 +246,7 @@ class Fleet:
         return self._watch.incidents() if self._has_incidents else []
 
     def takeoff(self, i: int) -> str | None:
-        """Start a take-off; return None, or why not."""
+        """Start a take-off; return None, or why it is refused."""
         charge = self.status(i)[1]
         if refusal := self._state_refusal(i, "takeoff"):
             return refusal
@@ -244,7 +260,7 @@ class Fleet:
         return None
 
     def land(self, i: int) -> str | None:
-        """Start a landing; return None, or why not."""
+        """Start a landing; return None, or why it is refused."""
         if refusal := self._state_refusal(i, "land"):
             return refusal
         if self._mode(i) != firmware.LANDING:
@@ -257,7 +273,7 @@ class Fleet:
         return None
 
     def reset(self, i: int) -> str | None:
-        """Leave the emergency; return None, or why not."""
+        """Leave the emergency; return None, or why that is refused."""
         if refusal := self._state_refusal(i, "reset"):
             return refusal
         self._enter(i, firmware.LANDED)
@@ -270,42 +286,42 @@ class Fleet:
         yaw_rate_rad_s: float = 0.0,
         frame: Literal["heading", "world"] = "heading",
     ) -> str | None:
-        """Fly a velocity in the heading frame, or in W by the firmware's own heading; return None, or why not."""
+        """Fly a velocity in the heading frame, or in W by the firmware's own heading; return why it is refused."""
         kind = firmware.VELOCITY if frame == "heading" else firmware.VELOCITY_WORLD
         return self._set(i, kind, (*velocity_m_s, yaw_rate_rad_s))
 
     def set_ardrone(
         self, i: int, forward: float, left: float, up: float, yaw_left: float, hover: bool = False
     ) -> str | None:
-        """Fly by tilt, climb and yaw rate, each in [-1, 1] of its limit, or hover; return None, or why not."""
+        """Fly by tilt, climb and yaw rate, each in [-1, 1] of its limit, or hover; return why it is refused."""
         return self._set(i, firmware.HOVER if hover else firmware.ARDRONE, (forward, left, up, yaw_left))
 
     def set_attitude(self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0) -> str | None:
-        """Fly a tilt (of q_WB, w first; its heading is not used), thrust [N] and yaw rate; return None, or why not."""
+        """Fly a tilt (q_WB, w first, without its heading), thrust [N] and yaw rate; return why it is refused."""
         if fault := self.orientation_fault(i, q_WB):
             return fault
         return self._set(i, firmware.ATTITUDE, (*q_WB, thrust_n, yaw_rate_rad_s))
 
     def set_rotors(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
-        """Command the speeds of all rotors within their limits; return None, or why not."""
+        """Command the speeds of all rotors within their limits; return why it is refused."""
         if fault := self.rotors_fault(i, speed_rad_s):
             return fault
         return self._set(i, firmware.ROTORS, tuple(speed_rad_s))
 
     def orientation_fault(self, i: int, q_WB: Sequence[float]) -> str | None:
-        """Return why an orientation sent to a drone is none, None if it is one."""
+        """Return why an orientation is invalid, None if it is valid."""
         if sum(x * x for x in q_WB) < QUATERNION_SQUARE_MIN:
             return f"{self.names[i]} was sent the orientation {list(q_WB)}; must be a quaternion of length 1"
         return None
 
     def rotors_fault(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
-        """Return why rotor speeds sent to a drone are not for it, None if they are."""
+        """Return why rotor speeds do not fit a drone, None if they do."""
         if len(speed_rad_s) != self.rotors[i]:
             return f"{self.names[i]} was sent {len(speed_rad_s)} rotor speeds; it has {self.rotors[i]} rotors"
         return None
 
     def release(self, i: int) -> None:
-        """Let nobody fly the drone any more: it hovers."""
+        """Let a drone hover that has no commander any more."""
         self.boards.setpoint[i, SETPOINT.kind] = firmware.NONE
 
     def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
@@ -339,7 +355,7 @@ class Fleet:
             self._add_sightings(self._sightings.due(self.bodies.state, self.t_ns))
 
     def _add_sightings(self, sightings: list[PictureSightings]) -> None:
-        """Put sightings among the samples of the gate, behind those of the same drone and time."""
+        """Insert sightings into the samples of the gate, after those of the same drone and time."""
         self.sightings = {}
         if not sightings:
             return
@@ -361,20 +377,163 @@ class Fleet:
             self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
 
 
-def _sighting_sampler(scenario: Scenario, hulls: NDArray[np.float64]) -> SightingSampler | None:
-    """Return what makes the sightings of a scenario, None where no drone has any."""
-    has_some = any(drone.sensors.sightings is not UNSET and not drone.is_external for drone in scenario.drones)
-    return SightingSampler(scenario, hulls.copy()) if has_some else None
+def initial_arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable) -> Arrays:
+    """Return the arrays of the kernel for a scenario whose drones are these vehicles with these sensors."""
+    dt, drones, place = scenario.time.physics_dt_ms / 1000.0, scenario.drones, scenario.environment
+    each = rotor_slots(vehicles)
+    row = np.array([vehicle_row(vehicle, drone, place) for vehicle, drone in zip(vehicles, drones, strict=True)])
+    rotors = np.array([rotor_row(vehicle, drone, each) for vehicle, drone in zip(vehicles, drones, strict=True)])
+    clock = np.zeros(CLOCK.size, dtype=np.int64)
+    clock[CLOCK.ticks_per_step] = round(observer.STEP_S / dt)
+    time = KernelTime(clock=clock, spans=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]))
+    numbers = NoiseRows(table=noise.table, at=noise.at, width=noise.width, cursor=noise.cursor)
+    bodies, boards = _bodies(scenario, row, rotors, dt), _boards(scenario, vehicles, row, rotors)
+    senses = _senses(scenario, sensors, noise)
+    watched = Watched(seen=np.zeros((len(drones), SEEN.size)), found=np.zeros(len(drones), dtype=np.int64))
+    watched.seen[bodies.external, SEEN.external] = 1.0
+    return Arrays(time, bodies, boards, numbers, senses, _wind(scenario), noise.gust, watched)
 
 
-def _gps_sigma(gps: GpsConfig) -> float:
-    return noise_sigma(gps.position_m, gps.rate_hz)
+def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:
+    drones, n, obstacles = scenario.drones, len(scenario.drones), obstacle_rows(scenario.environment)
+    each, slots = rotors.shape[1] // ROTOR.size, min(len(obstacles), SLOTS_MAX)
+    state = np.array([_standing(drone, own, each) for drone, own in zip(drones, row, strict=True)])
+    aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
+    external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
+    half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
+    return Bodies(
+        each=tuple(range(each)),
+        vehicle=row,
+        rotors=rotors,
+        state=state,
+        accel=np.zeros((n, 6)),
+        anchor=np.array([_anchors(drone, own) for drone, own in zip(drones, row, strict=True)]),
+        command=np.zeros((n, each)),
+        energy=row[:, VEHICLE.capacity] * [drone.battery_percent / 100.0 for drone in drones],
+        air=np.zeros((n, 3)),
+        push=np.zeros((n, 3)),
+        touching=np.zeros((n, n), dtype=np.int8),
+        touched=np.zeros((n, n), dtype=np.int8),
+        near=near(n),
+        obstacle=obstacles,
+        bumping=np.zeros((n, len(obstacles)), dtype=np.int8),
+        bumped=np.zeros((n, len(obstacles)), dtype=np.int8),
+        solid=np.full((n, slots), -1, dtype=np.int32),
+        held=np.zeros((n, slots, BALLS, 3)),
+        braced=np.zeros(n, dtype=np.int8),
+        twist=np.zeros((n, 3)),
+        aero_parts=(0, 1) if aero.any() else (0,),
+        aero=aero,
+        lanes=body_blocks(row, rotors, np.array([[half_decay(lag, dt)] for lag in row[:, VEHICLE.rotor_lag]]), aero),
+        external=external,
+        pose=state[external],
+    )
 
 
-def _vehicle(index: int, drone: Drone) -> Vehicle:
-    """Return what a drone of a scenario is.
+def near(n: int) -> NearPairs:
+    """Return near pairs that are yet to be found, since no drone is at its origin."""
+    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)
+    return NearPairs(pair=pairs, number=np.zeros(1, dtype=np.int64), origin=np.full((n, 3), np.inf))
 
-    Raises:
-        DocumentError: its model is a module that is not installed here.
+
+def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, rotors: np.ndarray) -> Boards:
+    drones, n, each = scenario.drones, len(scenario.drones), rotors.shape[1] // ROTOR.size
+    both = list(zip(vehicles, drones, strict=True))
+    setting = np.array([firmware.settings(vehicle, drone) for vehicle, drone in both])
+    calibration = np.array([_calibration(drone, scenario) for drone in drones])
+    obstacles = obstacle_rows(scenario.environment)
+    mounts = calibration[:, CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4]
+    return Boards(
+        setting=setting,
+        gain=np.array([observer.gain_row(vehicle, drone, scenario.environment) for vehicle, drone in both]),
+        calibration=calibration,
+        setpoint=np.zeros((n, firmware.SETPOINT.size)),
+        set_tick=np.zeros(n, dtype=np.int64),
+        memory=np.zeros((n, firmware.MEMORY.size)),
+        belief=np.array(
+            [
+                _first_belief(drone, own, board, obstacles, each)
+                for drone, own, board in zip(drones, row, calibration, strict=True)
+            ]
+        ),
+        actuator=sound_actuators(n, each),
+        device=np.zeros((n, DEVICE.size)),
+        lanes=board_blocks(row, rotors, setting, mounts),
+    )
+
+
+def _senses(scenario: Scenario, sensors: FleetSensors, noise: NoiseTable) -> Senses:
+    field, log = scenario.environment, sensor_set.samples_per_gate(sensors, scenario.time.gate_ms) + 1
+    kinds = len(sensors.names)
+    exposures = log if kinds > len(sensor_set.SENSORS) else 1
+    return Senses(
+        place=np.array([*field.magnetic_field_ut, field.height_m]),
+        config=sensor_set.config(sensors),
+        fault=np.zeros((len(scenario.drones), kinds, sensor_set.FAULT.size)),
+        schedule=sensor_set.schedule(sensors, scenario.time.physics_dt_ms),
+        soonest=np.zeros(len(scenario.drones), dtype=np.int64),
+        bias=noise.bias,
+        whose=np.zeros((log, 3), dtype=np.int64),
+        value=np.zeros((log, 6)),
+        exposed_count=np.zeros(1, dtype=np.int64),
+        exposed_whose=np.zeros((exposures, 3), dtype=np.int64),
+        exposed=np.zeros((exposures, EXPOSED.size)),
+    )
+
+
+def _standing(drone: Drone, row: np.ndarray, rotors: int) -> np.ndarray:
+    """Return the state of a drone whose feet carry its weight; from a position above the ground it falls."""
+    state = np.zeros(STATE.size + rotors)
+    state[STATE.p_WB : STATE.p_WB + 3] = drone.position_m
+    state[STATE.p_WB + 2] += row[VEHICLE.stand_height]
+    state[STATE.q_WB : STATE.q_WB + 4] = quaternion_from_heading(math.radians(drone.yaw_deg))
+    return state
+
+
+def _anchors(drone: Drone, row: np.ndarray) -> np.ndarray:
+    yaw = math.radians(drone.yaw_deg)
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    return np.array(drone.position_m[:2]) + contact_points(row)[:, :2] @ turn.T
+
+
+def _first_belief(
+    drone: Drone, row: np.ndarray, calibration: np.ndarray, obstacles: np.ndarray, rotors: int
+) -> np.ndarray:
+    """Return the belief at power-up: level, heading unknown until the first magnetometer sample.
+
+    Where the field gives none, the heading is the true one at the start. A drone that starts on a roof knows its
+    height, like one that has landed there.
     """
-    return vehicle_of(drone.model, f"drones[{index}].model")
+    belief = np.zeros(BELIEF.size + rotors)
+    belief[BELIEF.q_WB] = 1.0
+    if math.isnan(calibration[CALIBRATION.mag_bearing]):
+        belief[BELIEF.heading] = math.radians(drone.yaw_deg)
+        belief[BELIEF.q_WB : BELIEF.q_WB + 4] = quaternion_from_heading(belief[BELIEF.heading])
+    belief[BELIEF.height] = row[VEHICLE.stand_height]
+    roof_m = drone.position_m[2]
+    is_on_roof = any(abs(obstacle.nearest(solid, *drone.position_m)[0]) < ON_ROOF_M for solid in obstacles)
+    if is_on_roof and roof_m > observer.FLOOR_MIN_M:
+        belief[BELIEF.height] = belief[BELIEF.stand_height] = roof_m + row[VEHICLE.stand_height]
+    belief[BELIEF.still_steps] = observer.STILL_STEPS_MIN
+    return belief
+
+
+def _calibration(drone: Drone, scenario: Scenario) -> np.ndarray:
+    """Return the board's calibration: its mounts, and the bearing of the magnetic field where that gives a heading."""
+    board, field = np.zeros(CALIBRATION.size), scenario.environment.magnetic_field_ut
+    imu, mag = drone.sensors.imu.mount, drone.sensors.mag.mount
+    board[CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4] = quaternion_from_rpy(np.radians(imu.rpy_deg))
+    board[CALIBRATION.mag_turn : CALIBRATION.mag_turn + 4] = quaternion_from_rpy(np.radians(mag.rpy_deg))
+    compass = sensor_set.has_compass(drone.sensors.mag, field)
+    board[CALIBRATION.mag_bearing] = math.atan2(field[1], field[0]) if compass else math.nan
+    board[CALIBRATION.sonar_min] = drone.sensors.sonar.min_m
+    return board
+
+
+def _wind(scenario: Scenario) -> np.ndarray:
+    wind = scenario.environment.wind
+    row = np.empty(WIND.size)
+    row[WIND.steady : WIND.steady + 3] = wind.steady_m_s
+    row[WIND.gust], row[WIND.correlation] = wind.gust_m_s, wind.gust_correlation
+    row[WIND.length], row[WIND.speed_min] = wind.gust_length_m, wind.gust_speed_min_m_s
+    return row

@@ -15,12 +15,10 @@ from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import add, rotate
 from zsim.schema.quantities import G_M_S2
-from zsim_world.physics.ground import POINTS, contact_point
-from zsim_world.physics.obstacle_contact import FEET, nearest
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Arrays, Bodies, Watched
 from zsim_world.physics.rigid_body import four, vector
-from zsim_world.state.fleet_arrays import STATE, VEHICLE, Arrays, Bodies, Watched
-from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, TAKING_OFF
-from zsim_world.vehicles.firmware_settings import SETTING
+from zsim_world.physics.surfaces import FEET, POINTS, contact_point, nearest
+from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, SETTING, TAKING_OFF
 from zsim_world.vehicles.observer import STEP_S
 
 IMPACT_STEPS = 4  # over which a change of velocity is measured: 20 ms, about half of a contact on the feet
@@ -73,7 +71,7 @@ class FlightWatch:
         self._others = ("", "the ground", *obstacles, *drones)  # by what `SEEN.touched` holds
 
     def note_command(self, i: int, mode: int) -> None:
-        """Note that a drone was commanded to enter a mode: that is no incident."""
+        """Note a mode that was commanded: entering it is no incident."""
         self._seen[i, SEEN.mode] = mode
 
     def incidents(self) -> list[Incident]:
@@ -98,7 +96,7 @@ class FlightWatch:
         return found
 
     def _own_mode(self, i: int, name: str) -> Incident:
-        """Return the mode that the firmware of a drone entered by itself, with its reason."""
+        """Return the mode that the firmware of a drone has entered by itself, with the reason."""
         if self._boards.memory[i, MEMORY.mode] == EMERGENCY:
             tilt_deg = math.degrees(math.acos(self._boards.setting[i, SETTING.tilt_cut]))
             text = f"{name} stops its rotors: it finds itself tilted by more than {tilt_deg:.0f} deg"
@@ -112,7 +110,7 @@ class FlightWatch:
 
 @inlined
 def watch(bodies: Bodies, memory: NDArray, watched: Watched, step: int) -> None:
-    """Add the incidents (bits) of N drones in a step of the firmware to those of the gate; `step` counts them."""
+    """Add the incidents (bits) of N drones in step number `step` of the firmware to those of the gate."""
     seen, found = watched
     oldest = SEEN.v_WB + 3 * (step % IMPACT_STEPS)
     for i in range(found.size):
@@ -150,7 +148,7 @@ def watch(bodies: Bodies, memory: NDArray, watched: Watched, step: int) -> None:
 
 @inlined
 def _touchdown(bodies: Bodies, seen: NDArray, i: int, mode: float) -> int:
-    """Note what drone i touches; return TOUCHDOWN where it is in flight and touches the ground or a solid at first."""
+    """Note what drone i touches; return TOUCHDOWN where it first touches ground or obstacle in flight."""
     if bodies.braced[i] == 0 and bodies.state[i, STATE.p_WB + 2] > bodies.vehicle[i, VEHICLE.contact_reach]:
         seen[i, SEEN.airborne], seen[i, SEEN.grounded] = 1.0, 0.0
         return 0
@@ -177,7 +175,7 @@ def _touchdown(bodies: Bodies, seen: NDArray, i: int, mode: float) -> int:
 
 @inlined
 def _surface(bodies: Bodies, i: int) -> int:
-    """Return whether any contact point of drone i is in the ground, or a foot in an obstacle: see NOTHING."""
+    """Return the surface that a contact point of drone i is in, see NOTHING."""
     row, state = bodies.vehicle[i], bodies.state[i]
     p_WB, q_WB = vector(state, STATE.p_WB), four(state, STATE.q_WB)
     if p_WB[2] <= row[VEHICLE.contact_reach]:

@@ -15,27 +15,7 @@ from zsim_world.fleet.flight_watch import watch
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.air import WIND, blow
 from zsim_world.physics.contacts import meet_drones
-from zsim_world.physics.obstacle_contact import meet_obstacles
-from zsim_world.physics.rigid_body import four, put, put_four, vector
-from zsim_world.physics.rotors import drained
-from zsim_world.physics.simd import accelerate, lead, line_up, move
-from zsim_world.sensors import sensor_set as ss
-from zsim_world.sensors.equations import (
-    BodyTruth,
-    MountedSensor,
-    Site,
-    Values,
-    baro,
-    flow,
-    gps,
-    imu,
-    mag,
-    pressure,
-    sonar,
-)
-from zsim_world.sensors.reading import add_errors, displace, hold_reading
-from zsim_world.sensors.sensor_set import CONFIG, NEVER, SCHEDULE
-from zsim_world.state.fleet_arrays import (
+from zsim_world.physics.fleet_arrays import (
     CLOCK,
     EXPOSED,
     PLACE,
@@ -49,6 +29,27 @@ from zsim_world.state.fleet_arrays import (
     PerRotor,
     Senses,
 )
+from zsim_world.physics.rigid_body import drained, four, put, put_four, vector
+from zsim_world.physics.simd import accelerate, lead, line_up, move
+from zsim_world.physics.surfaces import meet_obstacles
+from zsim_world.sensors import sensor_set as ss
+from zsim_world.sensors.equations import (
+    BodyTruth,
+    MountedSensor,
+    Site,
+    Values,
+    add_errors,
+    baro,
+    displace,
+    flow,
+    gps,
+    hold_reading,
+    imu,
+    mag,
+    pressure,
+    sonar,
+)
+from zsim_world.sensors.sensor_set import CONFIG, NEVER, SCHEDULE
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.observer import DEVICE, STEP_S
 from zsim_world.vehicles.simd_firmware import steer
@@ -65,7 +66,7 @@ def _drain(bodies: Bodies) -> None:
 
 @inlined
 def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: NoiseRows) -> None:
-    """Let the gusts of every drone move on by one step."""
+    """Advance the gusts of every drone by one step."""
     count = gust.shape[0]
     at = noise.at[STREAMS.wind] + 3 * noise.cursor[count, STREAMS.wind]
     common, loaded = vector(noise.table[count], at), vector(wind, 0) + four(wind, 3)
@@ -142,7 +143,7 @@ def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, va
 def _read_faulty(
     s: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray, at: int, height: float
 ) -> bool:
-    """Do as `_read`, with what faults add to the errorless values and what they hold of the readings."""
+    """Do as `_read`, with the offset of a fault before and the hold of a stuck sensor after."""
     displace(ss.CHANNELS[s], value, fault)
     kept = _read(s, value, config, bias, noise, at, height)
     if kept:
@@ -152,7 +153,7 @@ def _read_faulty(
 
 @inlined
 def _register(device: NDArray, s: int, value: NDArray) -> None:
-    """Hand a sample to the firmware."""
+    """Pass a sample to the firmware."""
     if s == ss.IMU:
         put(device, DEVICE.accel, vector(value, 0))
         put(device, DEVICE.gyro, vector(value, 3))
@@ -184,9 +185,9 @@ def _due(plan: NDArray, tick: int) -> bool:
 def _sense(
     tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, noise: NoiseRows, senses: Senses
 ) -> int:
-    """Let all sensors sample what is due at this tick; return the length of the log.
+    """Take all samples that are due at this tick; return the length of the log.
 
-    The IMU samples in every step of the board, and what is due of it is published.
+    The IMU samples in every step of the board; those that are due are published.
     """
     for i in range(bodies.state.shape[0]):
         if step:
@@ -223,7 +224,7 @@ def _expose(s: int, i: int, tick: int, bodies: Bodies, senses: Senses) -> None:
 def _take(
     s: int, i: int, tick: int, logged: int, bodies: Bodies, device: NDArray, noise: NoiseRows, senses: Senses
 ) -> int:
-    """Let sensor s of drone i sample, and the firmware see it; return the length of the log, with it if it is due."""
+    """Sample sensor s of drone i, for the firmware and, if due, for the log; return the length of the log."""
     value = senses.value[logged]
     kept = _sample(s, i, bodies, noise, senses, value)
     if kept:
@@ -236,13 +237,13 @@ def _take(
 
 @inlined
 def _note(row: NDArray, s: int, i: int, tick: int) -> None:
-    """Note whose sample it is."""
+    """Note sensor, drone and tick of a sample."""
     row[0], row[1], row[2] = s, i, tick
 
 
 @inlined
 def _diverged(state: NDArray) -> int:
-    """Return the first drone whose state is no longer one, or -1."""
+    """Return the first drone whose state is not finite or out of bounds, or -1."""
     for i in range(state.shape[0]):
         size = 0.0
         for k in range(state.shape[1]):
@@ -261,7 +262,7 @@ def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
 
 @kernel()
 def advance(held: Held, ticks: int) -> tuple[int, float, int, bool]:
-    """Integrate so many physics ticks; 0 ticks: take the samples of the present instant.
+    """Integrate physics ticks; 0 ticks: take the samples of the present instant.
 
     Args:
         held: the arrays, by `zsim.math.compiled.hold`.
@@ -274,7 +275,6 @@ def advance(held: Held, ticks: int) -> tuple[int, float, int, bool]:
 
 @inlined
 def _advance(w: Arrays, ticks: int) -> tuple[int, float, int, bool]:
-    """Do as `advance` says."""
     time, bodies, boards, noise, senses, wind, gust, watched = w
     clock, device = time.clock, boards.device
     logged, least = 0, math.inf

@@ -4,7 +4,7 @@ Per drone: its samples in time order, truth, and status last, which counts them.
 """
 
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from zsim.contract import encoding, flight_messages, keys, messages
 from zsim.contract.camera_messages import Sightings
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError, reason_of
 from zsim.math.compiled import Held, compiled, hold, inlined, kernel
 from zsim.schema import plugin
@@ -21,11 +20,12 @@ from zsim.sensors.sensor import Sample, as_fields, field_types, message_type
 from zsim.sensors.sensor_catalogue import STOCK
 from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
-from zsim_world.physics.rotors import charge_percent
+from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.physics.rigid_body import charge_percent
+from zsim_world.run_state import IN_PLACE, Saved
 from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import WHOSE, Sampled
-from zsim_world.sensors.sighting_sampler import PictureSightings
-from zsim_world.state.fleet_arrays import STATE
+from zsim_world.sensors.sightings import PictureSightings
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY
 
@@ -56,7 +56,7 @@ class PublicationBuffers(NamedTuple):
 
 
 class MessageRow(NamedTuple):
-    """What one message is made of."""
+    """The numbers that one message is made of."""
 
     ints: NDArray[np.int64]
     floats: NDArray[np.float64]
@@ -64,7 +64,7 @@ class MessageRow(NamedTuple):
 
 
 class PublishedArrays(NamedTuple):
-    """The arrays of a fleet that messages are made of, see `zsim_world.state.fleet_arrays`."""
+    """The arrays of a fleet that messages are made of, see `zsim_world.physics.fleet_arrays`."""
 
     state: NDArray[np.float64]
     accel: NDArray[np.float64]
@@ -74,7 +74,7 @@ class PublishedArrays(NamedTuple):
 
 
 class PublishedState(NamedTuple):
-    """What messages are made of beside these arrays, of N drones."""
+    """What messages of N drones are made of beside these arrays."""
 
     touching: NDArray[np.bool_]  # (N,), whether a hull touched another in this gate
     sigma_m: NDArray[np.float64]  # (N,), of each one's GPS
@@ -85,7 +85,7 @@ class PublishedState(NamedTuple):
 
 
 class UserPayloads(NamedTuple):
-    """Messages of users' sensors among the M samples of a gate, one behind the other."""
+    """Messages of users' sensors among the M samples of a gate, one after the other."""
 
     data: NDArray[np.uint8]
     ends: NDArray[np.int64]  # (M,), where that of each sample ends, those of stock sensors being empty
@@ -106,6 +106,8 @@ class PublicationState(NamedTuple):
 class GatePublication:
     """Writes the messages of each gate and counts them per key."""
 
+    SAVED: ClassVar[Saved] = {"counts": IN_PLACE}
+
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         own = [*fleet.sensors.names[STOCK_SENSORS:], *([keys.SIGHTINGS] if fleet.has_sightings else [])]
@@ -115,35 +117,24 @@ class GatePublication:
         self._seen = PublishedArrays(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
         self._commanders: list[str | None] = []  # of the last gate
         commanders = np.zeros(fleet.count, dtype=np.int64)
-        counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
+        self.counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
         rotors = np.array(fleet.rotors, dtype=np.int64)
         own_messages = np.array([0 if i in fleet.external else OWN_MESSAGES for i in range(fleet.count)])
         self._first = int(np.argmax(own_messages))  # a drone with a status, which numbers the gates
         self._own_count = int(own_messages.sum())
         sigmas_m = np.array(fleet.gps_sigma_m)
-        self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, counts, rotors, own_messages)
+        self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, self.counts, rotors, own_messages)
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = encoding.words((*firmware.MODES, None))
         self._room_beside = 0  # bytes of users' messages
         self._make_room(16 * fleet.count)
-        self._rehearse()
-
-    def _rehearse(self) -> None:
-        """Load or compile what the first gate needs."""
-        uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
+        # loads or compiles what the first gate needs, and counts nothing
+        uncounted = self._fleetwide._replace(counts=self.counts.copy())
         state = PublicationState(self._words, self._seen, uncounted, self._written)
-        publish(hold(state), *self._fleet.sampled, *self._payloads(), 0)
-
-    def snapshot(self) -> State:
-        """Return how many messages each key has had."""
-        return {"counts": self._fleetwide.counts}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._fleetwide.counts[:] = state["counts"]
+        publish(hold(state), *fleet.sampled, *self._payloads(), 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
-        """Return the messages of the present gate; `commanders` are those of the drones, None for none."""
+        """Return the messages of the present gate; `commanders` has the commander of each drone, None for none."""
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + self._own_count
         payloads = self._payloads()
@@ -163,11 +154,11 @@ class GatePublication:
         return GateMessages(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
 
     def _payloads(self) -> "UserPayloads":
-        """Return what is written already of this gate: the messages of the users' sensors."""
+        """Return the encoded messages of the users' sensors of this gate."""
         return self._encoder.encoded(self._fleetwide.counts) if self._encoder else NO_PAYLOADS
 
     def _number(self, commander: str | None) -> int:
-        """Return the number of a word; a new one is learnt."""
+        """Return the number of a word; a new one is added."""
         if commander not in self._known:
             self._known[commander] = COMMANDER + len(self._known)
             self._words = encoding.words((*firmware.MODES, *self._known))
@@ -182,7 +173,7 @@ class GatePublication:
 
 
 class UserMessages:
-    """Encodes what users' sensors have sampled, and sightings."""
+    """Encodes the samples of users' sensors, and sightings."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -208,7 +199,9 @@ class UserMessages:
         seq: dict[tuple[int, int], int] = {}
         for m in places:
             sighting = sightings.get(m)
-            s, i, t_ns, t_sample_ns = whose[m].tolist() if sighting is None else _whose(self._seen, sighting)
+            s, i, t_ns, t_sample_ns = whose[m].tolist()
+            if sighting is not None:
+                s, i, t_ns, t_sample_ns = self._seen, sighting.drone, sighting.t_ns, sighting.t_sample_ns
             number = seq.get((i, s), counts.item(i, s + 2))
             seq[i, s] = number + 1
             stamps = (t_ns, number, t_sample_ns)
@@ -222,7 +215,7 @@ class UserMessages:
         """Return the message of a reading.
 
         Raises:
-            UserCodeError: the sensor's conversion fails, or returns what the message has no place for.
+            UserCodeError: the sensor's conversion fails, or returns values that the message cannot hold.
         """
         kind, settings = self._fleet.sensors.types[s], self._fleet.sensors.settings[i][s]
         numbers = values[: kind.values].tolist()
@@ -239,10 +232,6 @@ class UserMessages:
             text = f"its reading makes no {kind.message.__name__} ({reason_of(error)})"
             raise UserCodeError(text, what) from error
         return self._messages[s - STOCK_SENSORS](*stamps, *fields)
-
-
-def _whose(sensor: int, sighting: PictureSightings) -> tuple[int, int, int, int]:
-    return sensor, sighting.drone, sighting.t_ns, sighting.t_sample_ns
 
 
 def _sightings(stamps: tuple[int, int, int], sighting: PictureSightings) -> Sightings:
@@ -285,7 +274,7 @@ def _by_drone(whose: NDArray, own: NDArray, first: NDArray) -> None:
 
 @compiled
 def _in_order(whose: NDArray, own: NDArray, first: NDArray) -> NDArray:
-    """Return which sample, or -1 for truth and -2 for status, stands at each place."""
+    """Return the sample, -1 for truth or -2 for status, at each place."""
     drones = len(first) - 1
     order, free = np.empty(first[drones], np.int64), first.copy()
     for m in range(whose.shape[0]):
@@ -300,13 +289,13 @@ def _in_order(whose: NDArray, own: NDArray, first: NDArray) -> NDArray:
 
 @inlined
 def _kind(sensor: int) -> int:
-    """Return the number of a sensor's messages among the kinds: a user's sensors stand behind the status."""
+    """Return the number of a sensor's kind of message: those of users' sensors follow the status."""
     return sensor if sensor < STOCK_SENSORS else sensor + 2
 
 
 @inlined
 def _copy(user: UserPayloads, m: int, out: NDArray, start: int) -> int:
-    """Write the message of sample m of a user's sensor, which is encoded already; return where it ends."""
+    """Copy the encoded message of sample m of a user's sensor; return where it ends."""
     begin = user.ends[m - 1] if m > 0 else 0
     for k in range(user.ends[m] - begin):
         out[start + k] = user.data[begin + k]
@@ -341,7 +330,7 @@ def _fill(
 
 @kernel()
 def publish(held: Held, whose: NDArray, values: NDArray, data: NDArray, ends: NDArray, now_ns: int) -> int:
-    """Write the messages of a gate, drone by drone, and count them; return how many bytes that were.
+    """Write the messages of a gate, drone by drone, and count them; return the number of bytes.
 
     Args:
         held: a PublicationState, by `hold`.

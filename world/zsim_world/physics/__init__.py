@@ -1,1 +1,1 @@
-"""Compiled equations of motion: body, rotors, ground, wind, battery, encounters, obstacles. Imports state."""
+"""Compiled equations of motion: rigid body, rotors, battery, ground, obstacles, wind, contacts between drones."""

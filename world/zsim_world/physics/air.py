@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Vector
-from zsim_world.state.fleet_arrays import Row
+from zsim_world.physics.fleet_arrays import Row
 
 WIND = columns(
     "WindColumns",
@@ -34,7 +34,7 @@ def gust_decay(length_m: float, airspeed_m_s: float, speed_min_m_s: float, dt: f
 
 @inlined
 def gust_noise(correlation: float, common: float, own: float) -> float:
-    """Return a standard normal number that drones share to the given correlation."""
+    """Return a standard normal number with the given correlation between drones."""
     return math.sqrt(correlation) * common + math.sqrt(1.0 - correlation) * own
 
 
@@ -60,7 +60,7 @@ def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt
 
 @inlined
 def jet_reach(start_m: float, below_m: float) -> float:
-    """Return how far aside [m] of a drone its jet of this width at the start blows, so much below it."""
+    """Return the radius [m] of a jet, of this width at its start, so far below it."""
     return JET_WIDTHS * (start_m + JET_SPREAD * below_m)
 
 

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 from zsim.math.compiled import apart, inlined
 from zsim.math.rotation import Vector, add, axpy, cross, dot, norm, rotate, scaled, subtract, z_axis
 from zsim_world.physics.air import downwash, jet_reach
-from zsim_world.physics.obstacle_contact import brace
-from zsim_world.physics.rigid_body import four, vector
-from zsim_world.physics.rotors import free_thrust
-from zsim_world.state.fleet_arrays import STATE, VEHICLE, Bodies, NearPairs, PerRotor
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, NearPairs, PerRotor
+from zsim_world.physics.rigid_body import four, free_thrust, vector
+from zsim_world.physics.surfaces import brace
 
 DISTANCE_MIN_M = 1e-9  # m, so that two drones in one place have a direction
 CLOSE = 1.0 + 1e-9  # of the square of a distance: more than rounding can make of it
@@ -20,7 +19,7 @@ APPROACH_M = 0.501  # m, by which a pair's distance may have changed by then: tw
 
 @inlined
 def hull_force(stiffness: float, damping: float, depth_m: float, closing_m_s: float) -> float:
-    """Return the force [N] that parts two hulls dented by `depth_m`; never an attraction."""
+    """Return the force [N] that separates two hulls overlapping by `depth_m`; never an attraction."""
     if depth_m <= 0.0:
         return 0.0
     return max(stiffness * depth_m + damping * closing_m_s, 0.0)
@@ -45,7 +44,7 @@ def _blow(bodies: Bodies, above: int, below: int, aside: float, drop: float) -> 
 
 @apart
 def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
-    """Part the hulls of drones i and j, d = p_j - p_i: along it by spring and damper, across it by dry friction.
+    """Separate the hulls of drones i and j, d = p_j - p_i: spring and damper along d, dry friction across it.
 
     Both forces act at one point, a = (R_i - dent) n from i, so that linear and angular momentum are kept.
     """
@@ -116,7 +115,7 @@ def _meet(bodies: Bodies, i: int, j: int) -> float:
 
 @inlined
 def _strayed(state: NDArray, origin: NDArray) -> bool:
-    """Return whether a drone has left the surroundings for which the near pairs were found."""
+    """Return whether a drone has left the neighbourhood for which the near pairs were found."""
     for i in range(state.shape[0]):
         square = 0.0
         for k in range(3):
@@ -128,7 +127,7 @@ def _strayed(state: NDArray, origin: NDArray) -> bool:
 
 @inlined
 def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPairs) -> None:
-    """Note all pairs that can touch, blow on each other or be the closest before a drone strays; forget the others."""
+    """Note all pairs that can touch, blow on each other or be the closest until a drone strays."""
     count, least = 0, math.inf
     for i in range(state.shape[0]):
         for k in range(3):
@@ -154,9 +153,9 @@ def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPa
 def meet_drones(bodies: Bodies) -> float:
     """Add downwash to `air`, the forces between hulls to `push`, and return the least distance [m].
 
-    Only near pairs are looked at, in the order of all pairs: the result is that of all pairs, to the last bit. They are
-    found anew when a drone has moved by STRAY_M since. `touching[i, j]` is 1 where i < j are in contact now; `touched`
-    is set to 1 where contact begins.
+    Only near pairs are examined, in the order of all pairs: the result is that of all pairs, to the last bit. They are
+    updated when a drone has moved by STRAY_M since. `touching[i, j]` is 1 where i < j are in contact now; `touched` is
+    set to 1 where contact begins.
     """
     near = bodies.near
     if _strayed(bodies.state, near.origin):

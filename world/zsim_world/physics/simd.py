@@ -20,10 +20,9 @@ from zsim.math.columns import Field, columns
 from zsim.math.compiled import apart, inlined
 from zsim.math.rotation import Quaternion, Vector
 from zsim_world.physics import rigid_body as body
-from zsim_world.physics.ground import drag_anchors
-from zsim_world.physics.obstacle_contact import Touch
+from zsim_world.physics.fleet_arrays import AERO, ROTOR, STATE, VEHICLE, Aero, Bodies, PerRotor, Row
 from zsim_world.physics.rigid_body import four, put, vector
-from zsim_world.state.fleet_arrays import AERO, ROTOR, STATE, VEHICLE, Aero, Bodies, PerRotor, Row
+from zsim_world.physics.surfaces import Touch, drag_anchors
 
 LANES = 8  # doubles in a register of 512 bit, or in two of 256
 
@@ -47,7 +46,7 @@ BODY_ROTORS = columns(
 
 
 def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDArray[np.float64]:
-    """Return the blocks of N drones, (blocks, LANES * count), with what does not change; all else is 0.
+    """Return the blocks of N drones, (blocks, LANES * count), with the constant columns; all else is 0.
 
     Args:
         count: of a block's columns.
@@ -141,7 +140,7 @@ def move(bodies: Bodies, dt: float) -> None:
 
 @inlined
 def accelerate(bodies: Bodies) -> None:
-    """Note the accelerations of every drone in its present state."""
+    """Compute the accelerations of every drone in its present state."""
     count = bodies.state.shape[0]
     for first in range(0, count, LANES):
         lanes = bodies.lanes[first // LANES]
@@ -166,7 +165,7 @@ def line_up(bodies: Bodies) -> None:
 
 @inlined
 def lead(bodies: Bodies, dt: float) -> None:
-    """Move the external drones on with their velocities over one tick of dt [s], whatever became of them in it."""
+    """Move the external drones with their velocities over one tick of dt [s], whatever physics did to them in it."""
     for e in range(bodies.external.shape[0]):
         i, pose = bodies.external[e], bodies.pose[e]
         for c in range(3):
@@ -186,9 +185,10 @@ def _put_state(lanes: NDArray, k: int, state: NDArray, each: tuple[int, ...]) ->
 
 @inlined
 def _load(bodies: Bodies, lanes: NDArray, first: int) -> bool:
-    """Give the drones from `first` on their commands, air and pushes; return whether any is out of the ground's reach.
+    """Copy commands, air and forces into the lanes from `first` on; return whether any drone is above the ground's
+    reach.
 
-    In a lane without a drone numbers mean nothing, and nobody looks at what becomes of them.
+    In a lane without a drone the numbers mean nothing and are never read.
     """
     airborne, at = False, _group(BODY_ROTORS.command, bodies.each)
     for i in range(first, min(first + LANES, bodies.state.shape[0])):
@@ -250,7 +250,7 @@ def _accelerate_block(lanes: NDArray, each: tuple[int, ...], parts: tuple[int, .
 
 @inlined
 def _accelerate_alone(bodies: Bodies, i: int, touch: Touch | None) -> None:
-    """Note the accelerations of a drone that has the ground in reach, and what it touches besides."""
+    """Compute the accelerations of a drone near the ground, and of what else it touches."""
     each, row, anchor = bodies.each, bodies.vehicle[i], bodies.anchor[i]
     p, v, q, w = body.pose(bodies.state[i])
     rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
@@ -273,7 +273,7 @@ def _touch(bodies: Bodies, i: int) -> Touch:
 
 @apart
 def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
-    """Let a drone take its step with all that it touches."""
+    """Step a drone with everything that it touches."""
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
     air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
     rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
@@ -283,7 +283,7 @@ def _step_braced(bodies: Bodies, i: int, dt: float) -> None:
 
 @inlined
 def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> None:
-    """Take over what became of drone i in lane k; where it was not in free air, let it take its step again."""
+    """Copy the result of lane k to drone i; where it was not in free air, step it again."""
     row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
     if lanes[LANES * BODY_LANES.clear + k] > 0.0 and bodies.braced[i] == 0:
         for c in range(STATE.size):

@@ -1,1 +1,1 @@
-"""Sensors of a fleet: measurement equations, error models, schedules, latency. Imports physics and state."""
+"""Sensors of a fleet: measurement equations, error models, schedules, latency. Imports physics."""

@@ -1,14 +1,18 @@
-"""The equations of the stock sensors: truth to errorless values at a mount X_BS. All pure and compiled.
+"""From the truth to a reading: the equations of the stock sensors, then errors and faults. All compiled.
 
-A sensor stands at p_BS in the body and is turned by R_BS (q_BS: sensor components to body components). An equation
-is a function of body, mount and site, and returns two vectors; unused places are zero.
+A sensor is at p_BS in the body, rotated by R_BS (q_BS: sensor components to body components). An equation is a function
+of body, mount and site, and returns two vectors of errorless values; unused places are zero. The error model works on
+rows of `zsim_world.sensors.sensor_set`; `n` numbers of a reading have an error of their own.
 """
 
 import math
 from typing import NamedTuple
 
-from zsim.math.compiled import inlined
+from numpy.typing import NDArray
+
+from zsim.math.compiled import inlined, kernel
 from zsim.math.rotation import Quaternion, Vector, add, cross, heading, rotate, rotate_back, z_axis
+from zsim_world.sensors.sensor_set import ARMED, CHANNELS_MAX, CONFIG, FAULT, HOLDING
 
 SEA_LEVEL_PA = 101_325.0  # Pa, ISO 2533
 LAPSE_1_M = 2.25577e-5  # 1/m, 0.0065 K/m over 288.15 K, ISO 2533
@@ -31,7 +35,7 @@ class BodyTruth(NamedTuple):
 
 
 class MountedSensor(NamedTuple):
-    """Pose of a sensor in the body, and the largest range of one that has such."""
+    """Pose of a sensor in the body, and the largest range of a range sensor."""
 
     p_BS: Vector  # m
     q_BS: Quaternion
@@ -39,7 +43,7 @@ class MountedSensor(NamedTuple):
 
 
 class Site(NamedTuple):
-    """Where the flight is."""
+    """The place of the flight."""
 
     gravity: float  # m/s^2
     field_W: Vector  # uT, of the Earth
@@ -90,8 +94,8 @@ def baro(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
 def pressure(altitude_m: float) -> float:
     """Return the static pressure [Pa] of the standard atmosphere at an altitude above sea level (ISO 2533).
 
-    It holds to 11 km, which no scenario allows to exceed; a drone that a wind carries beyond finds the same law, and
-    where that ends, at 44 km, a vacuum.
+    The law holds to 11 km, the limit of scenarios; a drone carried beyond by the wind gets the same law, and a vacuum
+    where that ends, at 44 km.
     """
     return SEA_LEVEL_PA * math.pow(max(1.0 - LAPSE_1_M * altitude_m, 0.0), PRESSURE_EXPONENT)
 
@@ -121,3 +125,58 @@ def flow(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
     cos, sin = math.cos(psi), math.sin(psi)
     quality = max(z_axis(x.q_WB)[2], 0.0)
     return (cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]), (quality, 0.0, 0.0)
+
+
+@inlined
+def rounded(value: float, bias: float, white: float, quantum: float) -> float:
+    """Return the converter's output: value + bias + white, rounded to the quantum (0: none)."""
+    x = value + bias + white
+    return x if quantum == 0.0 else quantum * math.floor(x / quantum + 0.5)
+
+
+@inlined
+def add_errors(n: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int) -> None:
+    """Add the errors of n channels to a value, in place.
+
+    `noise` has standard normal numbers from `at` on (sensor_set.noise_width); `bias` is the bias of each channel, and
+    behind those of all its Gauss-Markov process.
+    """
+    if config[CONFIG.correlated] != 0.0:
+        for k in range(n):
+            state = CHANNELS_MAX + k
+            bias[state] = config[CONFIG.decay + k] * bias[state] + config[CONFIG.kick + k] * noise[at + 2 * n + 1 + k]
+            value[k] += bias[state]
+    for k in range(n):
+        bias[k] += config[CONFIG.walk + k] * noise[at + n + k]
+        white = config[CONFIG.white + k] * noise[at + k]
+        value[k] = rounded(value[k], bias[k], white, config[CONFIG.quantum + k])
+
+
+@inlined
+def displace(n: int, value: NDArray, fault: NDArray) -> None:
+    """Add the offset of a fault to the errorless values of a sensor, in place."""
+    for k in range(n):
+        value[k] += fault[FAULT.offset + k]
+
+
+@inlined
+def hold_reading(value: NDArray, fault: NDArray) -> None:
+    """Store the first reading (6,) of a stuck sensor, or replace a reading by the stored one, in place."""
+    if fault[FAULT.hold] == ARMED:
+        fault[FAULT.hold] = HOLDING
+        for k in range(CHANNELS_MAX):
+            fault[FAULT.held + k] = value[k]
+    elif fault[FAULT.hold] == HOLDING:
+        for k in range(CHANNELS_MAX):
+            value[k] = fault[FAULT.held + k]
+
+
+@kernel(makes_arrays=False)
+def read(n: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray) -> bool:
+    """Turn the errorless values of a user's sensor into a reading, in place; return False if it is lost."""
+    displace(n, value, fault)
+    add_errors(n, value, config, bias, noise, 0)
+    kept = noise[2 * n] >= config[CONFIG.drop]
+    if kept:
+        hold_reading(value, fault)
+    return kept

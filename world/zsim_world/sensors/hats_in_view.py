@@ -6,7 +6,7 @@ drones' z axis, and from below the rim of the drone's own rotors.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,12 @@ from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined, kernel
 from zsim.math.interpolation import attitude_between, position_between
 from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
-from zsim.scenario import obstacle
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of, pixel
+from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.physics.rigid_body import four, vector
+from zsim_world.physics.surfaces import nearest
 
-POSE = columns(  # of a drone at an instant
-    "PoseColumns", (Field("p_WB", "m", 3), Field("v_WB", "m/s", 3), Field("q_WB", "1", 4), Field("w_WB_B", "rad/s", 3))
-)
 VIEW = columns(  # of a hat in a camera
     "ViewColumns",
     (
@@ -51,8 +50,6 @@ SURFACE_M = 0.01  # m, nearer than which a ray has met an obstacle
 EDGE_PX = 3.0  # px, nearer than which to the picture's edge a detector takes a hat for cut; the blur of its rim
 STEPS_MAX = 64  # along a ray; each goes as far as the nearest surface
 
-nearest: Any = inlined(obstacle.nearest)
-
 
 class MountedCamera(NamedTuple):
     """A camera: lens, and pose in its drone's body."""
@@ -60,16 +57,6 @@ class MountedCamera(NamedTuple):
     lens: Lens
     p_BK: Vector  # m
     q_BK: Quaternion
-
-
-@inlined
-def _three(row: NDArray, at: int) -> Vector:
-    return (row[at], row[at + 1], row[at + 2])
-
-
-@inlined
-def _four(row: NDArray, at: int) -> Quaternion:
-    return (row[at], row[at + 1], row[at + 2], row[at + 3])
 
 
 def camera_row(camera: Camera) -> NDArray:
@@ -84,15 +71,15 @@ def mounted(row: NDArray) -> MountedCamera:
     lens = Lens(
         row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], int(row[9]), int(row[10])
     )  # as Lens has them
-    return MountedCamera(lens, _three(row, CAMERA.p_BK), _four(row, CAMERA.q_BK))
+    return MountedCamera(lens, vector(row, CAMERA.p_BK), four(row, CAMERA.q_BK))
 
 
 @kernel()
 def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_ns: int) -> NDArray:
-    """Return the poses of all drones at an instant between two gates, (N, POSE.size).
+    """Return the poses of all drones at an instant between two gates, (N, STATE.size).
 
     Args:
-        former, now: at the gates, (N, POSE.size or more), of which the rest is mixed.
+        former, now: at the gates, (N, STATE.size or more), of which the rest is mixed.
     """
     if t_ns >= now_ns or now_ns <= former_ns:
         return now.copy()
@@ -101,13 +88,13 @@ def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_
     for i in range(len(poses)):
         a, b = former[i], now[i]
         p = position_between(
-            s, dt, _three(a, POSE.p_WB), _three(a, POSE.v_WB), _three(b, POSE.p_WB), _three(b, POSE.v_WB)
+            s, dt, vector(a, STATE.p_WB), vector(a, STATE.v_WB), vector(b, STATE.p_WB), vector(b, STATE.v_WB)
         )
-        q = attitude_between(s, _four(a, POSE.q_WB), _four(b, POSE.q_WB))
+        q = attitude_between(s, four(a, STATE.q_WB), four(b, STATE.q_WB))
         for k in range(3):
-            poses[i, POSE.p_WB + k] = p[k]
+            poses[i, STATE.p_WB + k] = p[k]
         for k in range(4):
-            poses[i, POSE.q_WB + k] = q[k]
+            poses[i, STATE.q_WB + k] = q[k]
     return poses
 
 
@@ -157,7 +144,7 @@ def _obstacle_hides(eye: Vector, ray: Vector, far: float, clearance: float, row:
 @inlined
 def _drone_hides(eye: Vector, ray: Vector, away: float, i: int, m: int, pose: NDArray, radius: float) -> bool:
     """Tell whether drone i stands on a ray to a ball, that of drone m or of none."""
-    p, q = _three(pose, POSE.p_WB), _four(pose, POSE.q_WB)
+    p, q = vector(pose, STATE.p_WB), four(pose, STATE.q_WB)
     return _rim_hides(eye, ray, p, q, radius) if i == m else _hull_hides(eye, ray, away, p, q, radius)
 
 
@@ -206,7 +193,7 @@ def _hidden(
     hidden = 0
     for i in range(poses.shape[0] + obstacles.shape[0]):
         k = i - poses.shape[0]
-        if k < 0 and (i == own or (_passes(eye, ray, away, _three(poses[i], POSE.p_WB), RIM_WIDE * hulls[i] + ball))):
+        if k < 0 and (i == own or (_passes(eye, ray, away, vector(poses[i], STATE.p_WB), RIM_WIDE * hulls[i] + ball))):
             continue
         if k >= 0 and not _obstacle_hides(eye, ray, away, ball, obstacles[k], True):
             continue
@@ -259,7 +246,7 @@ def hats_in_view(
     Args:
         camera: of the drone `own`.
         own: number of its drone.
-        poses: of N drones at the instant of the picture, (N, POSE.size).
+        poses: of N drones at the instant of the picture, (N, STATE.size).
         hulls: radius of each hull [m], (N,).
         hat_B: centre of a hat in the body of its drone [m].
         diameter: of a hat [m].
@@ -269,9 +256,9 @@ def hats_in_view(
         view: the result, (N + M, VIEW.size): drones, then balls.
     """
     row = poses[own]
-    q_WB, w_B = _four(row, POSE.q_WB), _three(row, POSE.w_WB_B)
-    eye = add(_three(row, POSE.p_WB), rotate(q_WB, camera.p_BK))
-    v_eye = add(_three(row, POSE.v_WB), rotate(q_WB, cross(w_B, camera.p_BK)))
+    q_WB, w_B = four(row, STATE.q_WB), vector(row, STATE.w_WB_B)
+    eye = add(vector(row, STATE.p_WB), rotate(q_WB, camera.p_BK))
+    v_eye = add(vector(row, STATE.v_WB), rotate(q_WB, cross(w_B, camera.p_BK)))
     w_W = rotate(q_WB, w_B)
     drones = poses.shape[0]
     view[:, VIEW.seen] = 0.0
@@ -280,11 +267,11 @@ def hats_in_view(
             continue
         centre, velocity = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         if m < drones:
-            other = _four(poses[m], POSE.q_WB)
-            centre = add(_three(poses[m], POSE.p_WB), rotate(other, hat_B))
-            velocity = _three(poses[m], POSE.v_WB)
+            other = four(poses[m], STATE.q_WB)
+            centre = add(vector(poses[m], STATE.p_WB), rotate(other, hat_B))
+            velocity = vector(poses[m], STATE.v_WB)
         else:
-            centre = _three(balls[m - drones], 0)
+            centre = vector(balls[m - drones], 0)
         to_W = subtract(centre, eye)
         away = norm(to_W)
         to_K = rotate_back(camera.q_BK, rotate_back(q_WB, to_W))

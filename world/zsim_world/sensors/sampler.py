@@ -1,26 +1,33 @@
-"""What the sensors of a fleet give in a gate: rows of arrays, delayed until their latency is over.
+"""The samples of a fleet in a gate: rows of arrays, held back until their latency is over.
 
 Values in the contract's order of fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude [deg],
 altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m]; sonar: range [m],
-valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading.
+valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading, computed in Python
+after the gate from the truth that the kernel logged.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from zsim.contract.snapshot import State
+from zsim.errors import UserCodeError, reason_of
 from zsim.math import geodetic
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import Held, hold, inlined, kernel
+from zsim.math.frames import rotation_matrix
+from zsim.math.random_streams import stream
 from zsim.scenario.scenario import Scenario
-from zsim.sensors.sensor import SensorType
+from zsim.schema import plugin
+from zsim.schema.checker import show
+from zsim.sensors.sensor import Sensor, SensorTruth, SensorType
+from zsim_world.physics.fleet_arrays import EXPOSED, STATE, Senses
+from zsim_world.run_state import IN_PLACE, PART, Saved
 from zsim_world.sensors import sensor_set
-from zsim_world.sensors.sensor_set import SENSORS, FleetSensors
-from zsim_world.sensors.user_sensors import UserSensors
-from zsim_world.state.fleet_arrays import Senses
+from zsim_world.sensors.equations import read
+from zsim_world.sensors.noise import place, words
+from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width
 
 WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Field("t", "ns"), Field("t_sample", "ns")))
 VALUE_COLUMNS = 9  # of a GPS fix, with its place on the Earth
@@ -44,20 +51,17 @@ class Sampled(NamedTuple):
 
     def each(self, sensors: FleetSensors) -> list[SensorSample]:
         """Return them one by one."""
-        names, sizes = sensors.names, [_size(s, kind) for s, kind in enumerate(sensors.types)]
+        names, sizes = sensors.names, [kind.values for kind in sensors.types]
+        sizes[sensor_set.GPS] = VALUE_COLUMNS
         rows = zip(self.whose.tolist(), self.values.tolist(), strict=True)
         return [SensorSample(names[s], i, t, at, tuple(row[: sizes[s]])) for (s, i, t, at), row in rows]
-
-
-def _size(s: int, kind: SensorType) -> int:
-    return VALUE_COLUMNS if s == sensor_set.GPS else kind.values
 
 
 NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
 
 
 class SampledLog(NamedTuple):
-    """What the kernel logged, and what turns it into samples."""
+    """The log of the kernel, and what turns it into samples."""
 
     whose: NDArray[np.int64]  # (M, 3): sensor, drone, tick
     value: NDArray[np.float64]  # (M, CHANNELS_MAX)
@@ -67,13 +71,15 @@ class SampledLog(NamedTuple):
 
 
 class Sampler:
-    """Makes samples of what the kernel logged, and keeps back those that are delayed.
+    """Makes samples of the kernel's log, and holds back those that are delayed.
 
     Args:
         scenario: resolved.
         sensors: of its drones.
         senses: of the kernel.
     """
+
+    SAVED: ClassVar[Saved] = {"_later": Sampled, "_user_sensors": PART}
 
     def __init__(self, scenario: Scenario, sensors: FleetSensors, senses: Senses) -> None:
         place = scenario.environment
@@ -87,19 +93,8 @@ class Sampler:
         self._in_order = not (own or latency_ns.any())
         self._later = NONE
 
-    def snapshot(self) -> State:
-        """Return what is on its way, and what the users' sensors have come to."""
-        own = self._user_sensors.snapshot() if self._user_sensors else []
-        return {"whose": self._later.whose, "values": self._later.values, "user_sensors": own}
-
-    def restore(self, state: State) -> None:
-        """Take over what `snapshot` returned."""
-        self._later = Sampled(state["whose"], state["values"])
-        if self._user_sensors:
-            self._user_sensors.restore(state["user_sensors"])
-
     def due(self, logged: int, now_ns: int) -> Sampled:
-        """Return what falls due up to now of what was logged and of what waits.
+        """Return the samples that are due up to now, of the log and of those held back.
 
         Raises:
             UserCodeError: the equation of a user's sensor fails.
@@ -124,7 +119,7 @@ class Sampler:
 
 @kernel()
 def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
-    """Return index and values of Sampled of the first rows of a log.
+    """Return index and values of Sampled for the first rows of a log.
 
     Args:
         held: a SampledLog, by `hold`.
@@ -147,7 +142,7 @@ def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
 
 @inlined
 def _is_before(a: NDArray, b: NDArray) -> bool:
-    """Tell whether a measurement stands before or with another in the order of (t_ns, drone, sensor)."""
+    """Tell whether a measurement comes before or with another in the order of (t_ns, drone, sensor)."""
     if a[WHOSE.t] != b[WHOSE.t]:
         return a[WHOSE.t] < b[WHOSE.t]
     if a[WHOSE.drone] != b[WHOSE.drone]:
@@ -157,7 +152,7 @@ def _is_before(a: NDArray, b: NDArray) -> bool:
 
 @kernel()
 def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return measurements with others among them that have no numbers, and the rows in which these stand.
+    """Return measurements with others inserted that have no numbers, and the rows of these.
 
     Args:
         whose, values: of Sampled, in its order.
@@ -173,3 +168,119 @@ def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, 
         if k < extra:
             index[m + k], places[k] = more[k], m + k
     return index, numbers, places
+
+
+class UserSensors:
+    """The users' sensors of a fleet. Each drone and sensor has a random stream, as the stock sensors have.
+
+    Args:
+        scenario: resolved.
+        sensors: of its drones.
+        senses: of the kernel.
+    """
+
+    SAVED: ClassVar[Saved] = {"sensors": PART}
+
+    def __init__(self, scenario: Scenario, sensors: FleetSensors, senses: Senses) -> None:
+        self._senses = senses
+        self._environment = scenario.environment
+        self._tick_s = scenario.time.physics_dt_ms / 1000.0
+        self._sensors: dict[tuple[int, int], _UserSensor] = {}
+        for i, drone in enumerate(scenario.drones):
+            for s in range(len(SENSORS), len(sensors.names)):
+                settings = sensors.settings[i][s]
+                if settings is not None:
+                    name, rng = sensors.names[s], stream(scenario.seed, f"{drone.name}/{sensors.names[s]}")
+                    what = f"{drone.name}: sensors.{name}"
+                    self._sensors[s, i] = _UserSensor(what, sensors.types[s], settings, rng, senses.config[i, s])
+
+    @property
+    def sensors(self) -> list["_UserSensor"]:
+        """All of them, drone by drone."""
+        return [*self._sensors.values()]
+
+    def readings(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return whose (M, 3) and values (M, 6) of the exposures logged in a gate, without those that are lost.
+
+        Raises:
+            UserCodeError: an equation fails, or returns what is not a reading.
+        """
+        senses, kept = self._senses, []
+        count = int(senses.exposed_count[0])
+        values = np.zeros((count, CHANNELS_MAX))
+        for m in range(count):
+            s, i, tick = senses.exposed_whose[m].tolist()
+            sensor = self._sensors[s, i]
+            truth = sensor.truth(senses.exposed[m], tick * self._tick_s)
+            sensor.measure(truth, self._environment, values[m])
+            if read(sensor.width, values[m], senses.config[i, s], sensor.bias, senses.fault[i, s], sensor.numbers()):
+                kept.append(m)
+        return senses.exposed_whose[kept], values[kept]
+
+
+class _UserSensor:
+    """One sensor of one drone: settings, present bias and random stream."""
+
+    SAVED: ClassVar[Saved] = {"bias": IN_PLACE, "stream": list[int]}
+
+    def __init__(
+        self, what: str, kind: SensorType, settings: Sensor, rng: np.random.Generator, config: NDArray[np.float64]
+    ) -> None:
+        self._what, self._kind, self._settings, self._rng = what, kind, settings, rng
+        self.width = kind.width
+        models = kind.errors(settings)
+        self.bias = np.zeros(2 * CHANNELS_MAX)
+        self.bias[: self.width] = np.array([model.bias for model in models]) * rng.standard_normal(self.width)
+        self._numbers = noise_width(self.width, models)
+        if self._numbers > 2 * self.width + 1:
+            sigma = np.array([model.correlated_sigma for model in models])
+            self.bias[CHANNELS_MAX : CHANNELS_MAX + self.width] = sigma * rng.standard_normal(self.width)
+        self._p_BS = config[CONFIG.p_BS : CONFIG.p_BS + 3].copy()
+        self._R_BS = rotation_matrix(config[CONFIG.q_BS : CONFIG.q_BS + 4])
+
+    @property
+    def stream(self) -> list[int]:
+        return words(self._rng)
+
+    @stream.setter
+    def stream(self, stream: list[int]) -> None:
+        place(self._rng, stream)
+
+    def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
+        """Return the truth that it is exposed to, from a row of EXPOSED."""
+        state, accel = row[EXPOSED.state : EXPOSED.accel].copy(), row[EXPOSED.accel : EXPOSED.air].copy()
+        return SensorTruth(
+            t_s=t_s,
+            p_WB=state[STATE.p_WB : STATE.p_WB + 3],
+            v_WB=state[STATE.v_WB : STATE.v_WB + 3],
+            a_WB=accel[0:3],
+            R_WB=rotation_matrix(state[STATE.q_WB : STATE.q_WB + 4]),
+            w_WB_B=state[STATE.w_WB_B : STATE.w_WB_B + 3],
+            alpha_B=accel[3:6],
+            air_W=row[EXPOSED.air : EXPOSED.air + 3].copy(),
+            p_BS=self._p_BS,
+            R_BS=self._R_BS,
+        )
+
+    def measure(self, truth: SensorTruth, environment: object, values: NDArray[np.float64]) -> None:
+        """Write the errorless values into a row (6,)."""
+        assert self._kind.equation is not None  # a module without one is refused
+        count = self._kind.values
+        equation, where = self._kind.equation, f"{self._what} at {truth.t_s:.3f} s"
+        name = f"{equation.__module__}:{getattr(equation, '__qualname__', type(equation).__qualname__)}"
+        try:
+            returned = equation(truth, self._settings, environment)
+        except plugin.RAISED as error:
+            failure = plugin.user_code_error(error, where)
+            raise failure or UserCodeError(f"{name} raised {reason_of(error)}", where) from error
+        try:
+            values[:count] = np.reshape(plugin.numbers(returned), (count,))
+        except ValueError as error:
+            raise UserCodeError(f"{name} returns {show(returned)}; must be {count} numbers", where) from error
+        if not np.isfinite(values).all():
+            numbers = [float(value) for value in values[:count]]
+            raise UserCodeError(f"{name} returns {numbers}; must be finite", where)
+
+    def numbers(self) -> NDArray[np.float64]:
+        """Return the standard normal numbers of one sample, see `noise_width`."""
+        return self._rng.standard_normal(self._numbers)

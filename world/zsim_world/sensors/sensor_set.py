@@ -119,13 +119,13 @@ def _fill(row: NDArray[np.float64], name: str, kind: SensorType, settings: Senso
 
 
 def noise_width(numbers: int, models: Sequence[ErrorModel]) -> int:
-    """Return how many normal numbers a sample takes: white, walk of the bias, one for drop-out, Gauss-Markov if any."""
+    """Return the number of normal numbers per sample: white, bias walk, one for drop-out, Gauss-Markov if any."""
     correlated = any(model.correlated_sigma for model in models)
     return (3 if correlated else 2) * numbers + 1
 
 
 def schedule(sensors: FleetSensors, tick_ms: float) -> NDArray[np.int64]:
-    """Return the time tables of all published sensors, shape (N, S, SCHEDULE.size), with sample 0 due at tick 0."""
+    """Return the schedules of all published sensors, (N, S, SCHEDULE.size), with sample 0 due at tick 0."""
     table = np.zeros((len(sensors.settings), len(sensors.names), SCHEDULE.size), dtype=np.int64)
     table[:, :, SCHEDULE.due] = NEVER
     tick_us = round(tick_ms * 1000)
@@ -145,7 +145,7 @@ def latencies(sensors: FleetSensors) -> NDArray[np.int64]:
 
 
 def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:
-    """Return the most samples that all drones together take in one gate."""
+    """Return the largest number of samples that all drones together take in one gate."""
     rates = [
         rate_of(settings, name)
         for own in sensors.settings
@@ -156,13 +156,13 @@ def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:
 
 
 def heading_sigma(mag: MagConfig, horizontal_ut: float) -> float:
-    """Return the standard deviation [rad] of a heading from one magnetometer sample: that of the field, sideways."""
+    """Return the standard deviation [rad] of a heading from one magnetometer sample, from the sideways field."""
     model = mag.field_ut
     sideways_ut = math.hypot(noise_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0))
     return sideways_ut / max(horizontal_ut, FIELD_MIN_UT)
 
 
 def has_compass(mag: MagConfig, field_ut: Sequence[float]) -> bool:
-    """Return whether the magnetic field of the place [uT; W] shows a magnetometer where the nose points."""
+    """Return whether a magnetometer gives a heading in the magnetic field of the place [uT; W]."""
     horizontal_ut = math.hypot(*field_ut[:2])
     return horizontal_ut >= FIELD_MIN_UT and heading_sigma(mag, horizontal_ut) <= HEADING_SIGMA_MAX_RAD

@@ -1,1 +1,1 @@
-"""The world as a process on Zenoh: its loop, what comes in and goes out, deaths, history, pacing. Imports flight."""
+"""The world as a process on Zenoh: its loop, inputs and outputs, deaths, journal, pacing. Imports run."""

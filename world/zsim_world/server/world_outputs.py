@@ -1,4 +1,4 @@
-"""What the world publishes: encoded, kept in the history, put in one go, and handed to recorders with what passed."""
+"""What the world publishes: encoded, kept in the history, sent in one go, and passed on to recorders."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -7,11 +7,9 @@ from typing import Any
 from zsim.contract import keys, messages
 from zsim.contract.framing import BATCH_MAX, GateMessages, Pairs, encode_batch
 from zsim.runtime.agent import Output
-from zsim.transport.session import ReceivedSample, Session
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.journal.journal_entries import Kept
-from zsim_world.journal.run_journal import RunJournal
-from zsim_world.server.message_history import MessageHistory
+from zsim.transport.session import Session
+from zsim_world.run.inputs import Published, Run
+from zsim_world.server.run_journal import RunJournal
 
 
 class WorldOutputs:
@@ -19,28 +17,18 @@ class WorldOutputs:
 
     Args:
         link: the listening session.
-        world: whose outbox it is.
-        history: keeps what is published.
+        run: of the world.
         on_message: called with every key and message beside those of drones.
         journal: is written before anything is published.
     """
 
-    def __init__(
-        self,
-        link: Session,
-        world: Coordinator,
-        history: MessageHistory,
-        on_message: Callable[[str, Any], None],
-        journal: RunJournal,
-    ) -> None:
-        self._journal = journal
+    def __init__(self, link: Session, run: Run, on_message: Callable[[str, Any], None], journal: RunJournal) -> None:
         self._link = link
-        self._world = world
-        self._history = history
+        self._run = run
         self._on_message = on_message
+        self._journal = journal
         self._unsent: Pairs = []
-        self._passed: Pairs = []
-        self._gate_keys = [keys.gate(name) for name in world.names]
+        self._gate_keys = [keys.gate(name) for name in run.world.names]
 
     def flush(self) -> None:
         """Publish the outbox."""
@@ -49,10 +37,11 @@ class WorldOutputs:
 
     def gather(self) -> None:
         """Encode the outbox and keep it."""
-        outbox = self._world.take_outbox()
+        outbox = self._run.world.take_outbox()
         if not outbox:
             return
         encoded: Pairs = []
+        passed = self._run.history.passed
         for key, message in outbox:
             if type(message) is GateMessages:
                 self._gather_gate(message)
@@ -63,9 +52,9 @@ class WorldOutputs:
                     self._unsent.append(pair)
                     continue
                 encoded.append(pair)
-                self._passed.append(pair)
+                passed.append(pair)
         self._unsent += encoded
-        self._history.add_all(encoded, self._world.now_ns)
+        self._run.history.add_all(encoded, self._run.world.now_ns)
         for key, message in outbox:
             if type(message) is not GateMessages:
                 self._on_message(key, message)
@@ -73,7 +62,7 @@ class WorldOutputs:
     def _gather_gate(self, gate: GateMessages) -> None:
         """Keep the messages of a gate as one, of all drones and of each, where there is a subscriber to that."""
         whole = (keys.GATE, gate.pack())
-        self._passed.append(whole)
+        self._run.history.passed.append(whole)
         if self._link.has_subscribers(keys.GATE):
             self._unsent.append(whole)
         for key, (first, last) in zip(self._gate_keys, pairwise(gate.first), strict=True):
@@ -89,25 +78,22 @@ class WorldOutputs:
 
     def publish(self, output: Output) -> None:
         """Publish one message beside the outbox."""
-        payload = messages.encode(output.message)
-        self._passed.append((output.key, payload))
-        self._history.add(output.key, payload, self._world.now_ns)
-        self._journal.note(Kept(output.key, payload))
+        message: Any = output.message
+        payload = messages.encode(message)
+        self._run.enter(Published(output.key, message.seq, payload))
         self._journal.commit()
         self._link.put_raw(output.key, payload)
         self.put_batch()
+        self._on_message(output.key, message)
 
     def forget(self) -> None:
-        """Publish nothing of what was gathered: an incarnation of the world before has."""
-        self._unsent, self._passed = [], []
-
-    def passed(self, sample: ReceivedSample) -> None:
-        """Note a message that a participant or anyone else has published."""
-        self._passed.append(sample)
+        """Drop what was gathered: the former process of the world has published it."""
+        self._unsent, self._run.history.passed = [], []
 
     def put_batch(self) -> None:
-        """Hand what has passed to the recorders, if there are any."""
-        passed, self._passed = self._passed, []
+        """Send the recorders, if there are any, all messages since the last time."""
+        history = self._run.history
+        passed, history.passed = history.passed, []
         if self._link.has_subscribers(keys.BATCH):
             for first in range(0, len(passed), BATCH_MAX):
                 self._link.put_raw(keys.BATCH, encode_batch(passed[first : first + BATCH_MAX]))

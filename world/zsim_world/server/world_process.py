@@ -1,44 +1,72 @@
 """The world as a process on Zenoh: one loop that paces and gates simulated time.
 
-Order of this file: `run`, a world before this one, the loop, what other threads bring, publication.
+Order of this file: `run`, `WorldProcess` (continuing a former world's run, the loop, queries, other threads), pacing,
+and the watch over a loop that does not return.
 """
 
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
-from zsim.contract import keys, run_messages
+from zsim.contract import keys, messages, run_messages
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
+from zsim.errors import DecodeError, RunError
 from zsim.runtime.agent import Output
-from zsim.runtime.collector import rare_collections
-from zsim.runtime.health import HealthMeter
+from zsim.runtime.health import HealthMeter, rare_collections
+from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
-from zsim.transport.session import Query, Session
-from zsim.transport.session_tokens import SessionTokens
+from zsim.transport.link_watch import SessionTokens
+from zsim.transport.session import Query, ReceivedSample, Session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
-from zsim_world.flight.coordinator import Coordinator
-from zsim_world.flight.world import World
-from zsim_world.journal.journal_entries import Advanced, Died, Expired, FellSilent, Resumed
-from zsim_world.journal.run_journal import RunJournal
+from zsim_world.run.barrier import Participant
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.inputs import Advanced, Controlled, Expired, ProgressCallback, Resumed, Run, Taken
+from zsim_world.run.run_clock import RunClock
+from zsim_world.run.world import World
+from zsim_world.run_state import restore
 from zsim_world.server.admission import Admission
-from zsim_world.server.liveliness import LivelinessMonitor
-from zsim_world.server.message_history import MessageHistory
-from zsim_world.server.pacing import STOOD_STILL_NS, Pacer, Pipelining
-from zsim_world.server.query_service import QueryService
-from zsim_world.server.resumption import Resumption
-from zsim_world.server.slow_readers import SlowReaders
-from zsim_world.server.turn_watch import TurnWatch
-from zsim_world.server.world_inputs import TICK_S, MessageIntake, ProgressCallback, open_inputs
+from zsim_world.server.liveliness import LivelinessMonitor, SlowReaders
+from zsim_world.server.run_journal import RunJournal
+from zsim_world.server.world_inputs import TICK_S, open_inputs, recover_lost
 from zsim_world.server.world_outputs import WorldOutputs
 
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
-HEALTH = keys.process(WORLD, "health")
+HEALTH, JOIN = keys.process(WORLD, "health"), "/join"
+OWN = keys.process(WORLD, "")
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
 SERVE_NS = 5_000_000  # wall time after which a world that never waits looks at requests and losses
+LAG_GATES = 2  # that the slowest agent may still have before it when a series of gates begins
+GATES_SENT = 3  # at once; more keep agents waiting that could work
+DELAY_MAX_NS = 50_000_000  # wall time that a gate is delayed at most; a slow agent then has all the gates that it may
+STOOD_STILL_NS = 1_000_000_000  # wall time by which a gate is late where time stood still rather than being slow
+STUCK_NS = 2_000_000_000  # wall time in one turn from which on it is reported; a turn takes milliseconds
+STOPPED_NS = 1_000_000_000  # between two looks, ten times as long as it takes: the process was stopped, or its host
+
+
+def run(
+    world: Coordinator,
+    endpoints: Sequence[str],
+    stopped: Callable[[], str | None] = lambda: None,
+    progress: ProgressCallback = lambda kind, message, about: None,
+    ready: Callable[[], None] = lambda: None,
+    identity: Identity | None = None,
+    journal: RunJournal | None = None,
+) -> None:
+    """Listen on the endpoints, call `ready`, and run the world to its end, from where its journal ends.
+
+    Raises:
+        SessionError: an endpoint is taken, or the identity is of no use.
+    """
+    mode: Mode = "lockstep" if world.clock.mode == "lockstep" else "realtime"
+    with connection.listen(endpoints, world.scenario.federation, mode, identity) as link:
+        ready()
+        WorldProcess(link, world, stopped, progress, journal).run()
 
 
 class WorldProcess:
@@ -49,7 +77,7 @@ class WorldProcess:
         world: what to run.
         stopped: asked at every gate, and every TICK_S; a text ends the run with it as the reason.
         progress: shows progress.
-        journal: of the run; from the one that a world before has left, this one goes on.
+        journal: of the run; this world continues from the one that a former world has left.
         health: of this process.
     """
 
@@ -66,31 +94,18 @@ class WorldProcess:
         self._world = world
         self._clock = world.clock
         self._stopped = stopped
-        self._shown = progress
+        self._progress = progress
         self._journal = journal or RunJournal(None)
         self.health = health or HealthMeter(WORLD, host=link.host)
-        self._history = MessageHistory()
+        self._run = Run(world, self.health, self._journal.note)
+        self._history = self._run.history
         self._pacer = Pacer(world.clock)
         self._pipelining = Pipelining(world)
-        self._outputs = WorldOutputs(link, world, self._history, self._on_message, self._journal)
-        self._liveliness = LivelinessMonitor(
-            link, world.barrier, self._handle_death, self._take_in, self._handle_silence
-        )
+        self._outputs = WorldOutputs(link, self._run, self._on_message, self._journal)
+        self._liveliness = LivelinessMonitor(link, self._run, self._take_in)
         self._tokens = SessionTokens(link)
-        self._admission = Admission(self._tokens, world, link.guarded, self._journal)
-        self._intake = MessageIntake(
-            link,
-            world,
-            self._outputs,
-            self._history,
-            self._liveliness,
-            self._admission,
-            self.health,
-            self._progress,
-            self._journal,
-        )
-        self._readers = SlowReaders(link, self._tokens, world, self._history, self._journal)
-        self._service = QueryService(link, world, self._history, self._journal)
+        self._admission = Admission(self._tokens, self._run, link.guarded)
+        self._readers = SlowReaders(link, self._tokens, self._run)
         self._queries: deque[Query] = deque()
         self._over = threading.Event()
         self._clock_wall_ns = 0
@@ -98,7 +113,6 @@ class WorldProcess:
         self._served_wall_ns = 0  # when others than participants were served last; 0 once the world has waited
         self._view_wall_ns = 0
         self._view_seq = 0
-        self._resumes = False
 
     def run(self) -> None:
         """Run to the end: wait for the participants, integrate, publish the end.
@@ -107,7 +121,7 @@ class WorldProcess:
             RunError: a failure has ended the run; the end has been published before.
         """
         self._inputs = open_inputs(self._link, self._clock.mode == "realtime")
-        self._resume()
+        self._continue()
         self._announce()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
@@ -129,47 +143,53 @@ class WorldProcess:
     def _announce(self) -> None:
         if not self._history.last(keys.INFO):
             self._outputs.publish(Output(keys.INFO, self._world.info()))
-        answered = self._service.answered_keys()
-        for expression in sorted(answered, key=keys.INFO.__eq__):  # who is answered there is answered everywhere
+        answered = [*rights.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries]
+        answered.append(answered.pop(answered.index(keys.INFO)))  # who gets an answer there gets one everywhere
+        for expression in answered:
             self._link.declare_queryable(expression, self._on_query)
         self._tokens.watch()
         self._link.on_token(keys.token("*"), self._on_token)
         self._link.declare_process(WORLD)
 
-    # A world before this one
+    # Continuing the run of a former world
 
-    def _resume(self) -> None:
-        """Go on where the journal ends, once everybody is back."""
-        self._resumes = True
-        resumed = Resumption(self._world, self._journal, self._history, self._intake, self._outputs).run()
-        self._resumes = False
-        if resumed:
-            wall_ns = time.monotonic_ns()
-            self._world.await_return(wall_ns, self._journal.all_died)
-            self._journal.note(Resumed(wall_ns, self._journal.all_died))
+    def _continue(self) -> None:
+        """Apply what is in the journal, without publishing anything again, then wait for all who took part.
+
+        Raises:
+            RunError: the journal is of another run, or its state does not fit the scenario.
+        """
+        checkpoint, world = self._journal.open(), self._world
+        is_continued = isinstance(world, World) and checkpoint is not None
+        if isinstance(world, World):
+            truth = self._journal.truth(checkpoint.truth_bytes) if checkpoint else ()
+            world.keep_truth(self._journal.keep_truth, truth)
+        if checkpoint is not None and checkpoint.state is not None:
+            self._restore(checkpoint.state)
+        if is_continued:
+            for entry in self._journal.entries():
+                entry.apply(self._run)
+                self._outputs.gather()
+            self._outputs.forget()
+        self._run.progress = self._progress
+        self._run.on_done, self._run.on_health = self._admission.done_received, self._liveliness.health_received
+        if is_continued:
+            self._run.enter(Resumed(time.monotonic_ns(), self._journal.all_died))
             self._liveliness.check_all()
-            self._shown("resumed", self._world.now_ns, WORLD)
+            self._progress("resumed", world.now_ns, WORLD)
 
-    def _handle_death(self, name: str, wall_ns: int) -> None:
-        self._world.losses.died(name, wall_ns)
-        if self._world.ended is None:
-            self._journal.note(Died(wall_ns, name))
-
-    def _handle_silence(self, name: str, since_wall_ns: int | None) -> None:
-        self._world.losses.silence_changed(name, since_wall_ns)
-        if self._world.ended is None:
-            self._journal.note(FellSilent(name, since_wall_ns))
-
-    def _check_overdue(self) -> None:
-        losses = self._world.losses
-        if self._world.ended is None and (name := losses.overdue(time.monotonic_ns())):
-            losses.expired(name)
-            self._journal.note(Expired(name))
+    def _restore(self, state: dict[str, Any]) -> None:
+        try:
+            restore(self._world, state["world"])
+            self._history.restore(state["last"])
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            text = f"the checkpoint does not fit this version of zsim ({type(error).__name__}: {error})"
+            raise RunError(f"{text}; fly the run again") from error
 
     def _add_checkpoint(self, wall_ns: int) -> None:
         """Put the state of the run into the journal, now that nothing is pending."""
         if isinstance(self._world, World) and self._journal.is_due(self._world.now_ns, wall_ns):
-            state = {"world": self._world.snapshot(), "last": self._history.last_values()}
+            state = {"world": self._world.checkpoint(), "last": self._history.last_values()}
             self._journal.add_checkpoint(state, self._world.now_ns, wall_ns)
 
     # The loop
@@ -184,7 +204,7 @@ class WorldProcess:
         if self._turn_wall_ns - self._served_wall_ns >= SERVE_NS:
             self._serve_others()
             self._served_wall_ns = self._turn_wall_ns
-        self._intake.recover_lost()
+        recover_lost(self._link, self._run)
         wall_ns = time.monotonic_ns()
         if self._world.ended is None and self._world.may_advance() and not self._pipelining.delays(wall_ns):
             left_ns = self._pacer.due_ns(wall_ns) - wall_ns
@@ -198,7 +218,7 @@ class WorldProcess:
             self._stand_still(wall_ns)
 
     def _go_on_after_standstill(self, stood_ns: int) -> None:
-        """Go on in realtime where time stood still, rather than fly in a burst what the wall clock is ahead by."""
+        """In realtime, restart the pace after a standstill instead of catching up with the wall clock in a burst."""
         if self._clock.mode == "realtime" and self._clock.state == "running":
             self._pacer.restart()
             why = "this process or its machine was stopped, or nothing could be published"
@@ -206,18 +226,25 @@ class WorldProcess:
             seq, data = self._world.outbox.next_seq(keys.EVENT), {"wall_s": stood_ns / 1e9}
             event = run_messages.Event(self._world.now_ns, seq, "standstill", WORLD, WORLD, text, data)
             self._outputs.publish(Output(keys.EVENT, event))
-            self._on_message(keys.EVENT, event)
 
     def _take_in(self) -> None:
         for wall_ns, sample in self._inputs.drain():
-            self._intake.take(wall_ns, sample)
+            key = sample.key
+            if not key.startswith(OWN):  # the world's own health, kept when it was published
+                self._run.enter(Taken(wall_ns, sample))
+                if key.endswith(JOIN):
+                    self._take_join(sample, wall_ns)
+
+    def _take_join(self, sample: ReceivedSample, wall_ns: int) -> None:
+        with suppress(DecodeError):  # refused already
+            join = messages.decode(sample.key, sample.payload)
+            if isinstance(join, run_messages.Join):
+                self._liveliness.before_join(keys.thing(sample.key), join)
+                self._admission.take(keys.thing(sample.key), join, wall_ns)
 
     def _advance(self, wall_ns: int, late_ns: int) -> None:
         late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
-        self._world.statistics.world_misses += late
-        self._world.advance(wall_ns)
-        if self._world.failure is None:
-            self._journal.note(Advanced(wall_ns, late))
+        self._run.enter(Advanced(wall_ns, late))
         self._outputs.gather()
         self._add_checkpoint(wall_ns)
         if not self._pipelining.continues():
@@ -226,53 +253,114 @@ class WorldProcess:
             self._publish_view(wall_ns)
         self.health.step(time.monotonic_ns() - wall_ns)
 
+    def _publish_view(self, wall_ns: int) -> None:
+        if wall_ns - self._view_wall_ns < VIEW_PERIOD_NS:
+            return
+        self._view_wall_ns = wall_ns
+        for key, message in self._world.views(self._view_seq):
+            self._link.put(key, message)
+        self._view_seq += 1
+
     def _stand_still(self, wall_ns: int) -> None:
-        """Publish the clock once a second while time stands still, and wait for whatever comes."""
+        """Publish the clock once a second while time stands still, and wait for an input."""
         self._outputs.flush()
         self._pipelining.pause(wall_ns)
         self._publish_clock(wall_ns, self._world.waiting_for)
-        self._inputs.wait_for(self._required_dones())
+        required: set[str] = set()
+        if self._clock.state == "running" and self._clock.mode != "realtime":
+            required = {keys.process(p.name, "done") for p in self._pipelining.blocking()}
+        self._inputs.wait_for(required)
         self._served_wall_ns = 0
 
     def _publish_clock(self, wall_ns: int, waiting_for: Callable[[int], tuple[run_messages.Waiting, ...]]) -> None:
         """Publish once a second whom the world waits for."""
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
-            clock = self._world.clock_message(waiting_for(wall_ns))
-            self._outputs.publish(Output(keys.CLOCK, clock))
-            self._on_message(keys.CLOCK, clock)
+            self._outputs.publish(Output(keys.CLOCK, self._world.clock_message(waiting_for(wall_ns))))
 
-    def _required_dones(self) -> set[str]:
-        """Return the keys of the dones without which the world cannot go on."""
-        if self._clock.state != "running" or self._clock.mode == "realtime":
-            return set()
-        return {keys.process(p.name, "done") for p in self._pipelining.blocking()}
+    def _on_message(self, key: str, message: Any) -> None:
+        if key == keys.CLOCK:
+            self._clock_wall_ns = time.monotonic_ns()
+            self._run.progress("clock", message, self._run.phase)
+        elif key == keys.EVENT:
+            self._run.progress("event", message, self._run.phase)
 
     def _end(self) -> None:
-        """Publish the end, then wait until nobody has to be waited for any more, BYE_S at most."""
-        self._await_return()
+        """Publish the end, then wait until nobody has to be waited for any more, BYE_S at most.
+
+        A world that was started again after the end of its run first waits for all who have yet to come back.
+        """
+        while self._world.barrier.away() and self._stopped() is None:
+            self._wait_at_end()
+            self._outputs.flush()
+            self._publish_clock(self._turn_wall_ns, self._world.barrier.waiting_for_return)
         self._world.publish_end()
         self._outputs.flush()
         end_ns = self._clock_wall_ns = time.monotonic_ns()
-        while time.monotonic_ns() - end_ns < BYE_S * 1e9 and self._world.is_waiting_to_leave():
+        while time.monotonic_ns() - end_ns < BYE_S * 1e9 and self._world.waiting_to_leave():
             self._wait_at_end()
             self._outputs.put_batch()
             self._publish_clock(self._turn_wall_ns, lambda wall_ns: self._world.waiting_to_leave(wall_ns - end_ns))
         self._outputs.flush()
         self._turn_wall_ns = 0
 
-    def _await_return(self) -> None:
-        """Wait for who has yet to come back to a world that was started again as its run was over."""
-        while self._world.barrier.away() and self._stopped() is None:
-            self._wait_at_end()
-            self._outputs.flush()
-            self._publish_clock(self._turn_wall_ns, self._world.barrier.waiting_for_return)
-
     def _wait_at_end(self) -> None:
-        """Take what comes where time passes no more; a put that does not return is named as before."""
+        """Take inputs although time passes no more; a put that does not return is reported as before."""
         self._inputs.wait(TICK_S)
         self._turn_wall_ns = time.monotonic_ns()
         self._take_in()
         self._serve_others()
+
+    # Queries, losses, health
+
+    def _serve_others(self) -> None:
+        while self._queries:
+            self._serve(self._queries.popleft())
+            self._outputs.flush()
+        self._liveliness.check_due()
+        if self._world.ended is None and (name := self._world.overdue(time.monotonic_ns())):
+            self._run.enter(Expired(name))
+        self._readers.report()
+        self._admission.check_due(time.monotonic_ns())
+        if self.health.due():
+            self._liveliness.count_second()
+            health = self.health.message(self._world.now_ns, self._world.outbox.next_seq(HEALTH))
+            self._outputs.publish(Output(HEALTH, health))
+            self._run.progress("health", health, WORLD)
+
+    def _serve(self, query: Query) -> None:
+        """Answer a query: with last values, a part of the history, or as a request."""
+        expression = query.expression
+        process = keys.thing(expression) if keys.matches(keys.replay("*"), expression) else None
+        if expression in self._world.refused_queries:
+            reason = self._world.refusal_at(expression)
+            if reason is None:  # another process answers it
+                query.end()
+            else:
+                query.answer(ControlAnswer(ok=False, error=reason))
+        elif expression == keys.CONTROL or process is not None:
+            try:
+                answer = self._answer(query.request(), process)
+            except DecodeError as error:
+                answer = ControlAnswer(ok=False, error=str(error))
+            self._journal.commit()
+            query.answer(answer)
+        else:
+            for key, payload in self._history.last(expression):
+                query.reply(key, payload)
+            query.end()
+
+    def _answer(self, request: ControlRequest, process: str | None) -> ControlAnswer:
+        """Answer a request on `world/control`, or of a process on its own key, by which access control knows it."""
+        if request.op == "replay":
+            readable = ("**",)
+            if process is not None and self._link.guarded:
+                readable = rights.of(process, self._world.scenario).reads
+            return self._history.replay(request.args, readable)
+        if process is not None:
+            return ControlAnswer(ok=False, error=f"op is {request.op[:40]!r}; must be replay")
+        answer = self._run.enter(Controlled(request))
+        assert answer is not None
+        return answer
 
     # What other threads bring
 
@@ -286,74 +374,122 @@ class WorldProcess:
             self._inputs.wake()
 
     def _tick(self) -> None:
+        """Wake the loop, and show that a put does not return; `clock` cannot, since it would be stuck as well."""
         watch = TurnWatch(time.monotonic_ns())
         while not self._over.wait(TICK_S):
             self._inputs.wake()
             stuck_s = watch.stuck_s(time.monotonic_ns(), self._turn_wall_ns)
             if stuck_s is not None:
-                self._show_stuck(stuck_s)
-
-    def _show_stuck(self, since_s: float) -> None:
-        """Show that a put does not return; `clock` cannot, since it would have to go the same way."""
-        text = f"nothing can be published for {since_s:.1f} s: {self._readers.stuck()}"
-        event = run_messages.Event(self._world.now_ns, 0, "stuck", WORLD, WORLD, text)
-        self._progress("event", event, self._intake.phase)
-
-    def _serve_others(self) -> None:
-        while self._queries:
-            self._service.serve(self._queries.popleft())
-            self._outputs.flush()
-        self._liveliness.check_due()
-        self._check_overdue()
-        self._readers.report()
-        self._admission.check_due(time.monotonic_ns())
-        if self.health.due():
-            self._liveliness.count_second()
-            self._publish_health()
-
-    # Publication
-
-    def _progress(self, kind: str, message: Any, about: str) -> None:
-        """Show progress, but not once more what a world before this one has shown."""
-        if not self._resumes:
-            self._shown(kind, message, about)
-
-    def _on_message(self, key: str, message: Any) -> None:
-        if key == keys.CLOCK:
-            self._clock_wall_ns = time.monotonic_ns()
-            self._progress("clock", message, self._intake.phase)
-        elif key == keys.EVENT:
-            self._progress("event", message, self._intake.phase)
-
-    def _publish_health(self) -> None:
-        health = self.health.message(self._world.now_ns, self._world.outbox.next_seq(HEALTH))
-        self._outputs.publish(Output(HEALTH, health))
-        self._progress("health", health, WORLD)
-
-    def _publish_view(self, wall_ns: int) -> None:
-        if wall_ns - self._view_wall_ns < VIEW_PERIOD_NS:
-            return
-        self._view_wall_ns = wall_ns
-        for key, message in self._world.views(self._view_seq):
-            self._link.put(key, message)
-        self._view_seq += 1
+                text = f"nothing can be published for {stuck_s:.1f} s: {self._readers.stuck()}"
+                event = run_messages.Event(self._world.now_ns, 0, "stuck", WORLD, WORLD, text)
+                self._run.progress("event", event, self._run.phase)
 
 
-def run(
-    world: Coordinator,
-    endpoints: Sequence[str],
-    stopped: Callable[[], str | None] = lambda: None,
-    progress: ProgressCallback = lambda kind, message, about: None,
-    ready: Callable[[], None] = lambda: None,
-    identity: Identity | None = None,
-    journal: RunJournal | None = None,
-) -> None:
-    """Listen on the endpoints, call `ready`, and run the world to its end, from where its journal ends.
+class Pacer:
+    """Computes when gates are due by the wall clock.
 
-    Raises:
-        SessionError: an endpoint is taken, or the identity is of no use.
+    Args:
+        clock: of the run, with the rate to pace at.
     """
-    mode: Mode = "lockstep" if world.clock.mode == "lockstep" else "realtime"
-    with connection.listen(endpoints, world.scenario.federation, mode, identity) as link:
-        ready()
-        WorldProcess(link, world, stopped, progress, journal).run()
+
+    def __init__(self, clock: RunClock) -> None:
+        self._clock = clock
+        self._pace = (0.0, 0)  # rate, and jumps of time before it; its start by either clock:
+        self._start_wall_ns = 0
+        self._start_sim_ns = 0
+
+    def due_ns(self, wall_ns: int) -> int:
+        """Return the wall time of the next gate; the pace restarts when the rate changes or time stood still."""
+        clock = self._clock
+        if clock.rate <= 0 or clock.state != "running":
+            self._pace = (0.0, 0)
+            return wall_ns
+        if self._pace != (clock.rate, clock.jumps):
+            self._pace = (clock.rate, clock.jumps)
+            self._start_wall_ns, self._start_sim_ns = wall_ns, clock.next_ns
+        due_ns = self._start_wall_ns + round((clock.next_ns - self._start_sim_ns) / clock.rate)
+        if clock.mode == "lockstep" and wall_ns - due_ns > STOOD_STILL_NS:
+            self.restart()
+        return due_ns
+
+    def restart(self) -> None:
+        """Restart the pace with the next gate, which is due at once."""
+        self._pace = (0.0, 0)
+
+
+class Pipelining:
+    """Decides when to delay a gate so that several come at once: each process then wakes up less often.
+
+    Where agents may lag several gates behind, time is delayed until the slowest agent has nearly caught up; then gates
+    follow one another until its done is required again. No agent idles meanwhile: the first of these gates comes while
+    agents still work on the last ones before it.
+
+    Args:
+        world: in lockstep, as fast as it can; any other is never delayed.
+    """
+
+    def __init__(self, world: Coordinator) -> None:
+        self._world = world
+        self._clock = world.clock
+        self._continues = True
+        self._delayed_wall_ns = 0
+        self._gates = 0
+        self._ahead_ns = max(0, self._clock.delay_ns - LAG_GATES * self._clock.gate_ns)
+
+    @property
+    def _enabled(self) -> bool:
+        """Tell whether agents may lag, and no wall clock paces the gates."""
+        return self._ahead_ns > 0 and self._clock.mode == "lockstep" and self._clock.rate <= 0
+
+    def delays(self, wall_ns: int) -> bool:
+        """Tell whether to wait although the next gate may come."""
+        if self._continues or not self._enabled:
+            return False
+        late = wall_ns - self._delayed_wall_ns > DELAY_MAX_NS
+        self._continues = late or not self._world.blocking(self._ahead_ns)
+        return not self._continues
+
+    def continues(self) -> bool:
+        """Tell, after a gate, whether the next one comes at once, so that both can be sent together."""
+        self._gates = (self._gates + 1) % GATES_SENT
+        return self._gates > 0 and self._continues and self._enabled and self._world.may_advance()
+
+    def pause(self, wall_ns: int) -> None:
+        """Note that the next gate may not come yet."""
+        if self._continues:
+            self._continues, self._delayed_wall_ns = False, wall_ns
+
+    def blocking(self) -> list[Participant]:
+        """Return the participants that block the clock, or else those that delay it."""
+        return self._world.blocking() or self._world.blocking(self._ahead_ns)
+
+
+class TurnWatch:
+    """Tells a turn of the loop that does not end (a put that does not return) from a process that was stopped.
+
+    It is asked on a thread of its own, which a put does not block.
+
+    Args:
+        now_ns: monotonic wall time.
+    """
+
+    def __init__(self, now_ns: int) -> None:
+        self._looked_ns = now_ns
+        self._stopped_until_ns = 0
+        self._reported_ns = 0
+
+    def stuck_s(self, now_ns: int, turn_ns: int) -> float | None:
+        """Return for how long a turn has been stuck, once every STUCK_NS; None where there is nothing to report.
+
+        Args:
+            now_ns: monotonic wall time.
+            turn_ns: when the turn began, 0 when there is none.
+        """
+        if now_ns - self._looked_ns > STOPPED_NS:
+            self._stopped_until_ns = now_ns
+        self._looked_ns = now_ns
+        since_ns = max(turn_ns, self._stopped_until_ns)
+        if not turn_ns or now_ns - max(since_ns, self._reported_ns) <= STUCK_NS:
+            return None
+        self._reported_ns = now_ns
+        return (now_ns - since_ns) / 1e9

@@ -1,1 +1,1 @@
-"""The firmware of the aircraft: what it believes, decides and drives. Imports sensors, physics, state."""
+"""The firmware of the aircraft: its state estimate, decisions and motor commands. Imports sensors and physics."""

@@ -13,6 +13,7 @@ The gains follow from the rotors' lag and the design of `zsim.vehicles.vehicle.F
 import math
 from typing import NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState
@@ -20,12 +21,151 @@ from zsim.math import rotation as rot
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
-from zsim.vehicles.vehicle import ROTORS_MAX
-from zsim_world.physics.rigid_body import four, vector
-from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor, of, put_of
-from zsim_world.vehicles.attitude_control import DRIVE, clipped
-from zsim_world.vehicles.firmware_settings import SETTING
+from zsim.scenario.scenario import Drone
+from zsim.vehicles.vehicle import ROTORS_MAX, Firmware, Vehicle
+from zsim_world.physics.fleet_arrays import ROTOR, VEHICLE, PerRotor, Row, of, put_of
+from zsim_world.physics.rigid_body import four, mix, vector
 from zsim_world.vehicles.observer import BELIEF, FLOOR_MIN_M, STEP_S, STILL_STEPS_MIN, lift, standing_height
+
+DRIVE = columns(  # what the loops of attitude and rate need of the firmware's settings, by which these begin
+    "DriveColumns",
+    (
+        Field("k_rate", "1/s"),
+        Field("k_tilt", "1/s"),
+        Field("overdrive", "1"),  # part of the way to a command beyond it
+        Field("slope", "1"),  # tan of the largest tilt
+        Field("yaw_share", "1"),
+        Field("body_rate", "rad/s"),  # largest, wanted of the tilt loop
+    ),
+)
+Gains = tuple[float, float, float, float, float, float]
+
+
+def loop_gains(design: Firmware, rotor_lag_s: float) -> tuple[float, float, float]:
+    """Return the gains of rate, tilt and velocity loop [1/s] for a lag of the rotors."""
+    rate = design.rate_per_lag / max(design.lag_lead * rotor_lag_s, design.lag_min_s)
+    return rate, rate / design.loop_ratio, rate / design.loop_ratio**2
+
+
+def lag_shares(design: Firmware, rotor_lag_s: float) -> tuple[float, float]:
+    """Return the fraction of a rotor's lag left after a step, and the overdrive that shortens that lag."""
+    decay = math.exp(-STEP_S / rotor_lag_s)
+    return decay, (1.0 - math.exp(-STEP_S / (design.lag_lead * rotor_lag_s))) / (1.0 - decay)
+
+
+@inlined
+def drive(
+    row: Row,
+    rotors: PerRotor,
+    gains: Gains,
+    own: Quaternion,
+    q_WB: Quaternion,
+    w_WB_B: Vector,
+    speeds: PerRotor,
+    z_des: Vector,
+    thrust_n: float,
+    yaw_rate: float,
+    commands: PerRotor,
+) -> None:
+    """Set rotor commands for a wanted direction of z_B (heading frame), thrust [N] and yaw rate [rad/s].
+
+    Without a branch, so that several drones go at once (simd_firmware.py).
+
+    Args:
+        row, rotors: parameters; gains: its settings in DRIVE.
+        own: the heading frame in W; q_WB, w_WB_B, speeds: attitude, body rate and rotor speeds believed.
+        commands: [rad/s], to be set.
+    """
+    k_rate, k_tilt, overdrive, slope, yaw_share, body_rate_max = gains
+    q_HB = rot.level(own, q_WB)
+    z_B = rot.rotate_back(q_HB, limited_tilt(z_des, slope))
+    up_B = rot.rotate_back(q_HB, (0.0, 0.0, yaw_rate))
+    w, wx, wy = w_WB_B, -k_tilt * z_B[1], k_tilt * z_B[0]
+    size = math.sqrt(wx * wx + wy * wy)
+    s = 1.0 if size <= body_rate_max else body_rate_max / size
+    ix, iy, iz = vector(row, VEHICLE.inertia)
+    moment = (
+        ix * k_rate * (s * wx + up_B[0] - w[0]) + (iz - iy) * w[1] * w[2],
+        iy * k_rate * (s * wy + up_B[1] - w[1]) + (ix - iz) * w[2] * w[0],
+        iz * k_rate * yaw_share * (up_B[2] - w[2]) + (iy - ix) * w[0] * w[1],
+    )
+    mix(row, rotors, thrust_n, moment, commands)
+    for r in range(len(rotors.each)):  # under these commands the rotors reach what is wanted with a part of their lag
+        speed = of(speeds, 0, r)
+        put_of(commands, r, clipped(rotors, r, speed + overdrive * (of(commands, 0, r) - speed)))
+
+
+@inlined
+def clipped(rotors: PerRotor, r: int, speed: float) -> float:
+    """Return a speed [rad/s] of rotor r within its limits."""
+    return min(max(speed, of(rotors, ROTOR.low, r)), of(rotors, ROTOR.high, r))
+
+
+@inlined
+def limited_tilt(z: Vector, slope: float) -> Vector:
+    """Return the unit vector along z, no farther from the vertical than the tilt of this tangent."""
+    across = math.sqrt(z[0] * z[0] + z[1] * z[1])
+    most = max(z[2], 1e-3) * slope
+    s = 1.0 if across <= most else most / across
+    z = (s * z[0], s * z[1], max(z[2], 1e-3))
+    return axpy((0.0, 0.0, 0.0), 1.0 / rot.norm(z), z)
+
+
+SETTING = columns(  # limits of what a commander may ask, and the design of vehicle.Firmware
+    "SettingColumns",
+    (
+        Field("drive", "DRIVE", DRIVE.size),
+        Field("rotor_decay", "1"),  # left of the rotors' lag after a step
+        Field("k_velocity", "1/s"),
+        Field("k_climb", "1/s"),
+        Field("speed", "m/s"),
+        Field("climb", "m/s"),
+        Field("yaw_rate", "rad/s"),
+        Field("altitude", "m"),
+        Field("takeoff_height", "m"),
+        Field("k_hold", "1/s"),
+        Field("k_height", "1/s"),
+        Field("brake", "s"),
+        Field("tilt_cut", "1"),
+        Field("lift_min", "1"),
+        Field("spin_up", "s"),
+        Field("ascent", "m/s"),
+        Field("ascent_max", "s"),
+        Field("arrived", "m"),
+        Field("arrived_speed", "m/s"),
+        Field("descent", "m/s"),
+        Field("descent_far", "1/s"),
+        Field("flare", "m"),
+        Field("touch_share", "1"),
+        Field("touch_speed", "m/s"),
+        Field("touch", "s"),
+        Field("low_battery", "%"),
+    ),
+)
+
+
+def settings(vehicle: Vehicle, drone: Drone) -> NDArray[np.float64]:
+    """Return limits and loop gains of one drone, shape (SETTING.size,)."""
+    limits, design, row = drone.limits, vehicle.firmware, np.empty(SETTING.size)
+    k_rate, k_tilt, row[SETTING.k_velocity] = loop_gains(design, drone.rotor_time_constant_s)
+    row[SETTING.rotor_decay], overdrive = lag_shares(design, drone.rotor_time_constant_s)
+    slope = math.tan(math.radians(limits.tilt_deg))
+    drive = (k_rate, k_tilt, overdrive, slope, design.yaw_share, design.body_rate_max_rad_s)
+    row[SETTING.drive : SETTING.drive + DRIVE.size] = drive
+    row[SETTING.k_climb] = design.climb_share * k_rate
+    row[SETTING.speed], row[SETTING.climb] = limits.horizontal_speed_m_s, limits.vertical_speed_m_s
+    row[SETTING.yaw_rate], row[SETTING.altitude] = math.radians(limits.yaw_rate_deg_s), limits.altitude_m
+    row[SETTING.takeoff_height] = min(drone.takeoff_height_m, limits.altitude_m)
+    row[SETTING.k_hold], row[SETTING.k_height], row[SETTING.brake] = design.hold_1_s, design.height_1_s, design.brake_s
+    row[SETTING.tilt_cut], row[SETTING.lift_min] = design.tilt_cut_cosine, design.lift_share_min
+    row[SETTING.spin_up], row[SETTING.ascent] = design.spin_up_s, design.takeoff_m_s
+    row[SETTING.ascent_max], row[SETTING.arrived] = design.takeoff_s_max, design.arrived_m
+    row[SETTING.arrived_speed], row[SETTING.descent] = design.arrived_m_s, design.descent_m_s
+    row[SETTING.descent_far], row[SETTING.flare] = design.descent_far_1_s, design.flare_m
+    row[SETTING.touch_share], row[SETTING.touch_speed] = design.touch_share, design.touch_m_s
+    row[SETTING.touch], row[SETTING.low_battery] = design.touch_s, design.low_battery_percent
+    return row
+
 
 LANDED, TAKING_OFF, HOVERING, FLYING, LANDING, EMERGENCY = range(6)
 MODES: tuple[DroneState, ...] = ("landed", "taking_off", "hovering", "flying", "landing", "emergency")
@@ -52,7 +192,7 @@ RISING, HOLDING = 1.0, 2.0
 
 
 class Decision(NamedTuple):
-    """What the firmware has decided on for the next 5 ms."""
+    """The firmware's decision for the next 5 ms."""
 
     driven: bool  # True: the drive is to find the command from the last three; False: it is set
     z_H: Vector  # along the body's z wanted, in the heading frame
@@ -78,7 +218,7 @@ def decide(
     land_s: float,
     charge_percent: float,
 ) -> Decision:
-    """Decide what the rotors are to do in the next 5 ms: set commands [rad/s], or return what they are to give.
+    """Decide on the rotors of the next 5 ms: set commands [rad/s], or return the thrust and attitude wanted.
 
     Args:
         commands: of the rotors, set where the drive need not find them.
@@ -152,7 +292,7 @@ def _change_mode(
 
 @inlined
 def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
-    """Return the mode in the air that a setpoint of this kind and the commander's silence ask for."""
+    """Return the mode in the air for this kind of setpoint and the commander's silence."""
     if kind == NONE:
         return HOVERING
     if silence_s >= hover_s + land_s:
@@ -181,7 +321,7 @@ def _fly(
     setting: NDArray,
     setpoint: NDArray,
 ) -> Decision:
-    """Decide what the rotors are to do in the air, or on the way there."""
+    """Decide on the rotors in the air, or on the way there."""
     kind = int(setpoint[SETPOINT.kind])
     if mode == FLYING and kind == ROTORS:
         for r in range(len(rotors.each)):
@@ -257,7 +397,7 @@ def _asked_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: NDAr
 
 @inlined
 def _held(memory: NDArray, belief: NDArray, own: Quaternion, setting: NDArray, v_des: Vector) -> Vector:
-    """Return the v_des with the horizontal velocity that holds the place of the own odometry."""
+    """Return v_des with the horizontal velocity that holds the position of the odometry."""
     v_W = rot.rotate(own, vector(belief, BELIEF.v_H))
     for k in range(2):
         if memory[MEMORY.holds_xy] == 0.0:
@@ -296,7 +436,7 @@ def _climb(
 
 @inlined
 def _ascent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
-    """Return the vertical velocity of a take-off [m/s]: along a height that rises evenly."""
+    """Return the vertical velocity of a take-off [m/s], following a height that rises evenly."""
     height, standing = belief[BELIEF.height], standing_height(belief, row)
     final = min(setting[SETTING.takeoff_height] + (standing - row[VEHICLE.stand_height]), setting[SETTING.altitude])
     if memory[MEMORY.holds_z] == 0.0:

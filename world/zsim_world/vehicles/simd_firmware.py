@@ -11,8 +11,19 @@ from numpy.typing import NDArray
 from zsim.math import rotation as rot
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import apart, inlined
-from zsim_world.physics.rigid_body import four, put, put_four, vector
-from zsim_world.physics.rotors import charge_percent
+from zsim_world.physics.fleet_arrays import (
+    CLOCK,
+    ROTOR,
+    SPAN,
+    VEHICLE,
+    Boards,
+    Bodies,
+    KernelTime,
+    PerRotor,
+    of,
+    put_of,
+)
+from zsim_world.physics.rigid_body import charge_percent, four, put, put_four, vector
 from zsim_world.physics.simd import (
     LANES,
     blocks,
@@ -23,10 +34,8 @@ from zsim_world.physics.simd import (
     put_lane_four,
     put_lane_vector,
 )
-from zsim_world.state.fleet_arrays import CLOCK, ROTOR, SPAN, VEHICLE, Boards, Bodies, KernelTime, PerRotor, of, put_of
-from zsim_world.vehicles import attitude_control, firmware, observer
-from zsim_world.vehicles.attitude_control import DRIVE
-from zsim_world.vehicles.firmware_settings import SETTING
+from zsim_world.vehicles import firmware, observer
+from zsim_world.vehicles.firmware import DRIVE, SETTING
 from zsim_world.vehicles.observer import BELIEF, DEVICE
 
 BOARD_LANES = columns(
@@ -182,7 +191,7 @@ def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
         rotors, speeds = _rotors(lanes, BOARD_ROTORS.known, k, each), _rotors(lanes, BOARD_ROTORS.speed, k, each)
         commands, wanted = _rotors(lanes, BOARD_ROTORS.command, k, each), _rotors(lanes, BOARD_ROTORS.drive, k, each)
         row = lane_row(lanes, k)
-        attitude_control.drive(row, rotors, gains, own, attitude, rate, speeds, z, thrust, yaw_rate, wanted)
+        firmware.drive(row, rotors, gains, own, attitude, rate, speeds, z, thrust, yaw_rate, wanted)
         driven = lanes[LANES * BOARD_LANES.driven + k] > 0.0
         for r in range(len(each)):
             put_of(commands, r, of(wanted, 0, r) if driven else of(commands, 0, r))

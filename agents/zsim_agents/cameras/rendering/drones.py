@@ -1,6 +1,6 @@
 """The drones in one camera's picture: hulls, arms, motors, rotors as their blades sweep, and hats. Pure.
 
-They look like the console's (zsim_bridges.console.scene.airframe); lengths are the AR.Drone's, scaled by the arms.
+They look like the console's (zsim_bridges.console.airframe); lengths are the AR.Drone's, scaled by the arms.
 All drones of a picture are computed together.
 """
 

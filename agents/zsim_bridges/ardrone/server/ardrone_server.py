@@ -10,13 +10,12 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError, without_figures
 from zsim.extras import install_command
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges.ardrone.server.addresses import AllowedHosts, drone_addresses
 from zsim_bridges.ardrone.server.drone_server import DroneServer
-from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.picture_intake import PictureIntake
-from zsim_bridges.traffic_intake import TrafficIntake
+from zsim_bridges.intake import PictureIntake, TrafficIntake
 from zsim_bridges.vehicle_links import onboard_state
 from zsim_bridges.vehicle_links.run_pace import set_pace
 
@@ -40,7 +39,7 @@ class ArdroneOptions(NamedTuple):
 
 
 def serve(
-    link: Session, info: Info, observer: ObserverProcess, stopped: Callable[[], bool], say: Say, options: ArdroneOptions
+    link: Session, info: Info, observer: Participant, stopped: Callable[[], bool], say: Say, options: ArdroneOptions
 ) -> None:
     """Serve one run until it is over.
 
@@ -63,7 +62,7 @@ def serve(
 class ArdroneServer:
     """One run's drones."""
 
-    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: ArdroneOptions) -> None:
+    def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: ArdroneOptions) -> None:
         self._link = link
         self._info = info
         self._observer = observer

@@ -13,9 +13,11 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event
 from zsim.errors import DecodeError, RunError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone
 from zsim.transport.session import Session
+from zsim_bridges.intake import TrafficIntake
 from zsim_bridges.mavlink.autopilot.enums import COMPONENT_AUTOPILOT
 from zsim_bridges.mavlink.autopilot.personality import PERSONALITIES
 from zsim_bridges.mavlink.serve.peers import Address
@@ -24,8 +26,6 @@ from zsim_bridges.mavlink.telemetry.telemetry import Level
 from zsim_bridges.mavlink.vehicle.mavlink_vehicle import MavlinkVehicle, Options
 from zsim_bridges.mavlink.wire.frame import Link, Received, Version
 from zsim_bridges.mavlink.wire.signing import Signing
-from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.traffic_intake import TrafficIntake
 from zsim_bridges.vehicle_links.command_sender import CommandSender
 from zsim_bridges.vehicle_links.run_pace import set_pace
 
@@ -68,7 +68,7 @@ class MavlinkOptions(NamedTuple):
 def serve(
     link: Session,
     info: Info,
-    observer: ObserverProcess,
+    observer: Participant,
     stopped: Callable[[], bool],
     say: Say,
     options: MavlinkOptions,
@@ -102,7 +102,7 @@ class Served(NamedTuple):
 class MavlinkServer:
     """One run on UDP."""
 
-    def __init__(self, link: Session, info: Info, observer: ObserverProcess, say: Say, options: MavlinkOptions) -> None:
+    def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: MavlinkOptions) -> None:
         self._link = link
         self._info = info
         self._observer = observer

@@ -1,6 +1,6 @@
 """Who a vehicle talks with: the configured peers, and programs on this machine that speak to it."""
 
-from zsim_bridges.web.loopback import is_loopback
+from zsim_bridges.web import is_loopback
 
 LEARNT_MAX = 8  # programs at once, on one port
 SILENT_S = 30.0  # wall time after which one that learnt nothing new is forgotten

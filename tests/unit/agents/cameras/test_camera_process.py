@@ -10,11 +10,11 @@ from synthetic_pictures import jpeg
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Truth
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim_agents.cameras.camera_process import PENDING_MAX, CameraProcess, TruthHistory, standing
 from zsim_agents.cameras.rendering.renderer import Renderer
-from zsim_bridges.observer_process import ObserverProcess
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 SCENARIO = scenario_file.from_text("""
 name: three
@@ -50,7 +50,7 @@ class Drawing:
         link: Any = self.link
         info = World(SCENARIO, run_id="r").info()
         self.process = CameraProcess(
-            link, info, ObserverProcess(link, info, "camera.main", slack_ns=GATE_NS), SCENARIO, DRONES
+            link, info, Participant(link, info, "camera.main", slack_ns=GATE_NS), SCENARIO, DRONES
         )
         self.process.begin()
 

@@ -13,10 +13,10 @@ from synthetic_pictures import NO_JPEG, WIDTH_PX, image, info, jpeg
 from zsim.contract import keys
 from zsim.contract.camera_messages import Sightings
 from zsim.contract.messages import Info, Origin
+from zsim.runtime.participant import Participant
 from zsim_agents.cameras import detector_process
 from zsim_agents.cameras.detector import PIXELS_MAX
 from zsim_agents.cameras.detector_process import REPORTS_MAX, DetectorProcess
-from zsim_bridges.observer_process import ObserverProcess
 
 INFO = Info(0, 0, 1, "r", "zsim", "lockstep", 0.0, 1, 1, 1, 1, Origin(0.0, 0.0, 0.0), (), (), "", "", "", "")
 FRONT, FRONT_INFO = keys.camera("d1", "front"), keys.camera_info("d1", "front")
@@ -30,7 +30,7 @@ class Detecting:
     def __init__(self, drones: Sequence[str] = ("d1",)) -> None:
         self.link, self.said = FakeLink(), []
         link: Any = self.link
-        self.presence = ObserverProcess(link, INFO, "detector.d1")
+        self.presence = Participant(link, INFO, "detector.d1")
         self._process = DetectorProcess(link, self.presence, self.said.append, drones, HATS.diameter_m)
         self._process.begin()
 

@@ -12,7 +12,7 @@ import pytest
 from zsim.contract import keys
 from zsim.contract.flight_messages import Estimate, Status
 from zsim.contract.messages import Baro, DroneInfo, Gps, Imu, Info, Mag, Origin
-from zsim.runtime.routing import Input
+from zsim.runtime.inbox import Input
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.estimator import Estimator

@@ -19,7 +19,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.estimation.estimator_bank import EstimatorBank
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 END_S = 8.0  # s, of a flight that starts at 2 s
 ASIDE = {"mount": {"position_m": [0.1, -0.05, 0.04], "rpy_deg": [10.0, -20.0, 160.0]}}

@@ -17,7 +17,7 @@ from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
 from zsim_analysis.reading.recorded_run import AgentProcess, RecordedAgents, gates, recorded_agents
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 PRINT = "f" * 16

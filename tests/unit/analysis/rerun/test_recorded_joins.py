@@ -10,7 +10,7 @@ from zsim.record import Recorded
 from zsim.scenario import scenario_file
 from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents
 from zsim_analysis.rerun_bus import RerunBus
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 VISITOR = "tester.one"

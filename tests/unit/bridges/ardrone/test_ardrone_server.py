@@ -8,9 +8,9 @@ from fake_link import FakeLink
 from zsim.contract import keys
 from zsim.contract.messages import DroneInfo, Info, Origin
 from zsim.extras import install_command
+from zsim.runtime.participant import Participant
 from zsim_bridges.ardrone.server import ardrone_server
 from zsim_bridges.ardrone.server.ardrone_server import ArdroneOptions, ArdroneServer
-from zsim_bridges.observer_process import ObserverProcess
 
 SCENARIO = "{name: one, duration_s: 10, drones: [{name: drone1, position_m: [0, 0, 0]}]}"
 DRONES = (DroneInfo("drone1", "ardrone2"),)
@@ -24,7 +24,7 @@ def test_pictures_are_asked_for_where_they_can_be_encoded_else_the_extra_is_name
     link: Any = FakeLink()
     origin = Origin(0.0, 0.0, 0.0)
     info = Info(0, 0, 1, "r", "zsim", "lockstep", 1.0, 1, 1, 1, 1, origin, DRONES, (), SCENARIO, "", "", "")
-    observer, lines = ObserverProcess(link, info, "ardrone.main"), []
+    observer, lines = Participant(link, info, "ardrone.main"), []
     server = ArdroneServer(link, info, observer, lines.append, ArdroneOptions("127.0.0.2", frozenset(), None))
     assert list(server._wanted_pictures()) == []  # nobody is connected
     watcher: Any = object()
@@ -41,7 +41,7 @@ def test_a_reason_is_printed_once_whatever_its_figures_and_all_are_counted():
     link: Any = FakeLink()
     origin = Origin(0.0, 0.0, 0.0)
     info = Info(0, 0, 1, "r", "zsim", "lockstep", 1.0, 1, 1, 1, 1, origin, DRONES, (), SCENARIO, "", "", "")
-    observer, lines = ObserverProcess(link, info, "ardrone.main"), []
+    observer, lines = Participant(link, info, "ardrone.main"), []
     server = ArdroneServer(link, info, observer, lines.append, ArdroneOptions("127.0.0.2", frozenset(), None))
     for size in range(40):
         for drone in ("drone1", "drone2"):

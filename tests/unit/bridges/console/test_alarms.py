@@ -7,16 +7,17 @@ from refused import has_terms, without_tags
 
 from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import ViewCluster
+from zsim_bridges.console import alarms
+from zsim_bridges.console.alarms import KEPT, Alarm, AlarmBoard, DroneCondition, FaultWatch, Losses
 from zsim_bridges.console.console_tables import preflight_lines
-from zsim_bridges.console.monitoring import alarms
-from zsim_bridges.console.monitoring.alarms import Alarm, AlarmBoard, DroneCondition, Losses
-from zsim_bridges.console.monitoring.fault_watch import KEPT, FaultWatch
-from zsim_bridges.console.monitoring.preflight import Check, preflight_checks, takeoff_refusal
-from zsim_bridges.console.monitoring.run_condition import (
+from zsim_bridges.console.run_condition import (
+    Check,
     RunCondition,
     drone_refusals,
     fleet_refusals,
     formation_refusals,
+    preflight_checks,
+    takeoff_refusal,
 )
 
 DEAD, LOW = Alarm("red", "estimator.drone1", "dead"), Alarm("amber", "drone1", "battery", "17 %")
@@ -159,7 +160,9 @@ def test_an_engaged_formation_with_a_drone_flown_by_hand_is_an_alarm_with_its_fi
 
 def test_an_alarm_of_a_fault_has_its_magnitudes_as_the_terminal_writes_them():
     fault = Fault(1, "link_loss", "world/a", {"probability": 0.3, "one_way": False, "place": {}}, 0)
-    assert alarms.fault_alarms([fault]) == [Alarm("amber", "world/a", "link_loss", "probability=0.3 one_way=False")]
+    assert alarms.run_alarms({}, [fault], 0.0) == [
+        Alarm("amber", "world/a", "link_loss", "probability=0.3 one_way=False")
+    ]
 
 
 # Before a take-off

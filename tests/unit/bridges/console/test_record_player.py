@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from zsim_bridges.console.monitoring.run_condition import RunCondition
-from zsim_bridges.console.record_player import RecordPlayer
+from zsim_bridges.console.run_condition import RunCondition
+from zsim_bridges.console.time_monitor import RecordPlayer
 
 TIMELINE = {"from_s": 0.0, "to_s": 9.0, "marks": []}
 

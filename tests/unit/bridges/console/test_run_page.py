@@ -18,17 +18,15 @@ from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
+from zsim_bridges.console import scene as stages
 from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.monitoring.run_condition import drone_refusals
-from zsim_bridges.console.monitoring.time_monitor import TimeMonitor
 from zsim_bridges.console.orders import OrderRequest
-from zsim_bridges.console.run_page import RunPage
-from zsim_bridges.console.scene import scene_nodes as stages
-from zsim_bridges.console.scene.camera_follow import CameraFollow
-from zsim_bridges.console.scene.camera_frustums import CameraFrustums
-from zsim_bridges.console.scene.picture import drone_poses
-from zsim_bridges.console.scene.picture_rate import picture_rate_hz
-from zsim_bridges.console.server.private_viser import PrivateViser
+from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.picture import drone_poses
+from zsim_bridges.console.private_viser import PrivateViser
+from zsim_bridges.console.run_condition import drone_refusals
+from zsim_bridges.console.run_page import RunPage, picture_rate_hz
+from zsim_bridges.console.time_monitor import TimeMonitor
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
 SCENARIO = scenario_file.load(STEP)
@@ -265,7 +263,7 @@ def test_what_the_world_refuses_of_the_console_s_commands_is_shown_in_the_corner
         event = Event(0, 0, "refused", source, subject, f"{subject}: {reason}", {"reason": reason})
         seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
     assert shown == [(f"Refused: {subject}", reason)]
-    assert [event.kind for event in seen.show.views.events] == ["refused", "refused"]
+    assert [event.kind for event in seen.show.views.log.newest] == ["refused", "refused"]
 
 
 def test_a_world_that_is_gone_is_told_on_the_page(seen: Seen, monkeypatch: pytest.MonkeyPatch):
@@ -407,10 +405,10 @@ def test_no_take_off_of_a_drone_that_is_empty_or_on_its_back(
 
 def test_accepted_and_done_are_told_apart(seen: Seen):
     seen.show._on_outcome(RequestOutcome("main: engage", "", CLUSTER, "engage"))
-    kinds = [event.kind for event in seen.show.views.events]
+    kinds = [event.kind for event in seen.show.views.log.newest]
     assert kinds == ["accepted"]
     seen.draw(drones(*NAMES), cluster())
-    kinds = [event.kind for event in seen.show.views.events]
+    kinds = [event.kind for event in seen.show.views.log.newest]
     assert kinds == ["done", "accepted"]
 
 
@@ -451,7 +449,7 @@ def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_ever
         RequestOutcome("main", "not yet"),
     ):
         seen.show._on_outcome(outcome)
-    found = [(event.kind, event.text) for event in seen.show.views.events]
+    found = [(event.kind, event.text) for event in seen.show.views.log.newest]
     assert [kind for kind, _ in found] == ["refused", "accepted"]
     assert found[0][1] == "main: not yet"
     assert has_terms(found[1][1], "main", "takeoff")

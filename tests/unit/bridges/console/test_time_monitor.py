@@ -12,14 +12,13 @@ from zsim.contract.flight_messages import LinkState
 from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health, Waiting
 from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
+from zsim.runtime.participant import Participant
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_tables import TableRows
-from zsim_bridges.console.monitoring.page_head import page_head
-from zsim_bridges.console.monitoring.run_condition import RunCondition
-from zsim_bridges.console.monitoring.time_monitor import BEAT_S, SILENT_S, TimeMonitor
-from zsim_bridges.console.monitoring.view_buffer import ReceivedEstimate, ViewBuffer
-from zsim_bridges.console.run_state import console_state
-from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.console.run_condition import RunCondition, page_head
+from zsim_bridges.console.run_page import console_state
+from zsim_bridges.console.time_monitor import BEAT_S, SILENT_S, TimeMonitor
+from zsim_bridges.console.view_buffer import ReceivedEstimate, ViewBuffer
 
 S = 1_000_000_000  # ns
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -67,7 +66,7 @@ class MonitoredRun:
         info: Any = SimpleNamespace(
             run_id="r1", drones=[DroneInfo(names[0], ""), DroneInfo(names[1], "", body="external")]
         )
-        self.observer = ObserverProcess(self.link, info, "console.1")
+        self.observer = Participant(self.link, info, "console.1")
         self.monitor = TimeMonitor(self.link, self.observer, stamp_age_s, lambda: self.wall_s)
         self.views = ViewBuffer(self.link, info, self.observer, {}, self.refused.append, lambda: self.wall_s)
         self.words = TableRows(self.views, {})
@@ -246,10 +245,10 @@ def test_a_dead_estimator_is_not_shown_as_a_healthy_one():
         monitored.words.sensor_table("drone1")
         monitored.wall_s += 1.0
     assert "5 Hz" in monitored.words.sensor_table("drone1")
-    assert monitored.words.drone_rows()[0].lag_ms == 0.0
+    assert monitored.words.drone_rows()[0].drone.lag_ms == 0.0
     monitored.wall_s += 8.0
     monitored.deliver(drones(10 * S))
-    assert monitored.words.drone_rows()[0].lag_ms == 8000.0
+    assert monitored.words.drone_rows()[0].drone.lag_ms == 8000.0
     shown = monitored.words.sensor_table("drone1")
     assert has_terms(without_tags(shown), "no estimate", "2.0 s")
     assert "Hz" not in shown
@@ -263,7 +262,7 @@ def test_in_a_fast_run_a_view_may_be_seconds_older_than_another():
     monitored.wall_s += 0.05
     monitored.deliver(drones(9 * S))
     assert monitored.views.estimates()["drone1"].fresh
-    assert monitored.words.drone_rows()[0].lag_ms == 0.0
+    assert monitored.words.drone_rows()[0].drone.lag_ms == 0.0
 
 
 def test_in_a_slow_run_a_view_may_be_seconds_old():
@@ -291,7 +290,7 @@ def test_of_two_estimators_of_one_drone_the_later_is_shown(order: tuple[int, int
     )
     assert monitored.views.estimates()["drone1"].process == "estimator.new"
     assert monitored.words.drone_rows()[0].gps == "2 / 0"
-    assert monitored.words.drone_rows()[0].lag_ms == 3.0
+    assert monitored.words.drone_rows()[0].drone.lag_ms == 3.0
     assert "<td align=left>2</td>" in monitored.words.sensor_table("drone1")
 
 

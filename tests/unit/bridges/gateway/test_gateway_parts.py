@@ -18,9 +18,10 @@ from zsim.contract.flight_messages import Status, Velocity
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
+from zsim.runtime.rate_limit import RateLimit
 from zsim.transport.session import RawSample
 from zsim_bridges.gateway import publications, stream_requests
-from zsim_bridges.gateway.access_check import ConnectionLimit, TokenBucket
+from zsim_bridges.gateway.access_check import ConnectionLimit, count_request
 from zsim_bridges.gateway.client_messages import (
     MessageDefaults,
     TooManyError,
@@ -270,13 +271,13 @@ def test_no_bytes_are_more_than_refused(line: bytes):
 
 def test_a_bucket_lets_a_burst_through_and_then_its_rate():
     now = [0.0]
-    bucket = TokenBucket(10.0, 3.0, lambda: now[0])
+    limit = RateLimit(0.1, 3.0, lambda: now[0])
     for _ in range(3):
-        bucket.spend()
+        count_request(limit)
     with pytest.raises(TooManyError, match=r"0\.100 s"):
-        bucket.spend()
+        count_request(limit)
     now[0] = 0.1
-    bucket.spend()
+    count_request(limit)
 
 
 def test_a_limit_lets_so_many_in():
@@ -306,7 +307,7 @@ class FakeGateway:
 def test_a_client_that_floods_is_slowed_down_and_told():
     async def flood() -> list[bytes]:
         outbox = Outbox(pytest.fail, lambda lost: b"")
-        client = Client(FakeGateway(), outbox, "client.a", True, TokenBucket(1.0, 3.0, lambda: 0.0))  # type: ignore[arg-type]
+        client = Client(FakeGateway(), outbox, "client.a", True, RateLimit(1.0, 3.0, lambda: 0.0))  # type: ignore[arg-type]
         for _ in range(4):
             await client.handle_line(b'{"op": "hello"}')
         return await outbox.take()
@@ -319,7 +320,7 @@ def test_a_client_that_floods_is_slowed_down_and_told():
 def test_a_fault_of_ours_is_an_answer_and_a_line_for_a_person():
     async def ask(gateway: FakeGateway) -> list[bytes]:
         outbox = Outbox(pytest.fail, lambda lost: b"")
-        client = Client(gateway, outbox, "client.a", True, TokenBucket(1.0, 3.0, lambda: 0.0))  # type: ignore[arg-type]
+        client = Client(gateway, outbox, "client.a", True, RateLimit(1.0, 3.0, lambda: 0.0))  # type: ignore[arg-type]
         await client.handle_line(b'{"op": "subscribe", "key": "a"}')  # this gateway has no feed
         return await outbox.take()
 

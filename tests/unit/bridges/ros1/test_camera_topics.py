@@ -10,10 +10,10 @@ from ros1_drone import GATE_NS, Drone, Subscriber, scenario, status
 from synthetic_pictures import AHEAD, FRONT_P_BK, NO_JPEG, image, info, jpeg
 
 from zsim.contract import keys, messages
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import RawSample
-from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.picture_intake import WAITING_MAX, PictureIntake
+from zsim_bridges.intake import WAITING_MAX, PictureIntake
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.ros1_bridge import Ros1Bridge
 
@@ -101,7 +101,7 @@ def test_a_camera_is_read_while_somebody_subscribes(topic: str, wanted: list[str
 
 
 @pytest.fixture
-def bridged() -> tuple[Ros1Bridge, ObserverProcess]:
+def bridged() -> tuple[Ros1Bridge, Participant]:
     """A bridge without a graph, and its process."""
     text = scenario_file.to_text(scenario())
     about: Any = messages.Info(
@@ -109,7 +109,7 @@ def bridged() -> tuple[Ros1Bridge, ObserverProcess]:
         (messages.DroneInfo("quad-1", "ardrone2"),), (), text, "", "", "",
     )  # fmt: skip
     link: Any = FakeLink()
-    observer = ObserverProcess(link, about, "ros1.main")
+    observer = Participant(link, about, "ros1.main")
     node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", print)
     return Ros1Bridge(link, about, observer, node, print), observer
 
@@ -153,7 +153,7 @@ def test_a_loop_that_is_busy_gets_the_newest() -> None:
 
 @pytest.mark.parametrize("payload", [b"\xc1", messages.encode(image(0, 0, NO_JPEG))])
 def test_what_is_no_picture_is_counted_and_not_published(
-    bridged: tuple[Ros1Bridge, ObserverProcess], payload: bytes
+    bridged: tuple[Ros1Bridge, Participant], payload: bytes
 ) -> None:
     bridge, observer = bridged
     subscriber = Subscriber(bridge._node, OWN.format("front", IMAGE))
@@ -164,7 +164,7 @@ def test_what_is_no_picture_is_counted_and_not_published(
     assert len(subscriber.ros_messages) == 1
 
 
-def test_the_bridge_reads_what_nodes_subscribe_to(bridged: tuple[Ros1Bridge, ObserverProcess]) -> None:
+def test_the_bridge_reads_what_nodes_subscribe_to(bridged: tuple[Ros1Bridge, Participant]) -> None:
     bridge, _ = bridged
     assert list(bridge._wanted_pictures()) == []
     Subscriber(bridge._node, OWN.format("bottom", INFO))

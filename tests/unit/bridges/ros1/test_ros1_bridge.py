@@ -12,14 +12,13 @@ from zsim.contract import flight_messages, keys, messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.errors import RunError, SessionError
 from zsim.runtime.health import HealthMeter
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import ReceivedSample
-from zsim_bridges import traffic_intake
-from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.intake import TrafficIntake
 from zsim_bridges.ros1 import tcpros
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.ros1_bridge import Ros1Bridge, check_names
-from zsim_bridges.traffic_intake import TrafficIntake
 
 LEVEL, ZERO, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 
@@ -94,7 +93,7 @@ def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next
         0, 0, 1, "run", "zsim", "lockstep", 0.0, GATE_NS, 5_000_000, GATE_NS, 1, messages.Origin(0.0, 0.0, 0.0),
         (messages.DroneInfo("quad-1", "ardrone2"),), (), scenario_file.to_text(scenario()), "", "", "",
     )  # fmt: skip
-    observer = ObserverProcess(cast(Any, FakeLink()), info, "ros1.main")
+    observer = Participant(cast(Any, FakeLink()), info, "ros1.main")
     node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", command.append)
     bridge = Ros1Bridge(cast(Any, FakeLink()), info, observer, node, command.append)
     navdata = Subscriber(node, "/quad_1/ardrone/navdata")
@@ -142,7 +141,7 @@ class Link:
 
 
 def test_who_is_too_slow_goes_on_with_the_newest_gates(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(traffic_intake, "BACKLOG", 3)
+    monkeypatch.setattr("zsim_bridges.intake.BACKLOG", 3)
     info: Any = type(
         "Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "own_sensors": (), "sightings": False}
     )()

@@ -14,10 +14,10 @@ from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
 from zsim.contract.run_messages import ControlAnswer
 from zsim.math.frames import rotate
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport.session import RawSample, ReceivedSample
 from zsim.transport.zenoh_settings import Mode
-from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh
 from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, RosContext
 from zsim_bridges.ros2.ros2_bridge import Ros2Bridge
@@ -136,7 +136,7 @@ class Bench:
         )  # fmt: skip
         self.link: Any = Link()
         self.lines: list[str] = []
-        self.observer = ObserverProcess(self.link, self.info, "ros2.main")
+        self.observer = Participant(self.link, self.info, "ros2.main")
         self.bridge = Ros2Bridge(self.link, self.info, self.observer, self.lines.append, wall_ns)
         self.bridge.advertise_run(RosContext(self.link, 0, TYPES, wall_ns, self.bridge.count_refused))
 

@@ -13,8 +13,8 @@ from zsim.contract import flight_messages, keys, messages
 from zsim.contract.messages import DroneInfo, Info, Origin
 from zsim.contract.run_messages import Clock, Event
 from zsim.errors import RunError
+from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
-from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.vehicle_links import aircraft_socket, driver_process
 from zsim_bridges.vehicle_links.aircraft_socket import AircraftSocket
 from zsim_bridges.vehicle_links.aircraft_state import AircraftPose, AircraftState, Reading
@@ -109,7 +109,7 @@ class Flight:
     async def __aenter__(self) -> "Flight":
         loop = asyncio.get_running_loop()
         self._transport, self.aircraft = await loop.create_datagram_endpoint(Aircraft, local_addr=("127.0.0.1", 0))
-        observer = ObserverProcess(self.link, info(), ME)  # type: ignore[arg-type]
+        observer = Participant(self.link, info(), ME)  # type: ignore[arg-type]
         observer.announce()
         options = DriverOptions("drone2", armed=self.armed)
         link: Any = self.link
@@ -255,7 +255,7 @@ def test_an_aircraft_that_does_not_show_itself_is_reported_once_with_the_reason(
 
     async def test() -> None:
         link, lines = FakeLink(), []
-        observer = ObserverProcess(link, info(), ME)  # type: ignore[arg-type]
+        observer = Participant(link, info(), ME)  # type: ignore[arg-type]
         stopped = iter([False] * 30)
         args: Any = link, info(), observer, DriverOptions("drone2"), Session(9), lines.append
         await DriverProcess(*args).run(lambda: next(stopped, True))
@@ -290,7 +290,7 @@ def test_a_socket_that_cannot_be_had_is_refused_with_what_to_change(monkeypatch:
         session = Session(9)
         session.channels = (UdpChannel("127.0.0.1" if taken else "nowhere.invalid", 9, port),)
         link = FakeLink()
-        observer = ObserverProcess(link, info(), ME)  # type: ignore[arg-type]
+        observer = Participant(link, info(), ME)  # type: ignore[arg-type]
         args: Any = link, info(), observer, DriverOptions("drone2"), session, print
         with pytest.raises(RunError, match=f"{port}.*--local-port" if taken else "nowhere.invalid.*address"):
             await DriverProcess(*args).run(lambda: True)
@@ -304,7 +304,7 @@ def test_a_driver_whose_place_another_has_taken_does_not_land_the_aircraft():
         async with Flight(armed=True) as flight:
             flight.aircraft.state = "flying"
             await flight.aircraft.until("hold")
-            data = {"incarnation": 7, "host": flight.link.host, "pid": 1}
+            data = {"incarnation": 7, "host": flight.link.host, "pid": 1, "from_ns": 0}
             flight.link.deliver(keys.EVENT, Event(0, 0, "superseded", ME, ME, "", data))
             await asyncio.wait_for(flight.task, 30)
             assert flight.aircraft.demands[-1] == "hold"

@@ -7,7 +7,7 @@ from typing import Any
 
 from aiohttp import ClientSession, web
 
-from zsim_bridges.web.http_connections import BODY_BYTES_MAX, SMALL_BYTES, HttpConnections
+from zsim_bridges.web.web_server import BODY_BYTES_MAX, SMALL_BYTES, HttpConnections
 
 HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\n"  # the head never ends
 WHOLE = HALF + b"\r\n"

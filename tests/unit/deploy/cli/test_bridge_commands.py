@@ -48,7 +48,7 @@ def test_a_console_gives_way_to_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     served: list[tuple[int, int]] = []
     monkeypatch.setattr(os, "nice", lambda more: own[0] + more)
     monkeypatch.setattr(os, "sched_setscheduler", lambda *_: served.append((-1, -1)))
-    monkeypatch.setattr("zsim_deploy.roles.priority.lower_priority", lambda *_, **__: served.append((-1, -1)))
+    monkeypatch.setattr("zsim_deploy.roles.stop_channel.lower_priority", lambda *_, **__: served.append((-1, -1)))
     monkeypatch.setattr(
         "zsim_deploy.roles.roles.serve_runs", lambda *_, **__: served.append((os.nice(0), os.sched_getscheduler(0)))
     )

@@ -1,8 +1,10 @@
-"""The private key that a launcher lends: it goes with the process, and not with the one before it."""
+"""How a process is stopped, the private key that a launcher lends it, and its priority."""
 
+import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ from refused import has_terms
 
 from zsim.transport.tls import Identity
 from zsim_deploy.roles.closed_output import CLOSED
-from zsim_deploy.roles.stop_channel import REASONS, KeyLease, key_lease
+from zsim_deploy.roles.stop_channel import NICE, REASONS, KeyLease, interruptible, key_lease
 
 ROLE = """
 import os, sys, time
@@ -126,3 +128,54 @@ def test_a_closed_terminal_ends_a_process_in_order(
         for number in numbers:
             process.send_signal(number)
         assert process.wait(60.0) == 7
+
+
+# Signals that end a command
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_interrupts(number: signal.Signals) -> None:
+    former = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        signal.raise_signal(number)
+    assert signal.getsignal(number) is former
+
+
+def test_what_a_library_makes_of_it_is_an_interrupt_still() -> None:
+    def lose() -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise SystemError("returned NULL without setting an exception")
+
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        lose()
+
+
+def test_other_errors_are_what_they_are() -> None:
+    with pytest.raises(SystemError), interruptible():
+        raise SystemError("returned NULL without setting an exception")
+
+
+# Which processes give way, where Linux shares processors between sessions too
+
+
+AUTOGROUP = Path("/proc/self/autogroup")
+NICEST = 19  # of what Linux knows
+PROGRAM = """
+import os
+from pathlib import Path
+from zsim_deploy.roles.stop_channel import lower_priority
+lower_priority()
+print(os.nice(0), Path("/proc/self/autogroup").read_text().split()[-1])
+"""
+
+
+@pytest.mark.skipif(not AUTOGROUP.exists(), reason="sessions are not scheduled as groups by this kernel")
+@pytest.mark.parametrize("leads", [True, False])
+def test_a_process_that_leads_its_session_lowers_all_of_it(leads: bool) -> None:
+    """As a role of a run does; in a terminal, where the session is the shell's, the shell keeps its place."""
+    start = [sys.executable, "-c", PROGRAM]
+    shell = [] if leads else ["sh", "-c", '"$@"; exit $?', "sh"]
+    done = subprocess.run([*shell, *start], capture_output=True, text=True, check=True, start_new_session=True)
+    own = min(NICEST, os.nice(0) + NICE)
+    assert done.stdout.split() == [str(own), str(NICE if leads else 0)]

@@ -1,5 +1,7 @@
 """What `zsim push` compiles on a host: what its roles run, and no more."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from zsim_deploy.roles import warm_up
@@ -19,12 +21,13 @@ def test_what_the_roles_of_a_host_run_is_compiled(
     monkeypatch: pytest.MonkeyPatch, extras: tuple[str, ...], built: list[str]
 ) -> None:
     done: list[str] = []
-    monkeypatch.setattr(warm_up, "_build_world", lambda: done.append("world"))
-    monkeypatch.setattr(warm_up, "_rehearse_agents", lambda: done.append("agents"))
+    monkeypatch.setattr("zsim_world.run.world.World", lambda *_: done.append("world"))
+    group = SimpleNamespace(rehearse=lambda: done.append("agents"))
+    monkeypatch.setattr("zsim_agents.hosting.hosted", lambda *_: group)
     warm_up.main(extras)
     assert done == built
 
 
 def test_agents_of_every_kind_rehearse_without_a_world(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr("zsim_world.flight.world.World")
+    monkeypatch.delattr("zsim_world.run.world.World")
     warm_up.main(["agents"])

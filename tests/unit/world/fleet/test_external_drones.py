@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from continued import continue_from
 from refused import has_terms
 
 from zsim.contract import keys
@@ -199,8 +200,8 @@ def test_another_takes_over_what_the_drivers_have_published(fleet: Fleet, drones
     advance(fleet, drones, 3)
     other = fleet_of("simulated", "external")
     successor = ExternalDrones(other)
-    other.restore(fleet.snapshot())
-    successor.restore(drones.snapshot())
+    continue_from(fleet, other)
+    continue_from(drones, successor)
     for each, led in ((fleet, drones), (other, successor)):
         advance(each, led, 5)
     np.testing.assert_array_equal(fleet.bodies.state, other.bodies.state)

@@ -3,13 +3,14 @@
 from typing import Any, Literal
 
 import pytest
+from continued import continue_from
 
 from zsim.contract import flight_messages, keys
 from zsim.contract.run_messages import Event
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.flight.world import World
-from zsim_world.state.fleet_arrays import STATE
+from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.run.world import World
 
 
 def scenario(count: int = 2, drone: Any = None, **top: Any):
@@ -144,7 +145,7 @@ def test_a_drone_whose_commander_falls_silent_lands_and_says_why():
 def test_the_watch_goes_on_from_its_snapshot():
     fleet, other = airborne(), Fleet(scenario())
     fleet.emergency(0)
-    other.restore(fleet.snapshot())
+    continue_from(fleet, other)
     assert incidents_of(other, 1.0) == incidents_of(fleet, 1.0) != []
 
 

@@ -11,7 +11,7 @@ from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.air import JET_WIDTHS, downwash
 from zsim_world.physics.contacts import hull_force, meet_drones
-from zsim_world.state.fleet_arrays import STATE, VEHICLE, NearPairs, PerRotor
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, NearPairs, PerRotor
 
 RADIUS = ARDRONE2.airframe.hull_radius_m
 

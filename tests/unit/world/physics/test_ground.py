@@ -9,8 +9,8 @@ from vehicle_rows import one_drone
 from zsim.math.frames import quaternion_from_rpy, rpy_from_quaternion
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.physics import rigid_body as body
-from zsim_world.physics.ground import contact, drag_anchors
-from zsim_world.state.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.surfaces import contact, drag_anchors
 
 OFF, CALM = np.zeros(4), (0.0, 0.0, 0.0)
 DT = 0.0025

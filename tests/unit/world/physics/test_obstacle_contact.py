@@ -14,8 +14,8 @@ from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.crazyflie2 import VEHICLE as CRAZYFLIE2
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.physics.obstacle_contact import Touch, touched
-from zsim_world.state.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.surfaces import Touch, touched
 
 FRAME = ARDRONE2.airframe
 ROOF_M = 1.0

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from vehicle_rows import one_drone
 
 from zsim_world.physics import rigid_body as body
-from zsim_world.state.fleet_arrays import STATE, VEHICLE
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE
 
 OFF = (0.0, 0.0, 0.0, 0.0)
 ROTORS = one_drone()[1]

@@ -1,19 +1,33 @@
 """Rotors and mixer: speeds for a wanted wrench, limits, and what is given up first."""
 
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from vehicle_rows import one_drone, per_rotor
 
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
-from zsim.vehicles.vehicle_catalogue import vehicle_of
-from zsim_world.physics import rotors
-from zsim_world.physics.rotors import ground_effect, lagged
-from zsim_world.state.fleet_arrays import VEHICLE, PerRotor, rotor_row, rotor_slots, vehicle_row
+from zsim.vehicles.vehicle import Rotor, Vehicle
+from zsim.vehicles.vehicle_catalogue import STOCK, vehicle_of
+from zsim_world.physics import rigid_body
+from zsim_world.physics.fleet_arrays import (
+    CROSS_ROTORS,
+    ROTOR,
+    VEHICLE,
+    PerRotor,
+    mixed,
+    of,
+    place,
+    rotor_row,
+    rotor_slots,
+    vehicle_row,
+)
+from zsim_world.physics.rigid_body import ground_effect, lagged
 
 LEVEL, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 HIGH = 1000.0  # m, out of ground effect
@@ -28,12 +42,12 @@ def row():
 def wrench(row, q_WB, height_m, w_WB_B, speeds, slew=(0.0, 0.0, 0.0, 0.0)):
     """Return thrust and moment of rotors at these speeds that change by so much [rad/s^2]."""
     commands = np.array(speeds) + row[VEHICLE.rotor_lag] * np.array(slew)
-    return rotors.wrench(row, ROTORS, q_WB, height_m, w_WB_B, per_rotor(speeds), per_rotor(commands), None)
+    return rigid_body.wrench(row, ROTORS, q_WB, height_m, w_WB_B, per_rotor(speeds), per_rotor(commands), None)
 
 
 def mix(row, thrust_n, moment):
     speeds = per_rotor([0.0] * 4)
-    rotors.mix(row, ROTORS, thrust_n, moment, speeds)
+    rigid_body.mix(row, ROTORS, thrust_n, moment, speeds)
     return tuple(speeds.numbers)
 
 
@@ -122,13 +136,72 @@ def test_off_the_centre_the_mixer_keeps_the_limits_and_the_direction_of_the_tilt
     row = vehicle_row(vehicle, drone, scenario.environment)
     known = PerRotor(rotor_row(vehicle, drone, slots), 0, 1, tuple(range(slots)))
     speeds = per_rotor([0.0] * slots)
-    rotors.mix(row, known, thrust, asked, speeds)
+    rigid_body.mix(row, known, thrust, asked, speeds)
     low, high = row[VEHICLE.rotor_min], row[VEHICLE.rotor_max]
     flown = speeds.numbers[:4]
     speeds.numbers[4:] = 0.0  # a slot without a rotor, whose command is clipped to nothing
     assert all(low - 1e-9 <= speed <= high + 1e-9 for speed in flown)
-    total, moment = rotors.wrench(row, known, LEVEL, HIGH, STILL, speeds, speeds, None)
+    total, moment = rigid_body.wrench(row, known, LEVEL, HIGH, STILL, speeds, speeds, None)
     assert abs(moment[0] * asked[1] - moment[1] * asked[0]) < 1e-4  # its direction kept
     if 8.0 < thrust < 16.0 and max(map(abs, asked)) < 0.1:
         assert math.isclose(total, thrust, rel_tol=1e-4)
         np.testing.assert_allclose(moment[:2], asked[:2], atol=1e-4)
+
+
+def plus() -> Vehicle:
+    """Return a vehicle with rotors ahead, on the right, behind and on the left."""
+    ends: tuple[tuple[str, float, float, Literal[-1, 1]], ...] = (
+        ("ahead", 1.0, 0.0, 1), ("right", 0.0, -1.0, -1), ("behind", -1.0, 0.0, 1), ("left", 0.0, 1.0, -1)
+    )  # fmt: skip
+    vehicle = STOCK["ardrone2"]
+    arm_m = vehicle.arm_m
+    rotors = tuple(Rotor(name=name, x_m=arm_m * x, y_m=arm_m * y, turn=turn) for name, x, y, turn in ends)
+    return replace(vehicle, rotors=rotors)
+
+
+@pytest.mark.parametrize("model", STOCK)
+def test_the_constants_are_those_of_the_stock_vehicles(model: str):
+    _, rotors = one_drone(model=model)
+    assert len(rotors.each) == CROSS_ROTORS
+    for r in rotors.each:
+        assert place(rotors, r) == tuple(of(rotors, group, r) for group in (ROTOR.x, ROTOR.y, ROTOR.turn))
+        groups = (ROTOR.roll, ROTOR.pitch, ROTOR.yaw, ROTOR.yaw_inverse)
+        assert mixed(rotors, r) == tuple(of(rotors, group, r) for group in groups)
+
+
+def test_other_vehicles_have_places_of_their_own():
+    stock = list(STOCK.values())
+    assert rotor_slots(stock) == CROSS_ROTORS
+    assert rotor_slots([*stock, plus()]) == CROSS_ROTORS + 1
+    assert rotor_slots([*stock, vehicle_of("hexacopter")]) == 6
+    _, rotors = one_drone(model="hexacopter")
+    assert np.array(place(rotors, 0)).tolist() == [of(rotors, group, 0) for group in (ROTOR.x, ROTOR.y, ROTOR.turn)]
+
+
+def hover(row):
+    speed = math.sqrt(row[VEHICLE.mass] * row[VEHICLE.gravity] / (4 * row[VEHICLE.thrust]))
+    return per_rotor([speed] * 4)
+
+
+def test_a_full_battery_hovers_for_twelve_minutes(row):
+    minutes = row[VEHICLE.capacity] / rigid_body.power(row, hover(row)) / 60.0
+    assert abs(minutes - 12.0) < 0.2
+
+
+def test_power_is_torque_times_speed_over_efficiency_and_the_board(row):
+    speeds = (200.0, 300.0, 400.0, 500.0)
+    shaft = sum(row[VEHICLE.torque] * s**2 * s for s in speeds)
+    assert math.isclose(
+        rigid_body.power(row, per_rotor(speeds)),
+        shaft / ARDRONE2.battery.efficiency + ARDRONE2.battery.electronics_w,
+        rel_tol=1e-12,
+    )
+
+
+def test_energy_is_drained_and_ends_at_zero(row):
+    full = row[VEHICLE.capacity]
+    assert math.isclose(full, 1.0 * 3600 * 11.1, rel_tol=1e-12)  # 1 Ah at 11.1 V
+    left = rigid_body.drained(row, full, per_rotor([0.0] * 4), 100.0)
+    assert math.isclose(left, full - 100.0 * ARDRONE2.battery.electronics_w, rel_tol=1e-12)
+    assert rigid_body.drained(row, 1.0, hover(row), 1.0) == 0.0
+    np.testing.assert_allclose(rigid_body.charge_percent(row, full / 4), 25.0)

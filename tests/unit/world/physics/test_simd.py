@@ -10,9 +10,9 @@ from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics import simd
-from zsim_world.physics.ground import drag_anchors
+from zsim_world.physics.fleet_arrays import STATE, PerRotor
 from zsim_world.physics.rigid_body import four, put, vector
-from zsim_world.state.fleet_arrays import STATE, PerRotor
+from zsim_world.physics.surfaces import drag_anchors
 
 DT = 0.0025  # s
 COUNT = 11  # a whole block and a part of one

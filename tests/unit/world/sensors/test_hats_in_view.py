@@ -11,15 +11,16 @@ from zsim.scenario.obstacle import COLUMNS, row_of
 from zsim.scenario.scenario import Obstacle
 from zsim.sensors.camera import FrontCamera
 from zsim.sensors.camera_model import camera_pose, lens_of
-from zsim_world.sensors.hats_in_view import POINTS, POSE, VIEW, MountedCamera, hats_in_view
+from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.sensors.hats_in_view import POINTS, VIEW, MountedCamera, hats_in_view
 
 HAT_B, DIAMETER_M, HULL_M = (-0.03, 0.0, 0.11), 0.14, 0.26
 LENS_B = (0.162, 0.0, 0.012)  # of the front camera
 
 
 def pose(x: float, y: float, z: float, rpy_deg: tuple[float, float, float] = (0, 0, 0)) -> NDArray[np.float64]:
-    row = np.zeros(POSE.size)
-    row[:3], row[POSE.q_WB : POSE.q_WB + 4] = (x, y, z), quaternion_from_rpy(np.radians(rpy_deg))
+    row = np.zeros(STATE.size)
+    row[:3], row[STATE.q_WB : STATE.q_WB + 4] = (x, y, z), quaternion_from_rpy(np.radians(rpy_deg))
     return row
 
 
@@ -135,8 +136,8 @@ def test_an_obstacle_in_between_hides_it(obstacle: Obstacle, y: float, seen: int
 def test_it_moves_over_the_picture_as_the_drones_move_and_turn():
     watcher, other = pose(0, 0, 5), pose(4, 0, 5)
     away = 4 + HAT_B[0] - LENS_B[0]
-    other[POSE.v_WB + 1] = 2.0
+    other[STATE.v_WB + 1] = 2.0
     assert look([watcher, other])[1, VIEW.rate] == pytest.approx(2.0 / away, rel=0.01)
-    watcher[POSE.w_WB_B + 2] = 0.5
-    watcher[POSE.v_WB : POSE.v_WB + 3] = other[POSE.v_WB : POSE.v_WB + 3]
+    watcher[STATE.w_WB_B + 2] = 0.5
+    watcher[STATE.v_WB : STATE.v_WB + 3] = other[STATE.v_WB : STATE.v_WB + 3]
     assert look([watcher, other])[1, VIEW.rate] == pytest.approx(0.5 * (1 + LENS_B[0] / away), rel=0.01)

@@ -7,8 +7,19 @@ import numpy as np
 import pytest
 
 from zsim.math.frames import quaternion_from_rpy
-from zsim_world.sensors.equations import BodyTruth, MountedSensor, Site, baro, flow, gps, imu, mag, pressure, sonar
-from zsim_world.sensors.reading import rounded
+from zsim_world.sensors.equations import (
+    BodyTruth,
+    MountedSensor,
+    Site,
+    baro,
+    flow,
+    gps,
+    imu,
+    mag,
+    pressure,
+    rounded,
+    sonar,
+)
 
 NOWHERE, STILL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 STRAIGHT = (1.0, 0.0, 0.0, 0.0)

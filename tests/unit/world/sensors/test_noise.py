@@ -4,10 +4,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from zsim.math.compiled import kernel
 from zsim.math.random_streams import stream
 from zsim.scenario.scenario_file import resolve
-from zsim_world.sensors.noise import NoiseTable
+from zsim_world.sensors.noise import WORDS, NoiseTable, fill, words
 from zsim_world.sensors.sensor_set import CHANNELS, SENSORS
 
 IMU = 0
@@ -39,3 +41,25 @@ def test_all_drones_share_one_wind():
     rng.standard_normal(3)  # the gust at the start
     at = table.at[len(SENSORS)]
     np.testing.assert_array_equal(table.table[-1, at:], rng.standard_normal(table.table.shape[1] - at))
+
+
+@kernel(makes_arrays=False)
+def drawn(out: NDArray, stream: NDArray) -> None:
+    fill(out, stream)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_million_numbers_are_numpys(seed: int):
+    """About 270 of them are from the tail, and 12 000 from the layers' edges."""
+    rng = np.random.default_rng(seed)
+    stream, out = np.array(words(rng), dtype=np.uint64), np.zeros(1_000_000)
+    drawn(out, stream)
+    np.testing.assert_array_equal(out, rng.standard_normal(len(out)))
+    assert np.abs(out).max() > 3.66
+    assert stream.tolist() == words(rng)
+
+
+def test_another_generator_is_refused():
+    assert len(words(np.random.default_rng(0))) == WORDS.size
+    with pytest.raises(ValueError, match="MT19937"):
+        words(np.random.Generator(np.random.MT19937(0)))

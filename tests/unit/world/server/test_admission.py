@@ -5,10 +5,13 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.contract.run_messages import ControlRequest, Done, Event, Join
+from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
-from zsim.transport.session_tokens import SessionTokens
-from zsim_world.flight.budgets import STRANGERS_MAX
-from zsim_world.flight.world import World
+from zsim.scenario.rights import WORLD
+from zsim.transport.link_watch import SessionTokens
+from zsim_world.run.inputs import Run
+from zsim_world.run.outbox import STRANGERS_MAX
+from zsim_world.run.world import World
 from zsim_world.server.admission import DONE_NS, HELD_NS, LOOK_NS, SHOWN_NS, TOKEN_NS, WITHHELD_MAX, Admission
 
 GATE_NS = 20_000_000
@@ -31,7 +34,8 @@ class Case:
         self.world = World(scenario_file.from_text(SCENARIO), mode, run_id="run1")
         tokens = SessionTokens(self.link)  # type: ignore[arg-type]
         tokens.watch()
-        self.admission = Admission(tokens, self.world, trusts)
+        run = Run(self.world, HealthMeter(WORLD))
+        self.admission = Admission(tokens, run, trusts)
         self.wall_ns = TOKEN_NS
         self._dones = 0
 
@@ -150,7 +154,7 @@ def test_a_program_without_such_a_token_takes_over_with_its_first_done(case: Cas
 def test_or_as_soon_as_the_one_that_lives_is_not_there(case: Case, how: str) -> None:
     case.join(ME, pid=8, incarnation=2)
     if how == "silent":
-        case.world.losses.silence_changed(ME, case.wall_ns)
+        case.world.silence_changed(ME, case.wall_ns)
         case.passes(LOOK_NS)
     else:
         case.advance()
@@ -165,7 +169,7 @@ def test_the_same_process_rejoins_without_another_token(case: Case) -> None:
 
 @pytest.mark.parametrize("session", ["b", ""])
 def test_nobody_restarts_the_dead_without_a_token(case: Case, session: str) -> None:
-    case.world.losses.died(ME, case.wall_ns)
+    case.world.died(ME, case.wall_ns)
     case.show(ME, "a", alive=False)
     case.join(ME, pid=8, incarnation=2)
     case.passes(TOKEN_NS)

@@ -1,10 +1,11 @@
 """When gates are delayed, so that several come at once, and when they are not."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
 
-from zsim_world.server.pacing import DELAY_MAX_NS, GATES_SENT, LAG_GATES, Pipelining
+from zsim_world.server.world_process import DELAY_MAX_NS, GATES_SENT, LAG_GATES, Pipelining, TurnWatch
 
 GATE_NS = 20_000_000
 
@@ -84,3 +85,27 @@ def test_messages_are_sent_every_few_gates_and_when_the_next_may_not_come() -> N
         world.now += 1
         sent.append(not pipelining.continues())
     assert sent == [(gate + 1) % GATES_SENT == 0 or gate == len(sent) - 1 for gate in range(len(sent))]
+
+
+TICK_MS = 100
+
+
+def looks(watch: TurnWatch, at_ms: Iterable[int], turn_ms: int) -> list[tuple[int, float]]:
+    """Return when something was named, and for how long it had lasted."""
+    found = [(ms, watch.stuck_s(ms * 1_000_000, turn_ms * 1_000_000)) for ms in at_ms]
+    return [(ms, stuck_s) for ms, stuck_s in found if stuck_s is not None]
+
+
+def test_a_turn_that_does_not_end_is_named_every_two_seconds() -> None:
+    named = looks(TurnWatch(0), range(TICK_MS, 5_000, TICK_MS), turn_ms=100)
+    assert named == [(2_200, 2.1), (4_300, 4.2)]
+
+
+def test_no_turn_is_not_stuck() -> None:
+    assert looks(TurnWatch(0), range(TICK_MS, 5_000, TICK_MS), turn_ms=0) == []
+
+
+def test_a_process_that_stood_was_not_stuck() -> None:
+    watch = TurnWatch(0)
+    assert looks(watch, [100, 12_100, 12_200], turn_ms=50) == []
+    assert looks(watch, range(12_300, 14_300, TICK_MS), turn_ms=50) == [(14_200, 2.1)]

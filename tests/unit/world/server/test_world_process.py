@@ -18,7 +18,7 @@ from zsim.runtime.health import HealthMeter
 from zsim.scenario import rights, scenario_file
 from zsim.schema.message import Message
 from zsim_world.fleet.fleet import DivergedError
-from zsim_world.flight.world import DURATION_OVER, World
+from zsim_world.run.world import DURATION_OVER, World
 from zsim_world.server.world_process import WorldProcess
 
 GATE_NS = 20_000_000
@@ -320,13 +320,13 @@ def test_the_end_waits_for_a_recorder_that_died_where_it_comes_back(action: str,
     made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "tester", "here", 2, GATE_NS), 0)
     made.publish_end()
     made.handle(keys.process(ME, "bye"), run_messages.Bye(0, 0, "over"), 0)
-    assert made.is_waiting_to_leave()
-    made.losses.died("recorder", 0)
-    assert made.is_waiting_to_leave() is waits
+    assert made.waiting_to_leave()
+    made.died("recorder", 0)
+    assert bool(made.waiting_to_leave()) is waits
     made.handle(keys.process("recorder", "join"), Join(0, 1, "run1", 2, "recorder", "here", 3, 0, slack_ns=GATE_NS), 0)
-    assert made.is_waiting_to_leave()
+    assert made.waiting_to_leave()
     made.handle(keys.process("recorder", "bye"), run_messages.Bye(0, 0, "over"), 0)
-    assert not made.is_waiting_to_leave()
+    assert not made.waiting_to_leave()
 
 
 def test_the_end_names_whom_it_waits_for():

@@ -7,10 +7,10 @@ import numpy as np
 from zsim.math import rotation
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
+from zsim_world.physics.fleet_arrays import ROTOR, VEHICLE, PerRotor
 from zsim_world.physics.simd import LANES
-from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor
-from zsim_world.vehicles import attitude_control, observer
-from zsim_world.vehicles.attitude_control import DRIVE
+from zsim_world.vehicles import firmware, observer
+from zsim_world.vehicles.firmware import DRIVE
 from zsim_world.vehicles.observer import BELIEF
 from zsim_world.vehicles.simd_firmware import BOARD_LANES, BOARD_ROTORS
 
@@ -78,7 +78,7 @@ def test_a_block_turns_and_drives_with_the_bits_of_each_drone():
                 rotors_of(lanes, i, group, size) for group, size in ((0, ROTOR.size), (BOARD_ROTORS.speed, 1))
             )
             commands = PerRotor(np.zeros(4), 0, 1, (0, 1, 2, 3))
-            attitude_control.drive(row, known, gains, own, believed, rate, speeds, z, thrust, yaw_rate, commands)
+            firmware.drive(row, known, gains, own, believed, rate, speeds, z, thrust, yaw_rate, commands)
             assert tuple(rotors_of(lanes, i, BOARD_ROTORS.command, 1).numbers) == tuple(commands.numbers)
     assert driven == 60 * (COUNT - 2)
     np.testing.assert_array_equal(rotors_of(lanes, 2, BOARD_ROTORS.command, 1).numbers, fleet.bodies.command[2])

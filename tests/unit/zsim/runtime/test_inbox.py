@@ -1,8 +1,13 @@
-"""The inbox: whatever the order of arrival, an agent gets the same gates with the same inputs in the same order."""
+"""The inbox: whatever the order of arrival, an agent gets the same gates with the same inputs in the same order.
+
+The routing table says which reader reads which key.
+"""
 
 import random
 from typing import Any
 
+import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -10,8 +15,8 @@ from zsim.contract import keys, messages
 from zsim.contract.camera_messages import Sightings
 from zsim.contract.flight_messages import Estimate, Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import Baro, Imu
-from zsim.runtime.inbox import GAP_MAX, Inbox
+from zsim.contract.messages import Baro, Imu, encode
+from zsim.runtime.inbox import GAP_MAX, GateRouter, Inbox, RoutingTable
 
 GATE_NS = 20_000_000
 STEP_NS = 5_000_000
@@ -363,7 +368,7 @@ def test_who_comes_at_every_gate_is_waited_for():
     inbox = sparse_inbox(3)
     put_all(inbox, closed_by("d1", 3))
     assert inbox.missing(3 * GATE_NS) in SPARSE
-    assert inbox.missing_last(3 * GATE_NS) in SPARSE
+    assert inbox.last_missing() in SPARSE
     put_all(inbox, closed_by("d3", 3))
     assert inbox.missing(3 * GATE_NS) is None
 
@@ -425,3 +430,75 @@ def test_the_world_s_messages_of_a_gate_do_not_close_it_for_an_external_drone():
             inbox.take(t_ns)
         inbox.put(d3, status(t_ns, gate, 1))
     assert inbox.missing(2 * GATE_NS) is None
+
+
+# Which reader reads which key, and what of a gate's messages goes to whom
+
+
+DRONES = ("d1", "d2", "d3")
+CHUNKS = st.sampled_from(["a", "b", "ab", "@a"])
+KEYS = st.lists(CHUNKS, min_size=1, max_size=4).map("/".join)
+EXPRESSIONS = st.lists(st.one_of(CHUNKS, st.sampled_from(["*", "**", "a$*"])), min_size=1, max_size=4).map("/".join)
+
+
+@given(readers=st.lists(st.lists(EXPRESSIONS, max_size=3), max_size=4), key=KEYS)
+def test_it_says_what_comparing_each_expression_says(readers: list[list[str]], key: str) -> None:
+    wanted = [place for place, own in enumerate(readers) if any(keys.matches(each, key) for each in own)]
+    table = RoutingTable(readers)
+    assert list(table.readers(key)) == wanted
+    assert table.readers(key) is table.readers(key)
+
+
+def test_readers_of_any_of_some_keys_are_named_once() -> None:
+    table = RoutingTable([["drone/*/truth"], ["clock"], ["drone/d1/*"], ["**"]])
+    assert table.readers_of_any([keys.truth("d1"), keys.truth("d2")]) == (0, 2, 3)
+
+
+def gate_messages(*pairs: tuple[str, bytes]) -> GateMessages:
+    return GateMessages.of(GATE_NS, 1, key_table(DRONES), pairs)
+
+
+def status_pair(drone: str) -> tuple[str, bytes]:
+    return keys.status(drone), encode(Status(GATE_NS, 1, "flying", 90.0, False, None, 2))
+
+
+def baro_pair(drone: str, t_ns: int = GATE_NS) -> tuple[str, bytes]:
+    return keys.sensor(drone, "baro"), encode(Baro(t_ns, 1, t_ns, 101_325.0, 1.0))
+
+
+def test_each_reader_gets_what_it_reads_of_a_gate_decoded_once() -> None:
+    router = GateRouter(RoutingTable([["drone/*/sensor/status"], [keys.status("d2")], []]))
+    routed = list(router.split(gate_messages(baro_pair("d1"), status_pair("d1"), baro_pair("d2"), status_pair("d2"))))
+    assert [(key, readers) for readers, key, _ in routed] == [
+        (keys.status("d1"), (0,)),
+        (keys.status("d2"), (0, 1)),
+    ]
+    assert routed[0][2].count == 2
+
+
+def test_what_is_no_message_of_its_key_is_left_out() -> None:
+    router = GateRouter(RoutingTable([["**"]]))
+    assert [key for _, key, _ in router.split(gate_messages((keys.status("d1"), b"\xc1"), status_pair("d2")))] == [
+        keys.status("d2")
+    ]
+
+
+@pytest.mark.parametrize("place", [-1, 24, 2**62])
+def test_keys_outside_of_the_table_are_not_followed(place: int) -> None:
+    whole = gate_messages(status_pair("d1"), status_pair("d2"))
+    bad = GateMessages(GATE_NS, 1, whole.table, np.full(2, place), whole.stamps, whole.ends, whole.buffer)
+    assert list(GateRouter(RoutingTable([["**"]])).split(bad)) == []
+
+
+def test_messages_of_a_gate_come_among_the_others_in_canonical_order() -> None:
+    other = (keys.estimate("d1"), Status(GATE_NS, 1, "flying", 90.0, False, None, 1))
+    router = GateRouter(RoutingTable([["**"]]))
+    inputs = [(keys.GATE, gate_messages(status_pair("d2"), baro_pair("d1"), baro_pair("d3", GATE_NS - 1))), other]
+    names = [
+        keys.sensor("d3", "baro"),
+        keys.estimate("d1"),
+        keys.sensor("d1", "baro"),
+        keys.status("d2"),
+    ]
+    assert [key for key, _ in router.one_by_one(inputs)] == names
+    assert router.one_by_one([other]) == [other]

@@ -10,7 +10,7 @@ from refused import has_terms
 from zsim.contract import keys
 from zsim.contract.flight_messages import Estimate, Mode, Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import Imu, Info, encode
+from zsim.contract.messages import ClusterInfo, Imu, Info, Origin, encode
 from zsim.contract.run_messages import ControlRequest, Fault, Faults
 from zsim.contract.snapshot import pack, unpack
 from zsim.runtime.agent import Agent, Output
@@ -18,12 +18,16 @@ from zsim.runtime.link_faults import LinkFaults, place_of, reception_probability
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import planned
 from zsim_agents.formation.controller import REQUESTS_MAX, Controller
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 ME, OTHER = "controller.main", "estimator.d1"
 ESTIMATE, STATUS = keys.estimate("d1"), keys.status("d1")
 ZEROS = (0.0, 0.0, 0.0)
+RUN = Info(
+    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(*ZEROS), (),
+    (ClusterInfo("main", ("d1", "d2")),), "", "", "", "",
+)  # fmt: skip
 Given = tuple[str, Any]
 
 
@@ -40,7 +44,7 @@ def status(gate: int) -> Given:
 
 
 def links(*faults: Fault, names: tuple[str, ...] = (ME,), seed: int = 1) -> LinkFaults:
-    made = LinkFaults(names, seed, GATE_NS, {"main": ["d1", "d2"]})
+    made = LinkFaults(replace(RUN, seed=seed), names)
     made.update(Faults(0, 0, faults))
     return made
 
@@ -272,7 +276,7 @@ def test_a_controller_takes_so_many_requests_between_two_gates():
 
 def test_one_that_is_restored_hands_over_the_same_at_the_same_gates():
     acting = fault("link_delay", delay_ms=100), fault("link_loss", number=2, probability=0.3)
-    made, again = links(*acting), LinkFaults((ME,), 1, GATE_NS, {"main": ["d1", "d2"]})
+    made, again = links(*acting), LinkFaults(RUN, (ME,))
     gates(made, 20)
     again.restore(unpack(pack(made.snapshot())))
     for gate in range(21, 60):

@@ -26,7 +26,7 @@ from zsim.contract.run_messages import (
 )
 from zsim.contract.snapshot import VERSION, State, pack, unpack
 from zsim.errors import BehindError, RunError, SupersededError, UserCodeError
-from zsim.runtime import membership
+from zsim.runtime import participant
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
 
@@ -230,7 +230,7 @@ def test_garbage_in_place_of_a_gate_is_refused_and_changes_nothing():
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let what is owed be tried at every tick."""
-    monkeypatch.setattr(membership, "RETRY_S", 0.0)
+    monkeypatch.setattr(participant, "RETRY_S", 0.0)
 
 
 def answers(*given: ControlAnswer) -> Callable[[str, dict[str, Any]], ControlAnswer]:
@@ -321,7 +321,7 @@ def test_after_a_lost_link_it_rejoins_as_soon_as_the_world_answers(hears: bool):
     joins = world.published_on(keys.process(ME, "join"))
     again = 1 if hears else len(joins) - 1
     assert (again > 1) != hears
-    assert again <= 1 + membership.REJOINS_MAX
+    assert again <= 1 + participant.REJOINS_MAX
     assert [done.done_ns // GATE_NS for done in dones[:4]] == [0, 1, 0, 1]
     assert {done.done_ns // GATE_NS for done in dones[4:]} >= set(range(2, END + 1))
     assert len(dones) == END + 3 or not hears
@@ -364,28 +364,19 @@ def last_gate(before_gate: int, *lists: Faults) -> int:
     return world.gates_done()[-1]
 
 
-def test_a_kill_is_at_the_first_gate_in_which_it_acts():
-    assert last_gate(1, entries(0, 0, KILL)) == 3
-
-
 @pytest.mark.parametrize(
-    "lists", [(entries(2, 0, KILL), entries(4, 1)), (entries(4, 1), entries(2, 0, KILL))], ids=["late", "old"]
+    ("before_gate", "lists", "last"),
+    [
+        pytest.param(1, [entries(0, 0, KILL)], 3, id="at the first gate in which it acts"),
+        pytest.param(2, [entries(2, 0, KILL), entries(4, 1)], 3, id="heard of late, with the list that forgets it"),
+        pytest.param(2, [entries(4, 1), entries(2, 0, KILL)], 3, id="heard of after the list that forgets it"),
+        pytest.param(5, [entries(2, 0, KILL)], 5, id="heard of too late"),
+        pytest.param(1, [entries(0, 0, KILL), entries(1, 1)], END, id="cleared"),
+        pytest.param(1, [entries(1, 1, KILL), entries(0, 0)], 3, id="an older list comes later"),
+    ],
 )
-def test_what_was_forgotten_before_a_late_process_heard_of_it(lists: tuple[Faults, Faults]):
-    """Both lists arrive at once: one that names the kill, and the newer one, sent when it was over."""
-    assert last_gate(2, *lists) == 3
-
-
-def test_a_kill_that_is_heard_of_too_late_still_kills():
-    assert last_gate(5, entries(2, 0, KILL)) == 5
-
-
-def test_a_kill_that_is_cleared_kills_nobody():
-    assert last_gate(1, entries(0, 0, KILL), entries(1, 1)) == END
-
-
-def test_an_older_list_does_not_take_a_kill_away():
-    assert last_gate(1, entries(1, 1, KILL), entries(0, 0)) == 3
+def test_a_process_dies_of_a_kill_in_the_gate_in_which_it_acts(before_gate: int, lists: list[Faults], last: int):
+    assert last_gate(before_gate, *lists) == last
 
 
 class Second(Judge):
@@ -505,7 +496,7 @@ def test_it_steps_again_what_came_since_its_snapshot_and_publishes_what_the_form
         snapshot_of(1, own={"count": 7, "raises": True}),
         snapshot_of(Restarting.DIED + 1),
         Snapshot(GATE_NS, 0, ME, VERSION, b"\xc1"),
-        replace(snapshot_of(1), t_ns=-2 * membership.RESUME_NS),
+        replace(snapshot_of(1), t_ns=-2 * participant.RESUME_NS),
     ],
     ids=["other version", "other state", "half of it", "of the future", "garbage", "old"],
 )

@@ -14,7 +14,7 @@ from zsim.scenario.scenario import Obstacle, Scenario
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.flight.world import World
+from zsim_world.run.world import World
 
 BOX = {"name": "wall", "shape": "box", "position_m": [4, 0, 0], "size_m": [1, 6, 5]}
 PILLAR = {"name": "pillar", "shape": "cylinder", "position_m": [4, 0.1, 0], "radius_m": 0.5, "height_m": 5}

@@ -16,8 +16,7 @@ from zsim.errors import NoWorldError, SessionError
 from zsim.scenario.scenario import DRONES_MAX
 from zsim.transport import connection, zenoh_settings
 from zsim.transport.connection import find_world
-from zsim.transport.permissions import Permissions
-from zsim.transport.tls import Identity
+from zsim.transport.tls import Identity, Permissions
 
 
 class Silent:
@@ -47,26 +46,32 @@ def said(endpoint: str, identity: Identity | None = None) -> str:
     return str(caught.value).removeprefix(start)
 
 
-def test_who_is_not_let_in_is_told_that_it_may_be_that(monkeypatch: pytest.MonkeyPatch) -> None:
+EVE = Identity("h1", Path("certs/h1/operator.eve"))
+LET_IN = Permissions("world", "operator.eve", {"read": ("zsim/**",)})
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "identity", "permissions", "told", "not_told"),
+    [
+        ("tls/127.0.0.1:7447", EVE, None, ("another", "refused", "--federation"), "start one"),
+        ("tls/127.0.0.1:7447", EVE, LET_IN, ("another", "--federation"), "refused"),
+        ("tcp/127.0.0.1:7447", None, None, ("another",), "allowed"),
+    ],
+    ids=["not let in", "let in", "without certificates"],
+)
+def test_a_hub_that_answers_nothing_is_told_with_what_may_be_the_reason(
+    monkeypatch: pytest.MonkeyPatch,
+    endpoint: str,
+    identity: Identity | None,
+    permissions: Permissions | None,
+    told: tuple[str, ...],
+    not_told: str,
+) -> None:
     monkeypatch.setattr(connection, "connect", silent)
-    text = said("tls/127.0.0.1:7447", Identity("h1", Path("certs/h1/operator.eve")))
-    assert has_terms(text, "another", "refused", "--federation")
-    assert "start one" not in text
-
-
-def test_who_is_let_in_is_told_nothing_of_rights(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "connect", silent)
-    monkeypatch.setattr(Silent, "permissions", Permissions("world", "operator.eve", {"read": ("zsim/**",)}))
-    text = said("tls/127.0.0.1:7447", Identity("h1", Path("certs/h1/operator.eve")))
-    assert has_terms(text, "another", "--federation")
-    assert "refused" not in text
-
-
-def test_without_certificates_nobody_is_told_of_rights(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "connect", silent)
-    text = said("tcp/127.0.0.1:7447")
-    assert has_terms(text, "another")
-    assert "allowed" not in text
+    monkeypatch.setattr(Silent, "permissions", permissions)
+    text = said(endpoint, identity)
+    assert has_terms(text, *told)
+    assert not_told not in text
 
 
 def test_a_port_that_opens_to_who_is_refused_may_be_one_with_tls(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,11 +2,13 @@
 
 import os
 import socket
+import struct
+import sys
 
+import pytest
 from fake_link import FakeLink
 
 from zsim.contract import keys
-from zsim.transport.link_sockets import Progress
 from zsim.transport.link_watch import (
     HELD_BYTES,
     KEPT_OUT_S,
@@ -16,10 +18,12 @@ from zsim.transport.link_watch import (
     STALL_S,
     TOLD_S,
     Awaited,
+    LinkSockets,
     LinkWatch,
+    Progress,
+    SessionTokens,
 )
 from zsim.transport.session import FarEnd
-from zsim.transport.session_tokens import SessionTokens
 
 READER, RECORDER, ROUTER, ESTIMATOR = (f"10.0.0.{number}:{number}" for number in range(1, 5))
 FAR_ENDS = {READER: FarEnd("r", False), RECORDER: FarEnd("rec", False), ROUTER: FarEnd("x", True)}
@@ -87,18 +91,12 @@ def test_of_two_who_are_waited_for_only_the_one_that_takes_nothing_is_stuck():
     assert case.sockets.closed == []
 
 
-def test_who_takes_something_of_little_is_left_alone():
+@pytest.mark.parametrize(("held_bytes", "closed"), [(STALL_BYTES, []), (HELD_BYTES, [READER])])
+def test_who_takes_something_is_closed_only_if_it_never_catches_up(held_bytes: int, closed: list[str]):
     case = Case()
-    case.sockets.held = {READER: STALL_BYTES}
+    case.sockets.held = {READER: held_bytes}
     case.passes(10.0, taken=1)
-    assert case.sockets.closed == []
-
-
-def test_who_never_catches_up_is_closed():
-    case = Case()
-    case.sockets.held = {READER: HELD_BYTES}
-    case.passes(2.0, taken=1)
-    assert case.sockets.closed == [READER]
+    assert case.sockets.closed == closed
 
 
 def test_a_long_way_is_given_its_time():
@@ -174,3 +172,20 @@ def test_a_session_that_is_kept_out_is_reported_only_if_it_holds_something_back(
     case.passes(1.0)
     assert len(case.sockets.closed) == SPARED + 1
     assert list(case.watch.closed) == []
+
+
+# Connections of this process, as the kernel has them
+
+
+LINGER = struct.Struct("ii")  # socket(7): whether, and for how many seconds
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux shows a process its connections")
+def test_a_connection_that_was_seen_does_not_linger_when_it_is_closed() -> None:
+    """Whoever closes one that lingers, does nothing else for so long while the far end takes nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as near:
+        near.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.pack(1, 10))
+        host, port = near.getpeername()
+        assert f"{host}:{port}" in LinkSockets().queued()
+        lingers, _ = LINGER.unpack(near.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.size))
+        assert not lingers

@@ -1,8 +1,13 @@
 """What is known of an endpoint before anybody connects."""
 
 import pytest
+from refused import has_terms
+from rights_table import KEYS, ROLES, SCENARIO, keys_of
 
-from zsim.transport.tls import leaves_machine
+from zsim.contract import keys, messages
+from zsim.scenario import scenario_file
+from zsim.transport.tls import Act, Permissions, leaves_machine, permissions_of
+from zsim_deploy.certificates import access_control
 
 
 @pytest.mark.parametrize(
@@ -18,3 +23,41 @@ def test_a_link_that_stays_on_the_machine(endpoint: str):
 )
 def test_a_link_that_others_can_hear(endpoint: str):
     assert leaves_machine(endpoint)
+
+
+# What a process is told that its certificate permits is what access control permits
+
+
+ACTS: dict[Act, str] = {"publish": "p", "read": "r", "ask": "g"}
+RULES = access_control(scenario_file.from_text(SCENARIO), ROLES, {"router.site": ["estimator.drone2"]})
+
+
+@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize("act", ACTS)
+def test_what_a_role_may_do_is_what_the_table_says(role: str, act: Act) -> None:
+    answer = messages.encode(permissions_of(RULES, "world", role))
+    found = messages.decode_as(Permissions, answer, keys.access(role))
+    assert found.refusal() is None
+    allowed = {key for key in KEYS if any(keys.matches(each, f"zsim/{key}") for each in found.allowed[act])}
+    assert allowed == keys_of(role, ACTS[act])
+
+
+@pytest.mark.parametrize("name", ["operator.eve", "anyone", "estimator.drone2"])
+def test_who_is_not_named_is_not_let_in(name: str) -> None:
+    refusal = permissions_of(RULES, "world", name).refusal()
+    assert has_terms(refusal, name, "world", *ROLES[:4], str(len(ROLES) - 3), "zsim certs init", "world")
+
+
+def test_what_is_like_the_wanted_key_is_named_first() -> None:
+    line = permissions_of(RULES, "world", "estimator.drone1").denial("publish", "drone/drone2/estimate", "zsim/")
+    assert has_terms(line, "estimator.drone1", "publish", "drone/drone2/estimate", "drone/drone1/estimate", "3")
+
+
+def test_a_rule_that_denies_or_is_about_what_goes_out_allows_nothing() -> None:
+    rule = {"id": "a", "permission": "deny", "messages": ["put"], "key_exprs": ["zsim/**"]}
+    others = {"subjects": [{"id": "s", "cert_common_names": ["x"]}], "policies": [{"subjects": ["s"], "rules": ["a"]}]}
+    assert permissions_of({"rules": [rule], **others}, "world", "x").refusal()
+    outwards = {**rule, "permission": "allow", "flows": ["egress"]}
+    assert permissions_of({"rules": [outwards], **others}, "world", "x").refusal()
+    both_ways = {**rule, "permission": "allow"}
+    assert permissions_of({"rules": [both_ways], **others}, "world", "x").allowed["publish"] == ("zsim/**",)

@@ -1,14 +1,17 @@
-"""What passes the hub: batches taken apart once, and what cannot be read is counted."""
+"""What passes the hub, and its replay: batches taken apart once, and what cannot be read is counted."""
 
 from typing import Any
 
 import pytest
-from fake_link import FakeLink
+from fake_link import UNANSWERED, FakeLink
+from refused import refused
 
 from zsim.contract import keys
-from zsim.contract.framing import GateMessages, encode_batch, key_table
+from zsim.contract.framing import GateMessages, decode_batch, encode_batch, key_table, pairs_of
+from zsim.contract.run_messages import ControlAnswer
+from zsim.errors import DecodeError, NoWorldError
 from zsim.transport.session import ReceivedSample
-from zsim.transport.traffic import Traffic, samples
+from zsim.transport.traffic import Traffic, replay, samples
 
 DRONES = ["d1"]
 GATE = GateMessages.of(20, 1, key_table(DRONES), [(keys.truth("d1"), b"truth"), (keys.status("d1"), b"status")])
@@ -43,3 +46,43 @@ def test_a_reader_can_be_woken() -> None:
     traffic = Traffic(link, key_table(DRONES))
     traffic.wake()
     assert traffic.receive() == []
+
+
+# The pages of a replay
+
+
+def pages(link: FakeLink, *answers: ControlAnswer) -> list[tuple[str, bytes]]:
+    left = iter(answers)
+    link.on_request = lambda key, args: next(left)
+    return list(replay(link, "quiet.one", 7, ["**"], 1.0))  # type: ignore[arg-type]
+
+
+def test_a_replay_goes_on_until_the_last_page():
+    link = FakeLink()
+    first, second = ControlAnswer(True, result=[["a", b"1"]], more=41), ControlAnswer(True, result=[["b", b"2"]])
+    assert pages(link, first, second) == [("a", b"1"), ("b", b"2")]
+    assert link.requests == [
+        (keys.replay("quiet.one"), {"from_ns": 7, "keys": ["**"], "page": page}) for page in (0, 41)
+    ]
+
+
+NO_PAIRS = [None, 7, "text", [1], [["a"]], [["a", "dGV4dA=="]], [["a", b"1", b"2"]], {"a": b"1"}, [[b"a", b"1"]]]
+
+
+@pytest.mark.parametrize("result", NO_PAIRS)
+def test_a_result_that_is_no_list_of_pairs_is_none(result: Any):
+    with refused(DecodeError, "list", "[key, payload]"):
+        pairs_of(result)
+    with refused(NoWorldError, "replay"):
+        pages(FakeLink(), ControlAnswer(True, result=result))
+
+
+def test_no_answer_is_said():
+    with pytest.raises(NoWorldError, match="nobody answered"):
+        pages(FakeLink(), UNANSWERED)
+
+
+@pytest.mark.parametrize("payload", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1", b""])
+def test_a_batch_that_is_none_is_refused(payload: bytes):
+    with refused(DecodeError, "@batch", "list"):
+        decode_batch(payload)

@@ -1,0 +1,346 @@
+"""Cameras of a run for pages: which there are, the newest picture of each one watched, and the marks drawn on it.
+
+Pictures may come from any program, so each is checked before a browser decodes it. Frames: B of the drone; K of the
+camera, x right, y down, z ahead. Pixels count from the picture's upper left corner, whole numbers at pixel centres.
+"""
+
+import math
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from msgspec import Struct
+
+from zsim.contract import keys, messages
+from zsim.contract.camera_messages import CameraImage, CameraInfo, Seen, Sightings
+from zsim.errors import DecodeError, ZsimError
+from zsim.math import rotation
+from zsim.runtime.participant import Participant
+from zsim.sensors.camera import CAMERAS
+from zsim.sensors.camera_model import Lens, pixel, undistorted
+from zsim.sensors.jpeg_header import PictureError, frame_of
+from zsim.transport.session import RawSample, Session
+
+ASKED_S = 15.0  # wall; a page silent for longer sleeps: a slow one takes seconds for a picture
+MESSAGE_BYTES = 1_000  # of a picture's message beside its data, at most; chosen
+SIGHTINGS_KEPT = 8  # of one camera from one key: half a second of 15 Hz
+MARKS_MAX = 40  # on a picture; more would hide it
+RADIUS_MIN_PX = 5.0  # of a circle; a smaller one goes unnoticed
+SIGMAS = 2.0  # of direction, drawn around a hat
+FOLD_MAX = 1e-3  # focal lengths between a ray and the undistorted ray of its pixel; beyond it the lens folds over
+NORM_MIN = 1e-6  # of a quaternion or a direction
+AGE_MAX_NS = 300_000_000  # simulated, between a picture and sightings drawn on it; chosen: 3 pictures of 10 Hz
+PICTURE_BYTES_MAX = 1_000_000  # of a picture that is shown: ten a second of it fill 80 Mbit/s
+PIXELS_MAX = 1920 * 1200  # chosen: the largest camera of a scenario; a browser needs 4 bytes for each
+ENDS = b"\xff\xd9"  # of an image; ITU-T T.81, table B.1
+SHOWN = frozenset({0xC0, 0xC1, 0xC2})  # frames that browsers show: baseline, extended, progressive
+
+
+class CameraPicture(NamedTuple):
+    """A checked picture; another picture of the run has another number."""
+
+    number: int
+    image: CameraImage
+
+
+class Mark(Struct, frozen=True):
+    """A circle on a picture [px], with a text beside it."""
+
+    u: float  # of its centre
+    v: float
+    radius: float
+    text: str
+
+
+class _Watched:
+    """What is kept of a camera while a page watches it."""
+
+    def __init__(self) -> None:
+        self.payload: bytes | None = None  # newer than the picture; not decoded yet
+        self.picture: CameraPicture | None = None
+        self.sightings: dict[str, deque[Sightings]] = {}  # by key
+
+
+class CameraFeed:
+    """The cameras of one run, each named `DRONE/CAMERA`; only those that a page watches are subscribed to.
+
+    Args:
+        observer: of the console in the run; counts what is received and refused.
+        drones: of the run; cameras of others are ignored.
+        hat_m: diameter of a hat [m].
+
+    Attributes:
+        refused: number of refused pictures by camera.
+        reasons: why the last of them was refused.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        observer: Participant,
+        drones: Iterable[str],
+        hat_m: float,
+        wall_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._link = link
+        self._observer = observer
+        self._order = [f"{drone}/{camera}" for drone in drones for camera in CAMERAS]
+        self._hat_m = hat_m
+        self._wall_s = wall_s
+        self._lock = threading.Lock()
+        self._infos: dict[str, CameraInfo] = {}
+        self._asked: dict[object, tuple[tuple[str, ...], float]] = {}  # cameras, and until when [s; wall], by page
+        self._watched: dict[str, _Watched] = {}
+        self._undeclare: dict[str, Callable[[], None]] = {}  # by key
+        self._number = 0
+        self.refused: Counter[str] = Counter()
+        self.reasons: dict[str, str] = {}
+
+    def open(self) -> None:
+        """Learn which cameras exist, and of those that appear later."""
+        expression = keys.camera_info("*", "*")
+        self._link.declare_subscriber(expression, self._on_info)
+        try:
+            samples = self._link.get(expression)
+        except ZsimError:
+            return  # a certificate older than cameras does not permit the query; later cameras are still seen
+        for sample in samples:
+            self._on_info(sample, kept=True)
+
+    def close(self) -> None:
+        """End all subscriptions to pictures."""
+        with self._lock:
+            self._asked.clear()
+        self.update()
+
+    def update(self) -> None:
+        """Subscribe to the cameras that pages asked for lately, and no others; to be called several times a second."""
+        with self._lock:
+            now_s = self._wall_s()
+            self._asked = {page: asked for page, asked in self._asked.items() if asked[1] > now_s}
+            wanted = {camera for cameras, _ in self._asked.values() for camera in cameras if camera in self._infos}
+            self._watched = {camera: self._watched.get(camera) or _Watched() for camera in wanted}
+        wanted_keys = {keys.camera(*camera.split("/")) for camera in wanted}
+        wanted_keys |= {key for camera in wanted for key in _sighting_keys(camera)}
+        for key in self._undeclare.keys() - wanted_keys:
+            self._undeclare.pop(key)()
+        for key in wanted_keys - self._undeclare.keys():
+            on_sample = self._on_picture if keys.is_picture(key) else self._on_sightings
+            self._undeclare[key] = self._link.declare_subscriber(key, on_sample)
+
+    # For pages; from any thread
+
+    def cameras(self) -> tuple[tuple[str, CameraInfo], ...]:
+        """Return the known cameras in the order of the drones."""
+        infos = self._infos.copy()
+        return tuple((camera, infos[camera]) for camera in self._order if camera in infos)
+
+    def ask(self, page: object, cameras: Iterable[str]) -> None:
+        """Request pictures of these cameras, and of no others, for a page; to be repeated within ASKED_S."""
+        with self._lock:
+            self._asked[page] = tuple(cameras), self._wall_s() + ASKED_S
+
+    def release(self, page: object) -> None:
+        """Request nothing for a page any more."""
+        with self._lock:
+            self._asked.pop(page, None)
+
+    def picture(self, camera: str) -> CameraPicture | None:
+        """Return the newest picture of a watched camera, None before the first."""
+        with self._lock:
+            watched = self._watched.get(camera)
+            if watched is None:
+                return None
+            payload, watched.payload = watched.payload, None
+            if payload is not None:
+                watched.picture = self._checked(camera, payload) or watched.picture
+            return watched.picture
+
+    def marks(self, camera: str) -> tuple[Mark, ...]:
+        """Return the marks for the newest picture: of a detector's findings, else of the world's sightings."""
+        with self._lock:
+            watched, info = self._watched.get(camera), self._infos.get(camera)
+            if watched is None or watched.picture is None or info is None:
+                return ()
+            t_ns = watched.picture.image.t_sample_ns
+            for key in _sighting_keys(camera):
+                found = sightings_of(t_ns, watched.sightings.get(key, ()))
+                if found is not None:
+                    return marks_of(info, found.seen[:MARKS_MAX], self._hat_m)
+        return ()
+
+    def shown(self, camera: str) -> tuple[CameraInfo, CameraPicture] | None:
+        """Return a camera with its newest picture, None before the first."""
+        info, picture = self._infos.get(camera), self.picture(camera)
+        return None if info is None or picture is None else (info, picture)
+
+    def state(self) -> list[dict[str, Any]]:
+        """Return the cameras as plain data for programs and tests."""
+        found = []
+        for camera, _ in self.cameras():
+            with self._lock:
+                watched = self._watched.get(camera)
+                picture = watched.picture if watched is not None else None
+                found.append(
+                    {
+                        "camera": camera,
+                        "watched": watched is not None,
+                        "t_s": picture.image.t_sample_ns / 1e9 if picture is not None else None,
+                        "refused": self.refused[camera],
+                        "reason": self.reasons.get(camera, ""),
+                    }
+                )
+        return found
+
+    # Callbacks; in Zenoh's threads
+
+    def _on_info(self, sample: Any, kept: bool = False) -> None:
+        camera = _camera_of(sample.key)
+        if camera not in self._order or (kept and camera in self._infos):
+            return  # one that arrived meanwhile is newer than a kept one
+        try:
+            info = messages.decode(sample.key, sample.payload)
+        except DecodeError:
+            info = None
+        with self._lock:
+            if isinstance(info, CameraInfo) and is_usable(info):
+                self._infos[camera] = info
+            else:
+                self._observer.health.refused += 1
+
+    def _on_picture(self, sample: RawSample) -> None:
+        camera = _camera_of(sample.key)
+        with self._lock:
+            self._observer.health.received += 1
+            watched = self._watched.get(camera)
+            if watched is None:
+                return
+            if len(sample.payload) > PICTURE_BYTES_MAX + MESSAGE_BYTES:
+                self._refuse(camera, f"picture has {len(sample.payload)} bytes; must have {PICTURE_BYTES_MAX} at most")
+            else:
+                watched.payload = sample.payload
+
+    def _on_sightings(self, sample: RawSample) -> None:
+        try:
+            seen = messages.decode(sample.key, sample.payload)
+        except DecodeError:
+            seen = None
+        with self._lock:
+            self._observer.health.received += 1
+            if not isinstance(seen, Sightings):
+                self._observer.health.refused += 1
+                return
+            watched = self._watched.get(f"{keys.thing(sample.key)}/{seen.camera}")
+            if watched is not None:
+                watched.sightings.setdefault(sample.key, deque(maxlen=SIGHTINGS_KEPT)).append(seen)
+
+    def _checked(self, camera: str, payload: bytes) -> CameraPicture | None:
+        """Return a picture that may be shown; count one that may not."""
+        try:
+            image: CameraImage = messages.decode(keys.camera(*camera.split("/")), payload)
+            check_picture(image.data, image.width, image.height)
+        except (DecodeError, PictureError) as error:
+            self._refuse(camera, str(error))
+            return None
+        self._number += 1
+        return CameraPicture(self._number, image)
+
+    def _refuse(self, camera: str, reason: str) -> None:
+        self._observer.health.refused += 1
+        self.refused[camera] += 1
+        self.reasons[camera] = reason
+
+
+def _camera_of(key: str) -> str:
+    """Return the name of the camera that a key is about."""
+    _, drone, what = keys.parts(key)
+    return f"{drone}/{what.split('/')[1]}"
+
+
+def _sighting_keys(camera: str) -> tuple[str, str]:
+    """Return the keys of sightings by a camera's drone: a detector's, then the world's."""
+    drone = camera.split("/")[0]
+    return keys.detections(drone), keys.sensor(drone, keys.SIGHTINGS)
+
+
+def check_picture(data: bytes, width: int, height: int) -> None:
+    """Refuse data that is not a whole JPEG of a size [px], or is too large for a page.
+
+    Raises:
+        PictureError: in one line.
+    """
+    if len(data) > PICTURE_BYTES_MAX:
+        raise PictureError(f"picture has {len(data)} bytes; must have {PICTURE_BYTES_MAX} at most")
+    frame = frame_of(data)
+    if frame.marker not in SHOWN or not data.endswith(ENDS):
+        raise PictureError("JPEG is cut off, or not one that browsers show; must be baseline or progressive, and whole")
+    if (frame.width, frame.height) != (width, height):
+        found = f"{frame.width} × {frame.height}"
+        raise PictureError(f"JPEG is {found}, its message says {width} × {height}; must be the same")
+    if width * height > PIXELS_MAX:
+        raise PictureError(f"picture is {width} × {height}; must have {PIXELS_MAX} pixels at most")
+
+
+# Marks
+
+
+def is_usable(info: CameraInfo) -> bool:
+    """Return whether a camera's own description, which any program may have sent, can be computed with."""
+    fx, fy = info.K[0], info.K[4]
+    return fx > 0 and fy > 0 and math.sqrt(sum(q * q for q in info.orientation_wxyz)) > NORM_MIN
+
+
+def field_of_view(info: CameraInfo) -> float:
+    """Return the vertical angle of view without distortion [rad]."""
+    return 2.0 * math.atan(info.height / 2.0 / info.K[4])
+
+
+def sightings_of(picture_ns: int, candidates: Iterable[Sightings]) -> Sightings | None:
+    """Return the sightings nearest to a picture's exposure; None where all are too far from it."""
+    nearest = min(candidates, key=lambda each: abs(each.t_sample_ns - picture_ns), default=None)
+    if nearest is None or abs(nearest.t_sample_ns - picture_ns) > AGE_MAX_NS:
+        return None
+    return nearest
+
+
+def marks_of(info: CameraInfo, seen: Iterable[Seen], hat_m: float) -> tuple[Mark, ...]:
+    """Return the marks of sightings in B that fall on the picture of a usable camera.
+
+    A mark is a circle around a hat, of diameter `hat_m` [m], and 2 sigma of its direction.
+    """
+    fx, _, cx, _, fy, cy, *_ = info.K
+    lens = Lens(fx, fy, cx, cy, *info.D, info.width, info.height)
+    q_BK = rotation.normalised(info.orientation_wxyz)
+    marks = []
+    for each in seen:
+        place = _place(lens, rotation.rotate_back(q_BK, each.direction_B))
+        if place is None or each.range_m <= 0:
+            continue
+        half_angle = hat_m / 2.0 / each.range_m + SIGMAS * abs(each.sigma_direction_rad)
+        radius = min(max(lens.fx * half_angle, RADIUS_MIN_PX), float(lens.height))
+        marks.append(Mark(round(place[0], 1), round(place[1], 1), round(radius, 1), range_text(each)))
+    return tuple(marks)
+
+
+def _place(lens: Lens, ray_K: rotation.Vector) -> tuple[float, float] | None:
+    """Return the pixel of a ray, None where it is not on the picture.
+
+    A distortion polynomial folds over far outside of the field of view: a ray from there would be drawn at the pixel of
+    another ray.
+    """
+    x, y, z = ray_K
+    if z <= NORM_MIN * rotation.norm(ray_K):
+        return None
+    u, v = pixel(lens, x / z, y / z, 1.0)
+    if not (-0.5 <= u <= lens.width - 0.5 and -0.5 <= v <= lens.height - 0.5):
+        return None
+    back = undistorted(lens, u, v)
+    return (u, v) if math.dist(back, (x / z, y / z)) <= FOLD_MAX else None
+
+
+def range_text(seen: Seen) -> str:
+    """Return a range with its sigma: `4.1 ± 0.2 m`."""
+    digits = 1 if seen.sigma_range_m >= 0.1 else 2
+    return f"{seen.range_m:.{digits}f} ± {seen.sigma_range_m:.{digits}f} m"

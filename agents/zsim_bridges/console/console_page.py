@@ -1,0 +1,321 @@
+"""The page's panels in one run: forms, plots and tables that all pages share, and those of each page."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple
+
+import viser
+
+from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.console_tables import DroneRow, event_table
+from zsim_bridges.console.control_desk import EVERY, RUN, ControlDesk, ControlForm
+from zsim_bridges.console.drone_forms import DroneForm, FleetTable
+from zsim_bridges.console.formation_form import FormationForm
+from zsim_bridges.console.histories import TRAIL_S, TRAILS_S
+from zsim_bridges.console.operator_input import slider_ranges
+from zsim_bridges.console.picture import Array, DronePoses, FlightPreview
+from zsim_bridges.console.private_viser import control_id, control_ids
+from zsim_bridges.console.run_condition import RunCondition, ShownRun
+from zsim_bridges.console.run_forms import FaultForm, FleetForm, RunForm
+from zsim_bridges.console.run_monitor import FlightFigures
+from zsim_bridges.console.scene import ChosenRing, draw_ground
+from zsim_bridges.console.variable_plots import VariablePlots, flight_history
+from zsim_bridges.console.view_buffer import ALL, KINDS, EventRow, chosen_rows
+
+PANEL_PX = 350
+ROWS_SHOWN = 60  # events
+SWITCHES = {
+    "ghosts": "Ghosts: where the formation is to be",
+    "estimates": "Estimates: 2σ ellipsoids (hold 74 % in 3-D)",
+    "trails": "Trails",
+}
+
+
+class ConsolePage:
+    """The shared controls of one run, in two panels.
+
+    Args:
+        gui: viser's; the controls of another run are removed.
+        report: called with requests that are refused here.
+        show: shows or hides one of `SWITCHES` in the scene.
+        choose_trail: sets the length of trails [s].
+        request_return: lets a formation return to its start, and land.
+        show_preview: shows what a formation would fly; None: nothing.
+
+    Attributes:
+        phases, faults: the tables.
+        forms, plots: of each formation.
+        flights: history of single drones, for plots.
+        chosen: the formation that is shown; empty if there is none.
+        fleet: requests of all drones.
+        control_folder, drone_folder, figure_folder, event_folder, theme_folder: for each page's own controls.
+        parts: what a page must be in control of to use a control, by the control's id.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        run: ShownRun,
+        client: CommandClient,
+        report: Callable[[RequestOutcome], None],
+        show: Callable[[str, bool], None],
+        choose_trail: Callable[[float], None] = lambda _: None,
+        request_return: Callable[[str], None] = lambda _: None,
+        show_preview: Callable[[str, FlightPreview | None], None] = lambda name, preview: None,
+    ) -> None:
+        self._run = run
+        self._client = client
+        self._report = report
+        self._request_return = request_return
+        self._show_preview = show_preview
+        self.forms: dict[str, FormationForm] = {}
+        self.plots: dict[str, VariablePlots] = {}
+        self.flights = flight_history([drone.name for drone in run.scenario.drones], around=run.is_replay)
+        self.chosen = next(iter(run.spaces), "")
+        self.parts: dict[str, str] = {}
+        self._folders: dict[str, list[viser.GuiFolderHandle]] = {}
+        gui.reset()
+        set_theme(gui)
+        gui.set_panel_label(f"zsim {run.scenario.name}")
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL_PX)
+        self._right_panel(gui, show, choose_trail)
+        panel = gui.add_panel()
+        with panel.add_tab("Drones", viser.Icon.DRONE):
+            self.drone_folder = gui.add_folder(None)
+            self.figure_folder = gui.add_folder(None)
+        with panel.add_tab("Events", viser.Icon.LIST):
+            self.event_folder = gui.add_folder(None)
+        panel.dock_left()
+        panel.set_width(PANEL_PX)
+
+    def _right_panel(
+        self, gui: viser.GuiApi, show: Callable[[str, bool], None], choose_trail: Callable[[float], None]
+    ) -> None:
+        run = self._run
+        self.phases = gui.add_html("")
+        self.control_folder = gui.add_folder(None)
+        with self._part(gui, EVERY):
+            self.fleet = FleetForm(gui, self._client, run.scenario)
+        if len(run.spaces) > 1:
+            choice = gui.add_dropdown("formation", list(run.spaces))
+            choice.on_update(lambda _: self._show_formation(choice.value))
+        tabs = gui.add_tab_group()
+        if run.spaces:
+            self._formation_tabs(gui, tabs)
+        with tabs.add_tab("Faults"):
+            self.faults = gui.add_html("")
+            with self._part(gui, RUN):
+                FaultForm(gui, self._client, self._report, run.scenario, run.info.drones)
+        with tabs.add_tab("Run"):
+            with self._part(gui, RUN):
+                self.run_form = RunForm(gui, self._client, run.info.rate)
+            for what, label in SWITCHES.items():
+                switch = gui.add_checkbox(label, True)
+                switch.on_update(lambda _, what=what, switch=switch: show(what, switch.value))
+            lengths = {f"the last {length_s:g} s": length_s for length_s in TRAILS_S}
+            trail = gui.add_dropdown("trails of", list(lengths), initial_value=f"the last {TRAIL_S:g} s")
+            trail.on_update(lambda _: choose_trail(lengths[trail.value]))
+            self.theme_folder = gui.add_folder(None)
+
+    def _formation_tabs(self, gui: viser.GuiApi, tabs: Any) -> None:
+        """Give every formation a folder in two tabs; only that of the chosen one is visible."""
+        fly, plots = tabs.add_tab("Fly"), tabs.add_tab("Plots")
+        for cluster in self._run.scenario.clusters:
+            name, space = cluster.name, self._run.spaces[cluster.name]
+            ranges = slider_ranges(space, cluster, self._run.scenario)
+            preview = partial(self._show_preview, name)
+            with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder, self._part(gui, name):
+                form = FormationForm(
+                    gui, self._client, self._report, cluster, space, ranges, self._request_return, preview
+                )
+            self.forms[name] = form
+            for control in form.safe:
+                self.parts.pop(control_id(control), None)
+            with plots, gui.add_folder(None, visible=name == self.chosen) as plot_folder:
+                self.plots[name] = VariablePlots(gui, cluster, ranges, self.flights, self._run.is_replay)
+            self._folders[name] = [form_folder, plot_folder]
+
+    @contextmanager
+    def _part(self, gui: viser.GuiApi, part: str) -> Iterator[None]:
+        """Note that the controls added meanwhile belong to a part."""
+        before = control_ids(gui)
+        yield
+        self.parts |= dict.fromkeys(control_ids(gui) - before, part)
+
+    def _show_formation(self, chosen: str) -> None:
+        self.chosen = chosen
+        for name, folders in self._folders.items():
+            for folder in folders:
+                folder.visible = name == chosen
+
+    def refresh(self, run: RunCondition) -> None:
+        """Grey out what would be refused."""
+        self.fleet.refresh(run)
+        self.run_form.refresh(run)
+        for form in self.forms.values():
+            form.offer(run)
+
+
+class _PageForm(NamedTuple):
+    """Controls of one page."""
+
+    control: ControlForm
+    drone: DroneForm
+    fleet: FleetTable
+    ring: ChosenRing
+    instruments: viser.GuiHtmlHandle
+    figures: viser.GuiHtmlHandle
+    events: "EventForm"
+
+
+class PageForms:
+    """Adds its own controls to each page of a run, and keeps them.
+
+    Args:
+        shared: the controls of all pages, with folders for those of each.
+        names, radii_m: of the drones.
+        part_of: returns what a page must be in control of to let a drone take off.
+        request_return: lets drones return to their starts.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        client: CommandClient,
+        shared: ConsolePage,
+        names: Sequence[str],
+        radii_m: Array,
+        desk: ControlDesk,
+        part_of: Callable[[str], str],
+        request_return: Callable[[Sequence[str]], None] = lambda _: None,
+    ) -> None:
+        self._server = server
+        self._client = client
+        self._shared = shared
+        self._names = list(names)
+        self._radii_m = radii_m
+        self._desk = desk
+        self._part_of = part_of
+        self._request_return = request_return
+        self._forms: dict[int, _PageForm] = {}
+        self._closed = False
+        server.on_client_connect(self._add)
+        server.on_client_disconnect(self._remove)
+
+    def close(self) -> None:
+        """Add nothing to later pages."""
+        self._closed = True
+
+    def _form(self, client_id: int | None) -> _PageForm | None:
+        return None if client_id is None else self._forms.get(client_id)
+
+    def choose(self, client_id: int | None, drone: str) -> None:
+        """Choose a drone on one page, as a click on it in the scene does."""
+        if form := self._form(client_id):
+            form.drone.choose(drone)
+
+    def toggle(self, client_id: int | None, drone: str) -> None:
+        """Select a drone on one page for one command with others, or unselect it."""
+        if form := self._form(client_id):
+            form.fleet.toggle(drone)
+
+    def chosen(self, client_id: int | None) -> str:
+        """Return the drone that one page has chosen; empty for a page that is not open."""
+        form = self._form(client_id)
+        return form.drone.chosen if form else ""
+
+    def use(self, client_id: int, drone: str) -> str:
+        """Put a page in control of a drone's formation, if that is free; return why it may not be."""
+        return self._desk.use(client_id, self._part_of(drone))
+
+    def move_rings(self, drones: DronePoses) -> None:
+        """Put the ring of each page about the drone that it has chosen."""
+        self._update(lambda form: form.ring.move(drones, form.drone.chosen))
+
+    def show_figures(self, instruments_of: Callable[[str], str], sensors_of: Callable[[str], str]) -> None:
+        """Show on each page instruments and sensors, as HTML, of the drone that it has chosen."""
+        chosen = {form.drone.chosen for form in list(self._forms.values())}
+        contents = {drone: (instruments_of(drone), sensors_of(drone)) for drone in chosen}
+
+        def show(form: _PageForm) -> None:
+            form.instruments.content, form.figures.content = contents.get(form.drone.chosen, ("", ""))
+
+        self._update(show)
+
+    def show_drones(self, rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures]) -> None:
+        """Show on each page the drones as it sorts and filters them."""
+        self._update(lambda form: form.fleet.show(rows, figures, form.drone.chosen))
+
+    def show_events(self, rows: Sequence[EventRow]) -> None:
+        """Show on each page the events that it has chosen."""
+        self._update(lambda form: form.events.show(rows))
+
+    def refresh(self, run: RunCondition, formation: str) -> None:
+        """Grey out what would be refused; show who controls the formation that is shown, and the run."""
+        self._update(lambda form: form.drone.refresh(run))
+        self._update(lambda form: form.control.refresh([formation, RUN] if formation else [RUN]))
+
+    def _update(self, change: Callable[[_PageForm], None]) -> None:
+        """Change the forms of all pages; a page that closes meanwhile, whose handles viser has removed, is dropped."""
+        for client_id, form in list(self._forms.items()):
+            try:
+                change(form)
+            except RuntimeError:
+                self._forms.pop(client_id, None)
+
+    def _add(self, page: viser.ClientHandle) -> None:
+        if self._closed:
+            return
+        shared, gui, client_id = self._shared, page.gui, page.client_id
+        self._desk.open(client_id)
+
+        def may(drone: str, use: bool) -> str:
+            part = self._part_of(drone)
+            return self._desk.use(client_id, part) if use else self._desk.refusal(client_id, part)
+
+        with shared.control_folder:
+            control = ControlForm(gui, self._desk, client_id, shared.parts)
+        with shared.drone_folder:
+            drone = DroneForm(gui, self._client, self._names, may, self._request_return)
+            instruments = gui.add_html("")
+            fleet = FleetTable(gui, self._names, lambda: drone.select(fleet.selected))
+        with shared.figure_folder:
+            figures = gui.add_html("")
+        with shared.event_folder:
+            events = EventForm(gui, self._names)
+        with shared.theme_folder:
+            theme = gui.add_checkbox("Dark theme", False)
+
+        def set_page_theme() -> None:
+            set_theme(gui, dark=theme.value)
+            draw_ground(page.scene, dark=theme.value)
+
+        theme.on_update(lambda _: set_page_theme())
+        ring = ChosenRing(page.scene, self._radii_m)
+        self._forms[client_id] = _PageForm(control, drone, fleet, ring, instruments, figures, events)
+        if client_id not in self._server.get_clients():
+            self._remove(page)  # it has disconnected meanwhile
+
+    def _remove(self, page: viser.ClientHandle) -> None:
+        self._forms.pop(page.client_id, None)
+        self._desk.close(page.client_id)
+
+
+class EventForm:
+    """The events that one page has chosen, by drone and kind."""
+
+    def __init__(self, gui: viser.GuiApi, names: Sequence[str]) -> None:
+        self._drone = gui.add_dropdown("about", [ALL, *names])
+        self._kind = gui.add_dropdown("events", list(KINDS))
+        self._table = gui.add_html("")
+
+    def show(self, rows: Sequence[EventRow]) -> None:
+        """Show the chosen ones of the rows, newest first."""
+        self._table.content = event_table(chosen_rows(rows, self._drone.value, self._kind.value)[:ROWS_SHOWN])
+
+
+def set_theme(gui: viser.GuiApi, *, dark: bool = False) -> None:
+    """Set the theme of all pages, or of one."""
+    gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False, dark_mode=dark)

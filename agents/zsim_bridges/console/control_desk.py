@@ -1,0 +1,276 @@
+"""Which page of the console is in control of which part: a formation, or the run itself.
+
+A page takes control of a free part by using one of its controls. Another page asks for it, and has it once that is
+granted, or the page in control is closed or lost. An emergency, a landing and a hold need no control.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import zip_longest
+from typing import Any, NamedTuple
+
+import viser
+
+from zsim_bridges.console.run_forms import assign
+
+RUN = "run"  # the part of time, faults and drones of no formation; a formation of that name shares it
+EVERY = ""  # the part of a control that acts on all parts
+LOST_S = 10.0  # wall; after so long without a look a page counts as lost: its script stands, or its machine is gone
+SILENT_SHOWN_S = 3.0  # wall; pages look twice a second
+HERE = ("", "127.0.0.1", "::1")  # addresses of pages on the console's machine
+OPERATOR, VIEWER = "operator", "viewer"
+Tell = Callable[[int, str], None]
+CONTROL_STYLE = "font-size:12px;line-height:1.35;padding:2px 10px 6px;overflow-wrap:anywhere"
+
+
+class Holding(NamedTuple):
+    """Who is in control of a part, and who asks for it, as seen by one page; empty for nobody."""
+
+    part: str
+    holder: str = ""
+    silent_s: float = 0.0
+    asker: str = ""
+    mine: bool = False
+    asked_by_me: bool = False
+
+
+@dataclass
+class _Page:
+    number: int
+    role: str = OPERATOR
+    address: str = ""
+    looked_s: float | None = None  # wall; None before the first look
+
+    @property
+    def name(self) -> str:
+        return f"{self.role} {self.number}{f' ({self.address})' if self.address not in HERE else ''}"
+
+
+class ControlDesk:
+    """Keeps which page, by viser's number, is in control; thread-safe.
+
+    Args:
+        parts: the formations; RUN is added.
+        tell: shows a line of text on a page.
+    """
+
+    def __init__(
+        self, parts: Sequence[str], tell: Tell = lambda *_: None, wall_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._lock = threading.RLock()
+        self._tell = tell
+        self._wall_s = wall_s
+        self._pages: dict[int, _Page] = {}
+        self._count = 0
+        self._holders: dict[str, int] = {}
+        self._askers: dict[str, int] = {}
+        self.parts = tuple(dict.fromkeys((*parts, RUN)))
+
+    def open(self, page: int) -> None:
+        """Note that a page is open."""
+        with self._lock:
+            if page not in self._pages:
+                self._count += 1
+                self._pages[page] = _Page(self._count)
+
+    def close(self, page: int) -> None:
+        """Note that a page is closed, which releases its parts."""
+        with self._lock:
+            self._askers = {part: asker for part, asker in self._askers.items() if asker != page}
+            for part in [part for part, holder in self._holders.items() if holder == page]:
+                self._pass_on(part, f"{self.name_of(page)} is gone, and with it")
+            self._pages.pop(page, None)
+
+    def look(self, page: int, role: str, address: str) -> None:
+        """Note that a page is alive, its role, and its address."""
+        with self._lock:
+            self.open(page)
+            known = self._pages[page]
+            known.role, known.address, known.looked_s = role, address, self._wall_s()
+
+    def release_lost(self) -> None:
+        """Pass on requested parts of pages that are silent; a page keeps a part that nobody requests.
+
+        A page whose socket is closed has released its parts already.
+        """
+        with self._lock:
+            for part in list(self._askers):
+                holder = self._holders[part]
+                if self._silent_s(holder) > LOST_S:
+                    self._pass_on(part, f"{self.name_of(holder)} was silent for {LOST_S:.0f} s and has lost")
+                    self._tell(holder, f"Control of {words(part)} was given away: this page was silent")
+
+    def refusal(self, page: int, part: str) -> str:
+        """Return why a page may not use a control of a part; empty where it may."""
+        with self._lock:
+            for each in self.parts if part == EVERY else (part,):
+                holder = self._holders.get(each, page)
+                if holder != page:
+                    return f"{self.name_of(holder)} is in control of {words(each)}; ask for it under Control"
+        return ""
+
+    def use(self, page: int, part: str) -> str:
+        """Put a page in control of a free part; return why it may not use it, empty where it may."""
+        with self._lock:
+            refusal = self.refusal(page, part)
+            if not refusal and part != EVERY and part not in self._holders:
+                self.open(page)
+                self._holders[part] = page
+        return refusal
+
+    def ask(self, page: int, part: str) -> None:
+        """Ask the page in control for a part."""
+        with self._lock:
+            holder = self._holders.get(part)
+            if holder is None or holder == page:
+                self.use(page, part)
+                return
+            self._askers[part] = page
+            self._tell(holder, f"{self.name_of(page)} asks for control of {words(part)}: see Control")
+
+    def answer(self, page: int, part: str, granted: bool) -> None:
+        """Grant a part to the page that asks for it, or keep it."""
+        with self._lock:
+            asker = self._askers.get(part)
+            if self._holders.get(part) != page or asker is None:
+                return
+            del self._askers[part]
+            if granted:
+                self._holders[part] = asker
+            done = "gives you control of" if granted else "keeps control of"
+            self._tell(asker, f"{self.name_of(page)} {done} {words(part)}")
+
+    def release(self, page: int, part: str) -> None:
+        """Give up a part: it is free, or goes to the page that asks for it."""
+        with self._lock:
+            if self._holders.get(part) == page:
+                self._pass_on(part, f"{self.name_of(page)} has released")
+
+    def holdings(self, page: int, parts: Collection[str]) -> list[Holding]:
+        """Return who is in control of some parts, as a page sees it."""
+        found = []
+        with self._lock:
+            for part in parts:
+                holder, asker = self._holders.get(part), self._askers.get(part)
+                if holder is None:
+                    found.append(Holding(part))
+                    continue
+                asking = "" if asker is None else self.name_of(asker)
+                names = part, self.name_of(holder), self._silent_s(holder), asking
+                found.append(Holding(*names, mine=holder == page, asked_by_me=asker == page))
+        return found
+
+    def others(self, page: int) -> list[str]:
+        """Return the names of the other open pages that have looked, operators first."""
+        with self._lock:
+            known = [each for number, each in self._pages.items() if number != page and each.looked_s is not None]
+            return [each.name for each in sorted(known, key=lambda each: (each.role == VIEWER, each.number))]
+
+    def held_by_others(self, page: int) -> frozenset[str]:
+        """Return the parts whose controls a page may not use, EVERY among them."""
+        with self._lock:
+            held = frozenset(part for part, holder in self._holders.items() if holder != page)
+        return held | {EVERY} if held else held
+
+    def name_of(self, page: int) -> str:
+        known = self._pages.get(page)
+        return known.name if known else "a page"
+
+    def _silent_s(self, page: int) -> float:
+        known = self._pages.get(page)
+        return 0.0 if known is None or known.looked_s is None else self._wall_s() - known.looked_s
+
+    def _pass_on(self, part: str, why: str) -> None:
+        del self._holders[part]
+        asker = self._askers.pop(part, None)
+        if asker is not None:
+            self._holders[part] = asker
+            self._tell(asker, f"{why} the control of {words(part)}: it is yours now")
+
+
+def words(part: str) -> str:
+    """Return the name of a part on pages."""
+    return "time and faults" if part == RUN else part
+
+
+class ControlForm:
+    """Who is in control, on one page, with buttons to ask for control, grant it and give it up.
+
+    Args:
+        page: viser's number of this one.
+        part_of: part of each shared control by its id, which its element on the page has, too.
+    """
+
+    def __init__(self, gui: viser.GuiApi, desk: ControlDesk, page: int, part_of: Mapping[str, str]) -> None:
+        self._part_of = part_of
+        self._desk = desk
+        self._page = page
+        self._parts: list[str] = []
+        self._text = gui.add_html("")
+        self._buttons: list[tuple[Any, Any]] = []
+        for place in range(2):  # the formation that is shown, and the run
+            first, second = gui.add_button("Ask", visible=False), gui.add_button("Keep", visible=False, color="gray")
+            first.on_click(lambda _, place=place: self._press(place))
+            second.on_click(lambda _, place=place: self._answer(place, granted=False))
+            self._buttons.append((first, second))
+
+    def refresh(self, parts: list[str]) -> None:
+        """Show who is in control of some parts."""
+        self._parts = parts
+        holdings, others = self._desk.holdings(self._page, parts), self._desk.others(self._page)
+        here = f"you are {escape(self._desk.name_of(self._page))}"
+        lines = [f"<b>Control</b>: {here}, alone here"]
+        if others:
+            lines = [f"<b>Control</b>: {here}; also here: {escape(', '.join(others))}", *map(_holding_line, holdings)]
+        held = self._desk.held_by_others(self._page)
+        rules = ",".join(f'[id="{control}"]' for control, part in self._part_of.items() if part in held)
+        greyed = f"<style>{rules}{{opacity:.35}}</style>" if rules else ""
+        assign(self._text, content=f"<div style='{CONTROL_STYLE}'>{'<br>'.join(lines)}</div>{greyed}")
+        for (first, second), holding in zip_longest(self._buttons, holdings):
+            label, asked = _offer(holding) if others else ("", False)
+            keep = f"Keep {words(holding.part)}" if holding and asked else ""
+            assign(first, label=label or first.label, visible=bool(label))
+            assign(second, label=keep or second.label, visible=bool(keep))
+
+    def _press(self, place: int) -> None:
+        for holding in self._desk.holdings(self._page, self._parts[place : place + 1]):
+            if not holding.mine:
+                self._desk.ask(self._page, holding.part)
+            elif holding.asker:
+                self._answer(place, granted=True)
+            else:
+                self._desk.release(self._page, holding.part)
+        self.refresh(self._parts)
+
+    def _answer(self, place: int, granted: bool) -> None:
+        for part in self._parts[place : place + 1]:
+            self._desk.answer(self._page, part, granted)
+        self.refresh(self._parts)
+
+
+def _holding_line(holding: Holding) -> str:
+    name = escape(words(holding.part))
+    if not holding.holder:
+        return f"{name}: free"
+    silent = f", silent for {holding.silent_s:.0f} s" if holding.silent_s > SILENT_SHOWN_S else ""
+    who = "<b>you</b>" if holding.mine else f"<b>{escape(holding.holder)}</b>{silent}"
+    asked = ""
+    if holding.asked_by_me:
+        asked = "; you have asked for it"
+    elif holding.asker:
+        asked = f"; <b>{escape(holding.asker)} asks for it</b>"
+    return f"{name}: {who}{asked}"
+
+
+def _offer(holding: Holding | None) -> tuple[str, bool]:
+    """Return the label of a part's first button, empty for none, and whether somebody asks this page for the part."""
+    if holding is None or not holding.holder or holding.asked_by_me:
+        return "", False
+    if not holding.mine:
+        return f"Ask for {words(holding.part)}", False
+    if holding.asker:
+        return f"Give {words(holding.part)} to {holding.asker}", True
+    return f"Release {words(holding.part)}", False

@@ -1,0 +1,443 @@
+"""Drones flown from pages, by a stick or to a place on the map: acquired, commanded at a steady rate, given back.
+
+Whatever is not requested continuously means hover: a stick that is released, a page that is silent, hidden or gone.
+Axes of W, unless a name ends otherwise.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+from zsim.contract.state_rules import state_refusal
+from zsim.math.frames import turned_about_up
+from zsim.math.rotation import Vector
+from zsim.scenario.scenario import Scenario
+from zsim.vehicles.vehicle import Limits
+from zsim_bridges.console.command_client import CommandClient, NoAnswer
+from zsim_bridges.console.operator_input import SIDEWAYS_M, height_range_m
+
+PERIOD_S = 0.05  # wall; of commands: at 5 × real time ten of them within a drone's silence of 0.5 s
+STALE_S = 0.5  # wall; a page silent for longer does not fly any more: as the firmware's silence
+GONE_S = 5.0  # wall; after which the drone of a lost page is given back: it may be reloaded meanwhile
+REPEAT_S = 1.0  # wall; after which a silent world is asked for a drone again
+SETTLED_S = 1.5  # wall; after which a view shows who has acquired a drone; views come 20 times a second
+RATE_MAX = 5.0  # × real time; chosen: faster, manual flight is hopeless, and the firmware takes pauses for silence
+CLIMB_SHARE = 0.5  # of the horizontal speed, up and down; chosen: height is harder to see on a page
+YAW_RATE_RAD_S = math.radians(45.0)  # chosen: a full turn in 8 s
+SPEED_M_S = 1.5  # towards a place; chosen: as the paper's formations
+GAIN_1_S = 0.6  # of the distance to a place; as of formations, `Gains.proportional_1_s`
+BRAKE_S = 1.0  # in which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
+
+
+class Stick(NamedTuple):
+    """Deflections of a stick, or of held keys, from -1 to 1, in the drone's heading frame; yaw to the left."""
+
+    forward: float
+    left: float
+    up: float
+    turn: float
+    speed_m_s: float  # at full deflection
+
+
+class DronePose(NamedTuple):
+    """Position [m; W] and heading [rad] of a drone by its estimator."""
+
+    p_W: Vector
+    yaw_rad: float
+
+
+class FlownVelocity(NamedTuple):
+    """A velocity command in the heading frame."""
+
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+    yaw_rate_rad_s: float = 0.0
+
+
+HOVER = FlownVelocity()
+
+
+class DroneSight(NamedTuple):
+    """What is known of a drone: its firmware's state, empty before it is seen, who flies it, and a present estimate."""
+
+    state: str = ""
+    commander: str | None = None
+    pose: DronePose | None = None
+
+
+class RunSight(NamedTuple):
+    """What is known of the run.
+
+    Attributes:
+        off: why nothing can be flown; otherwise empty.
+        rate: simulated per wall second, as measured.
+        paused: whether it stands still.
+        silence: that the world does not answer, in words; otherwise empty. A drone is requested all the same.
+    """
+
+    off: str = ""
+    rate: float = 1.0
+    paused: bool = False
+    silence: str = ""
+
+
+class FlightAnswer(NamedTuple):
+    """What a page shows of the drone that it flies.
+
+    Attributes:
+        drone: its name; empty for none.
+        state: none, taking or flying.
+        text: why it is not flown, or what it does.
+        over: whether it may be taken over from its commander.
+        commander: who flies it.
+        id: of the page's request to take it.
+        goal: the place to which it flies [m; W].
+    """
+
+    drone: str = ""
+    state: str = "none"
+    text: str = ""
+    over: bool = False
+    commander: str = ""
+    id: str = ""
+    goal: Vector | None = None
+
+
+class Geofence(NamedTuple):
+    """A box around the drones' starts by its corners [m; W]; ranges of formations are those of their variables."""
+
+    low_m: Vector
+    high_m: Vector
+
+    def refusal(self, x_m: float, y_m: float) -> str:
+        """Return why no drone may be sent to a place; empty where it may."""
+        for axis, value, low, high in zip("xy", (x_m, y_m), self.low_m, self.high_m, strict=False):
+            if not low <= value <= high:
+                return f"{axis} is {value:.1f} m, outside of the geofence: {low:g} to {high:g} m"
+        return ""
+
+    def within(self, velocity_W: Vector, p_W: Vector) -> Vector:
+        """Return a wanted velocity [m/s] without what leads out; braking begins BRAKE_S before the fence.
+
+        From outside of the fence, a drone at p_W [m] may come back.
+        """
+        x, y, z = (
+            min(max(v, min(0.0, (low - p) / BRAKE_S)), max(0.0, (high - p) / BRAKE_S))
+            for v, p, low, high in zip(velocity_W, p_W, self.low_m, self.high_m, strict=True)
+        )
+        return x, y, z
+
+
+def geofence_of(scenario: Scenario) -> Geofence:
+    """Return the fence of a scenario's drones: around all starts, and below the lowest ceiling."""
+    xs, ys, _ = zip(*(drone.position_m for drone in scenario.drones), strict=True)
+    low_m, top_m = height_range_m(scenario.drones)
+    corner_m = (round(min(xs)) - SIDEWAYS_M, round(min(ys)) - SIDEWAYS_M, low_m)
+    return Geofence(corner_m, (round(max(xs)) + SIDEWAYS_M, round(max(ys)) + SIDEWAYS_M, top_m))
+
+
+def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofence) -> FlownVelocity:
+    """Return the velocity that a stick demands, within the drone's limits and the fence."""
+    speed = min(max(stick.speed_m_s, 0.0), limits.horizontal_speed_m_s)
+    deflection = max(1.0, math.hypot(stick.forward, stick.left))
+    climb = stick.up * min(CLIMB_SHARE * speed, limits.vertical_speed_m_s)
+    wanted = (stick.forward / deflection * speed, stick.left / deflection * speed, climb)
+    yaw_rate = stick.turn * min(YAW_RATE_RAD_S, math.radians(limits.yaw_rate_deg_s))
+    return FlownVelocity(_fenced(turned_about_up(wanted, pose.yaw_rad), pose, fence), yaw_rate)
+
+
+def velocity_to(place_W: Vector, pose: DronePose, limits: Limits, fence: Geofence) -> FlownVelocity:
+    """Return the velocity towards a place [m; W], without turning."""
+    x, y, z = (GAIN_1_S * (there - here) for there, here in zip(place_W, pose.p_W, strict=True))
+    speed = min(SPEED_M_S, limits.horizontal_speed_m_s)
+    excess = max(1.0, math.hypot(x, y) / speed)
+    climb_max = min(CLIMB_SHARE * speed, limits.vertical_speed_m_s)
+    return FlownVelocity(_fenced((x / excess, y / excess, min(max(z, -climb_max), climb_max)), pose, fence))
+
+
+def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
+    """Return a velocity of W in the heading frame, without what leads out of the fence."""
+    return turned_about_up(fence.within(velocity_W, pose.p_W), -pose.yaw_rad)
+
+
+def _too_fast(rate: float) -> str:
+    """Return why nobody can fly by hand at a rate; empty where somebody can."""
+    if rate <= RATE_MAX:
+        return ""
+    return f"time goes {rate:.1f} × as fast as the wall clock; to fly by hand set the rate to {RATE_MAX:g} or less"
+
+
+@dataclass
+class _Flight:
+    """A drone that a page flies, or is about to; times in s, wall.
+
+    Attributes:
+        modes: number requested of the drone before; a later one ends the flight.
+        begun_s: when the page requested it.
+        seen_s: when the page was last heard.
+        id: of the page's request.
+        owned_s: since when it is commanded; None before.
+        sent_s: when it was last commanded.
+        stick: that is held; None: hover, or on the way to `place_W`.
+        lost: whether the page's connection is gone.
+        asked_s, asking: when the world was last asked for the drone, and whether its answer is outstanding.
+    """
+
+    drone: str
+    modes: int
+    begun_s: float
+    seen_s: float
+    id: str = ""
+    owned_s: float | None = None
+    sent_s: float = 0.0
+    stick: Stick | None = None
+    place_W: Vector | None = None
+    lost: bool = False
+    asked_s: float = 0.0
+    asking: bool = False
+
+
+class ManualFlight:
+    """Flies drones for pages, each identified by any hashable value; thread-safe.
+
+    Args:
+        name: of the console's process.
+        gate_s: simulated seconds of a gate, for which one command is sent at most.
+        sight_of: returns what is known of a drone.
+        run_sight: returns what is known of the run.
+    """
+
+    def __init__(
+        self,
+        client: CommandClient,
+        name: str,
+        limits: Mapping[str, Limits],
+        fence: Geofence,
+        gate_s: float,
+        sight_of: Callable[[str], DroneSight],
+        run_sight: Callable[[], RunSight],
+        wall_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._client = client
+        self._name = name
+        self._limits = limits
+        self._fence = fence
+        self._gate_s = gate_s
+        self._sight_of = sight_of
+        self._run_sight = run_sight
+        self._wall_s = wall_s
+        self._lock = threading.RLock()
+        self._flights: dict[Any, _Flight] = {}
+        self._texts: dict[Any, FlightAnswer] = {}  # why a page flies no more
+        self._released: dict[str, float] = {}  # drones given back, and when to check on them [s; wall]
+        self._ticked_s = wall_s()
+        self._wake = threading.Event()  # something has to be sent at once
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Send commands meanwhile, in a thread of its own."""
+        over = threading.Event()
+
+        def run() -> None:
+            while not over.is_set():
+                self.tick()
+                self._wake.wait(PERIOD_S)
+                self._wake.clear()
+
+        thread = threading.Thread(target=run, name="manual", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            self._wake.set()
+            thread.join(STALE_S)
+            for page in list(self._flights):
+                self.leave(page)
+            self._give_back(self._wall_s())
+
+    def take(self, page: Any, drone: str, over: bool, request: str = "") -> FlightAnswer:
+        """Take a drone for a page; `over`: even from whoever flies it, with an operator's priority.
+
+        A repeated request, with its id, is carried out once; a page that has reconnected keeps its drone.
+        """
+        with self._lock:
+            if request and self._texts.get(page, FlightAnswer()).id == request:
+                return self._texts[page]
+            known = next((key for key, flight in self._flights.items() if request and flight.id == request), None)
+            if known is not None:
+                flight = self._flights[page] = self._flights.pop(known)
+                flight.seen_s, flight.lost = self._wall_s(), False
+                return self.answer(page)
+            if page in self._flights:
+                self.leave(page)
+            self._texts.pop(page, None)
+            refusal, who = self._take_refusal(drone), self._sight_of(drone).commander
+            may_be_over = not refusal and not over and who not in (None, self._name)
+            if refusal or may_be_over:
+                text = refusal or f"{drone} is flown by {who}"
+                self._texts[page] = FlightAnswer(drone, text=text, over=may_be_over, commander=who or "", id=request)
+                return self._texts[page]
+            now_s = self._wall_s()
+            flight = _Flight(drone, self._client.modes_requested(drone), now_s, now_s, request)
+            self._flights[page] = flight
+        self._ask(flight)
+        return self.answer(page)
+
+    def _ask(self, flight: _Flight) -> None:
+        flight.asked_s, flight.asking = self._wall_s(), True
+        self._client.take(flight.drone, partial(self._on_taken, flight))
+
+    def steer(self, page: Any, stick: Stick | None) -> FlightAnswer:
+        """Fly the page's drone by a stick; None: its dead-man key is not held, so hover, or continue to a place."""
+        with self._lock:
+            flight = self._flights.get(page)
+            if flight is not None:
+                if stick is not None:
+                    flight.place_W = None  # the stick overrides the place
+                elif flight.stick is not None:
+                    self._send_soon(flight)
+                flight.stick, flight.seen_s = stick, self._wall_s()
+        return self.answer(page)
+
+    def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None) -> FlightAnswer:
+        """Fly the page's drone to a place, at its present height unless another one is given."""
+        with self._lock:
+            flight = self._flights.get(page)
+            if flight is None:
+                return self.answer(page)._replace(text="no drone is flown from this page; take one first")
+            pose, refusal = self._sight_of(flight.drone).pose, self._fence.refusal(x_m, y_m)
+            if refusal or pose is None:
+                return self.answer(page)._replace(text=refusal or f"no estimate of {flight.drone}")
+            height_m = pose.p_W[2] if z_m is None else z_m
+            flight.stick, flight.place_W, flight.seen_s = None, (x_m, y_m, height_m), self._wall_s()
+        return self.answer(page)
+
+    def is_on_way(self, page: Any) -> bool:
+        """Return whether the page's drone flies to a place."""
+        with self._lock:
+            flight = self._flights.get(page)
+            return flight is not None and flight.place_W is not None
+
+    def leave(self, page: Any, text: str = "") -> FlightAnswer:
+        """Let the page's drone hover, and give it back; `text` says why."""
+        with self._lock:
+            flight = self._flights.pop(page, None)
+            if flight is not None:
+                self._released[flight.drone] = -math.inf
+                self._wake.set()
+                if not flight.lost:
+                    self._texts[page] = FlightAnswer(flight.drone, text=text, id=flight.id)
+        return self.answer(page)
+
+    def lose(self, page: Any) -> None:
+        """Note that a page's connection is gone: its drone hovers at once, and is given back after a while."""
+        with self._lock:
+            flight = self._flights.get(page)
+            self._texts.pop(page, None)
+            if flight is not None:
+                flight.stick, flight.place_W, flight.lost = None, None, True
+                self._send_soon(flight)
+
+    def answer(self, page: Any) -> FlightAnswer:
+        """Return what the page shows."""
+        with self._lock:
+            flight = self._flights.get(page)
+            if flight is None:
+                return self._texts.get(page, FlightAnswer())
+            if flight.owned_s is None:
+                silence = self._run_sight().silence
+                text = f"asked for {self._wall_s() - flight.begun_s:.1f} s ago, not confirmed"
+                return FlightAnswer(flight.drone, "taking", f"{text}: {silence}" if silence else text, id=flight.id)
+            if self._sight_of(flight.drone).pose is None:
+                text = f"hovers: no estimate of {flight.drone}"
+            elif flight.place_W is not None:
+                text = "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.place_W)
+            else:
+                text = "flown by hand" if flight.stick is not None else "hovers"
+            return FlightAnswer(flight.drone, "flying", text, id=flight.id, goal=flight.place_W)
+
+    def tick(self) -> None:
+        """Command every drone that is due; give back those that may not be flown any more.
+
+        Everything is sent from here, in one thread: no command follows a newer one, or the return of a drone.
+        """
+        wall_s, run = self._wall_s(), self._run_sight()
+        stood_s, self._ticked_s = wall_s - self._ticked_s, wall_s
+        stall = f"the console stood still for {stood_s:.0f} s" if stood_s > GONE_S else ""
+        period_s = max(PERIOD_S * 0.9, self._gate_s / max(run.rate, 1e-3))  # a slow run has few gates
+        for page, flight in list(self._flights.items()):
+            reason = stall or self._end_reason(flight, run, wall_s)
+            if reason:
+                self.leave(page, reason)
+            elif flight.owned_s is None:
+                if not flight.asking and not run.silence and wall_s - flight.asked_s >= REPEAT_S:
+                    self._ask(flight)
+            elif not run.paused and wall_s - flight.sent_s >= period_s:
+                flight.sent_s = wall_s
+                flown = self._velocity(flight, wall_s)
+                self._client.send_velocity(flight.drone, flown.velocity_m_s, flown.yaw_rate_rad_s)
+        self._give_back(wall_s)
+
+    def _give_back(self, wall_s: float) -> None:
+        """Release drones; again if the world took a command after the release, which made the console commander."""
+        with self._lock:
+            due = [drone for drone, at_s in self._released.items() if wall_s >= at_s]
+            flown = {flight.drone for flight in self._flights.values()}
+            for drone in due:
+                first = self._released.pop(drone) == -math.inf
+                if drone not in flown and (first or self._sight_of(drone).commander == self._name):
+                    self._released[drone] = wall_s + SETTLED_S
+                    self._client.give_back(drone)
+
+    def _take_refusal(self, drone: str) -> str:
+        run, sight = self._run_sight(), self._sight_of(drone)
+        if drone not in self._limits:
+            return f"drone is {drone!r}; must be one of the run's"
+        if any(flight.drone == drone for flight in self._flights.values()):
+            return f"{drone} is flown from another page"
+        return run.off or _too_fast(run.rate) or state_refusal(drone, sight.state or "unseen", "velocity") or ""
+
+    def _on_taken(self, flight: _Flight, refusal: str) -> None:
+        with self._lock:
+            flight.asking = False
+            page = next((key for key, each in self._flights.items() if each is flight), None)
+            if page is None:
+                if not refusal or isinstance(refusal, NoAnswer):  # the page has given it up meanwhile
+                    self._released[flight.drone] = -math.inf
+            elif isinstance(refusal, NoAnswer):
+                return  # to be asked for again
+            elif refusal:
+                del self._flights[page]
+                if not flight.lost:
+                    self._texts[page] = FlightAnswer(flight.drone, text=refusal, id=flight.id)
+            else:
+                flight.owned_s = self._wall_s()
+
+    def _end_reason(self, flight: _Flight, run: RunSight, wall_s: float) -> str:
+        drone, sight = flight.drone, self._sight_of(flight.drone)
+        if wall_s - flight.seen_s > GONE_S:
+            return "the page was silent"
+        if self._client.modes_requested(drone) != flight.modes:
+            return f"another mode of {drone} was asked for"
+        if flight.owned_s is not None and wall_s - flight.owned_s > SETTLED_S and sight.commander != self._name:
+            return f"{drone} is flown by {sight.commander or 'nobody'} now"
+        off = run.off or (run.silence if flight.owned_s is not None else "")
+        return off or _too_fast(run.rate / 2.0) or state_refusal(drone, sight.state, "velocity") or ""
+
+    def _velocity(self, flight: _Flight, wall_s: float) -> FlownVelocity:
+        pose, limits = self._sight_of(flight.drone).pose, self._limits[flight.drone]
+        if wall_s - flight.seen_s > STALE_S or pose is None:
+            return HOVER
+        if flight.stick is not None:
+            return stick_velocity(flight.stick, pose, limits, self._fence)
+        return HOVER if flight.place_W is None else velocity_to(flight.place_W, pose, limits, self._fence)
+
+    def _send_soon(self, flight: _Flight) -> None:
+        """Let a command be sent at once, not a period after the last one."""
+        flight.sent_s = -math.inf
+        self._wake.set()

@@ -1,0 +1,313 @@
+"""Cameras in the scenes of pages: those with which pages look at it, and frusta of drones' cameras within it.
+
+A page's camera follows the formation and keeps all of it in view, unless the page wants otherwise. A page may show the
+frustum of one drone's camera, with its picture.
+"""
+
+import math
+import secrets
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import viser
+
+from zsim.contract.camera_messages import CameraInfo
+from zsim.math import frames, rotation
+from zsim_bridges.console.camera_feed import CameraPicture, field_of_view
+from zsim_bridges.console.picture import Array, DronePoses
+from zsim_bridges.console.private_viser import show_jpeg
+
+OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a page's camera from what it looks at, where nothing needs more
+DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))
+SLOPE_MIN = 0.05  # of the narrowest page that is fitted; a hidden one has no width
+REACH_M = 0.6  # of a drone around its position, with its name over it; chosen
+FAR_M = 15.0  # beyond which a drone on the page is too small to count as in view; chosen: about 15 pixels
+MARGIN = 0.85  # of half the page, within which a point counts as in view
+UP_W = np.array([0.0, 0.0, 1.0])
+DIRECTIONS = {  # from the centre to the camera; not quite from above, where no direction would be up
+    "reset": OFFSET_M / DISTANCE_MIN_M,
+    "top": np.array([0.0, -0.02, 1.0]),
+    "side": np.array([0.0, -1.0, 0.06]),
+}
+DEADBAND = 0.05  # of the distance; a shorter move does not move the camera, so pictures need not be drawn anew
+SPARE = 1.15  # of the distance from which everything is just in view
+NEARER = 0.6  # of the distance; the camera comes nearer if the fitting one is less
+NODE = "/camera_frustum"
+SCALE = 0.8  # of a frustum: the picture on it is about a metre wide; chosen: beside a hull of half a metre
+EDGE_PX = 2.0
+COLOUR = (226, 0, 134)
+FIELD_MAX_RAD = 2.6  # of a drawn angle of view; beyond it the picture would be wider than the formation
+PAGE_KEY_BYTES = 12
+
+
+class CameraView(NamedTuple):
+    """What a page's camera sees; fov is the vertical angle of view."""
+
+    position: Array  # (3,) m; W
+    look_at: Array  # (3,) m; W
+    up: Array  # (3,); W
+    fov: float  # rad
+    aspect: float  # width / height
+
+    def contains(self, p_W: Array) -> bool:
+        """Return whether a point [m; W] is in view, and not far away."""
+        ahead = _unit(self.look_at - self.position)
+        right = _unit(np.cross(ahead, self.up))
+        away = p_W - self.position
+        x, y, z = away @ right, away @ np.cross(ahead, right), away @ ahead
+        half = MARGIN * math.tan(self.fov / 2) * z
+        return bool(0.0 < z <= FAR_M and abs(y) <= half and abs(x) <= half * self.aspect)
+
+    def offset(self) -> Array:
+        """Return from where to look at another point [m; W]: in the present direction, OFFSET_M away at most."""
+        back = self.position - self.look_at
+        return back * min(1.0, float(np.linalg.norm(OFFSET_M) / np.linalg.norm(back)))
+
+
+def fit_distance_m(points_W: Array, centre_W: Array, back_W: Array, up_W: Array, fov: float, aspect: float) -> float:
+    """Return from how far a camera that looks at a centre has all points in view [m]; DISTANCE_MIN_M at least.
+
+    Args:
+        points_W: (n, 3) m.
+        centre_W: (3,) m.
+        back_W: (3,), from the centre to the camera; not parallel to `up_W`.
+        up_W: (3,).
+        fov: vertical angle of view [rad].
+        aspect: width / height.
+    """
+    back = _unit(back_W)
+    right = _unit(np.cross(up_W, back))
+    away = points_W - centre_W
+    across = np.abs(np.column_stack((away @ right, away @ np.cross(back, right)))) + REACH_M
+    slopes = np.maximum(MARGIN * math.tan(fov / 2) * np.array([aspect, 1.0]), SLOPE_MIN)
+    return float(np.max(across / slopes + (away @ back)[:, None], initial=DISTANCE_MIN_M))
+
+
+def _unit(vector: Array) -> Array:
+    return vector / np.linalg.norm(vector)
+
+
+def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
+    """Aim a page's camera at a point from an offset [m; W]."""
+    with client.atomic():
+        client.camera.position = centre + offset
+        client.camera.look_at = centre
+
+
+@dataclass
+class _Page:
+    """A page's camera.
+
+    Attributes:
+        follows: whether it moves with the formation.
+        fits: whether it keeps all drones in view by its distance.
+        direction: from which it looks at the next picture; None: unchanged.
+        moved: whether it must be aimed anew.
+    """
+
+    client: viser.ClientHandle
+    follows: bool = True
+    fits: bool = True
+    direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)
+    moved: bool = True
+
+
+class CameraFollow:
+    """The cameras with which all pages look at the scene."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._lock = threading.Lock()
+        self._pages: dict[int, _Page] = {}  # by viser's number
+        self._points: Array = np.zeros((1, 3))
+        server.on_client_connect(self._on_connect)
+        server.on_client_disconnect(self._on_disconnect)
+
+    def restart(self) -> None:
+        """Aim all cameras anew at the first picture of another run."""
+        with self._lock:
+            for page in self._pages.values():
+                page.moved = True
+
+    def choose(self, client_id: int, follows: bool, fits: bool, direction: str = "") -> None:
+        """Let a page's camera follow or not, keep all in view or not, and look from a direction of `DIRECTIONS`."""
+        with self._lock:
+            page = self._pages.get(client_id)
+            if page is None:
+                return
+            page.moved = page.moved or direction in DIRECTIONS or (fits and not page.fits)
+            page.direction = DIRECTIONS.get(direction, page.direction)
+            page.follows, page.fits = follows, fits
+
+    def set_target(self, p_W: Array) -> None:
+        """Aim the cameras of later pages at positions (n, 3) [m], unless n is 0."""
+        if len(p_W):
+            self._points = p_W
+
+    def follow(self, p_W: Array) -> None:
+        """Move the cameras that follow the positions (n, 3) [m]."""
+        self.set_target(p_W)
+        if not len(p_W):
+            return
+        with self._lock:
+            pages = [page for page in self._pages.values() if page.follows or page.moved]
+        for page in pages:
+            self._move(page)
+
+    def _move(self, page: _Page) -> None:
+        camera, points = page.client.camera, self._points
+        centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        back = camera.position - camera.look_at
+        now_m = float(np.linalg.norm(back))
+        direction = page.direction if page.direction is not None else back / max(now_m, 1e-9)
+        fit_m = fit_distance_m(points, centre, direction, UP_W, camera.fov, camera.aspect)
+        keeps = not page.moved and (not page.fits or NEARER * now_m <= fit_m <= now_m)
+        near = float(np.linalg.norm(centre - camera.look_at)) <= DEADBAND * now_m
+        if not (keeps and near):
+            page.moved, page.direction = False, None
+            distance_m = now_m if keeps else SPARE * fit_m
+            _aim(page.client, centre, direction * distance_m / float(np.linalg.norm(direction)))
+
+    def _on_connect(self, client: viser.ClientHandle) -> None:
+        page = _Page(client)
+        self._move(page)
+        page.moved = True  # once more at the next picture: this one may be that of another run
+        with self._lock:
+            self._pages[client.client_id] = page
+        if client.client_id not in self._server.get_clients():
+            self._on_disconnect(client)  # it has disconnected meanwhile
+
+    def _on_disconnect(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            self._pages.pop(client.client_id, None)
+
+
+# Frusta
+
+
+def frustum_pose(info: CameraInfo, p_WB: Array, q_WB: Array) -> tuple[Array, Array]:
+    """Return position [m; W] and quaternion, K to W, of a usable camera of a drone at p_WB (3,) [m], q_WB (4,)."""
+    p_WK = p_WB + frames.rotate(q_WB, info.position_m)
+    return p_WK, frames.quaternion_multiply(q_WB, rotation.normalised(info.orientation_wxyz))
+
+
+def drone_index(drones: DronePoses | None, camera: str) -> int | None:
+    """Return which drone a camera is on, None if it is not in the view."""
+    drone = camera.partition("/")[0]
+    if drones is None or drone not in drones.names:
+        return None
+    index = drones.names.index(drone)
+    return index if drones.present[index] else None
+
+
+@dataclass
+class _KeyedPage:
+    """A page, the camera whose frustum it shows, and the drone clicked last in its scene; empty for none."""
+
+    client: viser.ClientHandle
+    camera: str = ""
+    clicked: str = ""
+
+
+@dataclass
+class _Frustum:
+    """A frustum of a camera, as viser's node, and the number of its picture."""
+
+    camera: str
+    node: Any
+    number: int = 0
+
+
+class CameraFrustums:
+    """The frusta of all pages; each page is told a key, by which its sockets identify it.
+
+    A frustum that appears out of its page's view is brought into it.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._lock = threading.Lock()
+        self._pages: dict[str, _KeyedPage] = {}  # by key
+        self._frusta: dict[str, _Frustum] = {}  # by key; only touched by the thread that draws
+        server.on_client_connect(self._on_connect)
+        server.on_client_disconnect(self._on_disconnect)
+
+    def client_id(self, page: str) -> int | None:
+        """Return viser's number of a page, None if it is not open."""
+        with self._lock:
+            return self._pages[page].client.client_id if page in self._pages else None
+
+    def choose(self, page: str, camera: str) -> None:
+        """Show a camera's frustum on a page; empty: none."""
+        with self._lock:
+            if page in self._pages:
+                self._pages[page].camera = camera
+
+    def click(self, client_id: int, drone: str) -> None:
+        """Note that a drone was clicked in the scene of a page, by viser's number."""
+        with self._lock:
+            for page in self._pages.values():
+                if page.client.client_id == client_id:
+                    page.clicked = drone
+
+    def take_click(self, page: str) -> str:
+        """Return once the drone that was clicked last in a page's scene; empty for none."""
+        with self._lock:
+            if page not in self._pages:
+                return ""
+            clicked, self._pages[page].clicked = self._pages[page].clicked, ""
+            return clicked
+
+    def draw(self, drones: DronePoses | None, shown: Callable[[str], tuple[CameraInfo, CameraPicture] | None]) -> None:
+        """Draw the chosen frusta, and remove others; `shown` returns a camera with its newest picture."""
+        with self._lock:
+            chosen = {key: (page.client, page.camera) for key, page in self._pages.items() if page.camera}
+        for key, frustum in list(self._frusta.items()):
+            if key not in chosen or chosen[key][1] != frustum.camera:
+                self._frusta.pop(key).node.remove()
+        for key, (client, camera) in chosen.items():
+            found, index = shown(camera), drone_index(drones, camera)
+            if found is None or drones is None or index is None:
+                continue
+            info, picture = found
+            p_W, q_WK = frustum_pose(info, drones.p_W[index], drones.q_WB[index])
+            frustum = self._frusta.get(key)
+            if frustum is None:
+                _bring_into_view(client, p_W, p_W + frames.rotate(q_WK, (0.0, 0.0, SCALE)))
+                node: Any = client.scene.add_camera_frustum(
+                    NODE, min(field_of_view(info), FIELD_MAX_RAD), info.width / info.height, scale=SCALE,
+                    thickness=EDGE_PX, thickness_units="screen", color=COLOUR, cast_shadow=False, receive_shadow=False,
+                )  # fmt: skip
+                frustum = self._frusta[key] = _Frustum(camera, node)
+            frustum.node.position, frustum.node.wxyz = p_W, q_WK
+            if picture.number != frustum.number:
+                frustum.number = picture.number
+                show_jpeg(frustum.node, picture.image.data)
+
+    def clear(self) -> None:
+        """Remove all: the run is over."""
+        with self._lock:
+            for page in self._pages.values():
+                page.camera = ""
+        self.draw(None, lambda _: None)
+
+    def _on_connect(self, client: viser.ClientHandle) -> None:
+        key = secrets.token_urlsafe(PAGE_KEY_BYTES)
+        with self._lock:
+            self._pages[key] = _KeyedPage(client)
+        client.gui.add_html(f'<i data-zsim-page="{key}"></i>', order=-2.0)
+
+    def _on_disconnect(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            others = {key: page for key, page in self._pages.items() if page.client.client_id != client.client_id}
+            self._pages = others
+
+
+def _bring_into_view(client: viser.ClientHandle, *points_W: Array) -> None:
+    """Aim a page's camera at the first of some points [m; W], unless it has all in view."""
+    camera = client.camera
+    view = CameraView(camera.position, camera.look_at, camera.up_direction, camera.fov, camera.aspect)
+    if not all(view.contains(p_W) for p_W in points_W):
+        _aim(client, points_W[0], view.offset())

@@ -1,0 +1,450 @@
+"""The console's HTTP server: serves the page to those who may open it, and relays between the page and viser.
+
+The page is viser's, with a head, tools over the scene and windows of the cameras in `frame/`; viewers see its controls
+disabled. It may also show what its run leaves behind, and copy that before the console leaves.
+"""
+
+import asyncio
+import gzip
+import importlib.resources
+import secrets
+import socket
+import stat
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import quote, urlsplit
+
+import msgspec
+from aiohttp import ClientError, ClientSession, WSMsgType, web
+
+from zsim.errors import RunError
+from zsim.record.record_reader import RECORD
+from zsim_bridges.console.control_desk import OPERATOR, VIEWER
+from zsim_bridges.console.orders import OrderRequest
+from zsim_bridges.web import is_loopback_authority
+from zsim_bridges.web.web_server import (
+    ANY_PORT,
+    ServedSite,
+    check_token,
+    open_on_thread,
+    start_site,
+    tokens_match,
+    url_host,
+)
+
+VIEW_PATH = "/view"
+MESSAGE_MAX = 100_000  # bytes of one message of a page
+BACKEND_HOST = "127.0.0.1"  # where viser listens
+PAGE_HEADER = "X-Zsim-Page"  # a page's name; pages of other sites cannot send it without permission
+CLIENT_HEADER = "X-Zsim-Client"  # the key of a page, by which viser's number of it is known
+COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has what it keeps of a console that leaves
+SECRET_HEADER = "X-Zsim-Console"  # demanded by viser's server
+ALL_ADDRESSES = ("0.0.0.0", "::")
+PAGES_MAX = 50  # open at once, of operators and of viewers: viewers keep no operator out
+HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed
+CLOSE_S = (
+    0.3  # wall; twice at the end, for requests in progress, and for pages to close their sockets; slow ones do not
+)
+POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
+HEADERS = {
+    "Content-Security-Policy": POLICY,  # the page is one file, and nothing on it comes from elsewhere
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+PARTS = (  # of the page, beside viser's; each part may use those before it
+    "layout.html",
+    "orders.html",
+    "head_bar.html",
+    "fleet_table.html",
+    "camera_windows.html",
+    "scene_tools.html",
+    "flight_bar.html",
+    "map_drawing.html",
+    "map_view.html",
+    "touch.html",
+)
+LOOKED_S = 5.0  # wall; a page that has not looked for so long is closed; above GONE_MS + LOOK_MS of head_bar.html
+MTIME_S = 2.0  # by which a file's time may be too early at most: that of FAT
+POLL_S = 0.1  # wall; between two looks at whether all pages have their copies
+LOOKS_MAX = 200  # pages remembered: more than may be open, 50 of operators and 50 of viewers
+
+
+class ListenAddress(NamedTuple):
+    """Where pages are served; `or_any`: on another port if this one is taken."""
+
+    host: str
+    port: int
+    or_any: bool = False
+
+    def url(self, path: str = "/", token: str | None = None) -> str:
+        """Return the URL of a page; by the name of this machine if it listens on all addresses."""
+        host = socket.gethostname() if self.host in ALL_ADDRESSES else self.host
+        query = f"?token={quote(token, safe='')}" if token else ""
+        return f"http://{url_host(host)}:{self.port}{path}{query}"
+
+
+class RunFiles:
+    """The report and the record of one run; files older than this object are of another run.
+
+    Args:
+        folder: of the run; None where it is unknown.
+
+    Attributes:
+        paths: by their names on pages; the files may not exist yet.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        whole = folder and folder.absolute()
+        self.paths = {"report": whole / "report.html", "record": whole / RECORD} if whole else {}
+        self._since_s = time.time()
+        self._looked_s: dict[str, float] = {}  # when pages without copies last looked [s; monotonic], by their names
+        self._leaves = False
+
+    def shown(self, page: str, has_copies: bool) -> dict[str, Any]:
+        """Return what the head of a page shows of them as plain data.
+
+        Args:
+            page: its name; empty where no page asks.
+            has_copies: whether it has copied everything that it wants to keep.
+        """
+        self._looked_s.pop(page, None)
+        if page and not has_copies:
+            while len(self._looked_s) >= LOOKS_MAX:
+                del self._looked_s[min(self._looked_s, key=self._looked_s.__getitem__)]
+            self._looked_s[page] = time.monotonic()
+        files = {name: {"path": str(path), "size_bytes": self.size_bytes(path)} for name, path in self.paths.items()}
+        return {"files": files, "leaves": self._leaves}
+
+    def offer(self, within_s: float, deserted: Callable[[], bool]) -> None:
+        """Tell pages to copy the files, since the console leaves; wait until all open ones have.
+
+        Args:
+            within_s: for how long at most [wall].
+            deserted: whether to return at once.
+        """
+        self._leaves = True
+        until_s = time.monotonic() + within_s
+        while (now_s := time.monotonic()) < until_s and not deserted():
+            if not any(now_s - looked_s < LOOKED_S for looked_s in list(self._looked_s.values())):
+                return
+            time.sleep(POLL_S)
+
+    def size_bytes(self, path: Path) -> int | None:
+        """Return the size of one of the files, None if this run has not written it."""
+        try:
+            status = path.stat()
+        except OSError:
+            return None
+        is_own = stat.S_ISREG(status.st_mode) and status.st_mtime >= self._since_s - MTIME_S
+        return status.st_size if is_own else None
+
+
+class ViserBackend(NamedTuple):
+    """What is behind the HTTP server.
+
+    Attributes:
+        port: of viser, on BACKEND_HOST.
+        secret: demanded by viser in SECRET_HEADER.
+        state: returns what the console shows as plain data.
+        permits: returns whether a message of a page in a role may reach viser.
+        serve_cameras: answers a page's request for a socket of pictures, until it closes.
+        serve_actions: answers a request for a socket of actions by a page in a role, until it closes.
+        head: returns what the head of the page shows as plain data.
+        command: takes an order; returns its progress as plain data with `state` and `reason`.
+        files: left behind by the run.
+        looked: called with key, role and address of a page that is alive.
+    """
+
+    port: int
+    secret: str
+    state: Callable[[], dict[str, Any]]
+    permits: Callable[[bytes, str], bool]
+    serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]
+    head: Callable[[], dict[str, Any]]
+    command: Callable[[OrderRequest], dict[str, Any]]
+    files: RunFiles
+    looked: Callable[[str, str, str], None]
+
+
+class HttpProxy:
+    """One server of pages.
+
+    Args:
+        token: of operators; None where only this machine can connect.
+
+    Raises:
+        RunError: others could reach it, and there is no token.
+    """
+
+    def __init__(self, address: ListenAddress, token: str | None, backend: ViserBackend) -> None:
+        self._address = address
+        self._token = token
+        self._view_token = secrets.token_urlsafe(12)
+        self._tokens = self._tokens_at(address)
+        self._backend = backend
+        self._pages = {OPERATOR: _page(), VIEWER: _page("viewer.html")}
+        self._open_pages: Counter[str] = Counter()  # sockets, by what they are for
+        self._loop = asyncio.new_event_loop()
+        self._client: ClientSession | None = None
+
+    def _tokens_at(self, address: ListenAddress) -> "PageTokens":
+        return PageTokens(address.host, address.port, self._token, self._view_token)
+
+    def urls(self) -> dict[str, str]:
+        """Return the URLs to be opened, by role."""
+        view_token = self._view_token if self._token is not None else None
+        return {OPERATOR: self._address.url("/", self._token), VIEWER: self._address.url(VIEW_PATH, view_token)}
+
+    @contextmanager
+    def open(self) -> Iterator[None]:
+        """Serve pages on a thread of its own.
+
+        Raises:
+            RunError: the port is taken, or the address is none of this machine.
+        """
+        with open_on_thread(self._loop, "console server", self._open, self._close):
+            yield
+
+    async def _open(self) -> ServedSite:
+        app = web.Application(client_max_size=MESSAGE_MAX)
+        app.add_routes([web.get(path, self._page) for path in ("/", VIEW_PATH)])
+        shared = {"/state": self._state, "/head": self._head, "/cameras": self._cameras, "/actions": self._actions}
+        shared |= {f"/{name}": partial(self._file, path) for name, path in self._backend.files.paths.items()}
+        for path, handler in shared.items():
+            app.add_routes([web.get(path, handler), web.get(f"{VIEW_PATH}{path}", handler)])
+        app.add_routes([web.post("/command", self._command)])
+        try:
+            host, port, or_any = self._address
+            site = await start_site(app, host, (port, ANY_PORT) if or_any else (port,), shutdown_s=CLOSE_S)
+        except OSError as error:
+            address = f"{self._address.host}, port {self._address.port}"
+            raise RunError(f"console: cannot listen on {address} ({error.strerror}); say --port") from error
+        self._address = self._address._replace(port=site.port)
+        self._tokens = self._tokens_at(self._address)
+        self._client = ClientSession()
+        return site
+
+    async def _close(self, site: ServedSite) -> None:
+        assert self._client is not None
+        await self._client.close()
+        await site.cleanup()
+
+    def _role_of(self, request: web.Request) -> str | None:
+        return self._tokens.role_of(_page_request(request))
+
+    async def _page(self, request: web.Request) -> web.StreamResponse:
+        """Serve the page, or its WebSocket."""
+        page_request = _page_request(request)
+        role = self._tokens.role_of(page_request)
+        if role is None:
+            return _missing_token()
+        if page_request.token:
+            return self._set_cookie(page_request)
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            return await self._stream(role, lambda: self._relay(request, role))
+        headers = {**HEADERS, "Content-Encoding": "gzip"}
+        return web.Response(body=self._pages[role], content_type="text/html", charset="utf-8", headers=headers)
+
+    def _set_cookie(self, page_request: "PageRequest") -> web.Response:
+        """Move the token from the address into a cookie; a reverse proxy may serve the page below a path of its own."""
+        response = web.Response(status=303, headers={**HEADERS, "Location": f".{page_request.path}"})
+        role = self._tokens.role_of_address(page_request)
+        if role is not None:
+            name = self._tokens.cookie(role)
+            response.set_cookie(name, page_request.token, httponly=True, samesite="Strict", path="/")
+        return response
+
+    async def _state(self, request: web.Request) -> web.Response:
+        return _missing_token() if self._role_of(request) is None else _json_response(self._backend.state())
+
+    async def _head(self, request: web.Request) -> web.Response:
+        role = self._role_of(request)
+        if role is None:
+            return _missing_token()
+        key = request.headers.get(CLIENT_HEADER, "")
+        if key:
+            self._backend.looked(key, role, request.remote or "")
+        files = self._backend.files.shown(request.headers.get(PAGE_HEADER, ""), COPIED_HEADER in request.headers)
+        return _json_response({**self._backend.head(), **files})
+
+    async def _file(self, path: Path, request: web.Request) -> web.StreamResponse:
+        """Serve what a run left behind: a page to be read, or a file to be kept."""
+        if self._role_of(request) is None:
+            return _missing_token()
+        if self._backend.files.size_bytes(path) is None:
+            return web.Response(status=404, text=f"{path} is not there yet\n", headers=HEADERS)
+        kept = {} if path.suffix == ".html" else {"Content-Disposition": f'attachment; filename="{path.name}"'}
+        return web.FileResponse(path, headers={**HEADERS, **kept})
+
+    async def _command(self, request: web.Request) -> web.Response:
+        """Take an order of an operator; viewers have no such path."""
+        if self._role_of(request) != OPERATOR:
+            return _missing_token()
+        try:
+            order = _ORDERS.decode(await request.read())
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            return _json_response({"refusal": f"body: {error}"}, 400)
+        progress = self._backend.command(order)
+        refusal = progress["reason"] if progress["state"] == "refused" else ""
+        return _json_response({"refusal": refusal, "order": progress}, 409 if refusal else 200)
+
+    async def _cameras(self, request: web.Request) -> web.StreamResponse:
+        """Serve a page's socket for pictures of cameras, viewers' too."""
+        return await self._socket(request, "cameras", lambda _: self._backend.serve_cameras(request))
+
+    async def _actions(self, request: web.Request) -> web.StreamResponse:
+        """Serve a page's socket for actions; viewers move their cameras."""
+        return await self._socket(request, "actions", partial(self._backend.serve_actions, request))
+
+    async def _socket(
+        self, request: web.Request, what: str, serve: Callable[[str], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        role = self._role_of(request)
+        return _missing_token() if role is None else await self._stream(f"{what} of {role}", lambda: serve(role))
+
+    async def _stream(self, what: str, serve: Callable[[], Awaitable[web.StreamResponse]]) -> web.StreamResponse:
+        """Serve a socket, unless too many of its kind are open."""
+        if self._open_pages[what] >= PAGES_MAX:
+            return web.Response(status=503, text=f"{PAGES_MAX} pages are open already; close one\n", headers=HEADERS)
+        self._open_pages[what] += 1
+        try:
+            return await serve()
+        finally:
+            self._open_pages[what] -= 1
+
+    async def _relay(self, request: web.Request, role: str) -> web.WebSocketResponse:
+        """Relay messages between page and viser until one side closes."""
+        header = request.headers.get("Sec-WebSocket-Protocol", "")
+        protocols = [part.strip() for part in header.split(",") if part.strip()]
+        page = web.WebSocketResponse(
+            protocols=protocols, compress=False, max_msg_size=MESSAGE_MAX, heartbeat=HEARTBEAT_S
+        )
+        await page.prepare(request)
+        assert self._client is not None
+        url = f"ws://{BACKEND_HOST}:{self._backend.port}/"
+        headers = {SECRET_HEADER: self._backend.secret}
+
+        async def forward(source: Any, sink: Any, permits: Callable[[bytes], bool]) -> None:
+            async for message in source:
+                if message.type is WSMsgType.BINARY and permits(message.data):
+                    await sink.send_bytes(message.data)
+
+        try:
+            connecting = self._client.ws_connect(url, protocols=protocols, headers=headers, compress=0, max_msg_size=0)
+            async with connecting as viser:
+                ways = (
+                    forward(viser, page, lambda _: True),
+                    forward(page, viser, lambda data: self._backend.permits(data, role)),
+                )
+                tasks = [asyncio.ensure_future(way) for way in ways]
+                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                for task in tasks:
+                    task.cancel()
+                await asyncio.gather(*tasks, return_exceptions=True)
+        except ClientError:
+            pass  # viser ends, or has ended
+        await page.close()
+        return page
+
+
+_ORDERS = msgspec.json.Decoder(OrderRequest)
+
+
+def _json_response(shown: dict[str, Any], status: int = 200) -> web.Response:
+    body = msgspec.json.encode(shown)
+    return web.Response(body=body, status=status, content_type="application/json", headers=HEADERS)
+
+
+def _missing_token() -> web.Response:
+    text = "This page needs the token of the console: open the link that it printed when it started.\n"
+    return web.Response(status=401, text=text, headers=HEADERS)
+
+
+def _page(style: str = "") -> bytes:
+    """Return the page, compressed, with a style of `frame/`."""
+    html = importlib.resources.files("viser").joinpath("client/build/index.html").read_text()
+    folder = importlib.resources.files("zsim_bridges.console.frame")
+    parts = "".join(folder.joinpath(name).read_text("utf-8") for name in PARTS)
+    head, end, tail = html.rpartition("</body>")
+    whole = f"{head}{parts}{end}{tail}" if end else f"{html}{parts}"
+    shown_as = folder.joinpath(style).read_text("utf-8") if style else ""
+    return gzip.compress(whole.replace("</head>", f"{shown_as}</head>", 1).encode())
+
+
+# Who may open a page
+
+
+class PageRequest(NamedTuple):
+    """The fields of an HTTP request that identify its sender."""
+
+    path: str
+    host: str  # of its Host header
+    origin: str | None
+    token: str  # in its address; empty for none
+    cookies: dict[str, str]
+
+
+def _page_request(request: web.Request) -> PageRequest:
+    headers = request.headers
+    token = request.query.get("token", "")
+    return PageRequest(request.path, headers.get("Host", ""), headers.get("Origin"), token, dict(request.cookies))
+
+
+class PageTokens:
+    """Decides who may open pages in which role: by tokens, or on this machine alone by a request's origin.
+
+    Args:
+        listen, port: the address at which pages are served.
+        operator, viewer: tokens; the first is None where only this machine can connect.
+
+    Raises:
+        RunError: others could reach it, and there is no token.
+    """
+
+    def __init__(self, listen: str, port: int, operator: str | None, viewer: str) -> None:
+        check_token("console", listen, operator)
+        self._tokens = {OPERATOR: operator, VIEWER: viewer}
+        self._port = port
+
+    def cookie(self, role: str) -> str:
+        """Return the name of a role's cookie; browsers keep those of all ports of a host together."""
+        return f"zsim_{role}_{self._port}"
+
+    def role_of(self, request: PageRequest) -> str | None:
+        """Return the role in which the page of this path may be opened, None if it may not."""
+        role = VIEWER if request.path.startswith(VIEW_PATH) else OPERATOR
+        from_own_page = request.origin is None or _origin_address(request.origin) == request.host
+        if self._tokens[OPERATOR] is None:
+            try:
+                return role if from_own_page and is_loopback_authority(request.host) else None
+            except ValueError:
+                return None
+        if not from_own_page:
+            return None
+        sufficient = (OPERATOR,) if role == OPERATOR else (VIEWER, OPERATOR)
+        shown = {each: (request.token, request.cookies.get(self.cookie(each), "")) for each in sufficient}
+        return role if any(self._is_token(token, each) for each in shown for token in shown[each]) else None
+
+    def role_of_address(self, request: PageRequest) -> str | None:
+        """Return the role whose token stands in the address, to become a cookie; None if none does."""
+        roles = (role for role in (OPERATOR, VIEWER) if self._is_token(request.token, role))
+        return next(roles, None) if request.token else None
+
+    def _is_token(self, received: str, role: str) -> bool:
+        token = self._tokens[role]
+        return token is not None and tokens_match(received, token)
+
+
+def _origin_address(origin: str) -> str | None:
+    """Return host and port of an Origin header, None if it cannot be parsed."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None

@@ -1,0 +1,332 @@
+"""The sockets of the console's own that a page opens: one for what it does, one for pictures of the drones' cameras.
+
+Pictures have a socket of their own, since a megabyte of them on a slow link must not delay the answers to a stick. Both
+end when a page says what no page of ours would. Viewers look and choose; operators also fly and play a record.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+import msgspec
+from aiohttp import WSMsgType, web
+from msgspec import Meta, Struct
+
+from zsim_bridges.console.camera_feed import CameraFeed
+from zsim_bridges.console.manual_flight import FlightAnswer, Stick
+from zsim_bridges.console.page_cameras import CameraFollow, CameraFrustums
+from zsim_bridges.console.page_flying import PageFlying
+from zsim_bridges.console.page_server import HEARTBEAT_S, OPERATOR
+from zsim_bridges.console.time_monitor import RecordPlayer
+
+ACTION_MAX = 2_000  # bytes
+NAME_MAX = 64  # characters of the name of a drone or camera, or of a page's key
+PLACE_MAX_M = 1e5  # of a place on the plan view; the fence is far nearer
+SPEED_MAX_M_S = 100.0  # of a stick; the drones' own limits are far lower
+PERIOD_S = 0.1  # wall, from one picture of a camera to the next, at least
+WANTED_MAX = 16  # pictures on one page
+REQUEST_MAX = 10_000  # bytes
+
+Name = Annotated[str, Meta(max_length=NAME_MAX)]
+Deflection = Annotated[float, Meta(ge=-1.0, le=1.0)]
+Metres = Annotated[float, Meta(ge=-PLACE_MAX_M, le=PLACE_MAX_M)]
+
+
+class _Action(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
+    pass
+
+
+class LookFrom(_Action, frozen=True, tag="look"):
+    """Let the page's camera follow the formation or not, keep all of it in view or not, and look from a direction."""
+
+    page: Name
+    follows: bool
+    fits: bool
+    direction: Literal["", "reset", "top", "side"] = ""
+
+
+class LookAtPlan(_Action, frozen=True, tag="plan"):
+    """Request the view from above; `whole`: with what does not change."""
+
+    page: Name
+    whole: bool = False
+
+
+class ChooseDrone(_Action, frozen=True, tag="choose"):
+    """Choose a drone on the page itself."""
+
+    page: Name
+    drone: Name
+
+
+class SelectDrone(_Action, frozen=True, tag="select"):
+    """Select a drone on the page itself for one command with others, or unselect it."""
+
+    page: Name
+    drone: Name
+
+
+class PlayRecord(_Action, frozen=True, tag="play"):
+    """Let a replay continue from an instant, pause, resume, step, or change its rate; of operators only."""
+
+    op: Literal["seek", "pause", "resume", "step", "rate"]
+    value: Annotated[float, Meta(ge=0.0, le=1e9)] = 1.0
+    """Simulated seconds to seek, gates to step, or simulated seconds per wall second."""
+
+
+class TakeDrone(_Action, frozen=True, tag="take"):
+    """Take a drone to fly it; `over`: even from whoever flies it; of operators only, as all below.
+
+    To be repeated until it is answered; requests with the same `id` are carried out once.
+    """
+
+    drone: Name
+    over: bool = False
+    id: Name = ""
+
+
+class SteerDrone(_Action, frozen=True, tag="steer"):
+    """Fly the drone that was taken, or let it hover if not `held`; to be repeated, since a silent page does not fly."""
+
+    held: bool = False
+    forward: Deflection = 0.0
+    left: Deflection = 0.0
+    up: Deflection = 0.0
+    turn: Deflection = 0.0
+    speed_m_s: Annotated[float, Meta(ge=0.0, le=SPEED_MAX_M_S)] = 1.0
+
+    def stick(self) -> Stick | None:
+        """Return the stick, None if it is not held."""
+        return Stick(self.forward, self.left, self.up, self.turn, self.speed_m_s) if self.held else None
+
+
+class GoToPlace(_Action, frozen=True, tag="go"):
+    """Send the drone that was taken to a place, at its present height unless `z_m` is given."""
+
+    x_m: Metres
+    y_m: Metres
+    z_m: Metres | None = None
+
+
+class LeaveDrone(_Action, frozen=True, tag="leave"):
+    """Give the drone back."""
+
+
+_Look = LookFrom | LookAtPlan | ChooseDrone | SelectDrone
+_Operate = PlayRecord | TakeDrone | SteerDrone | GoToPlace | LeaveDrone
+_ACTIONS = msgspec.json.Decoder(_Look | _Operate)
+
+
+async def _open(request: web.Request, max_bytes: int) -> web.WebSocketResponse:
+    socket = web.WebSocketResponse(compress=False, max_msg_size=max_bytes, heartbeat=HEARTBEAT_S)
+    await socket.prepare(request)
+    return socket
+
+
+class ActionSockets:
+    """The sockets for actions of all pages.
+
+    Args:
+        client_id: returns viser's number of a page by its key, None if it is not open.
+        record: returns what a replay plays, None without a run.
+        flying: returns what pages may do with single drones, None without a run.
+    """
+
+    def __init__(
+        self,
+        client_id: Callable[[str], int | None],
+        cameras: CameraFollow,
+        record: Callable[[], RecordPlayer | None],
+        flying: Callable[[], PageFlying | None] = lambda: None,
+    ) -> None:
+        self._client_id = client_id
+        self._cameras = cameras
+        self._record = record
+        self._flying = flying
+        self._keys: dict[Any, str] = {}  # of the page at each socket
+
+    async def respond(self, request: web.Request, role: str) -> web.StreamResponse:
+        """Answer a request for a socket; return when it is closed."""
+        socket = await _open(request, ACTION_MAX)
+        try:
+            async for message in socket:
+                answer = self.act(message.data, role, socket) if message.type is WSMsgType.TEXT else None
+                if answer is None:
+                    break
+                if answer:
+                    await socket.send_bytes(msgspec.json.encode(answer))
+        except ConnectionError:
+            pass  # the page has gone while it was answered
+        finally:
+            self.lose(socket)
+        await socket.close()
+        return socket
+
+    def lose(self, page: Any) -> None:
+        """Note that a page's socket is closed: the drone that it flies hovers."""
+        self._keys.pop(page, None)
+        flying = self._flying()
+        if flying is not None:
+            flying.control.lose(page)
+
+    def act(self, text: str, role: str, page: Any = None) -> dict[str, Any] | None:
+        """Carry out an action, as JSON, of a page in a role; return the answer, None for what is not permitted.
+
+        `page` identifies the page that flies a drone.
+        """
+        try:
+            action: _Look | _Operate = _ACTIONS.decode(text)
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            return None
+        if isinstance(action, _Operate):
+            return self._operate(action, page) if role == OPERATOR else None
+        client_id, flying = self._client_id(action.page), self._flying()
+        if isinstance(action, LookAtPlan) and page is not None:
+            self._keys[page] = action.page
+        if isinstance(action, LookFrom):
+            if client_id is not None:
+                self._cameras.choose(client_id, action.follows, action.fits, action.direction)
+        elif flying is None:
+            return {}
+        elif isinstance(action, LookAtPlan):
+            return {"plan": flying.plan(client_id, action.whole)}
+        elif isinstance(action, ChooseDrone):
+            flying.choose(client_id, action.drone)
+        else:
+            flying.select(client_id, action.drone)
+        return {}
+
+    def _operate(self, action: _Operate, page: Any) -> dict[str, Any]:
+        if isinstance(action, PlayRecord):
+            record = self._record()
+            if record is not None:
+                record.play(action.op, action.value)
+            return {}
+        flying = self._flying()
+        if flying is None:
+            return {}
+        if isinstance(action, TakeDrone):
+            client_id = self._client_id(self._keys.get(page, "")) if page is not None else None
+            refusal = flying.take_refusal(client_id, action.drone)
+            if refusal:
+                answer = FlightAnswer(action.drone, text=refusal)
+            else:
+                answer = flying.control.take(page, action.drone, action.over, action.id)
+        elif isinstance(action, SteerDrone):
+            answer = flying.control.steer(page, action.stick())
+        elif isinstance(action, GoToPlace):
+            answer = flying.control.go(page, action.x_m, action.y_m, action.z_m)
+        else:
+            answer = flying.control.leave(page)
+        return {"flight": answer._asdict()}
+
+
+# Pictures
+
+
+class PicturesRequest(Struct, frozen=True, forbid_unknown_fields=True):
+    """What a page requests; each request also confirms that it has shown what it was sent before."""
+
+    page: Name = ""
+    want: Annotated[tuple[Name, ...], Meta(max_length=WANTED_MAX)] = ()
+    frustum: Name = ""
+    """The camera whose frustum is shown in the page's scene; empty for none."""
+
+
+_PICTURES = msgspec.json.Decoder(PicturesRequest)
+
+
+class PageBatches:
+    """What one page is sent: all changes of the cameras that it wants, in one message.
+
+    A message is the length of its header (4 bytes, big-endian), the header as JSON, and the JPEGs one after the other.
+    The header has `cameras` (name, width, height; null if unchanged), `pictures` (camera, size [bytes; 0: unchanged],
+    t_s, marks), and `clicked` if a drone was clicked in the scene.
+    """
+
+    def __init__(self) -> None:
+        self._cameras: list[dict[str, Any]] = []
+        self._shown: dict[str, tuple[Any, ...]] = {}
+
+    def next(self, feed: CameraFeed | None, want: tuple[str, ...], clicked: str = "") -> bytes | None:
+        """Return the next message, None while nothing has changed and no drone was clicked."""
+        found = [] if feed is None else feed.cameras()
+        cameras = [{"name": name, "width": info.width, "height": info.height} for name, info in found]
+        header: dict[str, Any] = {"cameras": None, "pictures": []}
+        if cameras != self._cameras:
+            self._cameras, self._shown, header["cameras"] = cameras, {}, cameras
+        jpegs = []
+        for camera in dict.fromkeys(want):
+            picture = feed.picture(camera) if feed is not None else None
+            if feed is None or picture is None:
+                continue
+            shown, now = self._shown.get(camera), (feed, picture.number, feed.marks(camera))
+            if shown == now:
+                continue
+            self._shown[camera] = now
+            data = b"" if shown is not None and shown[:2] == now[:2] else picture.image.data
+            t_s = picture.image.t_sample_ns / 1e9
+            header["pictures"].append({"camera": camera, "size": len(data), "t_s": t_s, "marks": now[2]})
+            jpegs.append(data)
+        if header["cameras"] is None and not header["pictures"] and not clicked:
+            return None
+        encoded = msgspec.json.encode({**header, "clicked": clicked} if clicked else header)
+        return b"".join((len(encoded).to_bytes(4, "big"), encoded, *jpegs))
+
+
+class CameraSockets:
+    """The sockets for pictures of all pages.
+
+    Args:
+        feed: returns the cameras of the run that is shown, None without one.
+    """
+
+    def __init__(self, feed: Callable[[], CameraFeed | None], frustums: CameraFrustums) -> None:
+        self._feed = feed
+        self._frustums = frustums
+
+    async def respond(self, request: web.Request) -> web.StreamResponse:
+        """Answer a request for a socket; return when it is closed."""
+        socket = await _open(request, REQUEST_MAX)
+        await self.serve(socket)
+        await socket.close()
+        return socket
+
+    async def serve(self, socket: web.WebSocketResponse) -> None:
+        """Send pictures until the page closes its socket, or sends what is no request.
+
+        Only changes are sent, PERIOD_S apart at least, and none before the page has shown the previous ones.
+        """
+        wanted, ready = PicturesRequest(), asyncio.Event()
+
+        async def send() -> None:
+            batches = PageBatches()
+            while True:
+                await ready.wait()
+                feed, want = self._feed(), wanted.want
+                if feed is not None:
+                    feed.ask(socket, (*want, wanted.frustum) if wanted.frustum else want)
+                batch = batches.next(feed, want, self._frustums.take_click(wanted.page))
+                if batch is not None:
+                    ready.clear()
+                    await socket.send_bytes(batch)
+                await asyncio.sleep(PERIOD_S)
+
+        sending = asyncio.ensure_future(send())
+        try:
+            async for message in socket:
+                if message.type is not WSMsgType.TEXT:
+                    break
+                try:
+                    wanted = _PICTURES.decode(message.data)
+                except (msgspec.MsgspecError, ValueError, RecursionError):
+                    break
+                self._frustums.choose(wanted.page, wanted.frustum)
+                ready.set()
+        finally:
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
+            self._frustums.choose(wanted.page, "")
+            feed = self._feed()
+            if feed is not None:
+                feed.release(socket)

@@ -1,0 +1,320 @@
+"""Controls of the run: its time, all drones together, injected faults; and the elements that all forms share.
+
+viser sends every assigned property to all pages, so properties are set by `assign`, which leaves equal ones alone.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import viser
+
+from zsim.contract.messages import DroneInfo
+from zsim.contract.run_messages import GATES_MAX, RATE_MAX
+from zsim.scenario.fault_kinds import PROCESS_KILL, ROTORS, FaultKind, expected, kinds_of, unstated
+from zsim.scenario.scenario import Scenario
+from zsim.sensors.sensor_catalogue import declarations
+from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.operator_input import InputError, parse_fault, range_refusal
+from zsim_bridges.console.run_condition import (
+    RunCondition,
+    fleet_refusals,
+    preflight_refusal,
+    run_refusals,
+    single_drones,
+)
+
+REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
+"""The row of tabs below begins 9 px above the end of the text."""
+LIMITS_STYLE = "font-size:11px;line-height:1.2;color:#868e96;padding:0 12px 4px;text-align:right"
+HELD_HINT = "hold it for 0.6 s, by hand or by Space or Enter"  # as long as HOLD_MS of orders.html
+DURATION_MAX_S = 1e5  # of a fault; longer than any run
+DURATION_S = 30.0  # of a fault, unless another time is typed
+FIXES_LOST_PERCENT = 100.0
+THRUST_LEFT_PERCENT = 70.0  # of a weak motor: with less, the aircraft cannot be held level
+GUST_M_S = 4.0  # about what a formation's drones can still withstand
+MESSAGES_LOST_PERCENT = 30.0
+STRIKES = {
+    "drone": "a drone",
+    "world": "the world, so all drones",
+    "link": "the messages between two processes A/B; the radio of a drone is the kind radio",
+    "radio": "the radio between drones and others: the world's, or a formation's",
+    "process": "a process",
+}
+"""What the target of a kind of fault is, in words."""
+ORDERS = ("hold", "land", "emergency")  # operations whose buttons are those of orders
+
+
+class RunForm:
+    """Pause or resume, single steps, rate; initially that with which the run was started."""
+
+    def __init__(self, gui: viser.GuiApi, client: CommandClient, rate: float) -> None:
+        pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+        pause.on_click(lambda _: client.request_world("pause"))
+        resume = gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY, visible=False)
+        resume.on_click(lambda _: client.request_world("resume"))
+        gates = gui.add_number("gates", 1, min=1, max=GATES_MAX, step=1)
+        gui.add_html(limits_line(f"gates: 1 to {GATES_MAX}"))
+        step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
+
+        def request_step() -> None:
+            count = gates.value  # a fraction is sent as it is, and refused by the world
+            client.request_world("step", gates=int(count) if count == int(count) else count)
+
+        step.on_click(lambda _: request_step())
+        wanted = gui.add_number(
+            "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
+        )
+        gui.add_html(limits_line(f"rate: 0 to {RATE_MAX:g} × real time"))
+        set_rate = gui.add_button("Set rate")
+        set_rate.on_click(lambda _: client.request_world("rate", value=float(wanted.value)))
+        self._controls = {"pause": pause, "resume": resume, "step": step, "rate": set_rate}
+        self._reasons = gui.add_html("")
+
+    def refresh(self, run: RunCondition) -> None:
+        """Grey out what would be refused; Resume takes the place of Pause in a paused run."""
+        refusals = run_refusals(run)
+        set_refusals(self._controls, refusals)
+        paused = run.clock == "paused"
+        assign(self._controls["pause"], visible=not paused)
+        assign(self._controls["resume"], visible=paused)
+        toggle = {"resume": "Resume"} if paused else {"pause": "Pause"}
+        self._reasons.content = refusal_lines({**toggle, "step": "Step", "rate": "Set rate"}, refusals)
+
+
+class FleetForm:
+    """Take-off and reset of all drones; their landing and emergency are orders in the head of the page.
+
+    Formations take off by their controllers, single drones each by itself.
+    """
+
+    def __init__(self, gui: viser.GuiApi, client: CommandClient, scenario: Scenario) -> None:
+        self._client = client
+        self._formations = {cluster.name: cluster.drones for cluster in scenario.clusters}
+        self._drones = [drone.name for drone in scenario.drones]
+        self._single = single_drones(scenario)
+        self._run = RunCondition()
+        takeoff = gui.add_button("Take off all", icon=viser.Icon.PLANE_DEPARTURE, color="gray")
+        takeoff.on_click(lambda _: self._take_off())
+        reset = gui.add_button("Reset all", icon=viser.Icon.REFRESH, color="gray")
+        reset.on_click(lambda _: self._reset())
+        self._controls: dict[str, Any] = {"takeoff": takeoff, "reset": reset}
+        self._reasons = gui.add_html("")
+
+    def refresh(self, run: RunCondition) -> None:
+        """Grey out what would be refused; Reset all is visible only while a drone is in an emergency."""
+        self._run = run
+        refusals = fleet_refusals(run, self._single)
+        set_refusals(self._controls, refusals)
+        assign(self._controls["reset"], visible=not refusals["reset"])
+        self._reasons.content = refusal_lines({"takeoff": "Take off all"}, refusals)
+
+    def _take_off(self) -> None:
+        for name, drones in self._formations.items():
+            if not preflight_refusal(self._run, drones):
+                self._client.request_cluster(name, "takeoff")
+        single = [drone for drone in self._single if not preflight_refusal(self._run, [drone])]
+        if single:
+            self._client.send_mode(single, "takeoff")
+
+    def _reset(self) -> None:
+        self._client.send_mode([d for d in self._drones if self._run.drones.get(d) == "emergency"], "reset")
+
+
+class FaultForm:
+    """Controls of faults: common ones of a chosen drone, and any fault.
+
+    Args:
+        report: called with requests that are refused here.
+        scenario: has the drones and processes.
+        drones: of the run, with the names of their rotors; where they have none, the AR.Drone's.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        client: CommandClient,
+        report: Callable[[RequestOutcome], None],
+        scenario: Scenario,
+        drones: Sequence[DroneInfo] = (),
+    ) -> None:
+        self._rotors = {drone.name: [rotor.name for rotor in drone.rotors] for drone in drones}
+        self._client = client
+        self._report = report
+        self._kinds = kinds_of(declarations(scenario.drones))
+        self._drone = gui.add_dropdown("drone", [drone.name for drone in scenario.drones])
+        hint = "0: until it is cleared"
+        self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=DURATION_MAX_S, step=1.0, hint=hint)
+        gui.add_html(limits_line(f"for: 0 to {DURATION_MAX_S:g} s; {hint}"))
+        share: dict[str, Any] = {"min": 0.0, "max": 100.0, "step": 1.0}
+
+        def add_button(label: str) -> None:
+            gui.add_button(label, color="orange").on_click(lambda _: self._add(*self._common()[label][:3]))
+
+        self._fixes = gui.add_number("fixes lost [%]", FIXES_LOST_PERCENT, **share)
+        add_button("GPS lost")
+        self._thrust = gui.add_number("thrust left [%]", THRUST_LEFT_PERCENT, **share)
+        add_button("Motor weak")
+        self._gust = gui.add_number("gust [m/s]", GUST_M_S, min=-100.0, max=100.0, step=0.5, hint="to the east")
+        add_button("Gust")
+        self._messages = gui.add_number("msgs lost [%]", MESSAGES_LOST_PERCENT, **share)
+        add_button("Messages lost")
+        add_button("Kill estimator")
+        self._strikes = gui.add_html("")
+        for control in (self._drone, self._fixes, self._thrust, self._gust, self._messages):
+            control.on_update(lambda _: self._describe())
+        self._describe()
+        self._any_fault(gui)
+        gui.add_button("Clear all faults", color="green").on_click(lambda _: client.request_world("fault_clear"))
+
+    def _common(self) -> dict[str, tuple[str, str, dict[str, Any], str]]:
+        """Return kind, target, parameters and description of each common fault by its button."""
+        drone = self._drone.value
+        rotor = (self._rotors.get(drone) or ROTORS)[0]
+        fixes, thrust, gust, messages = (
+            float(each.value) for each in (self._fixes, self._thrust, self._gust, self._messages)
+        )
+        link = f"world/estimator.{drone}"
+        weak = f"rotor {rotor} of {drone}: {thrust:g} % of its thrust is left"
+        lost = f"{messages:g} % of the messages between the processes {link.replace('/', ' and ')}; no radio"
+        return {
+            "GPS lost": ("gps_dropout", drone, {"probability": fixes / 100}, f"{fixes:g} % of the fixes of {drone}"),
+            "Motor weak": ("rotor_efficiency", drone, {"rotor": rotor, "value": thrust / 100}, weak),
+            "Gust": ("gust", "world", {"velocity_m_s": [gust, 0.0, 0.0]}, f"all drones: {gust:g} m/s to the east"),
+            "Messages lost": ("link_loss", link, {"probability": messages / 100}, lost),
+            "Kill estimator": (PROCESS_KILL, f"estimator.{drone}", {}, f"process estimator.{drone}, as by kill -9"),
+        }
+
+    def _describe(self) -> None:
+        lines = (f"<b>{escape(label)}</b>: {escape(each[3])}" for label, each in self._common().items())
+        self._strikes.content = f"<div style='{REASON_STYLE}'>{'<br>'.join(lines)}</div>"
+
+    def _add(self, kind: str, target: str, parameters: Mapping[str, Any]) -> None:
+        lasts_s, lasts = float(self._for.value), self._kinds[kind].lasts != "once" and "for_s" not in parameters
+        refusal = range_refusal("for", lasts_s, 0.0, DURATION_MAX_S, "s") if lasts else None
+        if refusal:
+            self._report(RequestOutcome(f"fault_add {kind} of {target}", refusal))
+            return
+        duration = {"for_s": lasts_s} if lasts and lasts_s > 0 else {}
+        self._client.request_world("fault_add", kind=kind, target=target, **{**duration, **parameters})
+
+    def _any_fault(self, gui: viser.GuiApi) -> None:
+        with gui.add_folder("Any fault", expand_by_default=False):
+            kind = gui.add_dropdown("kind", list(self._kinds))
+            help_ = gui.add_markdown("")
+            target = gui.add_text("target", "", hint="as the kind asks; a link of processes is A/B")
+            text = gui.add_text(
+                "parameters", "", hint="as in `zsim fault add TARGET KIND …`: NAME=VALUE … --for 10s --at 40s"
+            )
+
+            def choose() -> None:
+                """Describe the kind, and fill in a possible target, and magnitudes that have a default."""
+                chosen = self._kinds[kind.value]
+                help_.content = _help(chosen)
+                estimator = f"estimator.{self._drone.value}"
+                targets = {"drone": self._drone.value, "link": f"world/{estimator}", "process": estimator}
+                target.value = targets.get(chosen.strikes, "world")
+                magnitudes = unstated(chosen, {})
+                text.value = " ".join(f"{p.name}={'' if p.default is None else p.default}" for p in magnitudes)
+
+            kind.on_update(lambda _: choose())
+            choose()
+            gui.add_button("Inject it", color="orange").on_click(
+                lambda _: self._inject(kind.value, target.value, text.value)
+            )
+
+    def _inject(self, kind: str, target: str, text: str) -> None:
+        try:
+            parameters = parse_fault(text, kind, self._kinds[kind])
+        except InputError as error:
+            self._report(RequestOutcome("fault_add", str(error)))
+            return
+        self._add(kind, target.strip(), parameters)
+
+
+def _help(fault: FaultKind) -> str:
+    """Describe a kind's effect, what it strikes, and its parameters with their limits."""
+    stated = unstated(fault, {})
+    lines = [
+        f"`{p.name}` {p.description}: {expected(p)}{'' if p in stated else ' (may be left out)'}"
+        for p in fault.parameters
+    ]
+    strikes = f"{fault.description}; strikes {STRIKES[fault.strikes]}."
+    return f"<sub>{' '.join([strikes, '; '.join(lines)])}</sub>"
+
+
+# Elements of forms
+
+
+class OrderButton:
+    """A button of an order, which its page repeats until it is confirmed: the page's own HTML, not one of viser's.
+
+    Args:
+        of: what it concerns: {"drone": name}, several separated by commas, or {"cluster": name}.
+        held: whether it must be held for a while.
+    """
+
+    visible = True
+
+    def __init__(self, gui: viser.GuiApi, label: str, op: str, of: dict[str, str], *, held: bool = False) -> None:
+        self._label, self._op, self._of, self._held = label, op, of, held
+        self._hint = HELD_HINT if held else ""
+        self.disabled = False
+        self._html = gui.add_html(self._content())
+
+    def name(self, label: str, of: dict[str, str]) -> None:
+        """Change its label and what it concerns."""
+        self._label, self._of = label, of
+        assign(self._html, content=self._content())
+
+    def lock(self, reason: str) -> None:
+        """Disable it for a reason; enable it if that is empty."""
+        self.disabled, self._hint = bool(reason), reason or (HELD_HINT if self._held else "")
+        assign(self._html, content=self._content())
+
+    def _content(self) -> str:
+        data = {"data-zsim-order": self._op, **{f"data-{key}": name for key, name in self._of.items()}}
+        data |= {"title": self._hint, **({"data-zsim-hold": "1", "class": "stop"} if self._held else {})}
+        attributes = " ".join(f'{key}="{escape(value)}"' for key, value in data.items())
+        off = " disabled" if self.disabled else ""
+        return f'<div class="zsim-order"><button type="button" {attributes}{off}>{escape(self._label)}</button></div>'
+
+
+def assign(control: Any, **properties: Any) -> None:
+    """Set the properties of a viser control that differ."""
+    for name, value in properties.items():
+        if getattr(control, name) != value:
+            setattr(control, name, value)
+
+
+def limits_line(text: str) -> str:
+    """Return the limits of a number as HTML, to stand below its field."""
+    return f"<div style='{LIMITS_STYLE}'>{escape(text)}</div>"
+
+
+def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> None:
+    """Grey out the controls of operations that would be refused; the reason is their tooltip."""
+    for op, control in controls.items():
+        reason = refusals.get(op, "")
+        if isinstance(control, OrderButton):
+            control.lock(reason)
+        else:
+            assign(control, disabled=bool(reason), hint=reason or None)
+
+
+def offered(run: RunCondition, refusals_of: Callable[[RunCondition], Mapping[str, str]]) -> dict[str, str]:
+    """Return refusals with those of orders, which may be given to a silent world, and of emergencies always."""
+    orders = {op: reason for op, reason in refusals_of(run._replace(silent_s=0.0)).items() if op in ORDERS}
+    if "emergency" in orders:
+        orders["emergency"] = ""
+    return {**refusals_of(run), **orders}
+
+
+def refusal_lines(labels: Mapping[str, str], refusals: Mapping[str, str]) -> str:
+    """Return a line of HTML for each reason, with the greyed-out controls; `labels` are by operation."""
+    by_reason: dict[str, list[str]] = {}
+    for op, label in labels.items():
+        if refusals.get(op):
+            by_reason.setdefault(refusals[op], []).append(label)
+    lines = [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()]
+    return f"<div style='{REASON_STYLE}'>{'<br>'.join(map(escape, lines))}</div>" if lines else ""

@@ -1,0 +1,202 @@
+"""What is known of a run beyond the newest views: condition, alarms, figures of flight, requests in progress."""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zsim.contract.views import DroneView, ViewCluster, ViewDrones
+from zsim.math import frames
+from zsim_bridges.console import alarms
+from zsim_bridges.console.alarms import AlarmBoard, DroneCondition, FaultWatch
+from zsim_bridges.console.orders import PendingRequest, PendingRequests
+from zsim_bridges.console.run_condition import RunCondition, ShownRun, page_head, preflight_checks
+from zsim_bridges.console.time_monitor import TimeMonitor
+from zsim_bridges.console.view_buffer import ViewBuffer
+
+ROUNDING_NS = 1_000.0  # of a time given in seconds
+SPEED_S = 0.2  # simulated, over which a speed is averaged; over less it would show the rounding of positions
+BATTERY_S = 20.0  # simulated, for which a battery must have been seen before its remaining time is shown
+BATTERY_POINTS_MAX = 120
+BATTERY_SPACING_S = 1.0  # simulated
+
+
+class RunMonitor:
+    """Follows the condition of a run.
+
+    Args:
+        world: where the run is, in words.
+
+    Attributes:
+        condition: of the run, at the last update.
+        board: its alarms.
+        flight: figures of the drones.
+        fault_watch: what faults strike, and what they have changed.
+        pending: requests in progress.
+        record_s: of a replay, simulated times of the first and the last gate on record.
+    """
+
+    def __init__(self, views: ViewBuffer, time_monitor: TimeMonitor, run: ShownRun, world: str = "") -> None:
+        self._views = views
+        self._time_monitor = time_monitor
+        self._run = run
+        self._world = world
+        self._members, self._single = run.members, run.single
+        self._ended = ""
+        self._t_ns = 0
+        self.condition = RunCondition(replayed=run.is_replay)
+        self.board = AlarmBoard()
+        self.flight = FlightMeter()
+        self.fault_watch = FaultWatch()
+        self.pending = PendingRequests()
+        self.record_s: tuple[float, float] | None = None
+
+    def end(self, reason: str) -> None:
+        """Note that the run is over."""
+        self._ended = self._views.end or reason
+
+    def unflyable(self) -> str:
+        """Return why nothing can be flown in this run any more; a silent world does not count."""
+        return self.condition._replace(silent_s=0.0, ended=self._ended).grounded()
+
+    def update(self, wall_s: float) -> list[PendingRequest]:
+        """Take over the newest views; return the requests that were done meanwhile."""
+        views, clock = self._views, self._time_monitor.clock
+        self._forget_future(views.drones.t_ns if views.drones else 0)
+        drones = views.conditions()
+        commanders = {name: drone.commander for name, drone in drones.items()}
+        roles = {name: health.role for name, health in views.healths.items()}
+        foreign = {
+            name: alarms.foreign_commanders(f"controller.{name}", members, commanders, roles)
+            for name, members in self._members.items()
+        }
+        phases = {
+            name: (view.phase, self._reason(name, view, drones, foreign.get(name, {})))
+            for name, view in views.clusters.items()
+        }
+        others = {drone: who for each in foreign.values() for drone, who in each.items()}
+        end_s = self.record_s[1] if self.record_s else math.inf
+        self.condition = RunCondition(
+            clock=clock.state if clock else None,
+            silent_s=self._time_monitor.silent_s,
+            ended=self._ended,
+            replayed=self._run.is_replay,
+            at_end=clock is not None and clock.state == "paused" and clock.t_ns >= end_s * 1e9 - ROUNDING_NS,
+            drones={name: drone.state for name, drone in drones.items()},
+            phases=phases,
+            members=self._members,
+            checks={
+                name: preflight_checks(drone, name not in self._single, others.get(name, ""))
+                for name, drone in drones.items()
+            },
+        )
+        active, states = views.active_faults(), {name: phase for name, (phase, _) in phases.items()}
+        wind_m_s = max((math.hypot(*each) for each in views.drones.wind_m_s), default=0.0) if views.drones else 0.0
+        self.fault_watch.update(list(views.begun), active, drones, states, views.losses.now, wind_m_s)
+        found: list[alarms.Alarm] = []
+        if views.drones is not None and not self._ended:
+            found = [alarm for drone in drones.values() for alarm in alarms.drone_alarms(drone)]
+            found += alarms.formation_alarms(phases, foreign, dict(views.clusters))
+            found += alarms.run_alarms(views.losses.now, active, self.condition.silent_s)
+        self.board.update(found, wall_s)
+        return self.pending.pop_done(views.clusters, self.condition.drones)
+
+    def head(self, wall_s: float) -> dict[str, Any]:
+        """Return the head of the page as plain data; called in another thread than `update`."""
+        t_ns = self._views.drones.t_ns if self._views.drones else 0
+        condition = self.condition._replace(silent_s=self._time_monitor.silent_s)
+        name, clock, rows = self._run.scenario.name, self._time_monitor.clock, self.board.rows(wall_s)
+        return page_head(name, condition, clock, t_ns, rows, self._single, self._world, self.record_s)
+
+    def _forget_future(self, t_ns: int) -> None:
+        """Remove alarms and losses of later times, if a replay has gone back."""
+        if t_ns < self._t_ns:
+            self.board.clear()
+            self.fault_watch.clear()
+            self._views.begun.clear()
+            self._views.losses.now, self._views.failsafes = {}, {}
+        self._t_ns = t_ns
+
+    def _reason(
+        self, name: str, view: ViewCluster, drones: Mapping[str, DroneCondition], foreign: dict[str, str]
+    ) -> str:
+        """Return a formation's reason: its controller's, who else flies its drones, and failsafes."""
+        notes = [alarms.foreign_text(foreign)] if foreign and view.phase in alarms.FLOWN_PHASES else []
+        members = (drones[drone] for drone in self._members[name] if drone in drones)
+        notes += [d.failsafe for d in members if d.failsafe and d.state in ("landing", "emergency", "landed")]
+        return "; ".join(filter(None, (view.reason, *notes)))
+
+
+class FlightFigures(NamedTuple):
+    """Figures of one drone; positions and velocities in W, heading from east to north."""
+
+    position_m: tuple[float, float, float]
+    speed_m_s: float
+    climb_m_s: float
+    roll_deg: float
+    pitch_deg: float
+    heading_deg: float  # 0 to 360
+    battery_left_s: float | None  # at the present drain; None while unknown
+
+
+class _Track:
+    """Recent places and charges of one drone, with their simulated times [s]."""
+
+    def __init__(self) -> None:
+        self.places: deque[tuple[float, tuple[float, float, float]]] = deque(maxlen=64)
+        self.charges: deque[tuple[float, float]] = deque(maxlen=BATTERY_POINTS_MAX)
+
+    def add(self, t_s: float, drone: DroneView) -> None:
+        if not self.places or t_s > self.places[-1][0]:
+            self.places.append((t_s, drone.position_m))
+        while len(self.places) > 2 and t_s - self.places[1][0] >= SPEED_S:
+            self.places.popleft()
+        if not self.charges or t_s - self.charges[-1][0] >= BATTERY_SPACING_S:
+            self.charges.append((t_s, drone.battery_percent))
+
+    def velocity(self) -> tuple[float, float, float]:
+        """Return the mean velocity [m/s; W] over the last SPEED_S, or the last two views."""
+        (first_s, first), (last_s, last) = self.places[0], self.places[-1]
+        if last_s <= first_s:
+            return 0.0, 0.0, 0.0
+        vx, vy, vz = ((b - a) / (last_s - first_s) for a, b in zip(first, last, strict=True))
+        return vx, vy, vz
+
+    def battery_left_s(self, t_s: float, percent: float) -> float | None:
+        first_s, first = self.charges[0]
+        if t_s - first_s < BATTERY_S or first - percent <= 0.0:
+            return None
+        return percent * (t_s - first_s) / (first - percent)
+
+
+class FlightMeter:
+    """Derives figures of each drone's flight from views of the true states."""
+
+    def __init__(self) -> None:
+        self._tracks: dict[str, _Track] = {}
+        self._t_s = -math.inf
+        self._drones: tuple[DroneView, ...] = ()
+
+    def update(self, view: ViewDrones) -> None:
+        """Take over a view; an earlier one, as in a replay, begins anew."""
+        t_s = view.t_ns / 1e9
+        if t_s < self._t_s:
+            self._tracks.clear()
+        self._t_s, self._drones = t_s, view.drones
+        for drone in self._drones:
+            self._tracks.setdefault(drone.name, _Track()).add(t_s, drone)
+
+    @property
+    def figures(self) -> dict[str, FlightFigures]:
+        """Figures by drone, at the newest view."""
+        found = {}
+        for drone in self._drones:
+            track = self._tracks[drone.name]
+            vx, vy, vz = track.velocity()
+            roll, pitch, yaw = np.degrees(frames.rpy_from_quaternion(np.array([drone.orientation_wxyz]))[0]).tolist()
+            left_s = track.battery_left_s(self._t_s, drone.battery_percent)
+            speed_m_s = math.hypot(vx, vy, vz)
+            found[drone.name] = FlightFigures(drone.position_m, speed_m_s, vz, roll, pitch, yaw % 360.0, left_s)
+        return found

@@ -1,0 +1,459 @@
+"""The 3-D scene of a run: its newest views as viser's nodes, of which only changes are sent.
+
+`RunScene` decides what is drawn, `SceneNodes` draws it for all pages; the ground follows each page's own theme, and the
+ring about the chosen drone is of one page alone.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from zsim.contract.messages import DroneInfo
+from zsim.contract.views import ViewDrones
+from zsim.drone_colours import drone_colours, rgb
+from zsim.math import frames
+from zsim.scenario.scenario import Obstacle
+from zsim.vehicles.vehicle import cross_layout
+from zsim_bridges.console import airframe
+from zsim_bridges.console.histories import CanvasTrails
+from zsim_bridges.console.page_cameras import CameraFollow
+from zsim_bridges.console.picture import (
+    Array,
+    DronePoses,
+    Ellipsoids,
+    FlightPreview,
+    FormationShape,
+    drone_on_ray,
+    drone_poses,
+    ellipsoids,
+    formation_shape,
+    ghosts,
+    rotor_angles,
+    rotor_poses,
+    short_names,
+)
+from zsim_bridges.console.run_condition import ShownRun
+from zsim_bridges.console.view_buffer import ViewBuffer
+
+NAMED_MAX = 60  # drones with their names beside them; more would hide each other
+LARGE_MAX = 12  # names in full, at full size; of more drones short names, smaller
+SMALL = 0.8  # of the size of a name
+SOLID = (134, 142, 150)
+GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
+PREVIEW = (217, 72, 15)
+PREVIEW_PX = 3.0  # of a previewed way
+SIDE_PX = 2.0  # of a formation's sides, at any distance
+WIND_M_PER_M_S = 0.5  # length of the arrow
+WIND_MIN_M_S = 0.05  # below it no arrow
+WIND_ABOVE_M = 1.5  # of the arrow over the highest drone
+LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name over its drone
+MIDDLE = "center-center"  # of a label
+LABELS_MAX = 3  # p, q and beta
+LUMINANCE_MIN = 0.12  # of a trail: 2.5 times as bright as the ground of the dark theme, as WCAG 2.2 counts contrast
+HIDDEN = (0.0, 0.0, -1000.0)  # m; of instances that are not shown: viser cannot hide them one by one
+HALF_M = 150.0  # half a side of the ground
+FIELD_BELOW_M = 0.15  # of the field below the grid; a depth buffer cannot order surfaces that are nearer to each other
+THICK_M = 0.02
+LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # of the field, of the grid's cells and of its sections
+DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
+CHOSEN = (25, 113, 194)
+
+
+class RunScene:
+    """The scene of one run; it replaces that of another run.
+
+    Attributes:
+        nodes: viser's.
+        drones: their newest poses, None before the first view.
+        shapes: the formations' true shapes by name; None where a drone of one is missing.
+        trails: of the drones.
+        previews: ways (n, M, 3) [m] of formations, by name, that would be flown.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, camera_follow: CameraFollow
+    ) -> None:
+        self._run = run
+        self._views = views
+        self._camera_follow = camera_follow
+        self._members = {name: [run.names.index(each) for each in drones] for name, drones in run.members.items()}
+        self._drawn_ghosts: dict[str, Any] = {}
+        self.drones: DronePoses | None = None
+        self.shapes: dict[str, FormationShape | None] = {}
+        self.previews: dict[str, Array] = {}
+        self.trails = CanvasTrails(len(run.names), around=run.is_replay)
+        robots = sum(space.n for space in run.spaces.values())
+        arms_m = [drone.arm_m for drone in run.scenario.drones]
+        self.nodes = SceneNodes(server, run.info.drones, arms_m, robots, len(run.spaces))
+        self.nodes.obstacles(run.scenario.environment.obstacles)
+        camera_follow.restart()
+
+    def clicked(self, event: viser.SceneClickEvent) -> str | None:
+        """Return the drone that a click hits."""
+        if self.drones is None:
+            return None
+        return drone_on_ray(self.drones, self.nodes.radii_m, event.ray_origin, event.ray_direction)
+
+    def store(self, view: ViewDrones) -> DronePoses:
+        """Keep and return the drones' newest poses, at which cameras of later pages look."""
+        drones = drone_poses(view, self._run.names)
+        self.drones = drones
+        self.trails.add(drones.t_ns / 1e9, drones.p_W)
+        self.shapes = self.shapes_of(drones)
+        self._camera_follow.set_target(self._camera_targets(drones))
+        return drones
+
+    def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
+        """Draw a view of the drones, and return their poses.
+
+        Rotors turn for `longest_s` at most from one picture to the next; `chosen` is the formation with figures.
+        """
+        before_ns = self.drones.t_ns if self.drones is not None else 0
+        drones = self.store(view)
+        self.nodes.drones(drones, min(longest_s, max(0.0, (drones.t_ns - before_ns) / 1e9)))
+        estimates = self._views.estimates().values()
+        self.nodes.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
+        if self.shapes:
+            self.nodes.shapes(list(self.shapes.values()), list(self.shapes).index(chosen))
+        desired = {name: (view.phase, view.desired) for name, view in self._views.clusters.items()}
+        if desired != self._drawn_ghosts:
+            self._drawn_ghosts = desired
+            poses = [ghosts(self._run.spaces[name], view) for name, view in self._views.clusters.items()]
+            shown = [(np.zeros((0, 3)), np.zeros((0, 4))), *(each for each in poses if each is not None)]
+            self.nodes.ghosts(np.concatenate([p_W for p_W, _ in shown]), np.concatenate([q for _, q in shown]))
+        self._camera_follow.follow(self._camera_targets(drones))
+        return drones
+
+    def preview(self, cluster: str, shown: FlightPreview | None) -> None:
+        """Show what a formation would fly in place of its previous preview; None: nothing."""
+        others = {name: paths_W for name, paths_W in self.previews.items() if name != cluster}
+        self.previews = {**others, cluster: shown.paths_W} if shown else others
+        self.nodes.previews(list(self.previews.values()))
+
+    def draw_trails(self) -> None:
+        """Draw what changes slowly: trails and wind."""
+        if self.drones is not None:
+            segments, owners, _ = self.trails.segments(self.drones.t_ns / 1e9, self.drones.p_W)
+            self.nodes.trails(segments, owners)
+            self.nodes.wind(self.drones)
+
+    def shapes_of(self, drones: DronePoses) -> dict[str, FormationShape | None]:
+        """Return the formations' true shapes by name; None where a drone of one is missing."""
+        there, yaw = drones.present, frames.heading(drones.q_WB)
+        return {
+            name: formation_shape(space, drones.p_W[members], yaw[members]) if there[members].all() else None
+            for name, space in self._run.spaces.items()
+            for members in [self._members[name]]
+        }
+
+    def _camera_targets(self, drones: DronePoses) -> Array:
+        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""
+        members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
+        return drones.p_W[members][drones.present[members]]
+
+
+class SceneNodes:
+    """The nodes of one run.
+
+    Args:
+        server: viser's; its scene is cleared.
+        arms_m: centre to rotor, of each.
+        robots: number of drones in formations, each with a ghost.
+
+    Attributes:
+        radii_m: (N,), how far each drone reaches from its centre.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        drones: Sequence[DroneInfo],
+        arms_m: Sequence[float],
+        robots: int,
+        clusters: int,
+    ) -> None:
+        self._server = server
+        self._scene = server.scene
+        self._count = len(drones)
+        names = tuple(drone.name for drone in drones)
+        self._trail_node: Any = None
+        self._trail_colours = linear(np.array([lightened(rgb(each)) for each in drone_colours(max(1, len(drones)))]))
+        self._trails_shown = True
+        server.scene.reset()
+        server.scene.set_up_direction("+z")
+        draw_ground(server.scene)
+        self._origin()
+        looks = [airframe.shape_of(*each) for each in zip(drones, arms_m, strict=True)]
+        self.radii_m: Array = np.array([look.reach_m for look in looks])
+        self._airframes = _AirframeNodes(self._scene, looks)
+        self._rotors = _RotorNodes(drones, looks, self._batch)
+        ghost = airframe.whole(looks[0])
+        self._ghosts = self._batch("/ghosts", ghost, robots, GHOST, opacity=0.5) if robots else None
+        self._ellipsoids = self._batch("/estimates", airframe.ball(), len(names), ELLIPSOID, opacity=0.35)
+        if robots:
+            self._preview_ends = self._batch("/preview_ends", ghost, robots, PREVIEW, opacity=0.6)
+            self._preview_lines: Any = self._scene.add_line_segments(
+                "/preview", np.tile(HIDDEN, (1, 2, 1)), PREVIEW, thickness=PREVIEW_PX, thickness_units="screen",
+                visible=False,
+            )  # fmt: skip
+        self._names = self._labels(names)
+        self._wind = self._scene.add_arrows(
+            "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
+            head_length=0.22, visible=False,
+        )  # fmt: skip
+        self._wind_label = self._scene.add_label("/wind_speed", "", visible=False, anchor="bottom-left")
+        self._shapes = _FormationNodes(self._scene, clusters) if clusters else None
+
+    def obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Draw the obstacles of the scenario: boxes, cylinders and spheres."""
+        for each in obstacles:
+            x, y, z = each.position_m
+            turn = math.radians(each.yaw_deg) / 2
+            look: Any = {"wxyz": (math.cos(turn), 0.0, 0.0, math.sin(turn)), "color": SOLID}
+            name = f"/obstacles/{each.name}"
+            height_m = each.height_m or 0.0
+            if each.size_m is not None:
+                self._scene.add_box(name, dimensions=each.size_m, position=(x, y, z + each.size_m[2] / 2), **look)
+            elif each.shape == "cylinder":
+                centre = (x, y, z + height_m / 2)
+                self._scene.add_cylinder(name, radius=each.radius_m or 0.0, height=height_m, position=centre, **look)
+            else:
+                self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
+
+    def drones(self, drones: DronePoses, dt_s: float) -> None:
+        """Move the drones, and turn their rotors for dt_s."""
+        drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
+        self._airframes.move(drones)
+        self._rotors.move(drones, dt_s)
+        for label, p_W in zip(self._names, drones.p_W, strict=False):
+            label.position = p_W + LABEL_B
+
+    def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
+        """Call back with viser's event of each click into the scene.
+
+        Not on the drones' nodes: a page of viser 1.1.1 fails to open when a batched mesh is clickable already.
+        """
+        self._scene.on_click()(act)
+
+    def close(self) -> None:
+        """End callbacks; the nodes stay."""
+        self._scene.remove_click_callback("all")
+
+    def wind(self, drones: DronePoses) -> None:
+        """Set the arrow of the wind, above the drones."""
+        speed = float(np.linalg.norm(drones.wind_W))
+        present = drones.p_W[drones.present]
+        blows = speed >= WIND_MIN_M_S and len(present) > 0
+        self._wind.visible = self._wind_label.visible = blows
+        if blows:
+            start = np.array([*present[:, :2].mean(axis=0), present[:, 2].max() + WIND_ABOVE_M])
+            self._wind.points = np.array([[start, start + WIND_M_PER_M_S * drones.wind_W]])
+            self._wind_label.position, self._wind_label.text = start, f"wind {speed:.1f} m/s"
+
+    def estimates(self, ellipsoids: Ellipsoids) -> None:
+        """Move the ellipsoids of the estimates."""
+        p, q, half_m = _padded(self._count, ellipsoids.p_W, ellipsoids.wxyz)
+        half_m[: len(ellipsoids.half_m)] = ellipsoids.half_m
+        self._ellipsoids.batched_positions, self._ellipsoids.batched_wxyzs, self._ellipsoids.batched_scales = (
+            p,
+            q,
+            half_m,
+        )
+
+    def ghosts(self, p_W: Array, q: Array) -> None:
+        """Move the ghosts of the formations to their desired positions; missing ones are hidden."""
+        if self._ghosts is not None:
+            positions, attitudes, _ = _padded(len(self._ghosts.batched_positions), p_W, q)
+            self._ghosts.batched_positions, self._ghosts.batched_wxyzs = positions, attitudes
+
+    def previews(self, ways: Sequence[Array]) -> None:
+        """Draw ways (n, M, 3) that formations would fly, with a mark at the end of each drone's."""
+        lines = [np.stack((way[:, :-1], way[:, 1:]), axis=2).reshape(-1, 2, 3) for way in ways]
+        ends = [way[:, -1] for way in ways]
+        segments = np.asarray(np.concatenate(lines) if lines else np.tile(HIDDEN, (1, 2, 1)), np.float32)
+        p_W = np.concatenate(ends) if ends else np.zeros((0, 3))
+        self._preview_lines.points, self._preview_lines.visible = segments, bool(lines)
+        p, q, _ = _padded(len(self._preview_ends.batched_positions), p_W, np.tile((1.0, 0.0, 0.0, 0.0), (len(p_W), 1)))
+        self._preview_ends.batched_positions, self._preview_ends.batched_wxyzs = p, q
+
+    def shapes(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
+        """Draw the frames and triangles of all formations, and the figures of the chosen one."""
+        if self._shapes is not None:
+            self._shapes.show(shapes, chosen)
+
+    def trails(self, segments: Array, owners: NDArray[np.int64]) -> None:
+        """Draw the drones' trails."""
+        if not len(segments):  # a replay went back: the old ones must vanish
+            segments, owners = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
+        colours = np.repeat(self._trail_colours[owners][:, None], 2, axis=1)
+        if self._trail_node is None:
+            self._trail_node = self._scene.add_line_segments(
+                "/trails", segments, colours, thickness=2.0, thickness_units="screen", visible=self._trails_shown
+            )
+        else:
+            self._trail_node.points, self._trail_node.colors = segments, colours
+
+    def show(self, what: str, visible: bool) -> None:
+        """Show or hide ghosts, estimates or trails."""
+        self._trails_shown = visible if what == "trails" else self._trails_shown
+        node = {"ghosts": self._ghosts, "estimates": self._ellipsoids, "trails": self._trail_node}[what]
+        if node is not None:
+            node.visible = visible
+
+    def _origin(self) -> None:
+        self._scene.add_frame("/origin", axes_length=1.0, axes_radius=0.02, position=(0.0, 0.0, 0.01))
+        self._scene.add_label("/origin/e", "east", position=(1.1, 0.0, 0.0))
+        self._scene.add_label("/origin/n", "north", position=(0.0, 1.1, 0.0))
+
+    def _batch(self, name: str, mesh: airframe.Mesh, count: int, colour: Any, opacity: float | None = None) -> Any:
+        p, q, scales = _padded(count, np.zeros((0, 3)), np.zeros((0, 4)))
+        return self._scene.add_batched_meshes_simple(
+            name, mesh.vertices, mesh.faces, q, p, batched_scales=scales, batched_colors=colour, opacity=opacity,
+            lod="off", flat_shading=opacity is None, cast_shadow=opacity is None, receive_shadow=False,
+        )  # fmt: skip
+
+    def _labels(self, names: tuple[str, ...]) -> list[Any]:
+        if len(names) > NAMED_MAX:
+            return []
+        many = len(names) > LARGE_MAX
+        look: Any = {"anchor": "bottom-center", "font_screen_scale": SMALL if many else 1.0}
+        shown = short_names(names) if many else names
+        return [self._scene.add_label(f"/names/{name}", text, **look) for name, text in zip(names, shown, strict=True)]
+
+
+class _AirframeNodes:
+    """The drones without their rotors, one node for all that look alike."""
+
+    def __init__(self, scene: viser.SceneApi, looks: Sequence[airframe.DroneShape]) -> None:
+        self.nodes: list[tuple[NDArray[np.int64], Any]] = []
+        for k, look in enumerate(dict.fromkeys(looks)):
+            owners = np.array([i for i, other in enumerate(looks) if other == look])
+            p, q, _ = _padded(len(owners), np.zeros((0, 3)), np.zeros((0, 4)))
+            name = f"/drones/{k}" if k else "/drones"
+            self.nodes.append((owners, scene.add_batched_glb(name, airframe.coloured(look), q, p, lod="off")))
+
+    def move(self, drones: DronePoses) -> None:
+        for owners, node in self.nodes:
+            node.batched_positions, node.batched_wxyzs = drones.p_W[owners], drones.q_WB[owners]
+
+
+class _RotorNodes:
+    """The rotors of all drones as one node, each at its size."""
+
+    def __init__(self, drones: Sequence[DroneInfo], looks: Sequence[airframe.DroneShape], batch: Any) -> None:
+        self._owners = np.repeat(np.arange(len(looks)), [len(look.hubs_B) for look in looks])
+        self._places = np.concatenate([np.arange(len(look.hubs_B)) for look in looks])
+        hubs = [(x, y, airframe.ROTOR_Z_M * look.size) for look in looks for x, y in look.hubs_B]
+        rotors = [drone.rotors or cross_layout(airframe.ARM_M) for drone in drones]
+        self._turns = np.array([float(rotor.turn) for of_one in rotors for rotor in of_one])
+        self._hubs_B, self._angles = np.array(hubs), np.zeros(len(hubs))
+        self._node = batch("/rotors", airframe.rotor(), len(hubs), airframe.COLOURS["rotor"])
+        scales = [look.radius_m / airframe.ROTOR_RADIUS_M for look in looks]
+        self._node.batched_scales = np.tile(np.array(scales)[self._owners, None], (1, 3))
+
+    def move(self, drones: DronePoses, dt_s: float) -> None:
+        """Move the rotors, which have turned for dt_s."""
+        speeds = drones.rotor[self._owners, self._places]
+        self._angles = rotor_angles(self._angles, speeds, self._turns, dt_s)
+        p_W, q_WB = drones.p_W[self._owners], drones.q_WB[self._owners]
+        self._node.batched_positions, self._node.batched_wxyzs = rotor_poses(p_W, q_WB, self._hubs_B, self._angles)
+
+
+class _FormationNodes:
+    """Frames and triangles of all formations as one node each, and the labels of one of them."""
+
+    def __init__(self, scene: viser.SceneApi, count: int) -> None:
+        self._scene = scene
+        p, q, _ = _padded(count, np.zeros((0, 3)), np.zeros((0, 4)))
+        self._frames: Any = scene.add_batched_axes("/formations/frames", q, p, axes_length=0.7, axes_radius=0.02)
+        self._lines: Any = None
+        self._labels = [
+            scene.add_label(f"/formations/label{i}", "", visible=False, anchor=MIDDLE) for i in range(LABELS_MAX)
+        ]
+
+    def show(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
+        shown = [shape for shape in shapes if shape is not None]
+        p_W, q = np.array([s.p_c for s in shown]).reshape(-1, 3), np.array([s.q_WC for s in shown]).reshape(-1, 4)
+        self._frames.batched_positions, self._frames.batched_wxyzs, _ = _padded(len(shapes), p_W, q)
+        self._draw(np.array([side.ends_W for shape in shown for side in shape.sides]).reshape(-1, 2, 3))
+        self._write(shapes[chosen])
+
+    def _draw(self, points: Array) -> None:
+        if self._lines is not None:
+            self._lines.points = points
+        elif len(points):
+            self._lines = self._scene.add_line_segments(
+                "/formations/sides", points, SIDE, thickness=SIDE_PX, thickness_units="screen"
+            )
+
+    def _write(self, shape: FormationShape | None) -> None:
+        texts = [] if shape is None else [(s.name, s.ends_W.mean(axis=0)) for s in shape.sides if s.name]
+        texts += [(shape.corner[1], shape.corner[0])] if shape is not None and shape.corner else []
+        for i, label in enumerate(self._labels):
+            label.visible = i < len(texts)
+            if label.visible:
+                label.text, label.position = texts[i]
+
+
+def _padded(count: int, p_W: Array, q: Array) -> tuple[Array, Array, Array]:
+    """Return positions (count, 3), attitudes (count, 4) and scales (count, 3); those beyond p_W and q are hidden."""
+    positions, attitudes = np.tile(np.array(HIDDEN), (count, 1)), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
+    positions[: len(p_W)], attitudes[: len(q)] = p_W, q
+    return positions, attitudes, np.ones((count, 3))
+
+
+class ChosenRing:
+    """A ring about the chosen drone in the scene of one page; `radii_m` are the drones', in their order."""
+
+    def __init__(self, scene: viser.SceneApi, radii_m: Array) -> None:
+        self._radii_m = radii_m
+        self._chosen = -1
+        mesh = airframe.ring()
+        level, nowhere = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array(HIDDEN).reshape(1, 3)
+        self._node: Any = scene.add_batched_meshes_simple(
+            "/chosen", mesh.vertices, mesh.faces, level, nowhere, batched_scales=np.ones((1, 3)),
+            batched_colors=CHOSEN, lod="off", cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+
+    def move(self, drones: DronePoses, chosen: str) -> None:
+        """Put the ring about the chosen drone; out of sight while that is missing."""
+        index = drones.names.index(chosen)
+        self._node.batched_positions = drones.p_W[[index]] if drones.present[index] else np.reshape(HIDDEN, (1, 3))
+        if index != self._chosen:
+            self._chosen = index
+            self._node.batched_scales = np.full((1, 3), self._radii_m[index])
+
+
+def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:
+    """Draw a field with a grid in place of the previous ground.
+
+    It is opaque, without a background image: viser's plane of a grid, or a sky, would hide whatever is transparent.
+    """
+    field, cells, sections = DARK if dark else LIGHT
+    position = (0.0, 0.0, -FIELD_BELOW_M - THICK_M / 2.0)
+    scene.add_box("/field", field, (2 * HALF_M, 2 * HALF_M, THICK_M), position=position, cast_shadow=False)
+    scene.add_grid(
+        "/ground", 2 * HALF_M, 2 * HALF_M, cell_size=1.0, section_size=5.0, cell_color=cells, section_color=sections,
+        fade_distance=80.0, shadow_opacity=0.0,
+    )  # fmt: skip
+
+
+def luminance(colour: Sequence[float]) -> float:
+    """Return the relative luminance of an sRGB colour, 0 to 255 (WCAG 2.2)."""
+    return float(np.dot((0.2126, 0.7152, 0.0722), linear(np.array(colour, float)) / 255.0))
+
+
+def lightened(colour: Sequence[float]) -> Sequence[float]:
+    """Return a colour, mixed with white until it stands out from the ground of the dark theme."""
+    mixed = (np.array(colour) + share * (255.0 - np.array(colour)) for share in np.arange(0.0, 1.01, 0.05))
+    return next(each.tolist() for each in mixed if luminance(each.tolist()) >= LUMINANCE_MIN)
+
+
+def linear(colours: Array) -> NDArray[np.uint8]:
+    """Return sRGB colours, 0 to 255, in linear light, as viser takes the colours of lines; IEC 61966-2-1, 5.3."""
+    share = colours / 255
+    return np.round(255 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)).astype(np.uint8)

@@ -1,0 +1,355 @@
+"""What a run has published: the newest views, kept undecoded until the next picture, and the log of its events."""
+
+import math
+import re
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import msgspec
+from msgspec import UNSET
+
+from zsim.contract import keys, messages, run_messages
+from zsim.contract.flight_messages import LinkState
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event, Fault, Health
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
+from zsim.errors import DecodeError
+from zsim.runtime.participant import Participant
+from zsim.transport.session import RawSample, Session
+from zsim_bridges.console.alarms import BACK, LOST, DroneCondition, Losses
+
+FRESH_S = 1.0  # simulated, or wall; views come 20 times a wall second: the estimator of an older one is dead, or stuck
+FAULTS_KEPT = 8  # the last that have begun
+EVENTS_KEPT = 200  # the newest, each by itself
+ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # of unequal events; of the console's own requests
+OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds by which an operator's request is answered
+ALL, OWN = "all", "own actions"
+INCIDENTS = frozenset({"emergency", "flip", "impact", "touchdown", "battery"})  # of drones
+KINDS: dict[str, frozenset[str]] = {
+    ALL: frozenset(),
+    OWN: frozenset(),
+    "refused": frozenset({"refused"}),
+    "faults": frozenset({"fault", "fault_end", "fault_clear", "collision", "diverged", *INCIDENTS}),
+    "flight": frozenset({"mode", "state", "commander", "release", "collision", "landing", "mission", *INCIDENTS}),
+    "processes": frozenset({*LOST, *BACK, "drop"} - {"diverged"}),
+}
+"""Filters, and the kinds of events in them; empty: all kinds."""
+_FIGURE = re.compile(r"\d[\d.e+-]*")
+
+
+class ReceivedEstimate(NamedTuple):
+    """A drone's last estimate, from an estimator's process; fresh if it is of the same time as the drones' view."""
+
+    process: str
+    t_ns: int
+    estimate: EstimateView
+    fresh: bool
+
+    @property
+    def yaw_sigma_deg(self) -> float:
+        return math.degrees(self.estimate.yaw_sigma_rad)
+
+    @property
+    def sigma_m(self) -> float:
+        """Root of the position's variance averaged over its axes; 0 where that is negative, so invalid."""
+        xx, _, _, yy, _, zz = self.estimate.covariance_m2
+        return math.sqrt(max(0.0, xx + yy + zz) / 3)
+
+
+class ReceivedLink(NamedTuple):
+    """The last state of a driver's link to its drone, and how long ago it was received [s; wall]."""
+
+    state: LinkState
+    age_s: float
+
+
+class ViewBuffer:
+    """Keeps the newest message of each key until the next update; those in between are never decoded.
+
+    Callbacks run in Zenoh's threads.
+
+    Args:
+        variables: names of each formation's variables; views of other formations or variables are refused.
+        refused: called with the event of each of the console's commands that the world refuses.
+        asked: called with a formation and a description of each request that somebody else makes of it.
+
+    Attributes:
+        drones: the newest view of the drones.
+        clusters: the newest view of each formation.
+        estimators: the newest view of each estimator, by its process.
+        healths: the newest of each process.
+        external: names of the drones whose bodies are external.
+        faults: injected ones, planned and active.
+        log: events as they are shown.
+        losses: processes and drones that are lost.
+        begun: the last injected faults that have begun.
+        failsafes: the event of each drone's automatic landing or stop, until it is commanded another mode.
+        end: why the run ended, by its last event; empty while it goes on.
+        on_own_event: called with each event that a command of this console causes.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        info: Info,
+        observer: Participant,
+        variables: Mapping[str, tuple[str, ...]],
+        refused: Callable[[Event], None],
+        wall_s: Callable[[], float] = time.monotonic,
+        asked: Callable[[str, str], None] = lambda *_: None,
+    ) -> None:
+        self._link = link
+        self._names = frozenset(drone.name for drone in info.drones)
+        self._observer = observer
+        self._variables = variables
+        self._refused = refused
+        self._asked = asked
+        self._wall_s = wall_s
+        self._received_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
+        self._new: dict[str, bytes] = {}
+        self._arrived = threading.Condition()
+        self._answers: Counter[str] = Counter()
+        self.drones: ViewDrones | None = None
+        self.clusters: dict[str, ViewCluster] = {}
+        self.estimators: dict[str, ViewEstimates] = {}
+        self.healths: dict[str, Health] = {}
+        self.external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
+        self._links: dict[str, LinkState] = {}
+        self.faults: tuple[Fault, ...] = ()
+        self.log = EventLog(observer.name)
+        self.losses = Losses()
+        self.failsafes: dict[str, Event] = {}
+        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)
+        self.end = ""
+        self.on_own_event: Callable[[Event], None] = lambda _: None
+
+    def open(self) -> None:
+        """Subscribe, and read the values published last."""
+        links = map(keys.link, sorted(self.external))
+        for expression in ("view/**", keys.FAULTS, "process/*/health", *links):
+            self._link.declare_subscriber(expression, self._on_publication)
+        for cluster in self._variables:
+            self._link.declare_subscriber(keys.cluster_request(cluster), self._on_request)
+        self._link.declare_subscriber(keys.EVENT, self._on_event)
+        samples = self._link.get(keys.FAULTS)
+        with self._arrived:
+            for sample in samples:
+                self._new.setdefault(sample.key, sample.payload)  # one that arrived meanwhile is newer
+
+    def update(self) -> bool:
+        """Decode what was received since the last update; return whether there is a new view of the drones."""
+        with self._arrived:
+            new, self._new = self._new, {}
+        for key, payload in new.items():
+            try:
+                self._store(key, messages.decode(key, payload))
+            except DecodeError:
+                self._observer.health.refused += 1
+        return keys.VIEW_DRONES in new
+
+    def estimates(self) -> dict[str, ReceivedEstimate]:
+        """Return the newest estimate of each drone by name, from whichever estimator; no future ones of a replay."""
+        now_ns = self.drones.t_ns if self.drones else 0
+        newest: dict[str, ReceivedEstimate] = {}
+        for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
+            seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
+            fresh = abs(view.t_ns - now_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S  # both views skip gates
+            if fresh or view.t_ns <= now_ns:
+                known = (estimate for estimate in view.estimates if estimate.name in self._names)
+                newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in known}
+        return newest
+
+    def conditions(self) -> dict[str, DroneCondition]:
+        """Return the condition of each drone in the newest view, by name."""
+        estimates, found = self.estimates(), {}
+        for drone in self.drones.drones if self.drones else ():
+            _, x, y, _ = drone.orientation_wxyz
+            failsafe, link = self.failsafes.get(drone.name), self.link_of(drone.name)
+            condition = DroneCondition(
+                drone.name,
+                drone.state,
+                drone.battery_percent,
+                tilt_deg=math.degrees(math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))),
+                commander=drone.commander,
+                failsafe=failsafe.text if failsafe else "",
+                is_external=drone.name in self.external,
+            )
+            received = estimates.get(drone.name)
+            if received is not None:
+                condition = condition._replace(lag_ms=self.lag_ms(received), estimate_lost=not received.fresh)
+            if received is not None and received.fresh:
+                condition = condition._replace(sigma_m=received.sigma_m, yaw_sigma_deg=received.yaw_sigma_deg)
+            if link is not None:
+                state, age_ms, loss = link.state.state, link.state.age_ms, link.state.loss_percent
+                condition = condition._replace(
+                    link_state=state, link_age_ms=age_ms, link_loss_percent=loss, link_age_s=link.age_s
+                )
+            found[drone.name] = condition
+        return found
+
+    def link_of(self, drone: str) -> ReceivedLink | None:
+        """Return the newest state of an external drone's link, None before the first."""
+        key = keys.link(drone)
+        return ReceivedLink(self._links[key], self._wall_s() - self._received_s[key]) if key in self._links else None
+
+    def active_faults(self) -> list[Fault]:
+        """Return the injected faults active at the time of the newest view."""
+        now_ns = self.drones.t_ns if self.drones else 0
+        return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
+
+    def lag_ms(self, received: ReceivedEstimate) -> float:
+        """Return an estimator's lag: by its health, or by its view where that is old."""
+        health = self.healths.get(received.process)
+        if health is not None and received.fresh:
+            return health.lag_ns / 1e6
+        return max(0, (self.drones.t_ns if self.drones else 0) - received.t_ns) / 1e6
+
+    def answered_commands(self, drone: str) -> int:
+        """Return how many commands to a drone the world has accepted or refused."""
+        return self._answers[drone]
+
+    def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
+        """Wait up to a time until more commands to a drone than `beyond` have been answered."""
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._answers[drone] > beyond, within_s)
+
+    def _on_publication(self, sample: RawSample) -> None:
+        self._observer.health.received += 1
+        with self._arrived:
+            self._new[sample.key] = sample.payload
+
+    def _store(self, key: str, message: Any) -> None:
+        if isinstance(message, ViewDrones):
+            self.drones, self._received_s[key] = message, self._wall_s()
+        elif isinstance(message, ViewCluster):
+            cluster, size = key.rpartition("/")[2], len(message.names)
+            if self._variables.get(cluster) == message.names and len(message.value) == len(message.desired) == size:
+                self.clusters[cluster] = message
+            else:
+                self._observer.health.refused += 1  # of a controller of another scenario
+        elif isinstance(message, ViewEstimates):
+            self._received_s[key] = self._wall_s()
+            self.estimators[key.rpartition("/")[2]] = message
+        elif isinstance(message, LinkState):
+            self._links[key], self._received_s[key] = message, self._wall_s()
+        elif isinstance(message, Health):
+            self.healths[keys.thing(key)] = message
+            self.losses.note_health(keys.thing(key), message)
+        elif isinstance(message, run_messages.Faults):
+            self.faults = message.faults
+
+    def _on_request(self, sample: RawSample) -> None:
+        """Log a request that somebody else, such as another console, has made of a formation."""
+        try:
+            request: run_messages.ClusterRequest = messages.decode(sample.key, sample.payload)
+        except DecodeError:
+            return
+        if request.ok and request.source != self._observer.name:
+            cluster = keys.thing(sample.key)
+            text = f"{cluster}: {request.op} by {request.source or 'somebody'} {arguments_text(request.args)}".strip()
+            self.log.add(Event(request.t_ns, 0, "accepted", request.source, cluster, text))
+            self._asked(cluster, text)
+
+    def _on_event(self, sample: RawSample) -> None:
+        try:
+            event = messages.decode(keys.EVENT, sample.payload)
+        except DecodeError:
+            return  # not an event of the world
+        if event.kind in ("command", "refused"):
+            with self._arrived:
+                self._answers[commanded_drone(event)] += 1
+                self._arrived.notify_all()
+        self.losses.note(event)
+        if event.kind in ("landing", "emergency"):
+            self.failsafes = {**self.failsafes, event.subject: event}
+        elif event.kind == "mode" and event.data.get("mode") != "emergency":
+            self.failsafes = {name: each for name, each in self.failsafes.items() if name != event.subject}
+        elif event.kind == "fault":
+            with suppress(msgspec.ValidationError):  # anybody may publish an event
+                self.begun.append(msgspec.convert(event.data, Fault))
+        elif event.kind == "end":
+            self.end = event.text
+        if event.kind != "command":  # a more specific event, of a mode or a refusal, follows
+            self.log.add(event)
+        if event.source == self._observer.name:
+            self.on_own_event(event)
+            if event.kind == "refused":
+                self._refused(event)
+
+
+def arguments_text(args: Mapping[str, Any]) -> str:
+    """Describe the arguments of a request."""
+    return ", ".join(f"{name} {_value_text(value)}" for name, value in args.items())
+
+
+def _value_text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, dict):
+        return " ".join(f"{name}={_value_text(item)}" for name, item in value.items())[:120]
+    if isinstance(value, list):
+        of_figures = all(isinstance(item, int | float) for item in value)
+        return " ".join(map(_value_text, value))[:120] if of_figures else f"({len(value)})"
+    return str(value)[:120]
+
+
+def commanded_drone(event: Event) -> str:
+    """Return the drone that an event about a command concerns; the subject of a refusal is the command's key."""
+    return keys.thing(event.subject) if event.kind == "refused" and "/" in event.subject else event.subject
+
+
+class EventRow(NamedTuple):
+    """The newest of events that differ by their figures alone, and how many there were."""
+
+    event: Event
+    times: int
+    own: bool
+
+
+class EventLog:
+    """Keeps the newest events, and a row for all that are equal but for their figures; thread-safe.
+
+    Args:
+        name: of the console's process; rows of its own events are kept apart from others.
+
+    Attributes:
+        newest: single events, newest first.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._lock = threading.Lock()
+        self._rows: dict[tuple[str, ...], EventRow] = {}
+        self.newest: deque[Event] = deque(maxlen=EVENTS_KEPT)
+
+    def add(self, event: Event) -> None:
+        key = (event.kind, event.source, event.subject, _FIGURE.sub("#", event.text))
+        own = event.source == self._name and event.kind in OWN_KINDS
+        with self._lock:
+            self.newest.appendleft(event)
+            before = self._rows.pop(key, None)
+            self._rows[key] = EventRow(event, before.times + 1 if before else 1, own)
+            same = [key for key, row in self._rows.items() if row.own == own]
+            if len(same) > (OWN_ROWS_KEPT if own else ROWS_KEPT):
+                del self._rows[same[0]]
+
+    def rows(self) -> list[EventRow]:
+        """Return the rows, newest first."""
+        with self._lock:
+            return list(reversed(self._rows.values()))
+
+
+def chosen_rows(rows: Iterable[EventRow], drone: str = ALL, kind: str = ALL) -> list[EventRow]:
+    """Return the rows about a drone (or `ALL`), of one of `KINDS`."""
+    kinds, name = KINDS[kind], re.compile(rf"(?<![\w-]){re.escape(drone)}(?![\w-])")
+    return [
+        row
+        for row in rows
+        if (drone == ALL or name.search(f"{row.event.subject} {row.event.text}"))
+        and (row.own or kind != OWN)
+        and (not kinds or row.event.kind in kinds)
+    ]

@@ -1,0 +1,520 @@
+"""The pictures of a run: subscribed to while a page asks, checked, matched with what was seen, and sent to pages. Where sightings fall on a picture, and what is written beside them. What is let through to a browser as a picture."""
+
+import io
+import json
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import synthetic_camera
+from hypothesis import given
+from hypothesis import strategies as st
+from refused import has_terms, refused
+
+from zsim.contract import keys, messages
+from zsim.contract.camera_messages import CameraInfo, Seen, Sightings
+from zsim.errors import SessionError
+from zsim.sensors.jpeg_header import PictureError, frame_of
+from zsim_bridges.console.camera_feed import (
+    AGE_MAX_NS,
+    ASKED_S,
+    PICTURE_BYTES_MAX,
+    RADIUS_MIN_PX,
+    SIGHTINGS_KEPT,
+    CameraFeed,
+    check_picture,
+    field_of_view,
+    is_usable,
+    marks_of,
+    range_text,
+    sightings_of,
+)
+from zsim_bridges.console.page_sockets import PageBatches
+
+FRONT, BOTTOM = "drone1/front", "drone1/bottom"
+PAGE = "a page"
+JPEG = {name: synthetic_camera.picture(name, 1) for name in ("front", "bottom")}
+
+
+class Link:
+    """A session on which only the test speaks."""
+
+    def __init__(self) -> None:
+        self.subscribed: dict[str, Callable[[Any], None]] = {}
+        self.kept: list[Any] = []
+        self.refusal: Exception | None = None
+
+    def declare_subscriber(self, expression: str, callback: Callable[[Any], None]) -> Callable[[], None]:
+        assert expression not in self.subscribed
+        self.subscribed[expression] = callback
+        return lambda: self.subscribed.pop(expression) and None
+
+    def get(self, expression: str) -> list[Any]:
+        if self.refusal is not None:
+            raise self.refusal
+        return [sample for sample in self.kept if keys.matches(expression, sample.key)]
+
+    def pictures(self) -> set[str]:
+        return {key for key in self.subscribed if keys.is_picture(key)}
+
+
+class Run:
+    """A feed, and what is said to it."""
+
+    def __init__(self) -> None:
+        self.link = Link()
+        self.health = SimpleNamespace(received=0, refused=0)
+        self.wall_s = 100.0
+        link: Any = self.link
+        observer: Any = SimpleNamespace(health=self.health)
+        self.feed = CameraFeed(link, observer, ["drone1", "drone2"], 0.14, lambda: self.wall_s)
+
+    def say(self, key: str, message: Any) -> None:
+        """Publish a message, or bytes, to who subscribes."""
+        payload = message if isinstance(message, bytes) else messages.encode(message)
+        for expression, callback in list(self.link.subscribed.items()):
+            if keys.matches(expression, key):
+                callback(SimpleNamespace(key=key, payload=payload))
+
+    def say_infos(self, drone: str = "drone1") -> None:
+        for name in ("front", "bottom"):
+            self.say(keys.camera_info(drone, name), synthetic_camera.info_of(name))
+
+    def say_picture(self, name: str = "front", t_ns: int = 0, data: bytes | None = None, **changes: Any) -> None:
+        message = synthetic_camera.image_message(name, 1, JPEG[name] if data is None else data, t_ns)
+        self.say(keys.camera("drone1", name), msgspec.structs.replace(message, **changes))
+
+    def watch(self, *cameras: str) -> None:
+        self.feed.ask(PAGE, cameras)
+        self.feed.update()
+
+
+@pytest.fixture
+def run() -> Run:
+    made = Run()
+    made.feed.open()
+    return made
+
+
+@pytest.fixture
+def watched(run: Run) -> Run:
+    run.say_infos()
+    run.watch(FRONT, BOTTOM)
+    return run
+
+
+def batch(made: PageBatches, feed: CameraFeed, *want: str) -> tuple[dict[str, Any], bytes]:
+    """Return header and pictures of the next message to a page."""
+    data = made.next(feed, want)
+    assert data is not None
+    end = 4 + int.from_bytes(data[:4], "big")
+    return json.loads(data[4:end]), data[end:]
+
+
+# What is subscribed to
+
+
+def test_without_cameras_nothing_is_subscribed_to_and_nothing_is_shown(run: Run):
+    run.watch(FRONT)
+    assert list(run.link.subscribed) == [keys.camera_info("*", "*")]
+    assert run.feed.cameras() == ()
+    assert PageBatches().next(run.feed, ()) is None
+
+
+def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
+    run.say_infos()
+    run.feed.update()
+    assert [name for name, _ in run.feed.cameras()] == [FRONT, BOTTOM]
+    assert run.link.pictures() == set()
+    run.say_infos("drone2")
+    run.watch(FRONT)
+    assert run.link.pictures() == {"drone/drone1/camera/front"}
+    run.watch("drone2/bottom")
+    assert run.link.pictures() == {"drone/drone2/camera/bottom"}
+    run.feed.release(PAGE)
+    run.feed.update()
+    assert list(run.link.subscribed) == [keys.camera_info("*", "*")]
+
+
+def test_two_pages_keep_each_others_pictures(watched: Run):
+    watched.feed.ask("another", [FRONT])
+    watched.feed.release(PAGE)
+    watched.feed.update()
+    assert watched.link.pictures() == {"drone/drone1/camera/front"}
+
+
+def test_a_page_that_sleeps_costs_nothing(watched: Run):
+    watched.wall_s += ASKED_S - 0.1
+    watched.feed.update()
+    assert len(watched.link.pictures()) == 2
+    watched.wall_s += 0.1
+    watched.feed.update()
+    assert watched.link.pictures() == set()
+
+
+def test_a_run_that_is_over_leaves_no_subscription_to_pictures(watched: Run):
+    watched.feed.close()
+    assert watched.link.pictures() == set()
+
+
+def test_cameras_of_before_are_asked_for_and_those_of_strangers_left_out():
+    run = Run()
+    for drone in ("drone1", "stranger"):
+        payload = messages.encode(synthetic_camera.info_of("front"))
+        run.link.kept.append(SimpleNamespace(key=keys.camera_info(drone, "front"), payload=payload))
+    run.feed.open()
+    assert [name for name, _ in run.feed.cameras()] == [FRONT]
+
+
+def test_a_certificate_that_may_not_ask_does_no_harm():
+    run = Run()
+    run.link.refusal = SessionError("may not ask")
+    run.feed.open()
+    run.say_infos()
+    assert len(run.feed.cameras()) == 2
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x00", {"orientation_wxyz": (0.0, 0.0, 0.0, 0.0)}])
+def test_a_camera_that_cannot_be_used_is_counted(run: Run, payload: Any):
+    info = synthetic_camera.info_of("front")
+    message = msgspec.structs.replace(info, **payload) if isinstance(payload, dict) else payload
+    run.say(keys.camera_info("drone1", "front"), message)
+    assert run.feed.cameras() == ()
+    assert run.health.refused == 1
+
+
+# Pictures
+
+
+def test_the_newest_picture_is_shown_as_it_came(watched: Run):
+    assert watched.feed.picture(FRONT) is None
+    watched.say_picture(t_ns=1)
+    watched.say_picture(t_ns=2)
+    shown = watched.feed.picture(FRONT)
+    assert shown is not None
+    assert (shown.image.t_ns, shown.image.data) == (2, JPEG["front"])
+    assert watched.feed.picture(FRONT) is shown
+    assert watched.feed.picture(BOTTOM) is None
+
+
+BAD = {
+    "no JPEG": {"data": b"GIF89a, and so on"},
+    "cut off": {"data": JPEG["front"][:-500]},
+    "another size": {"width": 32},
+    "too many pixels": {"data": JPEG["front"], "width": 16_000, "height": 16_000},
+    "too many bytes": {"data": JPEG["front"] + bytes(PICTURE_BYTES_MAX + 2000)},
+}
+
+
+@pytest.mark.parametrize("changes", BAD.values(), ids=BAD)
+def test_a_bad_picture_is_left_out_and_counted_and_nothing_else_is_touched(watched: Run, changes: dict[str, Any]):
+    watched.say_picture(t_ns=1)
+    watched.say_picture("bottom", t_ns=1)
+    good = watched.feed.picture(FRONT), watched.feed.picture(BOTTOM)
+    watched.say_picture(t_ns=2, **changes)
+    assert (watched.feed.picture(FRONT), watched.feed.picture(BOTTOM)) == good
+    assert watched.health.refused == 1
+    front, bottom = watched.feed.state()
+    assert (front["refused"], bottom["refused"]) == (1, 0)
+    assert has_terms(front["reason"], "must")
+    watched.say_picture(t_ns=3)
+    shown = watched.feed.picture(FRONT)
+    assert shown is not None
+    assert shown.image.t_ns == 3
+
+
+@pytest.mark.parametrize("key", [keys.camera("drone1", "front"), keys.detections("drone1")])
+@pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80"])
+def test_what_is_no_message_is_counted(watched: Run, key: str, payload: bytes):
+    watched.say(key, payload)
+    assert watched.feed.picture(FRONT) is None
+    assert watched.health.refused == 1
+
+
+def test_a_picture_too_large_is_not_even_kept(watched: Run):
+    watched.say(keys.camera("drone1", "front"), bytes(PICTURE_BYTES_MAX + 2000))
+    assert watched.feed.state()[0]["refused"] == 1
+
+
+# Sightings
+
+
+def detected(run: Run, t_ns: int, key: str = keys.detections("drone1")) -> None:
+    run.say(key, synthetic_camera.sightings_message(1, t_ns))
+
+
+def test_what_was_seen_at_the_pictures_time_is_drawn_on_it(watched: Run):
+    watched.say_picture(t_ns=1_000_000_000)
+    assert watched.feed.marks(FRONT) == ()
+    assert watched.feed.picture(FRONT) is not None
+    detected(watched, 1_000_000_000)
+    (mark,) = watched.feed.marks(FRONT)
+    assert (mark.u, mark.v) == pytest.approx(synthetic_camera.projected("front", synthetic_camera.HAT_B), abs=0.06)
+    assert mark.text == "6.1 ± 0.2 m"
+    assert watched.feed.marks(BOTTOM) == ()
+
+
+def test_what_a_detector_found_goes_before_what_the_world_saw(watched: Run):
+    watched.say_picture(t_ns=0)
+    assert watched.feed.picture(FRONT) is not None
+    world = msgspec.structs.replace(synthetic_camera.sightings_message(1, 0), seen=())
+    detected(watched, 0, keys.sensor("drone1", keys.SIGHTINGS))
+    assert len(watched.feed.marks(FRONT)) == 1
+    watched.say(keys.detections("drone1"), world)
+    assert watched.feed.marks(FRONT) == ()
+
+
+def test_few_sightings_are_kept(watched: Run):
+    watched.say_picture(t_ns=0)
+    assert watched.feed.picture(FRONT) is not None
+    for number in range(SIGHTINGS_KEPT + 1):
+        detected(watched, number * 1_000_000_000)
+    assert watched.feed.marks(FRONT) == ()  # that of the picture's time is gone
+
+
+# What a page is sent
+
+
+def test_a_page_is_told_of_cameras_and_sent_what_it_asks_for(watched: Run):
+    made = PageBatches()
+    header, _ = batch(made, watched.feed)
+    assert header["cameras"][0] == {"name": FRONT, "width": 640, "height": 360}
+    watched.say_picture("front", t_ns=1_500_000_000)
+    watched.say_picture("bottom")
+    header, data = batch(made, watched.feed, BOTTOM, FRONT, BOTTOM)
+    assert header["cameras"] is None
+    assert [(each["camera"], each["size"]) for each in header["pictures"]] == [
+        (BOTTOM, len(JPEG["bottom"])),
+        (FRONT, len(JPEG["front"])),
+    ]
+    assert header["pictures"][1]["t_s"] == 1.5
+    assert data == JPEG["bottom"] + JPEG["front"]
+
+
+def test_only_what_has_changed_is_sent(watched: Run):
+    made = PageBatches()
+    watched.say_picture()
+    watched.say_picture("bottom")
+    batch(made, watched.feed, FRONT, BOTTOM)
+    assert made.next(watched.feed, (FRONT, BOTTOM)) is None
+    watched.say_picture()
+    header, data = batch(made, watched.feed, FRONT, BOTTOM)
+    assert [each["camera"] for each in header["pictures"]] == [FRONT]
+    assert data == JPEG["front"]
+
+
+def test_a_detection_that_comes_after_its_picture_is_sent_without_it(watched: Run):
+    made = PageBatches()
+    watched.say_picture(t_ns=0)
+    batch(made, watched.feed, FRONT)
+    detected(watched, 0)
+    header, data = batch(made, watched.feed, FRONT)
+    assert [(each["size"], len(each["marks"])) for each in header["pictures"]] == [(0, 1)]
+    assert data == b""
+
+
+def test_a_page_learns_that_a_run_is_over(watched: Run):
+    made = PageBatches()
+    batch(made, watched.feed)
+    header, _ = batch(made, Run().feed)
+    assert header == {"cameras": [], "pictures": []}
+
+
+HAT_M = 0.14
+FRONT_INFO, BOTTOM_INFO = synthetic_camera.info_of("front"), synthetic_camera.info_of("bottom")
+AHEAD = (1.0, 0.0, 0.0)
+
+
+def seen(direction: Any, range_m: float = 4.1, sigma_rad: float = 0.005, sigma_m: float = 0.2) -> Seen:
+    unit: Any = tuple((np.array(direction) / np.linalg.norm(direction)).tolist())
+    return Seen(direction_B=unit, range_m=range_m, sigma_direction_rad=sigma_rad, sigma_range_m=sigma_m)
+
+
+def sightings(t_ns: int) -> Sightings:
+    return Sightings(t_ns=t_ns, seq=0, t_sample_ns=t_ns, camera="front", seen=(seen(AHEAD),))
+
+
+def changed(info: CameraInfo, **fields: Any) -> CameraInfo:
+    return msgspec.structs.replace(info, **fields)
+
+
+def test_what_is_straight_ahead_is_in_the_middle_of_the_front_picture():
+    (mark,) = marks_of(FRONT_INFO, [seen(AHEAD)], HAT_M)
+    assert (mark.u, mark.v) == (319.5, 179.5)
+    assert mark.text == "4.1 ± 0.2 m"
+
+
+@pytest.mark.parametrize(
+    ("info", "direction", "left", "above"),
+    [
+        (FRONT_INFO, (1.0, 0.2, 0.0), True, None),  # y of B is to the left
+        (FRONT_INFO, (1.0, -0.2, 0.0), False, None),
+        (FRONT_INFO, (1.0, 0.0, 0.2), None, True),
+        (BOTTOM_INFO, (0.2, 0.0, -1.0), None, True),  # ahead is at the top of the bottom picture
+        (BOTTOM_INFO, (0.0, 0.2, -1.0), True, None),
+    ],
+)
+def test_sides_are_those_of_the_body(info: CameraInfo, direction: Any, left: bool | None, above: bool | None):
+    (mark,) = marks_of(info, [seen(direction)], HAT_M)
+    du, dv = mark.u - (info.width - 1) / 2, mark.v - (info.height - 1) / 2
+    assert (du < -10) is bool(left) if left is not None else abs(du) < 0.1
+    assert (dv < -10) is bool(above) if above is not None else abs(dv) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("direction", "range_m"),
+    [
+        ((-1.0, 0.0, 0.0), 4.1),
+        ((0.0, 1.0, 0.0), 4.1),
+        ((1.0, 3.0, 0.0), 4.1),
+        ((0.0, 0.0, -1.0), 4.1),
+        (AHEAD, 0.0),
+        (AHEAD, -1.0),
+    ],
+)
+def test_what_the_picture_does_not_show_and_a_range_that_is_none_have_no_mark(direction: Any, range_m: float):
+    assert marks_of(FRONT_INFO, [seen(direction, range_m)], HAT_M) == ()
+
+
+def test_a_turned_quaternion_of_any_length_turns_the_camera():
+    half = math.radians(90) / 2  # the front camera looks to the left
+    w, x, y, z = FRONT_INFO.orientation_wxyz
+    c, s = math.cos(half), math.sin(half)
+    turned: Any = tuple(3.0 * q for q in (c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w))
+    (mark,) = marks_of(changed(FRONT_INFO, orientation_wxyz=turned), [seen((0.0, 1.0, 0.0))], HAT_M)
+    assert (mark.u, mark.v) == (319.5, 179.5)
+
+
+@given(y=st.floats(-0.6, 0.6), z=st.floats(-0.35, 0.35))
+def test_marks_fall_where_opencv_projects_with_distortion(y: float, z: float):
+    cv2 = pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+    D = (-0.12, 0.03, 0.001, -0.002, 0.0)
+    info = changed(FRONT_INFO, D=D)
+    ray_K = np.array([[-y, -z, 1.0]])
+    expected = cv2.projectPoints(ray_K, np.zeros(3), np.zeros(3), np.array(info.K).reshape(3, 3), np.array(D))[0][0, 0]
+    marks = marks_of(info, [seen((1.0, y, z))], HAT_M)
+    inside = bool(np.all(expected > 0) and expected[0] < info.width - 1 and expected[1] < info.height - 1)
+    assert len(marks) == 1 or not inside
+    for mark in marks:
+        assert (mark.u, mark.v) == pytest.approx(tuple(expected), abs=0.06)  # to a tenth of a pixel
+
+
+def test_a_lens_that_folds_over_shows_nothing_from_outside_of_its_field():
+    info = changed(FRONT_INFO, D=(-0.3, 0.0, 0.0, 0.0, 0.0))
+    y = 1.826  # where 1 - 0.3 y² is 0: the polynomial puts it into the middle of the picture
+    assert marks_of(info, [seen((1.0, y, 0.0))], HAT_M) == ()
+    assert len(marks_of(info, [seen((1.0, 0.3, 0.0))], HAT_M)) == 1
+
+
+def test_a_circle_is_as_large_as_the_hat_and_two_sigma():
+    near, far = marks_of(FRONT_INFO, [seen(AHEAD, 2.0, 0.01), seen(AHEAD, 500.0, 0.0)], HAT_M)
+    assert near.radius == pytest.approx(FRONT_INFO.K[0] * (0.07 / 2.0 + 0.02), abs=0.06)
+    assert far.radius == RADIUS_MIN_PX
+    (huge,) = marks_of(FRONT_INFO, [seen(AHEAD, 1e-9)], HAT_M)
+    assert huge.radius == FRONT_INFO.height
+
+
+@pytest.mark.parametrize(("sigma_m", "text"), [(0.2, "4.1 ± 0.2 m"), (0.04, "4.10 ± 0.04 m")])
+def test_a_range_has_the_digits_of_its_sigma(sigma_m: float, text: str):
+    assert range_text(seen(AHEAD, 4.1, sigma_m=sigma_m)) == text
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"K": (0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0)},
+        {"K": (1.0, 0.0, 1.0, 0.0, -1.0, 1.0, 0.0, 0.0, 1.0)},
+        {"orientation_wxyz": (0.0, 0.0, 0.0, 0.0)},
+    ],
+)
+def test_a_camera_that_cannot_be_computed_with_is_not_used(wrong: dict[str, Any]):
+    assert is_usable(FRONT_INFO)
+    assert not is_usable(changed(FRONT_INFO, **wrong))
+
+
+def test_the_angle_of_view_is_from_top_to_bottom():
+    diagonal = 2 * math.atan(math.hypot(320, 180) / FRONT_INFO.K[0])
+    assert math.degrees(diagonal) == pytest.approx(92.0)
+    assert field_of_view(FRONT_INFO) == pytest.approx(2 * math.atan(180 / FRONT_INFO.K[0]))
+
+
+def test_sightings_of_the_pictures_time_are_taken_and_else_the_nearest_unless_they_are_old():
+    kept = [sightings(t_ns) for t_ns in (0, 100_000_000, 200_000_000)]
+    assert sightings_of(100_000_000, kept) is kept[1]
+    assert sightings_of(170_000_000, kept) is kept[2]
+    assert sightings_of(AGE_MAX_NS, [sightings(0)]) is not None
+    assert sightings_of(AGE_MAX_NS + 1, [sightings(0)]) is None
+    assert sightings_of(0, [sightings(AGE_MAX_NS + 1)]) is None  # a replay has gone back
+    assert sightings_of(0, []) is None
+
+
+Image = pytest.importorskip("PIL.Image", reason="Pillow comes with viser; pip install '.[console]'")
+
+
+def encoded(width: int = 40, height: int = 30, kind: str = "JPEG", **options: Any) -> bytes:
+    out = io.BytesIO()
+    Image.new("RGB", (width, height), (20, 90, 160)).save(out, kind, **options)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"quality": 10}, {"comment": "x" * 3000}])
+def test_the_size_of_a_jpeg_is_read(options: dict[str, Any]):
+    assert frame_of(encoded(641, 363, **options))[1:] == (641, 363)
+
+
+def test_fill_bytes_before_a_marker_are_passed_over():
+    whole = encoded()
+    assert frame_of(whole[:2] + b"\xff\xff" + whole[2:])[1:] == (40, 30)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff\xd8",
+        b"\xff\xd8\xff\xd9",
+        b"no picture",
+        encoded(kind="PNG"),
+        encoded()[:-40],
+        encoded()[:30] + b"\xff\xd9",
+    ],
+)
+def test_what_is_no_jpeg_is_refused(data: bytes):
+    with pytest.raises(PictureError):
+        check_picture(data, 40, 30)
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_have_a_size_or_are_refused(middle: bytes):
+    with suppress(PictureError):
+        assert all(0 < side < 2**16 for side in frame_of(b"\xff\xd8" + middle + b"\xff\xd9")[1:])
+
+
+@given(at=st.integers(0, 600), byte=st.integers(0, 255))
+def test_a_byte_that_is_wrong_does_no_harm(at: int, byte: int):
+    data = bytearray(encoded())
+    data[at % len(data)] = byte
+    with suppress(PictureError):
+        check_picture(bytes(data), 40, 30)
+
+
+@pytest.mark.parametrize(
+    ("data", "width", "height", "terms"),
+    [
+        (encoded(), 30, 40, ("40 × 30", "30 × 40")),
+        (encoded(4000, 4000), 4000, 4000, ("4000 × 4000", "2304000")),  # it would fill a browser's memory
+        (encoded()[:-2] + bytes(PICTURE_BYTES_MAX) + encoded()[-2:], 40, 30, (str(PICTURE_BYTES_MAX),)),
+    ],
+    ids=["another size", "too many pixels", "too many bytes"],
+)
+def test_a_picture_of_another_size_or_too_large_is_refused(
+    data: bytes, width: int, height: int, terms: tuple[str, ...]
+):
+    check_picture(encoded(), 40, 30)
+    with refused(PictureError, *terms):
+        check_picture(data, width, height)

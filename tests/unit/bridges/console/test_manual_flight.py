@@ -1,0 +1,383 @@
+"""Drones that are flown from pages: who may, what is sent when, and what a page that is silent or gone leaves behind. The geofence of drones that are flown from a page, and velocities within it."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from refused import has_terms
+
+from zsim.math.frames import turned_about_up
+from zsim.scenario import scenario_file
+from zsim.vehicles.vehicle import Limits
+from zsim_bridges.console.command_client import NoAnswer
+from zsim_bridges.console.manual_flight import (
+    GONE_S,
+    PERIOD_S,
+    SETTLED_S,
+    STALE_S,
+    DronePose,
+    DroneSight,
+    Geofence,
+    ManualFlight,
+    RunSight,
+    Stick,
+    geofence_of,
+    stick_velocity,
+    velocity_to,
+)
+
+NAME = "console.1"
+FORWARD = Stick(1.0, 0.0, 0.0, 0.0, 1.0)
+STILL = (0.0, 0.0, 0.0)
+PAGE, OTHER = "page", "other"
+
+
+class Client:
+    """A command client that notes what is sent, and answers at once unless it is to wait."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, tuple[float, float, float]]] = []
+        self.taken: list[str] = []
+        self.given_back: list[str] = []
+        self.refusal = ""
+        self.waiting: list[Callable[[str], None]] | None = None
+        self.modes = 0
+
+    def take(self, drone: str, done: Callable[[str], None]) -> None:
+        self.taken.append(drone)
+        if self.waiting is None:
+            done(self.refusal)
+        else:
+            self.waiting.append(done)
+
+    def give_back(self, drone: str) -> None:
+        self.given_back.append(drone)
+
+    def send_velocity(self, drone: str, velocity_m_s: tuple[float, float, float], yaw_rate_rad_s: float) -> None:
+        self.sent.append((drone, velocity_m_s))
+
+    def modes_requested(self, drone: str) -> int:
+        return self.modes
+
+
+class Cockpit:
+    """Two drones that hover, seen and flown by pages; time goes when the test says so."""
+
+    def __init__(self) -> None:
+        self.client = Client()
+        self.now_s = 100.0
+        self.run = RunSight()
+        pose = DronePose((0.0, 0.0, 5.0), 0.0)
+        self.sights = {name: DroneSight("hovering", None, pose) for name in ("drone1", "drone2")}
+        limits = dict.fromkeys(self.sights, Limits())
+        fence = Geofence((-50.0, -50.0, 1.0), (50.0, 50.0, 30.0))
+        client: Any = self.client
+        self.control = ManualFlight(
+            client, NAME, limits, fence, 0.02, lambda drone: self.sights[drone], lambda: self.run, lambda: self.now_s
+        )
+
+    def see(self, drone: str, **changes: Any) -> None:
+        self.sights[drone] = self.sights[drone]._replace(**changes)
+
+    def after(self, seconds: float) -> list[tuple[float, float, float]]:
+        """Let time pass in periods; return the velocities that were sent meanwhile."""
+        before = len(self.client.sent)
+        for _ in range(round(seconds / PERIOD_S)):
+            self.now_s += PERIOD_S
+            self.control.tick()
+        return [velocity for _, velocity in self.client.sent[before:]]
+
+    def flying(self) -> "Cockpit":
+        assert self.control.take(PAGE, "drone2", over=False).state == "flying"
+        self.see("drone2", commander=NAME)
+        return self
+
+
+def test_a_drone_that_nobody_flies_is_taken_and_flown_while_the_stick_is_held():
+    cockpit = Cockpit().flying()
+    assert cockpit.client.taken == ["drone2"]
+    cockpit.control.steer(PAGE, FORWARD)
+    assert cockpit.after(STALE_S / 2) == [pytest.approx((1.0, 0.0, 0.0))] * 5
+    assert cockpit.control.steer(PAGE, None).text == "hovers"
+    cockpit.control.tick()
+    assert cockpit.client.sent[-1] == ("drone2", STILL)  # at once, not with the next command
+    assert cockpit.after(1.0) == [STILL] * 20  # and on: a firmware that gets nothing lands
+    assert {drone for drone, _ in cockpit.client.sent} == {"drone2"}
+
+
+def test_a_page_that_falls_silent_leaves_its_drone_hovering_and_then_gives_it_back():
+    cockpit = Cockpit().flying()
+    cockpit.control.steer(PAGE, FORWARD)
+    velocities = cockpit.after(STALE_S + 0.5)
+    assert velocities[-1] == STILL
+    assert velocities.count(STILL) == pytest.approx(10, abs=1)
+    cockpit.after(GONE_S)
+    assert cockpit.client.given_back == ["drone2"]
+    assert cockpit.control.answer(PAGE).state == "none"
+    assert cockpit.after(1.0) == []
+
+
+def test_a_connection_that_is_lost_lets_the_drone_hover_at_once():
+    cockpit = Cockpit().flying()
+    cockpit.control.steer(PAGE, FORWARD)
+    cockpit.after(0.1)
+    cockpit.control.lose(PAGE)
+    cockpit.control.tick()
+    assert cockpit.client.sent[-1] == ("drone2", STILL)
+    assert set(cockpit.after(GONE_S + 1.0)) == {STILL}
+    assert cockpit.client.given_back == ["drone2"]
+
+
+def test_a_drone_of_a_formation_is_flown_only_when_it_is_taken_over():
+    cockpit = Cockpit()
+    cockpit.see("drone2", commander="controller.main")
+    refused = cockpit.control.take(PAGE, "drone2", over=False)
+    assert (refused.state, refused.over) == ("none", True)
+    assert has_terms(refused.text, "drone2", "controller.main")
+    assert cockpit.client.taken == []
+    assert cockpit.control.steer(PAGE, FORWARD).state == "none"
+    assert cockpit.after(1.0) == []
+    assert cockpit.control.take(PAGE, "drone2", over=True).state == "flying"
+
+
+@pytest.mark.parametrize(
+    ("sight", "run", "terms"),
+    [
+        ({"state": "landed"}, {}, ("drone2", "landed", "hovering")),
+        ({"state": ""}, {}, ("drone2",)),
+        ({}, {"off": "a record is played back"}, ("record",)),
+        ({}, {"rate": 12.0}, ("12.0", "5")),
+    ],
+    ids=["landed", "unseen", "replay", "too fast"],
+)
+def test_what_cannot_be_flown_is_refused_with_its_reason(sight: dict, run: dict, terms: tuple[str, ...]):
+    cockpit = Cockpit()
+    cockpit.see("drone2", **sight)
+    cockpit.run = RunSight(**run)
+    answer = cockpit.control.take(PAGE, "drone2", over=True)
+    assert (answer.state, answer.over) == ("none", False)
+    assert has_terms(answer.text, *terms)
+    assert cockpit.client.taken == []
+
+
+def test_what_the_world_refuses_is_not_flown():
+    cockpit = Cockpit()
+    cockpit.client.refusal = "drone2: flown by 'console.2' with priority 10"
+    answer = cockpit.control.take(PAGE, "drone2", over=True)
+    assert (answer.state, answer.text) == ("none", cockpit.client.refusal)
+    assert cockpit.after(1.0) == []
+
+
+def test_a_request_that_is_repeated_is_carried_out_once():
+    cockpit = Cockpit()
+    cockpit.client.waiting = []
+    for _ in range(3):
+        assert cockpit.control.take(PAGE, "drone2", True, "one").state == "taking"
+    assert cockpit.client.taken == ["drone2"]
+    cockpit.client.waiting[0]("")
+    cockpit.see("drone2", commander=NAME)
+    assert cockpit.control.take(PAGE, "drone2", True, "one").state == "flying"
+    cockpit.control.leave(PAGE)
+    again = cockpit.control.take(PAGE, "drone2", True, "one")  # a repetition that was late takes it no more
+    assert (again.state, again.id) == ("none", "one")
+    assert cockpit.client.taken == ["drone2"]
+
+
+def test_a_page_that_has_connected_anew_has_its_drone_back_by_the_request():
+    cockpit = Cockpit()
+    assert cockpit.control.take(PAGE, "drone2", False, "one").state == "flying"
+    cockpit.control.lose(PAGE)
+    assert cockpit.control.take(OTHER, "drone2", False, "one").state == "flying"
+    assert cockpit.control.answer(PAGE).state == "none"
+
+
+def test_a_drone_is_asked_for_again_of_a_world_that_has_not_answered_and_says_for_how_long():
+    cockpit = Cockpit()
+    cockpit.client.waiting = []
+    cockpit.control.take(PAGE, "drone2", True, "one")
+    cockpit.run = RunSight(silence="the world has not answered for 5 s")
+    cockpit.client.waiting.pop()(NoAnswer("no answer came within 5 s"))
+    for _ in range(3):
+        cockpit.after(2.0)
+        cockpit.control.take(PAGE, "drone2", True, "one")  # the page is there
+    waits = cockpit.control.answer(PAGE)
+    assert waits.state == "taking"
+    assert has_terms(waits.text, "6.0 s", "not confirmed", "world", "5 s")
+    assert cockpit.client.taken == ["drone2"]
+    cockpit.run = RunSight()
+    cockpit.after(PERIOD_S)
+    assert cockpit.client.taken == ["drone2"] * 2
+    cockpit.client.waiting.pop()("")
+    assert cockpit.control.answer(PAGE).state == "flying"
+
+
+def test_a_console_that_stood_still_says_so_where_it_gives_a_drone_back():
+    cockpit = Cockpit().flying()
+    cockpit.control.steer(PAGE, FORWARD)
+    cockpit.after(0.5)
+    cockpit.now_s += 29.0
+    cockpit.control.tick()
+    assert has_terms(cockpit.control.answer(PAGE).text, "console", "29 s")
+
+
+def test_a_place_is_flown_to_at_the_height_that_was_confirmed():
+    cockpit = Cockpit().flying()
+    answer = cockpit.control.go(PAGE, 3.0, 0.0, 7.0)
+    assert answer.goal == (3.0, 0.0, 7.0)
+    assert cockpit.after(PERIOD_S)[0][2] > 0.0
+
+
+def test_one_drone_is_flown_from_one_page_and_a_page_flies_one_drone():
+    cockpit = Cockpit().flying()
+    assert has_terms(cockpit.control.take(OTHER, "drone2", over=True).text, "drone2", "another page")
+    assert cockpit.control.take(PAGE, "drone1", over=False).state == "flying"
+    cockpit.control.tick()
+    assert cockpit.client.given_back == ["drone2"]
+
+
+def test_a_page_that_gives_up_before_the_answer_gives_the_drone_back_twice_rather_than_never():
+    cockpit = Cockpit()
+    cockpit.client.waiting = []
+    assert cockpit.control.take(PAGE, "drone2", over=False).state == "taking"
+    assert cockpit.after(0.5) == []
+    cockpit.control.leave(PAGE)
+    cockpit.control.tick()
+    cockpit.client.waiting[0]("")
+    cockpit.control.tick()
+    assert cockpit.client.given_back == ["drone2"] * 2
+    assert cockpit.control.answer(PAGE).state == "none"
+
+
+@pytest.mark.parametrize("end", ["landing", "mode", "commander", "silent"])
+def test_what_ends_a_flight_gives_the_drone_back_and_says_why(end: str):
+    cockpit = Cockpit().flying()
+    cockpit.control.steer(PAGE, None)
+    cockpit.after(SETTLED_S + PERIOD_S)
+    cockpit.control.steer(PAGE, FORWARD)
+    if end == "landing":
+        cockpit.see("drone2", state="landing")
+    elif end == "mode":
+        cockpit.client.modes += 1
+    elif end == "commander":
+        cockpit.see("drone2", commander="console.2")
+    else:
+        cockpit.run = RunSight(off="the world has not answered for 2 s")
+    assert cockpit.after(2 * PERIOD_S) == []
+    assert cockpit.client.given_back == ["drone2"]
+    answer = cockpit.control.answer(PAGE)
+    assert answer.state == "none"
+    assert answer.text
+
+
+def test_a_drone_whose_last_command_came_after_the_release_is_given_back_again():
+    """The world makes whoever commands a drone that nobody flies its commander; a silent one would be landed."""
+    cockpit = Cockpit().flying()
+    cockpit.control.leave(PAGE)
+    cockpit.after(PERIOD_S)
+    assert cockpit.client.given_back == ["drone2"]
+    cockpit.after(SETTLED_S + PERIOD_S)
+    assert cockpit.client.given_back == ["drone2"] * 2
+    cockpit.see("drone2", commander=None)
+    cockpit.after(3 * SETTLED_S)
+    assert cockpit.client.given_back == ["drone2"] * 2
+
+
+def test_a_run_that_stands_still_is_sent_nothing_and_a_slow_one_a_command_for_each_gate():
+    cockpit = Cockpit().flying()
+    cockpit.run = RunSight(paused=True)
+    assert cockpit.after(1.0) == []
+    cockpit.run = RunSight(rate=0.1)  # a gate of 20 ms each 0.2 s
+    cockpit.control.steer(PAGE, None)
+    assert 7 <= len(cockpit.after(2.0)) <= 10
+
+
+def test_a_drone_is_sent_to_a_place_at_its_height_and_the_stick_ends_that():
+    cockpit = Cockpit().flying()
+    cockpit.see("drone2", pose=DronePose((0.0, 0.0, 4.0), math.pi / 2))
+    answer = cockpit.control.go(PAGE, 0.0, 20.0)
+    assert answer.state == "flying"
+    assert has_terms(answer.text, "0.0", "20.0", "4.0")
+    assert cockpit.after(0.2) == [pytest.approx((1.5, 0.0, 0.0))] * 4
+    cockpit.control.steer(PAGE, None)  # the page is there, its dead-man key is not held
+    assert cockpit.after(0.1)[-1] != STILL
+    cockpit.control.steer(PAGE, FORWARD)
+    cockpit.control.steer(PAGE, None)
+    assert set(cockpit.after(0.2)) == {STILL}
+
+
+def test_a_place_outside_of_the_fence_or_without_an_estimate_is_refused():
+    cockpit = Cockpit().flying()
+    assert has_terms(cockpit.control.go(PAGE, 80.0, 0.0).text, "x", "80.0", "50")
+    cockpit.see("drone2", pose=None)
+    assert has_terms(cockpit.control.go(PAGE, 8.0, 0.0).text, "drone2")
+    cockpit.control.steer(PAGE, FORWARD)
+    assert set(cockpit.after(0.2)) == {STILL}
+
+
+def test_nothing_flies_on_when_the_run_is_left():
+    cockpit = Cockpit().flying()
+    with cockpit.control.running():
+        pass
+    assert cockpit.client.given_back == ["drone2"]
+
+
+FENCE = Geofence((-50.0, -50.0, 1.0), (50.0, 50.0, 30.0))
+LIMITS = Limits(horizontal_speed_m_s=2.0, vertical_speed_m_s=0.5, yaw_rate_deg_s=30.0)
+MIDDLE = DronePose((0.0, 0.0, 5.0), math.pi / 2)
+deflections = st.floats(-1.0, 1.0)
+
+
+def test_the_fence_is_around_all_starts_and_below_the_lowest_ceiling():
+    drones = [
+        {"name": "one", "position_m": [0, 10, 0]},
+        {"name": "two", "position_m": [-20, 0, 0], "limits": {"altitude_m": 12}},
+    ]
+    fence = geofence_of(scenario_file.resolve({"name": "t", "duration_s": 1, "drones": drones}, "t.yaml"))
+    assert fence == Geofence((-70.0, -50.0, 1.0), (50.0, 60.0, 12.0))
+
+
+def test_a_place_outside_is_refused_with_its_axis_and_the_limits():
+    assert FENCE.refusal(50.0, -50.0) == ""
+    assert has_terms(FENCE.refusal(50.1, 0.0), "x", "50.1", "-50", "50")
+    assert has_terms(FENCE.refusal(0.0, -60.0), "y", "-60.0", "-50", "50")
+
+
+def test_a_drone_slows_down_before_the_fence_and_comes_back_from_beyond_it():
+    assert FENCE.within((2.0, -2.0, 1.0), (49.5, 0.0, 30.0)) == (0.5, -2.0, 0.0)
+    assert FENCE.within((2.0, 0.0, -1.0), (60.0, 0.0, 0.5)) == (0.0, 0.0, 0.0)
+    assert FENCE.within((-2.0, 0.0, 1.0), (60.0, 0.0, 0.5)) == (-2.0, 0.0, 1.0)
+
+
+@given(deflections, deflections, deflections, deflections, st.floats(0.0, 100.0), st.floats(-4.0, 4.0))
+def test_a_stick_never_asks_for_more_than_the_drone_s_limits(
+    forward: float, left: float, up: float, turn: float, speed: float, yaw: float
+):
+    pose = DronePose((0.0, 0.0, 15.0), yaw)
+    flown = stick_velocity(Stick(forward, left, up, turn, speed), pose, LIMITS, FENCE)
+    x, y, z = flown.velocity_m_s
+    assert math.hypot(x, y) <= min(speed, 2.0) + 1e-9
+    assert abs(z) <= 0.5
+    assert abs(flown.yaw_rate_rad_s) <= math.radians(30.0)
+
+
+def test_a_stick_is_in_the_heading_frame():
+    flown = stick_velocity(Stick(1.0, 0.0, 0.0, 0.5, 1.5), MIDDLE, LIMITS, FENCE)
+    assert flown.velocity_m_s == pytest.approx((1.5, 0.0, 0.0))
+    assert flown.yaw_rate_rad_s == pytest.approx(math.radians(15.0))
+
+
+def test_the_fence_holds_whatever_the_heading():
+    """It looks north at the fence in the north: nothing is left of forward, all of left."""
+    flown = stick_velocity(Stick(1.0, 1.0, 0.0, 0.0, 1.0), DronePose((0.0, 50.0, 5.0), math.pi / 2), LIMITS, FENCE)
+    assert flown.velocity_m_s == pytest.approx((0.0, math.sqrt(0.5), 0.0), abs=1e-9)
+
+
+def test_to_a_place_a_drone_flies_straight_and_slows_down_there():
+    far = velocity_to((30.0, 40.0, 5.0), MIDDLE, LIMITS, FENCE)
+    assert turned_about_up(far.velocity_m_s, MIDDLE.yaw_rad) == pytest.approx((0.9, 1.2, 0.0))
+    near = velocity_to((0.5, 0.0, 5.5), MIDDLE, LIMITS, FENCE)
+    assert turned_about_up(near.velocity_m_s, MIDDLE.yaw_rad) == pytest.approx((0.3, 0.0, 0.3))
+    assert far.yaw_rate_rad_s == near.yaw_rate_rad_s == 0.0

@@ -1,0 +1,417 @@
+"""Frusta in the scene: where they stand, and on whose page. Which way the page's camera goes with the formation, and what it has in view. What a page's camera has in view."""
+
+import math
+import re
+from collections.abc import Callable
+from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic_camera
+
+from zsim.math import frames
+from zsim_bridges.console.page_cameras import (
+    DISTANCE_MIN_M,
+    FAR_M,
+    OFFSET_M,
+    CameraFollow,
+    CameraFrustums,
+    CameraView,
+    drone_index,
+    fit_distance_m,
+    frustum_pose,
+)
+from zsim_bridges.console.picture import DronePoses, drone_on_ray
+
+FRONT, BOTTOM = synthetic_camera.info_of("front"), synthetic_camera.info_of("bottom")
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+AHEAD_K, DOWN_K = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
+
+
+def drones(x_m: float = 0.0) -> DronePoses:
+    p_W = np.array([(x_m, 0.0, 2.0), (math.nan,) * 3])
+    return DronePoses(0, ("drone1", "drone2"), p_W, np.tile(LEVEL, (2, 1)), np.zeros((2, 4)), np.zeros(3))
+
+
+def test_a_front_camera_looks_where_its_drone_looks():
+    north = frames.quaternion_from_heading(np.array(math.pi / 2))
+    p_WK, q_WK = frustum_pose(FRONT, np.array([1.0, 2.0, 3.0]), north)
+    assert p_WK == pytest.approx((1.0 - 0.0, 2.162, 3.012))
+    assert frames.rotate(q_WK, AHEAD_K) == pytest.approx((0.0, 1.0, 0.0), abs=1e-9)
+    assert frames.rotate(q_WK, DOWN_K) == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
+
+
+def test_a_bottom_camera_looks_down_with_ahead_at_the_top_of_its_picture():
+    p_WK, q_WK = frustum_pose(BOTTOM, np.array([0.0, 0.0, 3.0]), LEVEL)
+    assert p_WK == pytest.approx((0.0, 0.0, 2.97))
+    assert frames.rotate(q_WK, AHEAD_K) == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
+    assert frames.rotate(q_WK, DOWN_K) == pytest.approx((-1.0, 0.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("camera", "index"), [("drone1/front", 0), ("drone2/front", None), ("drone9/front", None), ("", None)]
+)
+def test_only_a_drone_in_the_view_has_a_place(camera: str, index: int | None):
+    assert drone_index(drones(), camera) == index
+    assert drone_index(None, camera) is None
+
+
+class Page:
+    """A page of viser's that notes its frusta; its camera looks north from 6 m south of the origin, 2 m above it."""
+
+    def __init__(self, client_id: int) -> None:
+        self.client_id = client_id
+        self.camera = SimpleNamespace(
+            position=np.array([0.0, -6.0, 2.0]), look_at=np.array([0.0, 0.0, 2.0]),
+            up_direction=np.array([0.0, 0.0, 1.0]), fov=math.radians(75), aspect=1.5,
+        )  # fmt: skip
+        self.atomic = nullcontext
+        self.html = ""
+        self.nodes: list[Any] = []
+        self.gui = SimpleNamespace(add_html=self._add_html)
+        self.scene = SimpleNamespace(add_camera_frustum=self._add)
+
+    def _add_html(self, content: str, **_: Any) -> None:
+        self.html = content
+
+    def _add(self, name: str, fov: float, aspect: float, **_: Any) -> Any:
+        node: Any = SimpleNamespace(fov=fov, aspect=aspect)
+        node.remove = lambda: self.nodes.remove(node)
+        self.nodes.append(node)
+        return node
+
+    @property
+    def key(self) -> str:
+        found = re.search('data-zsim-page="([^"]+)"', self.html)
+        assert found is not None
+        return found[1]
+
+
+class Server:
+    """A viser server with pages that come and go."""
+
+    def __init__(self) -> None:
+        self.comes: Callable[[Any], None] = lambda _: None
+        self.goes: Callable[[Any], None] = lambda _: None
+
+    def on_client_connect(self, act: Callable[[Any], None]) -> None:
+        self.comes = act
+
+    def on_client_disconnect(self, act: Callable[[Any], None]) -> None:
+        self.goes = act
+
+
+@pytest.fixture
+def server() -> Server:
+    return Server()
+
+
+@pytest.fixture
+def frustums(server: Any) -> CameraFrustums:
+    return CameraFrustums(server)
+
+
+@pytest.fixture
+def pages(server: Server, frustums: CameraFrustums) -> list[Page]:
+    made = [Page(1), Page(2)]
+    for page in made:
+        server.comes(page)
+    return made
+
+
+def shown(camera: str, number: int = 1) -> Any:
+    """Return what a camera shows: every one has the same picture."""
+    if not camera.startswith("drone"):
+        return None
+    name = camera.split("/")[1]
+    image = synthetic_camera.image_message(name, number, b"JPEG %d" % number, 0)
+    return synthetic_camera.info_of(name), SimpleNamespace(number=number, image=image)
+
+
+def test_a_page_shows_the_frustum_that_was_clicked_on_it_and_the_others_do_not(
+    frustums: CameraFrustums, pages: list[Page]
+):
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(5.0), shown)
+    (node,) = pages[0].nodes
+    assert pages[1].nodes == []
+    assert node.position == pytest.approx((5.162, 0.0, 2.012))
+    assert (node._format, node._image_data) == ("jpeg", b"JPEG 1")
+    assert node.aspect == pytest.approx(16 / 9)
+    frustums.draw(drones(6.0), lambda camera: shown(camera, 2))
+    assert pages[0].nodes == [node]
+    assert node.position[0] == pytest.approx(6.162)
+    assert node._image_data == b"JPEG 2"
+
+
+def test_a_frustum_that_is_in_view_leaves_its_page_s_camera_alone(frustums: CameraFrustums, pages: list[Page]):
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(1.0), shown)
+    assert pages[0].camera.position.tolist() == [0.0, -6.0, 2.0]
+
+
+def test_a_frustum_that_appears_out_of_view_is_brought_into_it_once(frustums: CameraFrustums, pages: list[Page]):
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(50.0), shown)
+    camera = pages[0].camera
+    assert camera.look_at == pytest.approx((50.162, 0.0, 2.012))
+    assert camera.position[1] == pytest.approx(-np.linalg.norm(OFFSET_M))
+    assert pages[1].camera.look_at.tolist() == [0.0, 0.0, 2.0]
+    frustums.draw(drones(90.0), lambda name: shown(name, 2))
+    assert camera.look_at[0] == pytest.approx(50.162)
+
+
+def test_another_click_hides_it(frustums: CameraFrustums, pages: list[Page]):
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(), shown)
+    frustums.choose(pages[0].key, "")
+    frustums.draw(drones(), shown)
+    assert pages[0].nodes == []
+
+
+def test_another_camera_takes_its_place(frustums: CameraFrustums, pages: list[Page]):
+    for camera in ("drone1/front", "drone1/bottom"):
+        frustums.choose(pages[0].key, camera)
+        frustums.draw(drones(), shown)
+    (node,) = pages[0].nodes
+    assert node.aspect == pytest.approx(4 / 3)
+
+
+@pytest.mark.parametrize("camera", ["drone2/front", "elsewhere", "drone9/front"])
+def test_a_camera_without_a_picture_or_a_place_has_none(frustums: CameraFrustums, pages: list[Page], camera: str):
+    frustums.choose(pages[0].key, camera)
+    frustums.draw(drones(), shown)
+    frustums.draw(None, shown)
+    assert pages[0].nodes == []
+
+
+def test_nobody_chooses_for_a_page_without_its_key(frustums: CameraFrustums, pages: list[Page]):
+    for key in ("", "guessed", pages[0].key[:-1]):
+        frustums.choose(key, "drone1/front")
+    frustums.draw(drones(), shown)
+    assert [page.nodes for page in pages] == [[], []]
+    assert pages[0].key != pages[1].key
+
+
+def test_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, pages: list[Page], server: Server):
+    frustums.choose(pages[0].key, "drone1/front")
+    server.goes(pages[0])
+    frustums.draw(drones(), shown)
+    assert pages[0].nodes == []
+    frustums.choose(pages[0].key, "drone1/front")
+    frustums.draw(drones(), shown)
+    assert pages[0].nodes == []
+
+
+def test_a_run_that_is_over_leaves_none(frustums: CameraFrustums, pages: list[Page]):
+    frustums.choose(pages[1].key, "drone1/front")
+    frustums.draw(drones(), shown)
+    frustums.clear()
+    assert pages[1].nodes == []
+
+
+def test_a_click_in_a_scene_is_for_its_page_and_told_once(frustums: CameraFrustums, pages: list[Page]):
+    frustums.click(2, "drone1")
+    assert frustums.take_click(pages[0].key) == ""
+    assert [frustums.take_click(pages[1].key) for _ in range(2)] == ["drone1", ""]
+
+
+def test_a_click_on_a_page_that_has_gone_is_forgotten(frustums: CameraFrustums, pages: list[Page], server: Server):
+    frustums.click(1, "drone1")
+    server.goes(pages[0])
+    frustums.click(1, "drone1")
+    assert frustums.take_click(pages[0].key) == ""
+
+
+@pytest.mark.parametrize(
+    ("direction", "drone"),
+    [
+        ((0.0, 0.0, -1.0), "near"),
+        ((5.0, 0.2, -10.0), "far"),  # passes by it at 0.2 m
+        ((5.0, 0.4, -10.0), None),
+        ((0.1, 0.0, -5.0), "near"),  # hits the one behind it, too, further from its centre
+        ((0.0, 50.5, -10.0), "distant"),  # passes by it at 0.5 m, 0.01 rad
+        ((0.0, 0.0, 1.0), None),  # all are behind
+        ((0.0, 0.0, 0.0), None),
+    ],
+)
+def test_a_click_is_on_the_drone_that_its_ray_hits(direction: tuple[float, ...], drone: str | None):
+    p_W = np.array([(0.0, 0.0, 5.0), (0.0, 0.0, 4.0), (5.0, 0.0, 0.0), (0.0, 50.0, 0.0), (math.nan,) * 3])
+    names = ("near", "behind", "far", "distant", "gone")
+    poses = DronePoses(0, names, p_W, np.tile(LEVEL, (5, 1)), np.zeros((5, 4)), np.zeros(3))
+    assert drone_on_ray(poses, np.full(5, 0.3), (0.0, 0.0, 10.0), direction) == drone
+
+
+def test_without_drones_a_click_is_on_none():
+    poses = DronePoses(0, ("gone",), np.full((1, 3), math.nan), LEVEL[None], np.zeros((1, 4)), np.zeros(3))
+    assert drone_on_ray(poses, np.ones(1), (0.0, 0.0, 10.0), (0.0, 0.0, -1.0)) is None
+
+
+UP_W = np.array([0.0, 0.0, 1.0])
+TRIANGLE = np.array([(0.0, 3.5, 15.0), (-3.5, -3.5, 15.0), (3.5, -3.5, 15.0)])
+
+
+class FollowingPage:
+    """A page of viser's, with its camera."""
+
+    def __init__(self, number: int, aspect: float = 1.6) -> None:
+        self.client_id = number
+        self.atomic = nullcontext
+        self.camera = SimpleNamespace(
+            position=np.array([9.0, 0.0, 0.0]), look_at=np.zeros(3), up_direction=UP_W, fov=1.31, aspect=aspect
+        )
+
+    @property
+    def distance_m(self) -> float:
+        return float(np.linalg.norm(self.camera.position - self.camera.look_at))
+
+    def shows(self, p_W: np.ndarray) -> bool:
+        """Return whether it has all points within its picture."""
+        camera = self.camera
+        back = (camera.position - camera.look_at) / self.distance_m
+        right = np.cross(UP_W, back)
+        away = (p_W - camera.position) @ np.column_stack((right / np.linalg.norm(right), np.cross(back, right), -back))
+        half = math.tan(camera.fov / 2) * away[:, 2]
+        return bool((np.abs(away[:, 0]) <= half * camera.aspect).all() and (np.abs(away[:, 1]) <= half).all())
+
+
+class Pages:
+    """Pages that come and go."""
+
+    def __init__(self) -> None:
+        self.there: dict[int, Any] = {}
+        self.calls: dict[str, Any] = {}
+        server: Any = SimpleNamespace(
+            on_client_connect=lambda call: self.calls.update(come=call),
+            on_client_disconnect=lambda call: self.calls.update(go=call),
+            get_clients=lambda: self.there,
+        )
+        self.follow = CameraFollow(server)
+
+    def come(self, page: FollowingPage) -> FollowingPage:
+        self.there[page.client_id] = page
+        self.calls["come"](page)
+        return page
+
+    def go(self, page: FollowingPage) -> None:
+        self.calls["go"](page)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 2.2])
+@pytest.mark.parametrize("direction", ["reset", "top", "side"])
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_a_formation_is_in_view_whatever_its_size_and_the_page_s(aspect: float, direction: str, scale: float):
+    pages = Pages()
+    page = pages.come(FollowingPage(1, aspect))
+    pages.follow.choose(1, follows=True, fits=True, direction=direction)
+    pages.follow.follow(scale * TRIANGLE)
+    assert page.shows(scale * TRIANGLE)
+    assert page.distance_m >= DISTANCE_MIN_M
+
+
+def test_a_hidden_page_has_a_camera_all_the_same():
+    distance_m = fit_distance_m(TRIANGLE, TRIANGLE.mean(axis=0), np.array([0.0, -1.0, 0.3]), UP_W, 1.31, 0.0)
+    assert math.isfinite(distance_m)
+
+
+def test_cameras_follow_from_the_start_and_go_back_where_a_formation_grows():
+    pages = Pages()
+    page = pages.come(FollowingPage(1))
+    for t in range(60):
+        flown = (1.0 + t / 10) * TRIANGLE + np.array((t, -t, 0.0))
+        pages.follow.follow(flown)
+        assert page.shows(flown)
+    before_m = page.distance_m
+    pages.follow.follow(TRIANGLE)
+    assert page.distance_m < before_m
+
+
+def test_a_camera_keeps_the_direction_that_its_page_gave_it():
+    pages = Pages()
+    page = pages.come(FollowingPage(1))
+    pages.follow.follow(TRIANGLE)
+    page.camera.position = page.camera.look_at + np.array((0.0, page.distance_m, 0.0))
+    pages.follow.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
+    back = (page.camera.position - page.camera.look_at) / page.distance_m
+    assert back == pytest.approx((0.0, 1.0, 0.0), abs=1e-9)
+    assert page.camera.look_at[0] == pytest.approx(40.0)
+
+
+def test_a_formation_that_hovers_moves_no_camera():
+    pages = Pages()
+    page = pages.come(FollowingPage(1))
+    pages.follow.follow(TRIANGLE)
+    before = page.camera.position.copy()
+    pages.follow.follow(TRIANGLE + np.array((0.1, 0.0, 0.05)))
+    assert page.camera.position.tolist() == before.tolist()
+
+
+def test_who_zooms_keeps_the_distance_and_who_does_not_follow_the_place():
+    pages = Pages()
+    zoomed, still = pages.come(FollowingPage(1)), pages.come(FollowingPage(2))
+    pages.follow.follow(TRIANGLE)
+    zoomed.camera.position = zoomed.camera.look_at + np.array((0.0, -2.0, 0.0))
+    pages.follow.choose(1, follows=True, fits=False)
+    pages.follow.choose(2, follows=False, fits=True)
+    place = still.camera.look_at.tolist()
+    pages.follow.follow(TRIANGLE + np.array((40.0, 0.0, 0.0)))
+    assert zoomed.distance_m == pytest.approx(2.0)
+    assert zoomed.camera.look_at[0] == pytest.approx(40.0)
+    assert still.camera.look_at.tolist() == place
+    pages.follow.restart()  # another run: everybody looks there
+    pages.follow.follow(TRIANGLE + np.array((80.0, 0.0, 0.0)))
+    assert still.camera.look_at[0] == pytest.approx(80.0)
+
+
+def test_who_follows_again_after_a_zoom_has_all_in_view_from_the_fitting_distance():
+    pages = Pages()
+    page = pages.come(FollowingPage(1))
+    pages.follow.follow(TRIANGLE)
+    fitting_m = page.distance_m
+    page.camera.position = page.camera.look_at + 1.3 * (page.camera.position - page.camera.look_at)
+    pages.follow.choose(1, follows=True, fits=False)
+    pages.follow.follow(TRIANGLE)
+    assert page.distance_m == pytest.approx(1.3 * fitting_m)
+    pages.follow.choose(1, follows=True, fits=True)
+    pages.follow.follow(TRIANGLE)
+    assert page.distance_m == pytest.approx(fitting_m)
+
+
+def test_a_page_that_went_before_it_was_known_is_forgotten():
+    pages = Pages()
+    gone = FollowingPage(1)
+    pages.go(gone)
+    pages.calls["come"](gone)
+    before = gone.camera.position.tolist()
+    pages.follow.choose(1, follows=True, fits=True, direction="top")
+    pages.follow.follow(TRIANGLE)
+    assert gone.camera.position.tolist() == before
+
+
+def test_without_drones_no_camera_moves():
+    pages = Pages()
+    page = pages.come(FollowingPage(1))
+    before = page.camera.position.tolist()
+    pages.follow.follow(np.zeros((0, 3)))
+    assert page.camera.position.tolist() == before
+
+
+NORTHWARDS = CameraView(np.zeros(3), np.array([0.0, 2.0, 0.0]), np.array([0.0, 0.0, 1.0]), math.radians(90), 1.5)
+
+
+@pytest.mark.parametrize(
+    ("p_W", "seen"),
+    [
+        ((0.0, 5.0, 0.0), True),
+        ((6.0, 5.0, 0.0), True),  # to the right, where a page is wider than high
+        ((0.0, 5.0, 6.0), False),
+        ((0.0, 5.0, -6.0), False),
+        ((-9.0, 5.0, 0.0), False),
+        ((0.0, -5.0, 0.0), False),  # behind
+        ((0.0, FAR_M + 1.0, 0.0), False),
+    ],
+)
+def test_a_point_is_in_view_where_the_page_shows_it(p_W: tuple[float, float, float], seen: bool):
+    assert NORTHWARDS.contains(np.array(p_W)) == seen

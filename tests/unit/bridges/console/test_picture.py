@@ -1,0 +1,192 @@
+"""The picture of a run as arrays. What a formation would fly: the ways of its drones, from where it is."""
+
+import math
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from refused import has_terms
+
+from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
+from zsim.math import frames
+from zsim.scenario import scenario_file
+from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
+from zsim_bridges.console import picture as pic
+from zsim_bridges.console.picture import PreviewError, preview_of
+
+SCENARIOS = Path(__file__).parents[4] / "scenarios"
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+RNG = np.random.default_rng(4)
+
+
+def some_attitudes(count: int) -> np.ndarray:
+    q = RNG.normal(size=(count, 4))
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def drones(p_W: np.ndarray, q_WB: np.ndarray, t_ns: int = 0) -> pic.DronePoses:
+    names = tuple(f"drone{i}" for i in range(len(p_W)))
+    return pic.DronePoses(t_ns, names, p_W, q_WB, np.full((len(p_W), 4), 300.0), np.zeros(3))
+
+
+def test_a_view_becomes_arrays():
+    views = tuple(DroneView(f"d{i}", (i, 2.0, 3.0), LEVEL, (1.0, 2.0, 3.0, 4.0), "flying", 80.0) for i in range(2))
+    found = pic.drone_poses(ViewDrones(7, 0, views, ((1.0, 0.0, 0.0), (3.0, 0.0, 0.0))), ("d0", "d1"))
+    assert found.t_ns == 7
+    assert found.names == ("d0", "d1")
+    assert found.p_W.tolist() == [[0, 2, 3], [1, 2, 3]]
+    assert found.rotor.tolist() == [[1, 2, 3, 4, 0, 0, 0, 0]] * 2
+    assert found.wind_W.tolist() == [2, 0, 0]
+
+
+def test_a_view_of_some_drones_keeps_their_places():
+    some = tuple(
+        DroneView(name, (1.0, 2.0, 3.0), LEVEL, (1.0, 2.0, 3.0, 4.0), "flying", 80.0) for name in ("d2", "stranger")
+    )
+    found = pic.drone_poses(ViewDrones(7, 0, some), ("d0", "d1", "d2"))
+    assert found.present.tolist() == [False, False, True]
+    assert found.p_W[2].tolist() == [1, 2, 3]
+    assert found.q_WB.shape == (3, 4)
+    assert not pic.drone_poses(ViewDrones(7, 0, ()), ("d0",)).present.any()
+
+
+def test_many_names_are_shown_by_what_tells_them_apart():
+    assert pic.short_names(["drone1", "drone2", "drone30"]) == ["1", "2", "30"]
+    assert pic.short_names(["drone10", "drone11"]) == ["10", "11"]
+    assert pic.short_names(["north", "south"]) == ["north", "south"]
+    assert pic.short_names(["drone", "drone2"]) == ["drone", "drone2"]
+
+
+def test_rotors_stand_on_their_drone_and_turn_about_its_axis():
+    hubs = np.array([(0.1, 0.1, 0.03), (0.1, -0.1, 0.03), (-0.1, -0.1, 0.03), (-0.1, 0.1, 0.03)])
+    q = some_attitudes(5)
+    p = RNG.normal(size=(5, 3))
+    owners = np.repeat(np.arange(5), 4)
+    places, turns = pic.rotor_poses(p[owners], q[owners], np.tile(hubs, (5, 1)), RNG.uniform(0, 6, 20))
+    R = frames.rotation_matrix(q)
+    for n in range(5):
+        for k in range(4):
+            assert places[4 * n + k] == pytest.approx(p[n] + R[n] @ hubs[k])
+            assert frames.rotation_matrix(turns)[4 * n + k][:, 2] == pytest.approx(R[n][:, 2])
+
+
+def test_rotors_turn_so_slowly_that_eyes_see_which_way():
+    fastest, ways = np.full(4, 503.0), np.array([1.0, -1.0, 1.0, -1.0])  # rad/s, of the AR.Drone
+    turned = pic.rotor_angles(np.zeros(4), fastest, ways, 0.1)  # ten pictures a second, the fewest
+    steps = np.abs((turned + math.pi) % math.tau - math.pi)
+    assert (steps > 0.1).all()
+    assert (steps < math.pi / 2).all()  # a propeller of two blades looks the same after half a turn
+    assert pic.rotor_angles(turned, fastest, ways, 0.0) == pytest.approx(turned)
+
+
+def test_an_ellipsoid_is_the_covariance_at_two_sigma():
+    R = frames.rotation_matrix(some_attitudes(1))[0]
+    P = R @ np.diag([0.04, 0.25, 1.0]) @ R.T
+    estimate = EstimateView("d", (1.0, 2.0, 3.0), tuple(P[np.triu_indices(3)]), 0.0, 0.1, {})
+    balls = pic.ellipsoids([estimate])
+    assert balls.p_W.tolist() == [[1, 2, 3]]
+    assert sorted(balls.half_m[0]) == pytest.approx([0.4, 1.0, 2.0])
+    axes = frames.rotation_matrix(balls.wxyz)[0]
+    assert axes @ np.diag(balls.half_m[0] / 2) ** 2 @ axes.T == pytest.approx(P)
+
+
+def test_what_an_ellipsoid_holds_is_said_rightly():
+    samples = np.linalg.norm(RNG.normal(size=(200_000, 3)), axis=1)
+    assert pytest.approx(float((samples < pic.SIGMAS).mean()), abs=0.004) == pic.SHARE_WITHIN
+    assert f"{pic.SHARE_WITHIN:.0%}" == "74%"
+
+
+def test_without_estimates_there_are_no_ellipsoids():
+    balls = pic.ellipsoids([])
+    assert balls.p_W.shape == (0, 3)
+    assert balls.wxyz.shape == (0, 4)
+
+
+@pytest.mark.parametrize("name", ["step", "ring10", "triads", "grid30"])
+def test_ghosts_stand_where_the_formation_is_to_be(name: str):
+    scenario = scenario_file.load(SCENARIOS / f"{name}.yaml")
+    cluster = scenario.clusters[0]
+    space = scenario_space(scenario, cluster)
+    c = space.specimen(4.0)
+    view = ViewCluster(0, 0, "engaged", space.names, tuple(c), tuple(c), "")
+    found = pic.ghosts(space, view)
+    assert found is not None
+    p_W, q = found
+    assert space.difference(space.forward(p_W, frames.heading(q)), c) == pytest.approx(np.zeros(space.size), abs=1e-6)
+    assert pic.ghosts(space, msgspec.structs.replace(view, phase="idle")) is None
+
+
+def test_a_triangle_is_drawn_with_its_sides_and_its_corner():
+    p_W = np.array([(0.0, 0.0, 2.0), (3.0, 0.0, 2.0), (0.0, 4.0, 2.0)])
+    found = pic.formation_shape(cluster_space(3), p_W, np.zeros(3))
+    assert found is not None
+    assert [side.name for side in found.sides] == ["p 3.00 m", "q 4.00 m", ""]
+    assert found.sides[1].ends_W.tolist() == p_W[[0, 2]].tolist()
+    assert found.corner is not None
+    assert found.corner[1] == "β 90.0°"
+    assert found.p_c == pytest.approx(p_W.mean(axis=0))
+
+
+def test_a_formation_in_line_has_no_frame():
+    line = np.array([(0.0, 0.0, 2.0), (3.0, 0.0, 2.0), (6.0, 0.0, 2.0)])
+    assert pic.formation_shape(cluster_space(3), line, np.zeros(3)) is None
+
+
+def test_a_pair_has_one_side():
+    found = pic.formation_shape(cluster_space(2), np.array([(0.0, 0.0, 2.0), (3.0, 0.0, 2.0)]), np.zeros(2))
+    assert found is not None
+    assert [side.name for side in found.sides] == ["p 3.00 m"]
+    assert found.corner is None
+
+
+SCENARIO = scenario_file.load(Path(__file__).parents[4] / "scenarios" / "step.yaml")
+SPACE = scenario_space(SCENARIO, SCENARIO.clusters[0])
+BASE = SPACE.specimen(4.0)
+APART_M = 2.0
+
+
+def changed(**values: float) -> np.ndarray:
+    c = BASE.copy()
+    for name, value in values.items():
+        c[SPACE.index(name)] = value
+    return c
+
+
+def test_the_way_to_a_target_begins_where_the_formation_is_and_ends_there():
+    preview = preview_of(SPACE, "target", {"values": {"x_c": BASE[0] + 3.0, "yaw_deg": 90.0}}, BASE, APART_M)
+    assert np.allclose(preview.paths_W[:, 0], SPACE.inverse(BASE)[0])
+    goal = changed(x_c=BASE[0] + 3.0, yaw=np.pi / 2)
+    assert np.allclose(preview.paths_W[:, -1], SPACE.inverse(goal)[0])
+    assert "less than" not in preview.text
+
+
+def test_the_way_of_a_trajectory_has_its_beginning_and_its_figures():
+    waypoints = [
+        {"at_s": 0.0, "values": {"x_c": 1.0, "z_c": 8.0}},
+        {"at_s": 20.0, "values": {"x_c": 21.0, "z_c": 12.0}},
+    ]
+    preview = preview_of(SPACE, "trajectory", {"waypoints": waypoints}, BASE, APART_M)
+    assert np.allclose(preview.paths_W[:, 0], SPACE.inverse(BASE)[0])
+    assert np.allclose(preview.paths_W[:, -1], SPACE.inverse(changed(x_c=21.0, z_c=12.0))[0])
+    # a cubic from rest to rest is 1.5 times as fast in its middle as on the whole: 1.5 * hypot(20, 4) / 20
+    assert has_terms(preview.text, "20 s", "heights 8.0 to 12.0 m", "1.5 m/s at most")
+
+
+def test_drones_that_would_come_too_near_are_named():
+    preview = preview_of(SPACE, "target", {"values": {"p": 1.0}}, BASE, APART_M)
+    assert has_terms(preview.text, "1.0 m apart", "less than the 2 m")
+
+
+@pytest.mark.parametrize(
+    ("op", "args", "finding"),
+    [
+        ("target", {"values": {"speed": 1.0}}, "speed"),
+        ("trajectory", {"expressions": {"x_c": "5*cos("}}, "x_c"),
+        ("trajectory", {"waypoints": []}, "expressions or waypoints"),
+    ],
+)
+def test_what_no_formation_can_fly_has_no_preview(op: str, args: dict[str, object], finding: str):
+    with pytest.raises(PreviewError) as refused:
+        preview_of(SPACE, op, args, BASE, APART_M)
+    assert finding in str(refused.value)

@@ -1,0 +1,305 @@
+"""The command queue: who flies a drone, the order of commands of one instant, and what is refused."""
+
+import random
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from refused import has_terms
+
+from zsim.contract import keys
+from zsim.contract.flight_messages import Mode, Velocity
+from zsim.contract.run_messages import ControlRequest, Event
+from zsim.scenario import scenario_file
+from zsim_world.run.commands import PROGRAM, RECENT_PER_DRONE, CommandQueue, QueuedCommand
+from zsim_world.run.outbox import Refusal
+from zsim_world.run.world import World
+
+D1, D2 = 0, 1
+OPERATOR = 10  # priority that docs/protocol.md gives to operators
+GATE_NS = 20_000_000
+
+
+def velocity(source: str, seq: int = 0, t_ns: int = 0, x: float = 1.0) -> Velocity:
+    return Velocity(t_ns, seq, source, (x, 0.0, 0.0), 0.0)
+
+
+def mode(source: str, what: str, seq: int = 0, t_ns: int = 0) -> Mode:
+    return Mode(t_ns, seq, source, what)  # type: ignore[arg-type]
+
+
+def queue() -> CommandQueue:
+    return CommandQueue(["drone1", "drone2"])
+
+
+def fly(made: CommandQueue, t_ns: int) -> list[tuple[QueuedCommand, Refusal | None]]:
+    """Apply what is due as a world does: check, then make the source of a setpoint the commander."""
+    checked = []
+    for command in made.pop(t_ns):
+        reason = made.refusal(command)
+        if reason is None and command.kind != "mode":
+            made.claim(command.drone, command.source)
+        checked.append((command, reason))
+    return checked
+
+
+def send(made: CommandQueue, drone: int, source: str, t_ns: int = 0) -> Refusal | None:
+    made.push(drone, "velocity", velocity(source, t_ns=t_ns), t_ns)
+    ((_, reason),) = fly(made, t_ns)
+    return reason
+
+
+# The order of commands
+
+
+def test_a_command_waits_for_its_instant():
+    made = queue()
+    made.push(D1, "velocity", velocity("a"), GATE_NS)
+    assert made.pop(GATE_NS - 1) == []
+    assert [command.source for command in made.pop(GATE_NS)] == ["a"]
+    assert made.pop(GATE_NS) == []
+
+
+@settings(max_examples=100, deadline=None)
+@given(order=st.randoms(use_true_random=False))
+def test_commands_of_one_instant_are_ordered_by_priority_source_and_number(order: random.Random):
+    """Whatever the order of arrival; instants before later ones, and the last one wins."""
+    made = queue()
+    made.acquire(D1, "a.operator", OPERATOR)
+    wanted = [(0, "b", 2), (0, "b", 9), (0, "c", 1), (0, "c", 10), (10, "a.operator", 0), (10, "a.operator", 3)]
+    arrivals = [(source, seq, at) for at in (GATE_NS, 2 * GATE_NS) for _, source, seq in wanted]
+    order.shuffle(arrivals)
+    for source, seq, at in arrivals:
+        made.push(D1, "velocity", velocity(source, seq, at - GATE_NS), at)
+    popped = made.pop(2 * GATE_NS)
+    assert [(command.priority, command.source, command.seq) for command in popped] == wanted * 2
+    assert [command.apply_ns for command in popped] == [GATE_NS] * 6 + [2 * GATE_NS] * 6
+
+
+@settings(max_examples=50, deadline=None)
+@given(order=st.randoms(use_true_random=False))
+def test_equal_places_do_not_fall_back_on_the_order_of_arrival(order: random.Random):
+    made = queue()
+    arrivals = [(drone, kind) for drone in (D1, D2) for kind in ("mode", "velocity")]
+    order.shuffle(arrivals)
+    for drone, kind in arrivals:
+        made.push(drone, kind, velocity("a") if kind == "velocity" else mode("a", "takeoff"), 0)
+    assert [(command.drone, command.kind) for command in made.pop(0)] == [
+        (D1, "mode"),
+        (D1, "velocity"),
+        (D2, "mode"),
+        (D2, "velocity"),
+    ]
+
+
+def test_a_command_that_comes_again_takes_effect_once():
+    """As after a rejoin: an old setpoint must not replace a newer one."""
+    made = queue()
+    old, new = velocity("a", 1, 0, x=1.0), velocity("a", 2, GATE_NS, x=2.0)
+    assert made.push(D1, "velocity", old, GATE_NS)
+    assert not made.push(D1, "velocity", old, GATE_NS)
+    assert made.push(D1, "velocity", new, 2 * GATE_NS)
+    assert [command.message for command in made.pop(2 * GATE_NS)] == [old, new]
+    assert not made.push(D1, "velocity", old, GATE_NS)
+    assert not made.push(D1, "velocity", new, 2 * GATE_NS)
+    assert made.pop(9 * GATE_NS) == []
+
+
+def test_the_same_number_for_another_drone_kind_or_instant_is_another_command():
+    made = queue()
+    command = velocity("a")
+    assert made.push(D1, "velocity", command, GATE_NS)
+    assert made.push(D2, "velocity", command, GATE_NS)
+    assert made.push(D1, "velocity", command, 2 * GATE_NS)
+    assert made.push(D1, "mode", mode("a", "land"), GATE_NS)
+    assert made.push(D1, "mode", mode("a", "takeoff"), GATE_NS)
+    assert len(made.pop(2 * GATE_NS)) == 5
+
+
+def test_what_is_remembered_of_commands_is_bounded():
+    made = queue()
+    for seq in range(10 * RECENT_PER_DRONE):
+        made.push(D1, "velocity", velocity("a", seq), 0)
+        made.pop(0)
+    assert len(made._recent) <= 2 * RECENT_PER_DRONE
+
+
+# Who flies
+
+
+def test_the_first_setpoint_makes_the_commander_and_others_are_refused_with_its_name():
+    made = queue()
+    assert made.commanders() == [None, None]
+    assert send(made, D1, "controller.main") is None
+    assert made.commanders() == ["controller.main", None]
+    reason = send(made, D1, "console.1")
+    assert reason is not None
+    assert reason[0] == "drone1"
+    assert has_terms(reason[1], "'controller.main'", "priority 0")
+    assert made.commanders()[D1] == "controller.main"
+    assert send(made, D2, "console.1") is None
+
+
+def test_claim_tells_whether_the_commander_is_new():
+    made = queue()
+    assert [made.claim(D1, source) for source in ("a", "a", "b")] == [True, False, False]
+
+
+def test_a_drone_is_acquired_with_a_higher_priority_only():
+    made = queue()
+    send(made, D1, "controller.main")
+    refusal = made.acquire(D1, "console.1", PROGRAM)
+    assert refusal is not None
+    assert refusal[0] == "drone1"
+    assert has_terms(refusal[1], "'controller.main'", "priority 0")
+    assert made.acquire(D1, "console.1", OPERATOR) is None
+    assert made.commanders()[D1] == "console.1"
+    assert made.acquire(D1, "console.2", OPERATOR) is not None
+    assert made.acquire(D1, "console.2", OPERATOR + 1) is None
+    assert made.commanders()[D1] == "console.2"
+
+
+def test_the_commander_may_change_its_own_priority():
+    made = queue()
+    assert made.acquire(D1, "a", OPERATOR) is None
+    assert made.acquire(D1, "a", PROGRAM) is None
+    assert made.acquire(D1, "b", PROGRAM + 1) is None
+
+
+def test_a_released_drone_is_free_and_the_priority_is_gone():
+    made = queue()
+    made.acquire(D1, "console.1", OPERATOR)
+    assert made.release(D1, "console.1") is None
+    assert made.commanders()[D1] is None
+    send(made, D1, "console.1")
+    assert made.acquire(D1, "other", PROGRAM + 1) is None
+
+
+@pytest.mark.parametrize(("holder", "who"), [("a", "'a'"), (None, "nobody")])
+def test_only_the_commander_releases(holder: str | None, who: str):
+    made = queue()
+    if holder:
+        made.claim(D1, holder)
+    refusal = made.release(D1, "b")
+    assert refusal is not None
+    assert refusal[0] == "drone1"
+    assert has_terms(refusal[1], who, "not", "'b'")
+    assert made.commanders()[D1] == holder
+
+
+def test_a_setpoint_on_its_way_does_not_undo_a_release():
+    made = queue()
+    send(made, D1, "a")
+    made.push(D1, "velocity", velocity("a", 1), GATE_NS)
+    made.push(D1, "mode", mode("a", "land"), GATE_NS)
+    made.push(D2, "velocity", velocity("a", 1), GATE_NS)
+    made.release(D1, "a")
+    assert [(command.drone, command.kind) for command, _ in fly(made, GATE_NS)] == [(D1, "mode"), (D2, "velocity")]
+    assert made.commanders()[D1] is None
+    assert made.commanders()[D2] == "a"
+
+
+def test_who_is_gone_flies_nothing_any_more():
+    made = queue()
+    send(made, D1, "a")
+    send(made, D2, "a")
+    made.push(D1, "velocity", velocity("a", 1), GATE_NS)
+    made.push(D2, "mode", mode("a", "land"), GATE_NS)
+    made.push(D2, "velocity", velocity("b", 1), GATE_NS)
+    assert made.remove_source("a") == [D1, D2]
+    assert made.remove_source("a") == []
+    assert made.commanders()[D1] is None
+    assert [(command.source, command.kind) for command in made.pop(GATE_NS)] == [("a", "mode"), ("b", "velocity")]
+
+
+def test_who_is_gone_has_no_priority_any_more():
+    made = queue()
+    made.acquire(D1, "console.1", OPERATOR)
+    made.acquire(D1, "console.2", OPERATOR + 1)
+    assert made.remove_source("console.1") == []
+    made.release(D1, "console.2")
+    made.push(D1, "velocity", velocity("console.1"), 0)
+    assert [command.priority for command in made.pop(0)] == [PROGRAM]
+
+
+# Modes
+
+
+@pytest.mark.parametrize(
+    ("priority", "refused"), [(PROGRAM, True), (OPERATOR - 1, True), (OPERATOR, False), (OPERATOR + 1, False)]
+)
+def test_modes_are_open_to_a_priority_no_lower_than_the_commander_s(priority: int, refused: bool):
+    made = queue()
+    made.acquire(D1, "a", OPERATOR)
+    reason = made.refusal(QueuedCommand(0, priority, "b", 0, D1, "mode", mode("b", "land")))
+    assert (reason is not None) is refused
+
+
+@pytest.mark.parametrize("commander", [None, "controller.main"])
+def test_modes_are_open_to_all_while_nobody_or_a_program_flies(commander: str | None):
+    made = queue()
+    if commander:
+        send(made, D1, commander)
+    made.push(D1, "mode", mode("other", "land"), 0)
+    ((_, reason),) = fly(made, 0)
+    assert reason is None
+    assert made.commanders()[D1] == commander
+
+
+GATE_MS = 20
+AGE_MAX_MS = 400
+SCENARIO = f"""
+name: one
+duration_s: 10
+time: {{max_command_age_ms: {AGE_MAX_MS}}}
+drones: [{{name: d1, position_m: [0, 0, 0]}}]
+processes: {{expect: []}}
+"""
+
+
+def refusals(mode: str, age_ms: int, kind: str = "velocity") -> list[dict[str, Any]]:
+    """Return the refusals of a command of gate 0 that comes so much later."""
+    world = World(scenario_file.from_text(SCENARIO), mode, run_id="run1")
+    for _ in range(1 + age_ms // GATE_MS):
+        world.advance(0)
+    command = Mode(0, 0, "me.x", "land") if kind == "mode" else Velocity(0, 0, "me.x", (0.0, 0.0, 0.0), 0.0)
+    world.handle(keys.command("d1", kind), command, 0)
+    events = [message for _, message in world.outbox.take() if isinstance(message, Event)]
+    return [event.data for event in events if event.kind == "refused"]
+
+
+@pytest.mark.parametrize("kind", ["velocity", "mode"])
+def test_an_old_command_is_refused_in_realtime_alone(kind: str):
+    (refusal,) = refusals("realtime", AGE_MAX_MS + GATE_MS, kind)
+    assert has_terms(refusal["reason"], "age", "420 ms", "400 ms")
+    assert refusals("realtime", AGE_MAX_MS, kind) == refusals("lockstep", 10 * AGE_MAX_MS, kind) == []
+
+
+MISSION = {"drone": "d1", "state": "aborted", "items": 5, "done": 3, "reason": "it left its geofence", "failsafe": True}
+
+
+def reported(**changed: Any) -> tuple[str, list[Event]]:
+    """Report a mission; return the refusal and the events of missions."""
+    world = World(scenario_file.from_text(SCENARIO), "realtime", run_id="run1")
+    world.advance(0)
+    answer = world.control(ControlRequest("mission", MISSION | changed, "mavlink.main"))
+    events = [message for _, message in world.outbox.take() if isinstance(message, Event)]
+    return answer.error, [event for event in events if event.kind == "mission"]
+
+
+def test_a_mission_that_is_reported_is_an_event_of_its_drone():
+    error, (event,) = reported()
+    assert (error, event.subject, event.source) == ("", "d1", "mavlink.main")
+    assert event.data == {name: value for name, value in MISSION.items() if name != "drone"}
+    assert has_terms(event.text, "3 of 5 items", "geofence")
+
+
+@pytest.mark.parametrize(
+    "changed", [{"drone": "d9"}, {"state": "lost"}, {"items": -1}, {"done": "3"}, {"done": 10**9}, {"items": True}]
+)
+def test_a_report_of_a_mission_that_is_none_is_refused_and_is_no_event(changed: dict[str, Any]):
+    error, events = reported(**changed)
+    ((name, value),) = changed.items()
+    assert error.startswith(f"{name} is {value!r}; must be ")
+    assert events == []

@@ -1,0 +1,302 @@
+"""Requested faults: added, begun, ended, cleared, and published before the first gate that they change."""
+
+from typing import Any
+
+import pytest
+from refused import has_terms, parts
+
+from zsim.contract import keys
+from zsim.contract.flight_messages import Velocity
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Faults, Join
+from zsim.scenario import fault_kinds, scenario_file
+from zsim_world.run.world import World
+
+GATE_NS = 20_000_000
+SCENARIO = """
+name: one
+seed: 3
+duration_s: 2
+drones:
+  - {name: d1, position_m: [0, 0, 0]}
+  - {name: d2, position_m: [5, 0, 0]}
+clusters: [{name: main, drones: [d1, d2]}]
+processes: {expect: []}
+"""
+
+
+def world(faults: str = "[]", delay_gates: int = 1) -> World:
+    text = f"{SCENARIO}\nfaults: {faults}\ntime: {{command_delay_gates: {delay_gates}}}"
+    return World(scenario_file.from_text(text), run_id="run1")
+
+
+def ask(made: World, op: str, **args: Any) -> ControlAnswer:
+    return made.control(ControlRequest(op, args, "tester.one"))
+
+
+def add(made: World, kind: str = "gps_dropout", target: str = "d1", **args: Any) -> Any:
+    answer = ask(made, "fault_add", kind=kind, target=target, **args)
+    assert answer.ok, answer.error
+    return answer.result
+
+
+def go(made: World, gates: int) -> None:
+    for _ in range(gates):
+        made.advance(0)
+
+
+def events(made: World) -> list[tuple[int, str, int]]:
+    """Return (gate, kind, id) of the events of faults since the last time."""
+    published = [message for key, message in made.take_outbox() if key == keys.EVENT]
+    return [(e.t_ns // GATE_NS, e.kind, e.data["id"]) for e in published if e.kind.startswith("fault")]
+
+
+def listed(made: World) -> list[list[int]]:
+    """Return the ids of every list since the last time."""
+    return [[fault.id for fault in m.faults] for _, m in made.take_outbox() if isinstance(m, Faults)]
+
+
+def test_what_the_scenario_plans_is_published_at_the_start_begun_and_ended():
+    made = world("[{kind: gps_dropout, target: d1, at_s: 0.04, for_s: 0.06}, {kind: mag_stuck, target: d2}]")
+    key, message = made.outbox.pending[0]
+    assert (key, [(f.id, f.source) for f in message.faults]) == (keys.FAULTS, [(1, "scenario"), (2, "scenario")])
+    go(made, 8)
+    assert events(made) == [(0, "fault", 2), (2, "fault", 1), (5, "fault_end", 1)]
+
+
+def test_an_event_says_all_of_a_fault():
+    made = world()
+    go(made, 3)
+    add(made, "baro_bias", value_m=2, for_s=1)
+    go(made, 1)
+    event = next(m for k, m in made.take_outbox() if k == keys.EVENT and m.kind == "fault")
+    assert isinstance(event, Event)
+    assert event.subject == "d1"
+    assert has_terms(event.text, "baro_bias", "d1")
+    assert event.data == {
+        "id": 1,
+        "kind": "baro_bias",
+        "target": "d1",
+        "parameters": {"value_m": 2.0},
+        "from_ns": 2 * GATE_NS,
+        "until_ns": 52 * GATE_NS,
+        "source": "tester.one",
+        "rank": 0,
+    }
+
+
+def test_a_requested_fault_is_published_before_the_gate_that_nobody_has_seen_yet():
+    made = world(delay_gates=5)
+    go(made, 4)
+    made.take_outbox()
+    assert add(made, for_s=0.04) == {"id": 1, "from_ns": 3 * GATE_NS, "until_ns": 5 * GATE_NS}
+    go(made, 1)
+    published = [key for key, _ in made.take_outbox() if key in (keys.FAULTS, keys.GATE)]
+    assert published == [keys.FAULTS, keys.GATE]
+
+
+def test_what_has_ended_stays_on_the_list_while_somebody_may_work_on_its_gates():
+    made = world(delay_gates=3)
+    go(made, 1)
+    add(made, for_s=0.04)
+    assert listed(made)[-1] == [1]
+    go(made, 5)
+    assert listed(made) == []
+    go(made, 1)
+    assert listed(made) == [[]]
+
+
+def test_nothing_is_kept_of_what_has_left_the_list():
+    made = world("[{kind: gps_dropout, target: d1, at_s: 0.02, for_s: 0.04}]")
+    go(made, 1)
+    add(made, "mag_stuck", "d2")
+    go(made, 1)
+    ask(made, "fault_clear", kind="mag_stuck")
+    assert made.faults._begun
+    go(made, 8)
+    assert made.faults.all == ()
+    assert made.faults._begun == made.faults._over == set()
+
+
+def test_a_kill_has_no_end():
+    made = world("[{kind: process_kill, target: estimator.d1, at_s: 0.04}]")
+    go(made, 8)
+    assert events(made) == [(2, "fault", 1)]
+
+
+def joined(made: World, name: str, period_gates: int, fingerprint: str = "x") -> None:
+    """Let a process join, as one of zsim.runtime.runner does, unless it has no fingerprint."""
+    run_id, period_ns = made.info().run_id, period_gates * GATE_NS
+    join = Join(0, 0, run_id, 1, name.partition(".")[0], "here", 1, period_ns, fingerprint=fingerprint)
+    made.handle(keys.process(name, "join"), join, 0)
+
+
+def test_what_has_ended_stays_on_the_list_for_who_steps_rarely():
+    """One that steps every fourth gate hands its agent gates of up to four gates, and the delay, ago."""
+    made = world(delay_gates=3)
+    joined(made, "slow.one", 4)
+    go(made, 1)
+    add(made, for_s=0.04)
+    made.take_outbox()
+    lists = []
+    for gate in range(1, 16):
+        made.handle(keys.process("slow.one", "done"), Done(0, gate, made.info().run_id, 1, gate * GATE_NS, 0), 0)
+        go(made, 1)
+        lists += [(gate, ids) for ids in listed(made)]
+    assert lists == [(2 + 3 + 4 + 1, [])]
+
+
+@pytest.mark.parametrize(
+    ("name", "period_gates", "fingerprint", "refused"),
+    [
+        ("console.one", 0, "x", True),
+        ("my.filter", 1, "", True),
+        ("estimator.d1", 0, "x", True),
+        ("my.filter", 1, "x", False),
+    ],
+)
+def test_no_process_is_killed_that_does_not_read_the_faults(
+    name: str, period_gates: int, fingerprint: str, refused: bool
+):
+    made = world()
+    joined(made, name, period_gates, fingerprint)
+    answer = ask(made, "fault_add", kind="process_kill", target=name)
+    assert answer.ok == (not refused)
+    if refused:
+        where, found = parts(answer.error)
+        assert (where, found.partition(",")[0]) == ("target", repr(name))
+
+
+def test_a_planned_kill_of_who_does_not_die_says_so():
+    made = world("[{kind: process_kill, target: estimator.d1, at_s: 0.04}]")
+    joined(made, "estimator.d1", 0)
+    go(made, 4)
+    texts = [message.text for key, message in made.take_outbox() if key == keys.EVENT and message.kind == "fault"]
+    assert len(texts) == 1
+    assert has_terms(texts[0], "process_kill", "estimator.d1", "no effect")
+
+
+def ranks(made: World) -> dict[int, int]:
+    return {fault.id: fault.rank for fault in made.faults.all}
+
+
+def test_equal_faults_are_numbered_by_who_begins_and_keep_that():
+    """So the same faults planned from the events of their beginning draw the same."""
+    cut = {"kind": "link_loss", "target": "world/controller.main", "probability": 0.5}
+    made = world()
+    for more in ({"for_s": 0.04}, {}, {"at_s": 0.02}, {}):
+        add(made, **{**cut, **more})
+    assert ranks(made) == {1: 0, 2: 1, 3: 0, 4: 2}
+    ask(made, "fault_clear", id=2)
+    assert ranks(made) == {1: 0, 3: 0, 4: 1}
+    go(made, 8)
+    assert ranks(made) == {3: 0, 4: 1}
+
+
+def test_what_links_carry_is_what_acts():
+    made = world()
+    add(made, "link_cut", "world/controller.main", at_s=0.04, for_s=0.04)
+    add(made, "radio", "main", range_m=10)
+    add(made, "gps_dropout")
+    for _ in range(8):
+        for gate in range(12):
+            t_ns = gate * GATE_NS
+            acting = [each for each in made.faults.all if fault_kinds.acts(each, t_ns) and each.kind != "gps_dropout"]
+            assert list(made.faults.of_links(gate * GATE_NS)) == acting
+        go(made, 1)
+
+
+def test_clearing_ends_what_acts_and_forgets_what_was_planned():
+    made = world()
+    go(made, 2)
+    add(made, "gps_dropout")
+    add(made, "gps_stuck", at_s=1.0)
+    go(made, 2)
+    made.take_outbox()
+    assert ask(made, "fault_clear").result == {"cleared": [1, 2]}
+    published = made.take_outbox()
+    cleared = [m for _, m in published if isinstance(m, Event) and m.kind == "fault_clear"]
+    assert [(m.data["id"], m.source) for m in cleared] == [(1, "tester.one"), (2, "tester.one")]
+    (faults,) = [m for _, m in published if isinstance(m, Faults)]
+    assert [(fault.id, fault.until_ns) for fault in faults.faults] == [(1, 3 * GATE_NS)]
+    go(made, 60)
+    assert events(made) == []
+    assert ask(made, "fault_clear").result == {"cleared": []}
+
+
+@pytest.mark.parametrize(
+    ("args", "cleared"), [({"id": 2}, [2]), ({"target": "d1"}, [1, 2]), ({"kind": "gps_stuck"}, [2, 3])]
+)
+def test_some_are_cleared(args: dict[str, Any], cleared: list[int]):
+    made = world()
+    go(made, 1)
+    for kind, target in (("gps_dropout", "d1"), ("gps_stuck", "d1"), ("gps_stuck", "d2")):
+        add(made, kind, target)
+    assert ask(made, "fault_clear", **args).result == {"cleared": cleared}
+
+
+@pytest.mark.parametrize(
+    ("op", "args", "where", "found"),
+    [
+        ("fault_add", {}, "kind", "missing"),
+        ("fault_add", {"kind": "gps_dropout", "target": "d3"}, "target", "'d3'"),
+        ("fault_add", {"kind": "gps_dropout", "target": "d1", "at_s": 0.01}, "at_s", "0.01"),
+        ("fault_add", {"kind": "gps_dropout", "target": "d1", "at_s": 2.0}, "at_s", "2"),
+        ("fault_add", {"kind": "process_kill", "target": "my.filter"}, "target", "'my.filter'"),
+        ("fault_clear", {"id": 7}, "id", "7"),
+        ("fault_clear", {"name": 7}, "name", "not known"),
+    ],
+)
+def test_a_refusal_is_a_line_with_the_argument_and_its_value(op: str, args: dict[str, Any], where: str, found: str):
+    made = world()
+    go(made, 4)
+    add(made)
+    answer = ask(made, op, **args)
+    assert not answer.ok
+    assert parts(answer.error) == (where, found)
+    assert len(answer.error.splitlines()) == 1
+
+
+def test_all_is_as_before_when_all_is_cleared():
+    made, sound = world(), world()
+    faults: tuple[tuple[str, dict[str, Any]], ...] = (
+        ("gps_noise", {"factor": 2}),
+        ("accel_bias", {"value_m_s2": [1, 0, 0]}),
+        ("mag_dropout", {"probability": 0.5}),
+        ("rotor_efficiency", {"rotor": "all", "value": 0.5}),
+    )
+    for kind, more in faults:
+        add(made, kind, **more)
+    add(made, "gust", "world", velocity_m_s=[1, 2, 3], for_s=1)
+    go(made, 20)
+    go(sound, 20)
+    assert made.fleet.wind_m_s.tolist() != sound.fleet.wind_m_s.tolist()
+    ask(made, "fault_clear")
+    go(made, 1)
+    assert (made.fleet._w.senses.config == sound.fleet._w.senses.config).all()
+    assert (made.fleet.boards.actuator == sound.fleet.boards.actuator).all()
+    assert (made.fleet._w.wind == sound.fleet._w.wind).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "more", "applied_after"), [("link_delay", {"delay_ms": 50}, 4), ("link_cut", {}, None)]
+)
+def test_commands_come_late_or_never(kind: str, more: dict[str, Any], applied_after: int | None):
+    """The sender is nobody in the lockstep: its command takes effect a gate after its arrival, and the delay."""
+    made = world()
+    go(made, 1)
+    add(made, kind, "pilot.me/world", **more)
+    made.handle(keys.command("d1", "velocity"), Velocity(0, 0, "pilot.me", (0.0, 0.0, 0.0), 0.0), 0)
+    applied = [m.data["apply_t_ns"] for _, m in made.take_outbox() if isinstance(m, Event) and m.kind == "command"]
+    assert applied == ([] if applied_after is None else [(1 + applied_after) * GATE_NS])
+
+
+def test_a_radio_out_of_reach_brings_no_command():
+    made = world()
+    go(made, 1)
+    add(made, "radio", "main", range_m=10, spread_m=0.1, place={"pilot.me": [100, 0, 0]})
+    for drone, seq in (("d1", 0), ("d2", 1)):
+        made.handle(keys.command(drone, "velocity"), Velocity(0, seq, "pilot.me", (0.0, 0.0, 0.0), 0.0), 0)
+    made.handle(keys.command("d1", "velocity"), Velocity(0, 0, "pilot.near", (0.0, 0.0, 0.0), 0.0), 0)
+    go(made, 4)
+    refused = [m.source for _, m in made.take_outbox() if isinstance(m, Event) and m.kind == "refused"]
+    assert refused == ["pilot.near"]  # only its command comes, and a drone on the ground refuses it

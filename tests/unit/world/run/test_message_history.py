@@ -1,0 +1,175 @@
+"""The history: last values, replays, bounded memory, and outputs of a participant that have not come."""
+
+import pytest
+from msgspec import Struct
+
+from zsim.contract import keys, messages
+from zsim.contract.flight_messages import Velocity
+from zsim.contract.run_messages import Done
+from zsim.transport.session import ReceivedSample
+from zsim_world.run import message_history
+from zsim_world.run.message_history import KEEP_NS, MessageHistory
+
+SECOND_NS = 1_000_000_000
+IMU = keys.sensor("d1", "imu")
+VELOCITY = keys.command("d1", "velocity")
+
+
+def since(history: MessageHistory, from_ns: int, expressions: list[str]) -> list[tuple[str, bytes]]:
+    """Return all pages of what is stamped later."""
+    messages, start = [], 0
+    while start is not None:
+        passed, start = history.page(from_ns, lambda key: any(keys.matches(e, key) for e in expressions), start)
+        messages += passed
+    return messages
+
+
+def clock(history: MessageHistory, t_ns: int) -> None:
+    history.add(keys.CLOCK, b"tick", t_ns)
+
+
+def test_the_last_values_of_an_expression_are_answered_however_old():
+    history = MessageHistory()
+    for payload in (b"old", b"new"):
+        for key in ("drone/d1/truth", "drone/d2/truth", "drone/d1/estimate"):
+            history.add(key, payload, 0)
+    clock(history, 100 * SECOND_NS)
+    assert history.last("drone/d1/truth") == [("drone/d1/truth", b"new")]
+    assert sorted(history.last("drone/*/truth")) == [("drone/d1/truth", b"new"), ("drone/d2/truth", b"new")]
+    assert len(history.last("**")) == 4
+    assert history.last("drone/d3/truth") == since(history, -1, ["drone/**"]) == []
+
+
+def test_a_replay_brings_what_was_stamped_later_in_order_of_arrival():
+    history = MessageHistory()
+    for t_ns in (1, 3, 2, 4):
+        history.add(IMU, b"%d" % t_ns, t_ns)
+        history.add("drone/d2/truth", b"other", t_ns)
+    assert [payload for _, payload in since(history, 1, ["drone/d1/**"])] == [b"3", b"2", b"4"]
+    assert since(history, 4, ["**"]) == []
+    assert since(history, -1, []) == []
+
+
+def test_a_message_that_several_expressions_take_comes_once():
+    history = MessageHistory()
+    history.add(IMU, b"x", 5)
+    assert since(history, 0, ["drone/**", "**", IMU]) == [(IMU, b"x")]
+
+
+def test_what_is_older_than_the_window_is_forgotten():
+    history = MessageHistory()
+    for second in range(20):
+        clock(history, second * SECOND_NS)
+        history.add(IMU, b"%d" % second, second * SECOND_NS)
+    kept = [int(payload) for _, payload in since(history, -1, [IMU])]
+    assert kept == list(range(19 - KEEP_NS // SECOND_NS, 20))
+
+
+def test_a_sender_s_stamp_pushes_out_no_messages_of_others_and_keeps_none_for_ever():
+    history = MessageHistory()
+    clock(history, 10 * SECOND_NS)
+    history.add(IMU, b"mine", 10 * SECOND_NS)
+    history.add("drone/d1/cmd/mode", b"from the future", 2**63 - 1)
+    clock(history, 11 * SECOND_NS)
+    assert [payload for _, payload in since(history, 0, [IMU])] == [b"mine"]
+    clock(history, 100 * SECOND_NS)
+    assert since(history, -1, ["drone/**"]) == []
+
+
+def test_memory_is_bounded_while_time_stands_still():
+    history = MessageHistory(keep_bytes=1000)
+    for number in range(100):
+        history.add(IMU, b"%0100d" % number, 0)
+    assert [int(payload) for _, payload in since(history, -1, [IMU])] == list(range(90, 100))
+
+
+def test_strangers_push_nothing_out_and_have_room_again_when_theirs_is_forgotten(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(message_history, "FOREIGN_BYTES", 250)
+    history = MessageHistory(keep_bytes=1000)
+    history.add(IMU, b"first", 0)
+    for number in range(100):
+        history.add_foreign("lab/camera", b"%0100d" % number)
+    assert [key for key, _ in since(history, -1, ["**"])] == [IMU, "lab/camera", "lab/camera"]
+    clock(history, 2 * KEEP_NS)
+    history.add_foreign("lab/camera", b"new")
+    assert since(history, -1, ["lab/**"]) == [("lab/camera", b"new")]
+
+
+def test_pages_bring_everything_once_and_in_order():
+    history = MessageHistory(page_bytes=10)
+    published = [(IMU, bytes([number]) * (number % 5 + 1)) for number in range(50)]
+    for number, (key, payload) in enumerate(published):
+        history.add(key, payload, number)
+        history.add("drone/d2/truth", b"another's", number)
+    assert since(history, -1, [IMU]) == published
+    first, _ = history.page(-1, lambda key: key == IMU)
+    assert sum(len(payload) for _, payload in first) <= 10
+    assert first == published[: len(first)]
+
+
+def test_a_page_brings_what_alone_is_longer_than_a_page():
+    history = MessageHistory(page_bytes=10)
+    for payload in (b"x" * 30, b"y"):
+        history.add(IMU, payload, 0)
+    assert since(history, -1, [IMU]) == [(IMU, b"x" * 30), (IMU, b"y")]
+
+
+def test_a_page_goes_on_where_the_last_one_ended_when_the_oldest_is_forgotten_meanwhile():
+    history = MessageHistory(keep_bytes=20, page_bytes=4)
+    for number in range(20):
+        history.add(IMU, bytes([number]), number)
+    passed, more = history.page(-1, lambda key: True)
+    for number in range(20, 22):
+        history.add(IMU, bytes([number]), number)
+    assert more is not None
+    assert [payload[0] for _, payload in (*passed, *history.page(-1, lambda key: True, more)[0])] == [*range(8)]
+
+
+# Outputs that were lost
+
+
+def command(t_ns: int, seq: int, source: str = "a.b", speed: float = 0.0) -> Velocity:
+    return Velocity(t_ns, seq, source, (speed, 0.0, 0.0), 0.0)
+
+
+def kept(*outputs: Struct, key: str = VELOCITY) -> list[list[object]]:
+    return [[key, messages.encode(output)] for output in outputs]
+
+
+def history_of(*came: Velocity) -> MessageHistory:
+    made = MessageHistory()
+    for each in came:
+        made.add(VELOCITY, messages.encode(each), each.t_ns)
+    return made
+
+
+def samples(*outputs: Velocity) -> list[ReceivedSample]:
+    return [ReceivedSample(VELOCITY, messages.encode(output)) for output in outputs]
+
+
+ONE, TWO, THREE = (command(t_ns, t_ns) for t_ns in (1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("came", "has_kept", "done_ns", "lost"),
+    [
+        ((TWO,), (ONE, TWO, THREE), 3, (ONE, THREE)),
+        ((), (TWO, THREE), 2, (TWO,)),  # the next done will count the other
+        ((), (ONE, ONE), 1, (ONE,)),
+        ((command(1, 1, "c.d"),), (ONE,), 1, (ONE,)),
+        ((command(1, 2),), (ONE,), 1, (ONE,)),
+    ],
+    ids=["some", "on its way", "kept twice", "another source's", "of another number"],
+)
+def test_outputs_that_have_not_arrived_are_found(
+    came: tuple[Velocity, ...], has_kept: tuple[Velocity, ...], done_ns: int, lost: tuple[Velocity, ...]
+):
+    assert history_of(*came).lost_outputs(kept(*has_kept), done_ns) == samples(*lost)
+
+
+def test_only_outputs_that_can_be_read_are_taken():
+    done = kept(Done(1, 1, "r", 1, 1, 0), key="process/a.b/done")
+    assert (
+        history_of().lost_outputs([*done, [VELOCITY, b"\xc1"], [keys.estimate("d1"), b"\x80"], ["of/mine", b""]], 1)
+        == []
+    )

@@ -1,0 +1,331 @@
+"""What a loss means for a run: who comes back in its time, and what is done without it."""
+
+from typing import Any
+
+import pytest
+from continued import continue_from
+from msgspec import UNSET
+from refused import has_terms
+
+from zsim.contract import keys
+from zsim.contract.run_messages import Bye, Done, Event, Join
+from zsim.errors import RunFailedError, ScenarioError
+from zsim.scenario import scenario_file
+from zsim_world.run import inputs
+from zsim_world.run.inputs import Expired
+from zsim_world.run.participants import DataFlow
+from zsim_world.run.world import World
+
+GATE_NS = 20_000_000
+ME = "estimator.d1"
+RETURN_NS = 2_000_000_000
+SCENARIO = """
+name: one
+duration_s: 1
+drones: [{name: d1, position_m: [0, 0, 0]}]
+processes: {expect: [], PROCESSES}
+"""
+
+
+def world(processes: str, mode: str = "lockstep") -> World:
+    """Return a world that ME has taken part in since wall time 0, and whose time stands for ME."""
+    made = World(scenario_file.from_text(SCENARIO.replace("PROCESSES", processes)), mode, run_id="run1")
+    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "estimator", "h", 7, GATE_NS), 0)
+    while made.may_advance():
+        made.advance(0)
+    made.take_outbox()
+    return made
+
+
+def events(made: World) -> list[tuple[str, str]]:
+    """Return kinds and subjects of the events since the last look."""
+    taken = [message for _, message in made.take_outbox()]
+    return [(message.kind, message.subject) for message in taken if isinstance(message, Event)]
+
+
+def test_one_that_died_is_overdue_after_its_time_and_not_before() -> None:
+    made = world("return_s: 2")
+    assert made.overdue(10 * RETURN_NS) is None
+    made.died(ME, 1)
+    assert made.overdue(RETURN_NS + 1) is None
+    assert made.overdue(RETURN_NS + 2) == ME
+
+    made.expired(ME)
+    assert events(made) == [("death", ME), ("overdue", ME)]
+    assert has_terms(made.ended or "", ME, "2")
+
+
+@pytest.mark.parametrize(("processes", "changes"), [("on_death: {}", ["death"]), ("return_s: 2", ["silence", "back"])])
+def test_without_a_time_or_after_its_return_nobody_is_overdue(processes: str, changes: list[str]) -> None:
+    made = world(processes)
+    for change in changes:
+        made.died(ME, 1) if change == "death" else made.silence_changed(ME, 5 if change == "silence" else None)
+    assert made.overdue(10**18) is None
+
+
+@pytest.mark.parametrize("whose", ["estimator", ME])
+def test_or_goes_on_without_it(whose: str) -> None:
+    made = world(f"return_s: 2, on_overdue: {{{whose}: drop}}")
+    made.died(ME, 1)
+    assert not made.may_advance()
+    made.expired(ME)
+    assert events(made) == [("death", ME), ("overdue", ME), ("drop", ME)]
+    assert made.ended is None
+    assert made.may_advance()
+
+
+@pytest.mark.parametrize("name", ["camera.main", "detector.d1"])
+def test_one_for_which_no_gate_waits_ends_nothing_by_staying_away(name: str) -> None:
+    made = world("return_s: 2")
+    made.handle(keys.process(name, "join"), Join(0, 0, "run1", 2, name.split(".")[0], "h", 8, 0), 0)
+    made.died(name, 1)
+    made.expired(name)
+    assert events(made)[-3:] == [("death", name), ("overdue", name), ("drop", name)]
+    assert made.ended is None
+
+
+@pytest.mark.parametrize(("on_death", "ends"), [("wait", True), ("restart", True), ("end", True), ("drop", False)])
+def test_one_that_is_stopped_is_overdue_too_and_on_death_says_what_it_means(on_death: str, ends: bool) -> None:
+    made = world(f"return_s: 2, on_death: {{estimator: {on_death}}}")
+    made.silence_changed(ME, 5)
+    assert made.overdue(RETURN_NS + 5) is None
+    assert made.overdue(RETURN_NS + 6) == ME
+    made.expired(ME)
+    assert (made.ended is not None) is ends
+
+
+def test_nobody_overdue_is_waited_for() -> None:
+    with pytest.raises(ScenarioError, match=r"processes\.on_overdue\.estimator"):
+        scenario_file.from_text(SCENARIO.replace("PROCESSES", "return_s: 1, on_overdue: {estimator: wait}"))
+
+
+def test_the_journal_has_it() -> None:
+    assert inputs.decode(inputs.encode([Expired(ME)])) == [Expired(ME)]
+
+
+# One that never comes
+
+WAITED_NS = 61_000_000_000
+OWN = "fence.main"
+
+
+def waiting(processes: str, is_launched: bool = True) -> World:
+    """Return a world that waits for OWN, and for the estimator that its launcher starts."""
+    text = SCENARIO.replace("expect: [], PROCESSES", f"expect: [{OWN}, {ME}], {processes}")
+    made = World(scenario_file.from_text(text), run_id="run1", wall_ns=lambda: 0)
+    made.is_launched = is_launched
+    return made
+
+
+@pytest.mark.parametrize(
+    ("processes", "is_launched", "after_s", "name"),
+    [
+        ("on_death: {}", True, 59.9, None),
+        ("on_death: {}", True, 60.1, OWN),
+        ("on_death: {}", False, 10_000.0, None),
+        ("start_timeout_s: 5", False, 5.1, OWN),
+        ("start_timeout_s: 500", True, 400.0, None),
+    ],
+)
+def test_one_that_never_joins_is_overdue_after_its_time(
+    processes: str, is_launched: bool, after_s: float, name: str | None
+) -> None:
+    assert waiting(processes, is_launched).overdue(round(after_s * 1e9)) == name
+
+
+def test_one_that_the_launcher_starts_may_compile_first() -> None:
+    made = waiting("on_death: {}")
+    made.handle(keys.process(OWN, "join"), Join(0, 0, "run1", 1, "fence", "h", 7, GATE_NS), 0)
+    assert made.overdue(WAITED_NS) is None
+    assert made.overdue(601_000_000_000) == ME
+
+
+def test_then_the_run_fails_and_names_it() -> None:
+    made = waiting("start_timeout_s: 5")
+    made.expired(OWN)
+    assert events(made) == [("overdue", OWN)]
+    assert isinstance(made.failure, RunFailedError)
+    assert has_terms(str(made.failure), OWN, "5", "processes.start_timeout_s")
+    assert made.ended == str(made.failure)
+
+
+def test_or_begins_without_it_where_the_scenario_says_so() -> None:
+    made = waiting("start_timeout_s: 5, on_overdue: {fence: drop}")
+    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "estimator", "h", 7, GATE_NS), 0)
+    assert not made.may_advance()
+    made.expired(OWN)
+    assert [kind for kind, name in events(made) if name == OWN] == ["overdue", "drop"]
+    assert made.may_advance()
+    assert made.failure is None
+
+
+# One that cannot go on
+
+
+@pytest.mark.parametrize(
+    ("on_death", "kinds", "ends", "waits"),
+    [
+        ("restart", ["failure"], True, False),
+        ("end", ["failure"], True, False),
+        ("wait", ["failure"], False, True),
+        ("drop", ["failure", "drop"], False, False),
+    ],
+)
+def test_one_that_cannot_go_on_is_named_and_on_death_says_what_follows(
+    on_death: str, kinds: list[str], ends: bool, waits: bool
+) -> None:
+    made = world(f"on_death: {{estimator: {on_death}}}")
+    made.handle(keys.process(ME, "bye"), Bye(0, 0, "mine:Law.rates raised", True, "run1", 1), 5)
+    assert [kind for kind, name in events(made) if name == ME] == kinds
+    assert made.ended == ("mine:Law.rates raised" if ends else None)
+    assert (made.failure is not None) is ends
+    assert made.may_advance() is not (ends or waits)
+
+
+# Who leaves
+
+
+def say_bye(made: World, reason: str = "enough", **of: Any) -> None:
+    made.handle(keys.process(ME, "bye"), Bye(0, 0, reason, **of), 5)
+
+
+def texts(made: World) -> list[tuple[str, str]]:
+    """Return kinds and texts of the events since the last look."""
+    return [(each.kind, each.text) for _, each in made.take_outbox() if isinstance(each, Event)]
+
+
+@pytest.mark.parametrize(
+    ("of", "wrong"),
+    [
+        ({"run_id": "run1", "incarnation": 2}, ("process/estimator.d1/bye", "incarnation", "2", "1")),
+        ({"run_id": "run0", "incarnation": 1}, ("process/estimator.d1/bye", "run_id", "'run0'", "'run1'")),
+        ({"incarnation": 2}, ("process/estimator.d1/bye", "incarnation", "2", "1")),
+        ({"run_id": "run0"}, ("process/estimator.d1/bye", "run_id", "'run0'", "'run1'")),
+    ],
+)
+@pytest.mark.parametrize("failed", [UNSET, True])
+def test_a_bye_of_another_incarnation_or_run_is_refused(
+    of: dict[str, Any], wrong: tuple[str, ...], failed: Any
+) -> None:
+    made = world("on_death: {}")
+    say_bye(made, failed=failed, **of)
+    ((kind, text),) = texts(made)
+    assert kind == "refused"
+    assert has_terms(text, *wrong)
+    assert made.barrier.participants[ME].alive
+    assert made.ended is None
+
+
+def test_a_late_bye_of_a_former_incarnation_ends_nothing() -> None:
+    made = world("on_death: {}")
+    made.died(ME, 1)
+    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 2, "estimator", "h", 8, GATE_NS), 2)
+    say_bye(made, run_id="run1", incarnation=1)
+    assert [kind for kind, _ in events(made)] == ["death", "restart", "refused"]
+    assert made.barrier.participants[ME].join.incarnation == 2
+
+
+@pytest.mark.parametrize("failed", [UNSET, True])
+def test_a_bye_without_an_incarnation_counts_when_the_token_is_gone_as_well(failed: Any) -> None:
+    made = world("on_death: {estimator: drop}")
+    say_bye(made, failed=failed)
+    assert events(made) == []
+    made.died(ME, 6)
+    assert [kind for kind, _ in events(made)] == (["failure", "drop"] if failed is True else ["leave"])
+    assert ME not in made.barrier.participants
+
+
+@pytest.mark.parametrize("is_over", [False, True])
+def test_or_when_nobody_ever_showed_a_token_or_the_run_is_over(is_over: bool) -> None:
+    made = world("on_death: {}")
+    say_bye(made)
+    made.publish_end() if is_over else made.not_shown(ME, "has no liveliness token", 6)
+    assert events(made) == [("leave", ME), *[("end", "world")] * is_over]
+    assert not made.waiting_to_leave()
+    assert (made.left_early == []) is is_over
+
+
+def test_who_says_done_after_such_a_bye_has_not_said_it() -> None:
+    """A living estimator that somebody else says bye for takes part as before, and its death is a death."""
+    made = world("on_death: {}")
+    say_bye(made)
+    made.handle(keys.process(ME, "done"), Done(0, 0, "run1", 1, 0, 0), 6)
+    ((kind, text),) = texts(made)
+    assert kind == "refused"
+    assert has_terms(text, "process/estimator.d1/bye", "incarnation", "missing", "1")
+    made.died(ME, 7)
+    assert events(made) == [("death", ME)]
+
+
+@pytest.mark.parametrize(
+    ("processes", "serves", "fails"),
+    [
+        ("on_death: {}", (), True),
+        ("on_death: {estimator: drop}", (), False),
+        ("on_death: {estimator.d1: drop}", (), False),
+        ("on_death: {}", (ME,), False),
+    ],
+)
+def test_who_leaves_early_is_named_and_fails_the_run_unless_that_is_allowed(
+    processes: str, serves: tuple[str, ...], fails: bool
+) -> None:
+    made = world(processes)
+    if serves:
+        made.handle(keys.process("host.b", "join"), Join(0, 0, "run1", 9, "host", "h", 9, 0, serves=serves), 0)
+    made.take_outbox()
+    say_bye(made, run_id="run1", incarnation=1)
+    (event,) = [each for _, each in made.take_outbox() if isinstance(each, Event)]
+    assert event.data == {"reason": "enough", "run_id": "run1", "incarnation": 1, **({"fails": True} if fails else {})}
+    assert [has_terms(line, ME, "0.02 s", "enough") for line in made.left_early] == [True] * fails
+    assert made.ended is None
+    restored = world(processes)
+    continue_from(made, restored)
+    assert restored.left_early == made.left_early
+
+
+@pytest.mark.parametrize(("name", "role"), [("console.1", "console"), ("recorder", "recorder")])
+def test_who_is_not_needed_may_leave_and_a_recorder_ends_the_run(name: str, role: str) -> None:
+    made = world("on_death: {}")
+    made.handle(keys.process(name, "join"), Join(0, 0, "run1", 4, role, "h", 8, 0), 0)
+    made.handle(keys.process(name, "bye"), Bye(0, 0, "enough", UNSET, "run1", 4), 5)
+    assert made.left_early == []
+    assert (made.ended is not None) is (role == "recorder")
+
+
+PAIR = scenario_file.from_text("""
+name: pair
+duration_s: 1
+drones: [{name: d1, position_m: [0, 0, 0]}, {name: d2, position_m: [5, 0, 0]}]
+clusters: [{name: main, drones: [d1, d2]}]
+processes: {expect: []}
+""")
+ESTIMATORS, CONTROLLER = ("estimator.d1", "estimator.d2"), "controller.main"
+
+
+def test_estimators_feed_the_controller_and_nobody_else_anybody():
+    flow = DataFlow(PAIR)
+    names = (*ESTIMATORS, CONTROLLER, "planner.main", "tester.one")
+    pairs = {(writer, reader) for writer in names for reader in names if flow.feeds(writer, reader)}
+    assert pairs == {(e, reader) for e in ESTIMATORS for reader in (CONTROLLER, "planner.main")}
+
+
+def standing(*done: str) -> dict[str, tuple[str, ...]]:
+    """Return whom a world waits for, and by whom each is held up, when those given are done with a gate."""
+    world = World(PAIR, run_id="r")
+    for pid, name in enumerate((*ESTIMATORS, CONTROLLER)):
+        join = Join(0, 0, "r", pid, name.split(".")[0], "h", pid, GATE_NS)
+        world.handle(keys.process(name, "join"), join, 0)
+    while world.may_advance():
+        world.advance(0)
+    for pid, name in enumerate((*ESTIMATORS, CONTROLLER)):
+        if name in done:
+            world.handle(keys.process(name, "done"), Done(0, 0, "r", pid, 0, 0), 0)
+    return {waiting.name: waiting.held_by for waiting in world.waiting_for(10**9)}
+
+
+def test_who_lacks_an_estimate_is_a_victim():
+    assert standing("estimator.d1") == {"estimator.d2": (), CONTROLLER: ("estimator.d2",)}
+
+
+def test_who_has_them_all_is_the_cause():
+    assert standing(*ESTIMATORS) == {CONTROLLER: ()}

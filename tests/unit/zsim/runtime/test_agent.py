@@ -1,0 +1,195 @@
+"""Agents that share a process: what each hears and says is what it would hear and say by itself."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+from refused import refused
+
+from zsim.contract import keys
+from zsim.contract.flight_messages import Estimate, Status
+from zsim.contract.messages import Info, Origin
+from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest
+from zsim.contract.snapshot import pack, unpack
+from zsim.errors import RunError
+from zsim.runtime.agent import Agent, AgentGroup, Output
+
+GATE_NS = 20_000_000
+HOLD_NS = 2 * GATE_NS  # with a command delay of a gate
+CLUSTER = keys.cluster_control("main")
+
+
+class Member(Agent):
+    """Says one message per gate on a key of its own, and notes what it hears; its messages are not the keys' own."""
+
+    _is_own = False  # type: ignore[assignment]
+
+    def __init__(self, name: str, reads: Sequence[str], writes: str, period_ns: int = GATE_NS) -> None:
+        super().__init__()
+        self.name, self.period_ns = name, period_ns
+        self.reads = self.gate_keys = tuple(reads)
+        self.writes = (writes,)
+        self.notes: list[Any] = []
+        self.rehearsed = False
+
+    def receive(self, key: str, message: Any) -> None:
+        self.notes.append((key, message.t_ns, message.seq))
+
+    def step(self, t_ns: int) -> list[Output]:
+        self.notes.append(t_ns)
+        key = self.writes[0]
+        return [Output(key, Bye(t_ns, self.next_seq(key), f"{self.source} of {self.name}"))]
+
+    def rehearse(self) -> None:
+        self.rehearsed = True
+
+    def warm_start_keys(self) -> tuple[str, ...]:
+        return self.writes
+
+    def warm_start(self, key: str, message: Any) -> None:
+        self.notes.append(("warm", key))
+
+
+class Overhearing(Member):
+    """One that reads all estimates, and whose gate the drone's status closes."""
+
+    def __init__(self, name: str, writes: str) -> None:
+        super().__init__(name, [keys.status("d1")], writes)
+        self.reads = (*self.reads, keys.estimate("*"))
+
+    def snapshot(self) -> dict[str, Any]:
+        return {}
+
+
+class Asked(Member):
+    """One that answers requests."""
+
+    def control_keys(self) -> tuple[str, ...]:
+        return (CLUSTER,)
+
+    def control(self, key: str, request: ControlRequest) -> ControlAnswer:
+        return ControlAnswer(ok=True, result=request.op)
+
+
+def status(t_ns: int, seq: int = 0) -> Status:
+    return Status(t_ns, seq, "flying", 50.0, False, None, 1)
+
+
+def estimate(t_ns: int, seq: int) -> Estimate:
+    zeros = (0.0, 0.0, 0.0)
+    return Estimate(t_ns, seq, zeros, zeros, (1.0, *zeros), 0.0, (0.0,) * 36, 0.1, zeros, {})
+
+
+def team() -> tuple[Member, Member, AgentGroup]:
+    first = Member("estimator.d1", [keys.status("d1")], keys.estimate("d1"))
+    first.serves = ("estimator.d2",)
+    first.counted = ("d1",)
+    last = Asked("controller.main", [keys.status("d1"), keys.estimate("d1")], keys.cluster_state("main"))
+    return first, last, AgentGroup([first, last], HOLD_NS)
+
+
+def test_a_group_reads_what_its_members_do_not_tell_each_other():
+    _, _, group = team()
+    assert group.reads == group.gate_keys == (keys.status("d1"),)
+    assert group.counted == ("d1",)
+    assert group.writes == (keys.estimate("d1"), keys.cluster_state("main"))
+
+
+def test_it_goes_by_the_name_of_the_last_and_stands_for_the_others():
+    _, _, group = team()
+    assert (group.name, group.role, group.period_ns) == ("controller.main", "controller", GATE_NS)
+    assert group.serves == ("estimator.d1", "estimator.d2")
+
+
+def test_a_member_hears_in_the_same_gate_what_those_before_it_said():
+    first, last, group = team()
+    group.receive(keys.status("d1"), status(GATE_NS))
+    outputs = group.step(GATE_NS)
+    assert first.notes == [(keys.status("d1"), GATE_NS, 0), GATE_NS]
+    assert last.notes == [(keys.estimate("d1"), GATE_NS, 0), (keys.status("d1"), GATE_NS, 0), GATE_NS]
+    assert [output.key for output in outputs] == [keys.estimate("d1"), keys.cluster_state("main")]
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_what_closes_the_gate_of_one_is_held_for_another_who_only_reads_it(resumed: bool):
+    """Also where the group goes on from a snapshot in between."""
+
+    def made() -> tuple[Overhearing, AgentGroup]:
+        waiting = Member("controller.main", [keys.estimate("d2")], keys.cluster_state("main"))
+        waiting.snapshot = dict
+        overhearing = Overhearing("talk.a", keys.cluster_state("a"))
+        return overhearing, AgentGroup([overhearing, waiting], HOLD_NS)
+
+    overhearing, group = made()
+    info = Info(0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0, 0, 0), (), (), "", "", "", "")
+    for gate in range(4):
+        group.receive(keys.status("d1"), status(gate * GATE_NS, gate))
+        group.receive(keys.estimate("d2"), estimate(gate * GATE_NS, gate))
+        group.step(gate * GATE_NS)
+        if resumed and gate == 1:
+            assert [note for note in overhearing.notes if keys.estimate("d2") in str(note)] == []
+            state = unpack(pack(group.checkpoint() or {}))
+            overhearing, group = made()
+            group.resume(info, state)
+    heard = overhearing.notes[-6:]
+    assert heard == [
+        *((keys.estimate("d2"), 0, 0), (keys.status("d1"), 2 * GATE_NS, 2), 2 * GATE_NS),
+        *((keys.estimate("d2"), GATE_NS, 1), (keys.status("d1"), 3 * GATE_NS, 3), 3 * GATE_NS),
+    ]
+
+
+def test_members_that_wait_for_each_other_are_refused():
+    first = Member("talk.a", [keys.cluster_state("b")], keys.cluster_state("a"))
+    second = Member("talk.b", [keys.cluster_state("a")], keys.cluster_state("b"))
+    with refused(RunError, "gate_keys", "talk.a", "talk.b", "each other"):
+        AgentGroup([first, second], HOLD_NS)
+
+
+def test_inputs_come_in_the_order_of_time_key_and_number():
+    _, last, group = team()
+    for t_ns, seq in ((2 * GATE_NS, 3), (GATE_NS, 2), (GATE_NS, 1)):
+        group.receive(keys.status("d1"), status(t_ns, seq))
+    group.step(2 * GATE_NS)
+    statuses = [note[1:] for note in last.notes if isinstance(note, tuple) and note[0] == keys.status("d1")]
+    assert statuses == [(GATE_NS, 1), (GATE_NS, 2), (2 * GATE_NS, 3)]
+
+
+def test_what_members_say_has_the_source_of_the_process():
+    _, _, group = team()
+    decisions: list[Any] = [message for _, message in group.step(GATE_NS)]
+    assert [message.reason for message in decisions] == [
+        "controller.main of estimator.d1",
+        "controller.main of controller.main",
+    ]
+
+
+def test_requests_and_last_values_go_to_whom_they_belong():
+    first, last, group = team()
+    assert group.control_keys() == (CLUSTER,)
+    assert group.control(CLUSTER, ControlRequest("hold", {}, "console.1")).result == "hold"
+    assert group.warm_start_keys() == (keys.estimate("d1"), keys.cluster_state("main"))
+    group.warm_start(keys.estimate("d1"), None)
+    group.resume_seq(keys.estimate("d1"), 41)
+    assert first.notes == [("warm", keys.estimate("d1"))]
+    assert last.notes == []
+    assert [message.seq for _, message in group.step(GATE_NS)] == [42, 0]  # type: ignore[attr-defined]
+
+
+def test_everybody_rehearses():
+    first, last, group = team()
+    group.rehearse()
+    assert first.rehearsed
+    assert last.rehearsed
+
+
+def test_members_of_different_periods_are_refused():
+    slow = Member("controller.main", [], "a", 2 * GATE_NS)
+    fast = Member("estimator.d1", [], "b")
+    pattern = r"period_ns of a group's members is estimator\.d1 20000000, controller\.main 40000000; must be the same"
+    with pytest.raises(RunError, match=pattern):
+        AgentGroup([fast, slow], HOLD_NS)
+
+
+def test_nobody_is_no_group():
+    with refused(RunError, "group", "members", "one"):
+        AgentGroup([], HOLD_NS)

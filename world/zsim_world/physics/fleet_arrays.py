@@ -1,0 +1,332 @@
+"""The arrays that a fleet is made of: what the kernel reads and writes. N drones, a row each; R rotors.
+
+R is the largest number of rotors in the fleet. Numbers per rotor stand after the columns of a row, R for each group of
+them; a drone with fewer rotors has some that do not exist, whose speeds and limits are zero. `each`, a tuple of R
+numbers, gives compiled code their number: it is compiled for each R, and its loops over rotors are unrolled.
+R is four only where all are crosses of four, whose places and mixing are then constants of the code: with a vehicle
+whose four rotors stand elsewhere, R is five.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from zsim.math.columns import Field, columns
+from zsim.math.compiled import inlined
+from zsim.scenario.scenario import Drone, Environment
+from zsim.schema.quantities import COULOMB_PER_MAH, SEA_LEVEL_KG_M3
+from zsim.vehicles.vehicle import Aerodynamics, Vehicle, allocation, lift_shares, mixing
+
+REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # thrust, torque and drag of a vehicle hold there
+
+VEHICLE = columns(
+    "VehicleColumns",
+    (
+        Field("mass", "kg"),
+        Field("inertia", "kg m^2", 3),
+        Field("rotor_unit", "m"),  # unit of the rotors' positions: arm / sqrt(2)
+        Field("thrust", "N s^2"),  # at the field's air density, as torque and drag
+        Field("torque", "N m s^2"),
+        Field("rotor_lag", "s"),
+        Field("rotor_min", "rad/s"),
+        Field("rotor_max", "rad/s"),
+        Field("drag", "N s/m"),
+        Field("gravity", "m/s^2"),
+        Field("air_density", "kg/m^3"),
+        Field("rotor_radius", "m"),
+        Field("rotor_inertia", "kg m^2"),
+        Field("rotor_share", "1"),  # 1 / number of its rotors
+        Field("jet_start", "m"),  # width of the jet where it leaves the rotors
+        Field("contact_reach", "m"),  # farther than any contact point from the centre of mass
+        Field("stand_height", "m"),  # of the centre of mass of a standing drone
+        Field("foot_stiffness", "N/m"),  # per contact point
+        Field("foot_damping", "N s/m"),
+        Field("foot_xy", "m"),
+        Field("foot_depth", "m"),
+        Field("rim_xy", "m"),
+        Field("rim_height", "m"),
+        Field("friction", "1"),
+        Field("hull_radius", "m"),
+        Field("hull_stiffness", "N/m"),  # between two hulls, of this drone's mass
+        Field("hull_damping", "N s/m"),
+        Field("capacity", "J"),  # of a full battery
+        Field("efficiency", "1"),  # electric to shaft power
+        Field("electronics", "W"),
+    ),
+)
+ROTOR = columns(  # groups of what is known of each rotor
+    "RotorGroups",
+    (
+        Field("x", "rotor_unit"),
+        Field("y", "rotor_unit"),
+        Field("turn", "1"),  # sign of its drag torque on the body about z; 0 where there is no rotor
+        Field("low", "rad/s"),  # limits of its speed
+        Field("high", "rad/s"),
+        Field("roll", "1"),  # thrust per moment over rotor_unit
+        Field("pitch", "1"),
+        Field("yaw", "1"),  # thrust per moment over torque per thrust
+        Field("yaw_inverse", "1"),  # 0 where yaw is
+        Field("lift", "1"),  # thrust over the mean of all, so that it gives no moment; 1 of balanced rotors
+    ),
+)
+AERO = columns(  # zsim.vehicles.vehicle.Aerodynamics, at the field's air density
+    "AeroColumns",
+    (
+        Field("linear", "N s/m", 3),
+        Field("quadratic", "N s^2/m^2", 3),
+        Field("rotor_drag", "N s^2/m"),
+        Field("rotor_inflow", "N s^2/m"),
+        Field("rotor_lift", "N s^2/m^2"),
+    ),
+)
+STATE = columns(  # and R speeds [rad/s]
+    "StateColumns", (Field("p_WB", "m", 3), Field("v_WB", "m/s", 3), Field("q_WB", "1", 4), Field("w_WB_B", "rad/s", 3))
+)
+CLOCK = columns("ClockColumns", (Field("tick", "1"), Field("ticks_per_step", "1")))  # present one; of the board's step
+SPAN = columns("SpanColumns", (Field("dt", "s"), Field("hover", "s"), Field("land", "s")))  # tick; patience in silence
+PLACE = columns("PlaceColumns", (Field("field_W", "uT", 3), Field("height", "m")))  # height of W above the sea
+EXPOSED = columns(  # what a user's sensor is exposed to; accel as in Bodies
+    "ExposedColumns", (Field("state", "STATE", 13), Field("accel", "m/s^2, rad/s^2", 6), Field("air", "m/s", 3))
+)
+STREAMS = columns("StreamColumns", (Field("sensors", "1", 6), Field("wind", "1")))
+
+Row = NDArray[np.float64] | tuple[float, ...]  # of one drone: a view, or loaded
+CROSS_ROTORS = 4
+# Of a cross of four (zsim.vehicles.vehicle.cross_layout), as in ROTOR
+_X, _Y, _TURN = (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0)
+_ROLL, _PITCH, _YAW = (0.25, -0.25, -0.25, 0.25), (-0.25, -0.25, 0.25, 0.25), (0.25, -0.25, 0.25, -0.25)
+
+
+class KernelTime(NamedTuple):
+    clock: NDArray  # int64 (CLOCK.size,)
+    spans: NDArray  # (SPAN.size,)
+
+
+class NearPairs(NamedTuple):
+    """Pairs of drones that can affect each other, and the positions for which they were found (contacts.py)."""
+
+    pair: NDArray  # int32 (N (N - 1) / 2, 2), i < j, ascending
+    number: NDArray  # int64 (1,), how many pairs
+    origin: NDArray  # (N, 3), m
+
+
+class Bodies(NamedTuple):
+    """The bodies of N aircraft."""
+
+    each: tuple[int, ...]  # R numbers
+    vehicle: NDArray  # (N, VEHICLE.size)
+    rotors: NDArray  # (N, ROTOR.size * R)
+    state: NDArray  # (N, STATE.size + R)
+    accel: NDArray  # (N, 6), acceleration in W and angular acceleration in B
+    anchor: NDArray  # (N, 8, 2), m
+    command: NDArray  # (N, R), rad/s
+    energy: NDArray  # (N,), J
+    air: NDArray  # (N, 3), m/s
+    push: NDArray  # (N, 3), N
+    touching: NDArray  # int8 (N, N)
+    touched: NDArray  # int8 (N, N), contacts that began in this gate
+    near: NearPairs
+    obstacle: NDArray  # (M, obstacle.COLUMNS)
+    bumping: NDArray  # int8 (N, M), who touches which obstacle with more than its feet
+    bumped: NDArray  # int8 (N, M), contacts that began in this gate
+    solid: NDArray  # int32 (N, K), the obstacles in reach of each, see physics/surfaces.py
+    held: NDArray  # (N, K, BALLS, 3), m, anchors on them
+    braced: NDArray  # int8 (N,), 1 where an obstacle is in reach or a hull touches another
+    twist: NDArray  # (N, 3), N m in W, of other drones' hulls; of those that are braced
+    lanes: NDArray  # (blocks, columns of a block), see physics/simd.py
+    aero_parts: tuple[int, ...]  # one number; two where any drone has aerodynamics, which are left out else
+    aero: NDArray  # (N, AERO.size)
+    external: NDArray  # int64 (E,), the drones that are not integrated
+    pose: NDArray  # (E, STATE.size + R), where they are: moved on with their velocities in every tick
+
+
+class Boards(NamedTuple):
+    """N navigation boards with their firmware."""
+
+    setting: NDArray  # (N, firmware_settings.SETTING.size)
+    gain: NDArray  # (N, observer_gains.GAIN.size)
+    calibration: NDArray  # (N, observer.CALIBRATION.size)
+    setpoint: NDArray  # (N, firmware.SETPOINT.size)
+    set_tick: NDArray  # int64 (N,), when the setpoint was sent
+    memory: NDArray  # (N, firmware.MEMORY.size)
+    belief: NDArray  # (N, observer.BELIEF.size + R)
+    actuator: NDArray  # (N, simd_firmware.ACTUATOR.size + 2 R), what faults make of the commands to the rotors
+    device: NDArray  # (N, observer.DEVICE.size)
+    lanes: NDArray  # (blocks, columns of a block), see simd_firmware.py
+
+
+class NoiseRows(NamedTuple):
+    """Standard normal numbers, a row per drone; the last row holds the wind that all share."""
+
+    table: NDArray  # (N + 1, all streams)
+    at: NDArray  # int64 (STREAMS.size,), where each stream begins in a row
+    width: NDArray  # int64 (N + 1, STREAMS.size), numbers of a sample
+    cursor: NDArray  # int64 (N + 1, STREAMS.size), how much of each stream is used
+
+
+class Senses(NamedTuple):
+    """N sets of S sensors, the six stock ones first, and the log of what they sampled in a gate."""
+
+    place: NDArray  # (PLACE.size,)
+    config: NDArray  # (N, S, sensor_set.CONFIG.size)
+    fault: NDArray  # (N, S, sensor_set.FAULT.size)
+    schedule: NDArray  # int64 (N, S, sensor_set.SCHEDULE.size)
+    soonest: NDArray  # int64 (N,), tick at which one of the sensors but the IMU falls due
+    bias: NDArray  # (N, 6, 12): of each channel its bias, behind all of them their Gauss-Markov processes
+    whose: NDArray  # int64 (samples, 3): sensor, drone, tick
+    value: NDArray  # (samples, 6)
+    exposed_count: NDArray  # int64 (1,), samples of users' sensors that are to be made of this gate
+    exposed_whose: NDArray  # int64 (user samples, 3), as whose
+    exposed: NDArray  # (user samples, EXPOSED.size)
+
+
+class Watched(NamedTuple):
+    """What is kept of N drones to detect their incidents, see fleet/flight_watch.py."""
+
+    seen: NDArray  # (N, flight_watch.SEEN.size)
+    found: NDArray  # int64 (N,), bits of the incidents of each in the last gate
+
+
+class Arrays(NamedTuple):
+    """All arrays of a fleet."""
+
+    time: KernelTime
+    bodies: Bodies
+    boards: Boards
+    noise: NoiseRows
+    senses: Senses
+    wind: NDArray  # (air.WIND.size,)
+    gust: NDArray  # (N, 3), m/s
+    watched: Watched
+
+
+def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
+    """Yield the arrays that make up the state of a fleet: all but the near pairs, which are found anew."""
+    for member in group:
+        if isinstance(member, np.ndarray):
+            yield member
+        elif isinstance(member, tuple) and not isinstance(member, NearPairs):
+            yield from state_arrays(member)
+
+
+class PerRotor(NamedTuple):
+    """Groups of numbers per rotor of one drone, in a row or in a block of drones, read by `of`."""
+
+    numbers: NDArray
+    first: int
+    step: int
+    each: tuple[int, ...]
+
+
+class Aero(NamedTuple):
+    """Aerodynamics of one drone; compiled code knows the number of `parts` (Bodies.aero_parts) and omits the rest."""
+
+    parts: tuple[int, ...]
+    numbers: Row  # (AERO.size,)
+
+
+@inlined
+def of(rotors: PerRotor, group: int, r: int) -> float:
+    """Return the number of rotor r in a group of groups."""
+    return rotors.numbers[rotors.first + rotors.step * (group * len(rotors.each) + r)]
+
+
+@inlined
+def place(rotors: PerRotor, r: int) -> tuple[float, float, float]:
+    """Return x, y [rotor_unit] and turn of rotor r, `rotors` being its parameters."""
+    if len(rotors.each) == CROSS_ROTORS:
+        return _X[r], _Y[r], _TURN[r]
+    return of(rotors, ROTOR.x, r), of(rotors, ROTOR.y, r), of(rotors, ROTOR.turn, r)
+
+
+@inlined
+def mixed(rotors: PerRotor, r: int) -> tuple[float, float, float, float]:
+    """Return roll, pitch, yaw of rotor r and the inverse of yaw, `rotors` being its parameters."""
+    if len(rotors.each) == CROSS_ROTORS:
+        return _ROLL[r], _PITCH[r], _YAW[r], 1.0 / _YAW[r]
+    inverse = of(rotors, ROTOR.yaw_inverse, r)
+    return of(rotors, ROTOR.roll, r), of(rotors, ROTOR.pitch, r), of(rotors, ROTOR.yaw, r), inverse
+
+
+@inlined
+def lift_share(rotors: PerRotor, r: int) -> float:
+    """Return the thrust of rotor r over the mean, `rotors` being its parameters."""
+    if len(rotors.each) == CROSS_ROTORS:
+        return 1.0
+    return of(rotors, ROTOR.lift, r)
+
+
+@inlined
+def put_of(rotors: PerRotor, r: int, value: float) -> None:
+    """Set the number of rotor r in the first group."""
+    rotors.numbers[rotors.first + rotors.step * r] = value
+
+
+def rotor_slots(vehicles: Iterable[Vehicle]) -> int:
+    """Return R of a fleet."""
+    slots, of_cross = CROSS_ROTORS, np.array((_Y, [-x for x in _X], _TURN))
+    for vehicle in vehicles:
+        cross = np.array_equal(allocation(vehicle), of_cross)
+        slots = max(slots, len(vehicle.rotors) if cross else max(len(vehicle.rotors), CROSS_ROTORS + 1))
+    return slots
+
+
+def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDArray[np.float64]:
+    """Return the parameters of one drone, (VEHICLE.size,): its vehicle's, with the scenario's changes."""
+    row, frame = np.empty(VEHICLE.size), vehicle.airframe
+    density = environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3
+    size = drone.arm_m / vehicle.arm_m
+    row[VEHICLE.mass] = drone.mass_kg
+    row[VEHICLE.inertia : VEHICLE.inertia + 3] = drone.inertia_kg_m2
+    row[VEHICLE.rotor_unit] = drone.arm_m / math.sqrt(2.0)
+    row[VEHICLE.thrust], row[VEHICLE.torque] = drone.thrust_n_s2 * density, drone.torque_nm_s2 * density
+    row[VEHICLE.rotor_lag] = drone.rotor_time_constant_s
+    row[VEHICLE.rotor_min], row[VEHICLE.rotor_max] = drone.rotor_min_rad_s, drone.rotor_max_rad_s
+    row[VEHICLE.drag] = drone.drag_n_s_m * density
+    row[VEHICLE.gravity], row[VEHICLE.air_density] = environment.gravity_m_s2, environment.air_density_kg_m3
+    row[VEHICLE.rotor_radius] = vehicle.rotor_radius_m * (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25
+    row[VEHICLE.rotor_inertia] = vehicle.rotor_inertia_kg_m2 * drone.torque_nm_s2 / vehicle.torque_nm_s2
+    row[VEHICLE.rotor_share] = 1.0 / len(vehicle.rotors)
+    row[VEHICLE.jet_start] = math.sqrt(len(vehicle.rotors)) * row[VEHICLE.rotor_radius]
+    row[VEHICLE.contact_reach] = frame.reach_m * size
+    row[VEHICLE.stand_height] = size * (frame.foot_depth_m - frame.foot_sag_m)
+    stiffness = drone.mass_kg * environment.gravity_m_s2 / (4.0 * size * frame.foot_sag_m)
+    row[VEHICLE.foot_stiffness] = stiffness
+    row[VEHICLE.foot_damping] = 2.0 * frame.foot_damping_ratio * math.sqrt(stiffness * drone.mass_kg / 4.0)
+    row[VEHICLE.foot_xy], row[VEHICLE.foot_depth] = size * frame.foot_xy_m, size * frame.foot_depth_m
+    row[VEHICLE.rim_xy], row[VEHICLE.rim_height] = size * frame.rim_xy_m, size * frame.rim_height_m
+    row[VEHICLE.friction] = frame.friction
+    reduced = drone.mass_kg / 2.0
+    row[VEHICLE.hull_radius] = size * frame.hull_radius_m
+    row[VEHICLE.hull_stiffness] = reduced * frame.hull_frequency_rad_s**2
+    row[VEHICLE.hull_damping] = 2.0 * frame.hull_damping_ratio * reduced * frame.hull_frequency_rad_s
+    row[VEHICLE.capacity] = drone.battery_mah * COULOMB_PER_MAH * vehicle.battery.voltage_v
+    row[VEHICLE.efficiency], row[VEHICLE.electronics] = vehicle.battery.efficiency, vehicle.battery.electronics_w
+    return row
+
+
+def aero_row(drone: Drone, environment: Environment) -> NDArray[np.float64]:
+    """Return the aerodynamics of one drone, (AERO.size,)."""
+    row, aero = np.empty(AERO.size), Aerodynamics() if drone.aerodynamics is UNSET else drone.aerodynamics
+    row[AERO.linear : AERO.linear + 3] = aero.linear_drag_n_s_m
+    row[AERO.quadratic : AERO.quadratic + 3] = aero.quadratic_drag_n_s2_m2
+    row[AERO.rotor_drag], row[AERO.rotor_inflow] = aero.rotor_drag_n_s2_m, aero.rotor_inflow_n_s2_m
+    row[AERO.rotor_lift] = aero.rotor_lift_n_s2_m2
+    return row * (environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3)
+
+
+def rotor_row(vehicle: Vehicle, drone: Drone, rotors: int) -> NDArray[np.float64]:
+    """Return the parameters of each rotor of one drone, (ROTOR.size * rotors,)."""
+    groups, count = np.zeros((ROTOR.size, rotors)), len(vehicle.rotors)
+    roll, minus_pitch, turn = allocation(vehicle)
+    groups[ROTOR.x, :count], groups[ROTOR.y, :count], groups[ROTOR.turn, :count] = -minus_pitch, roll, turn
+    groups[ROTOR.low, :count], groups[ROTOR.high, :count] = drone.rotor_min_rad_s, drone.rotor_max_rad_s
+    groups[ROTOR.roll : ROTOR.yaw + 1, :count] = mixing(vehicle).T
+    groups[ROTOR.lift], groups[ROTOR.lift, :count] = 1.0, lift_shares(vehicle)
+    yaw = groups[ROTOR.yaw]
+    groups[ROTOR.yaw_inverse] = np.divide(1.0, yaw, out=np.zeros(rotors), where=yaw != 0.0)
+    return groups.ravel()

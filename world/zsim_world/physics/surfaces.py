@@ -1,0 +1,263 @@
+"""Contact with the ground z = 0 and with obstacles: spring and damper under every contact point, with dry friction.
+
+Friction is a spring to an anchor on the surface; where it would exceed the friction cone, the anchor is dragged along.
+The anchor is fixed within a step and moves after it, so that a step is a smooth function of the state.
+
+At obstacles a drone is a rigid set of balls: the contact points of the ground, with no radius, then balls along its
+hull and one in its middle, so that neither a post nor an edge fits between the points. A ball is pushed along the
+surface normal by the same law. The distance to a convex solid is the depth of a potential, so springs and anchors
+return no more energy than they were given. A drone has slots for the solids within its reach, each with an anchor for
+every ball; they are updated after every step and do not change within one.
+"""
+
+import math
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.math.compiled import apart, inlined
+from zsim.math.rotation import Quaternion, Vector, add, axpy, cross, dot, norm, rotate, rotate_back, scaled, subtract
+from zsim.scenario import obstacle
+from zsim.scenario.scenario import Environment
+from zsim_world.physics.fleet_arrays import STATE, VEHICLE, Bodies, Row
+
+Pair = tuple[float, float]
+
+
+POINTS = 8  # under which there may be ground: four feet, four corners of the hull's rim
+
+
+@inlined
+def contact_point(row: Row, k: int) -> Vector:
+    """Return contact point k in B [m]: front left, front right, rear right, rear left; first the feet."""
+    foot, x, y = k < 4, 1.0 if k % 4 < 2 else -1.0, 1.0 if k % 4 in (0, 3) else -1.0
+    xy = row[VEHICLE.foot_xy] if foot else row[VEHICLE.rim_xy]
+    return (x * xy, y * xy, -row[VEHICLE.foot_depth] if foot else row[VEHICLE.rim_height])
+
+
+def contact_points(row: NDArray) -> np.ndarray:
+    """Return all contact points in B [m], (POINTS, 3)."""
+    return np.array([[float(x) for x in cast(Any, contact_point).py_func(row, k)] for k in range(POINTS)])
+
+
+@inlined
+def _tangential(row: Row, normal: float, gap: Pair, speed: Pair) -> Pair:
+    """Return the friction force [N] of one point, within the cone."""
+    fx = -row[VEHICLE.foot_stiffness] * gap[0] - row[VEHICLE.foot_damping] * speed[0]
+    fy = -row[VEHICLE.foot_stiffness] * gap[1] - row[VEHICLE.foot_damping] * speed[1]
+    size = math.sqrt(fx * fx + fy * fy)
+    limit = row[VEHICLE.friction] * normal
+    if size <= limit:
+        return fx, fy
+    return fx * limit / size, fy * limit / size
+
+
+@inlined
+def contact(
+    row: Row, anchor: NDArray, p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector
+) -> tuple[Vector, Vector]:
+    """Return force in W [N] and moment in B [N m] of the ground on one drone.
+
+    Args:
+        row: the drone's parameters.
+        anchor: (8, 2) anchors of the contact points on the ground [m].
+        p_WB, v_WB, q_WB, w_WB_B: state of the drone [m, m/s, -, rad/s].
+    """
+    force, moment = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    if p_WB[2] > row[VEHICLE.contact_reach]:
+        return force, moment
+    for k in range(POINTS):
+        r_B = contact_point(row, k)
+        r_W = rotate(q_WB, r_B)
+        depth = -(p_WB[2] + r_W[2])
+        if depth > 0.0:
+            v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
+            normal = max(row[VEHICLE.foot_stiffness] * depth - row[VEHICLE.foot_damping] * v[2], 0.0)
+            gap = (p_WB[0] + r_W[0] - anchor[k, 0], p_WB[1] + r_W[1] - anchor[k, 1])
+            fx, fy = _tangential(row, normal, gap, (v[0], v[1]))
+            f_W = (fx, fy, normal)
+            force = add(force, f_W)
+            moment = add(moment, cross(r_B, rotate_back(q_WB, f_W)))
+    return force, moment
+
+
+@inlined
+def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) -> None:
+    """Move the anchors after a step: to the point itself in the air, along with it where it slides."""
+    for k in range(POINTS):
+        r_W = rotate(q_WB, contact_point(row, k))
+        x, y = p_WB[0] + r_W[0], p_WB[1] + r_W[1]
+        depth = -(p_WB[2] + r_W[2])
+        gx, gy = x - anchor[k, 0], y - anchor[k, 1]
+        size = math.sqrt(gx * gx + gy * gy)
+        limit = row[VEHICLE.friction] * max(depth, 0.0)
+        if size > limit:
+            keep = 0.0 if size == 0.0 else limit / size
+            anchor[k, 0], anchor[k, 1] = x - gx * keep, y - gy * keep
+
+
+HULL_BALLS = 16  # along the hull, chosen: 2 cm are between two of the AR.Drone's, and a thinner post meets the last
+BALLS = POINTS + HULL_BALLS + 1
+BALL_SHARE = 0.35  # of the height from feet to rim, chosen: a landing tilted by 9 deg does not touch with the hull
+BELOW_RIM_SHARE = 0.05  # of that height, chosen: lying on its back the rim bears it, which is more than a foot's sag
+FEET = 4  # the first of the contact points
+SLOTS_MAX = 8  # solids in reach of one drone at a time, chosen: as many boxes as meet in a corner
+LOOK_S = 0.01  # s, two of the longest steps: what a drone reaches within it is in its reach
+_ANGLES = [2.0 * math.pi * (k + 0.5) / HULL_BALLS for k in range(HULL_BALLS)]
+_COSINES = (*(math.cos(angle) for angle in _ANGLES), 0.0)  # of the hull balls, in units of the hull's middle line
+_SINES = (*(math.sin(angle) for angle in _ANGLES), 0.0)
+
+nearest: Any = inlined(obstacle.nearest)
+
+
+class Touch(NamedTuple):
+    """What acts on one drone besides air and ground."""
+
+    obstacle: NDArray  # (M, obstacle.COLUMNS)
+    solid: NDArray  # int32 (K,), those in its reach by their places in `obstacle`; -1: none
+    anchor: NDArray  # (K, BALLS, 3), m, in W
+    twist_W: Vector  # N m, of other drones' hulls
+
+
+def obstacle_rows(environment: Environment) -> NDArray[np.float64]:
+    """Return the obstacles of a scenario, (M, obstacle.COLUMNS)."""
+    return np.array([obstacle.row_of(each) for each in environment.obstacles]).reshape(-1, obstacle.COLUMNS)
+
+
+@inlined
+def ball(row: Row, k: int) -> tuple[Vector, float]:
+    """Return centre in B and radius [m] of ball k: four feet, four corners of the rim, the hull, its middle."""
+    if k < POINTS:
+        return contact_point(row, k), 0.0
+    height = abs(row[VEHICLE.rim_height] + row[VEHICLE.foot_depth])
+    radius = BALL_SHARE * height
+    line = max(row[VEHICLE.hull_radius] - radius, 0.0)
+    z = row[VEHICLE.rim_height] - BELOW_RIM_SHARE * height - radius
+    return (line * _COSINES[k - POINTS], line * _SINES[k - POINTS], z), radius
+
+
+@inlined
+def _vector(row: NDArray) -> Vector:
+    return (row[0], row[1], row[2])
+
+
+@inlined
+def _across(a: Vector, n: Vector) -> Vector:
+    """Return the component of a vector perpendicular to the unit vector n."""
+    return axpy(a, -dot(a, n), n)
+
+
+@apart
+def touched(
+    row: Row, touch: Touch, p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector
+) -> tuple[Vector, Vector]:
+    """Return force in W [N] and moment in B [N m] of the obstacles and of other hulls' twist on one drone.
+
+    Args:
+        row: the drone's parameters; touch: what it touches.
+        p_WB, v_WB, q_WB, w_WB_B: state of the drone [m, m/s, -, rad/s].
+    """
+    force, moment = (0.0, 0.0, 0.0), rotate_back(q_WB, touch.twist_W)
+    for s in range(touch.solid.shape[0]):
+        if touch.solid[s] < 0:
+            continue
+        for k in range(BALLS):
+            r_B, radius = ball(row, k)
+            x = add(p_WB, rotate(q_WB, r_B))
+            distance, nx, ny, nz = nearest(touch.obstacle[touch.solid[s]], x[0], x[1], x[2])
+            depth, n = radius - distance, (nx, ny, nz)
+            if depth > 0.0:
+                hull = k >= POINTS
+                stiffness = row[VEHICLE.hull_stiffness] if hull else row[VEHICLE.foot_stiffness]
+                damping = row[VEHICLE.hull_damping] if hull else row[VEHICLE.foot_damping]
+                v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
+                normal = max(stiffness * depth - damping * dot(v, n), 0.0)
+                gap = _across(subtract(x, _vector(touch.anchor[s, k])), n)
+                held = axpy(scaled(gap, -stiffness), -damping, _across(v, n))
+                size, limit = norm(held), row[VEHICLE.friction] * normal
+                f_W = axpy(scaled(n, normal), 1.0 if size <= limit else limit / size, held)
+                force = add(force, f_W)
+                moment = add(moment, cross(r_B, rotate_back(q_WB, f_W)))
+    return force, moment
+
+
+@apart
+def meet_obstacles(bodies: Bodies) -> None:
+    """Find the obstacles within reach of every drone, move its anchors, and note which hulls touch which.
+
+    `braced[i]` is 1 where there are any; `bumping[i, m]` where more than its feet is in contact now; `bumped` is set to
+    1 where such contact begins.
+    """
+    p, v = STATE.p_WB, STATE.v_WB
+    for i in range(bodies.state.shape[0]):
+        row, state = bodies.vehicle[i], bodies.state[i]
+        reach = max(row[VEHICLE.contact_reach], row[VEHICLE.hull_radius]) + ball(row, POINTS)[1]
+        reach += LOOK_S * norm(_vector(state[v : v + 3]))
+        for m in range(bodies.obstacle.shape[0]):
+            distance = nearest(bodies.obstacle[m], state[p], state[p + 1], state[p + 2])[0]
+            hit = False
+            if distance < reach:
+                brace(bodies, i)
+                s = _slot(bodies, i, m, distance)
+                if s >= 0:
+                    is_new = bodies.solid[i, s] != m
+                    bodies.solid[i, s] = m
+                    hit = _drag_anchors(row, bodies.obstacle[m], bodies.held[i, s], state, is_new)
+            else:
+                for s in range(bodies.solid.shape[1]):
+                    if bodies.solid[i, s] == m:
+                        bodies.solid[i, s] = -1
+            if hit and bodies.bumping[i, m] == 0:
+                bodies.bumped[i, m] = 1
+            bodies.bumping[i, m] = 1 if hit else 0
+
+
+@inlined
+def brace(bodies: Bodies, i: int) -> None:
+    """Note that drone i is not in free air: it is stepped with everything that it touches."""
+    if bodies.braced[i] == 0:
+        bodies.braced[i] = 1
+        for k in range(3):
+            bodies.twist[i, k] = 0.0
+
+
+@inlined
+def _slot(bodies: Bodies, i: int, m: int, distance: float) -> int:
+    """Return the slot for obstacle m of drone i: its own, or that of the farthest; -1 if all hold nearer ones."""
+    solid, p = bodies.solid[i], STATE.p_WB
+    x, y, z = bodies.state[i, p], bodies.state[i, p + 1], bodies.state[i, p + 2]
+    chosen, farthest = -1, distance
+    for s in range(solid.shape[0]):
+        if solid[s] == m:
+            return s
+        away = math.inf if solid[s] < 0 else nearest(bodies.obstacle[solid[s]], x, y, z)[0]
+        if away > farthest:
+            chosen, farthest = s, away
+    return chosen
+
+
+@inlined
+def _drag_anchors(row: NDArray, solid: NDArray, anchor: NDArray, state: NDArray, is_new: bool) -> bool:
+    """Move the anchors of one drone on one obstacle after a step; return whether more than its feet touches it.
+
+    An anchor is at its ball's centre where there is no contact or `is_new`, and otherwise follows within the friction
+    cone.
+    """
+    p_WB, q = _vector(state[STATE.p_WB : STATE.p_WB + 3]), state[STATE.q_WB : STATE.q_WB + 4]
+    q_WB = (q[0], q[1], q[2], q[3])
+    hit = False
+    for k in range(BALLS):
+        r_B, radius = ball(row, k)
+        x = add(p_WB, rotate(q_WB, r_B))
+        distance, nx, ny, nz = nearest(solid, x[0], x[1], x[2])
+        keep, gap = 0.0, (0.0, 0.0, 0.0)
+        if distance < radius:
+            hit |= k >= FEET
+            if not is_new:
+                gap = _across(subtract(x, _vector(anchor[k])), (nx, ny, nz))
+            size, limit = norm(gap), row[VEHICLE.friction] * (radius - distance)
+            keep = 1.0 if size <= limit else limit / size
+        for axis in range(3):
+            anchor[k, axis] = x[axis] - keep * gap[axis]
+    return hit

@@ -1,0 +1,14 @@
+"""The rules of a run, without session and wall clock: participants, time, commands, faults, requests, refusals.
+
+Each file uses those below it only; what an object needs of another one is passed to its constructor.
+
+    world                                 one flight                playback                one replay
+      ├─ commands                         commands: checked, queued, applied; commanders
+      ├─ faults                           injected faults
+      └─ coordinator                      what a flight and a replay have in common
+           ├─ participants                how processes join, leave and get lost, and what each means
+           ├─ run_statistics              figures of the run
+           ├─ barrier                     participants, and whom the world waits for
+           ├─ run_clock                   simulated time and its requests
+           └─ outbox                      messages, events and refusals to be published
+"""

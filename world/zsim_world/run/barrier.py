@@ -1,0 +1,384 @@
+"""The participants of the lockstep, how far each has come, and whom the world waits for.
+
+Pure bookkeeping: no session, no clock; wall times are passed in. To integrate from t on, the world needs every gating
+participant's done for t minus the command delay. That is the only wait there is.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from msgspec import UNSET
+
+from zsim.contract import keys
+from zsim.contract.run_messages import Bye, Done, Join, Waiting
+from zsim.scenario.rights import WORLD
+from zsim_world.run.outbox import Refusal
+from zsim_world.run_state import Saved
+
+
+@dataclass
+class Participant:
+    """One process that has joined, by its newest incarnation.
+
+    Attributes:
+        join: as published.
+        from_ns: first gate that it is waited for.
+        done_ns: newest gate that it has completed.
+        surplus: outputs that have arrived since its last done.
+        missing: outputs counted in its dones that have not arrived.
+        done_seq: number of its newest done, None before the first of its process.
+        lost_done: whether a done was lost, and with it the count of the outputs before it.
+        was_incomplete: whether outputs were missing at the last gate, in realtime.
+        rejoined: whether another incarnation of its name was there before.
+        repeats: whether it may publish again what was counted before.
+        successor: whether it has replaced another process that was alive.
+        since_wall_ns: when it last joined, sent a done or died.
+        joined_wall_ns: when this incarnation joined.
+        deadline_misses: dones that were late in realtime.
+        away: whether it has yet to come back to a world that was started again.
+        silent_wall_ns: when its last health came, if it has fallen silent since.
+        farewell: its bye, if that names no incarnation and so may be somebody else's; it counts when the token is lost,
+            and is taken back by the next done.
+    """
+
+    name: str
+    join: Join
+    from_ns: int
+    done_ns: int = -1
+    surplus: int = 0
+    missing: int = 0
+    done_seq: int | None = None
+    lost_done: bool = False
+    was_incomplete: bool = False
+    rejoined: bool = False
+    repeats: bool = False
+    successor: bool = False
+    alive: bool = True
+    since_wall_ns: int = 0
+    joined_wall_ns: int = 0
+    deadline_misses: int = 0
+    away: bool = False
+    silent_wall_ns: int | None = None
+    farewell: Bye | None = None
+
+    @property
+    def is_missed(self) -> bool:
+        """Tell whether it is dead, silent, or has yet to come back."""
+        return not self.alive or self.away or self.silent_wall_ns is not None
+
+    @property
+    def gating(self) -> bool:
+        return self.join.period_ns > 0
+
+    @property
+    def is_waited_for(self) -> bool:
+        return self.gating or self.join.slack_ns > 0
+
+    def is_process_of(self, join: Join) -> bool:
+        """Tell whether another join comes from the same process, taking part in the same way."""
+        fields = ("host", "pid", "role", "period_ns", "slack_ns", "serves")
+        return all(getattr(self.join, name) == getattr(join, name) for name in fields)
+
+    @property
+    def served_names(self) -> set[str]:
+        """Return the names of the processes whose work it does, including its own."""
+        return {self.name, *self.join.serves}
+
+    @property
+    def incomplete(self) -> bool:
+        """Tell whether outputs counted in its dones have not arrived, or a done was lost."""
+        return self.missing > 0 or self.lost_done
+
+    def required_ns(self, need_ns: int) -> int | None:
+        """Return the newest done required of it for `need_ns`, None if none is required yet."""
+        join = self.join
+        if join.period_ns > 0:
+            required = need_ns - need_ns % join.period_ns
+        elif join.slack_ns:
+            required = need_ns - join.slack_ns
+        else:
+            return None
+        return required if required >= self.from_ns else None
+
+    def blocks(self, need_ns: int) -> bool:
+        """Tell whether its done for `need_ns`, or an output that it counted, has not arrived."""
+        required = self.required_ns(need_ns)
+        return required is not None and (self.done_ns < required or self.missing > 0 or self.lost_done)
+
+    def note_done(self, message: Done) -> None:
+        """Compare the number of a done and its count of outputs with what has arrived.
+
+        A gap in the numbers shows that a done was lost. More outputs than it counts belong to the next done.
+        """
+        if self.gating and self.done_seq is not None and message.seq > self.done_seq + 1:
+            self.lost_done = True
+        self.done_seq = message.seq if self.done_seq is None else max(message.seq, self.done_seq)
+        balance = self.surplus - self.missing - message.sent
+        self.surplus, self.missing = max(0, balance), max(0, -balance)
+
+    def note_refused_done(self, seq: int) -> None:
+        """Note the number of a refused done, if it is the next of the same process: it was not lost."""
+        if self.done_seq is not None and seq == self.done_seq + 1:
+            self.done_seq = seq
+
+    def reset_counts(self) -> int:
+        """Restart the counts once outputs were requested again; return how many are missing for good.
+
+        A surplus would hide the next loss: outputs that belong to the next done do not come while some are missing. Of
+        the outputs repeated after a rejoin some were counted before: these are not missing.
+        """
+        missing = 0 if self.repeats else self.missing
+        self.missing, self.surplus, self.lost_done, self.repeats = 0, 0, False, False
+        return missing
+
+    def waiting(self, wall_ns: int, held_by: tuple[str, ...] = ()) -> Waiting:
+        """Return the entry of `clock` that names it as waited for."""
+        return Waiting(self.name, self.join.host, (wall_ns - self.since_wall_ns) / 1e9, held_by)
+
+    def missed(self, wall_ns: int) -> Waiting:
+        """Return the entry of `clock` that names it as dead or silent, in realtime, where nobody is waited for."""
+        since_ns = self.since_wall_ns if not self.alive or self.silent_wall_ns is None else self.silent_wall_ns
+        return Waiting(self.name, self.join.host, (wall_ns - since_ns) / 1e9)
+
+    def entry(self) -> dict[str, Any]:
+        """Return the data of the event of its join."""
+        entry: dict[str, Any] = {
+            "incarnation": self.join.incarnation,
+            "host": self.join.host,
+            "pid": self.join.pid,
+            "from_ns": self.from_ns,
+            "done_ns": self.done_ns,
+        }
+        return {**entry, "serves": self.join.serves} if self.join.serves else entry
+
+
+class Barrier:
+    """The participants of a run.
+
+    Args:
+        run_id: joins and dones of other runs are refused.
+        gate_ns: every period is a multiple of it.
+        expected: names without which the run does not start.
+    """
+
+    SAVED: ClassVar[Saved] = {"_expected": list[str], "participants": dict[str, Participant]}
+
+    def __init__(self, run_id: str, gate_ns: int, expected: list[str]) -> None:
+        self._run_id = run_id
+        self._gate_ns = gate_ns
+        self._expected = [*dict.fromkeys(expected)]
+        self.participants: dict[str, Participant] = {}
+
+    def expect(self, name: str) -> None:
+        """Wait for another process at the start."""
+        if name not in self._expected:
+            self._expected.append(name)
+
+    def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> Refusal | None:
+        """Admit a participant; return why it is refused.
+
+        The new incarnation of a known name continues from its progress; so does a participant that does all the work of
+        others that are dead, and replaces them. The same join again changes nothing.
+        """
+        refusal = self._join_refusal(name, message)
+        if refusal:
+            return refusal
+        former = self.participants.get(name)
+        if former is not None and former.alive and former.join.incarnation == message.incarnation:
+            former.away = False
+            return None
+        replaced = self.replaced(name, message)
+        for dead in replaced:
+            del self.participants[dead.name]
+        predecessors = [*([former] if former else []), *replaced]
+        self.participants[name] = Participant(
+            name=name,
+            join=message,
+            from_ns=min((each.from_ns for each in predecessors if each.is_waited_for), default=next_gate_ns),
+            done_ns=min((each.done_ns for each in predecessors), default=-1),
+            since_wall_ns=wall_ns,
+            joined_wall_ns=wall_ns,
+            deadline_misses=former.deadline_misses if former else 0,
+            done_seq=former.done_seq if former and former.is_process_of(message) else None,
+            rejoined=former is not None,
+            repeats=former is not None,
+            successor=former is not None and former.alive and not former.is_process_of(message),
+        )
+        return None
+
+    def takes_place(self, name: str, message: Join) -> bool:
+        """Tell whether a join would replace another process."""
+        if not self.accepts(name, message):
+            return False
+        former = self.participants.get(name)
+        return (former is not None and not former.is_process_of(message)) or bool(self.replaced(name, message))
+
+    def accepts(self, name: str, message: Join) -> bool:
+        """Tell whether a join fits the run."""
+        return self._join_refusal(name, message) is None
+
+    def replaced(self, name: str, message: Join) -> list[Participant]:
+        """Return the dead whose work a newcomer of another name is to do."""
+        served = {name, *message.serves}
+        return [p for p in self.participants.values() if not p.alive and p.name != name and p.served_names <= served]
+
+    def _join_refusal(self, name: str, message: Join) -> Refusal | None:
+        if name == WORLD or not keys.PROCESS_NAME.fullmatch(name):
+            return Refusal("name", repr(name[:60]), f"must be a role, a dot and a name of a-z 0-9 _ . -, not {WORLD!r}")
+        if message.run_id != self._run_id:
+            return self._run_id_refusal(message.run_id)
+        if message.period_ns < 0 or message.period_ns % self._gate_ns:
+            return Refusal("period_ns", str(message.period_ns), f"must be 0 or a multiple of {self._gate_ns}")
+        return None
+
+    def _run_id_refusal(self, run_id: str) -> Refusal:
+        return Refusal("run_id", repr(run_id[:40]), f"must be {self._run_id!r} (read world/info)")
+
+    def done(self, name: str, message: Done, now_ns: int, wall_ns: int) -> Refusal | None:
+        """Note that a participant has completed the gate `done_ns`; return why the done is refused."""
+        participant = self.participants.get(name)
+        if participant is None:
+            return Refusal("join", "missing", f"must publish process/{name}/join first")
+        if message.run_id != self._run_id:
+            return self._run_id_refusal(message.run_id)
+        if message.incarnation != participant.join.incarnation:
+            participant.note_refused_done(message.seq)
+            return _incarnation_refusal(participant, str(message.incarnation))
+        if message.done_ns > now_ns:
+            return Refusal("done_ns", str(message.done_ns), f"must be <= {now_ns}, the newest gate")
+        participant.away = False
+        if message.done_ns > participant.done_ns:
+            participant.done_ns = message.done_ns
+            participant.since_wall_ns = wall_ns
+        participant.note_done(message)
+        return None
+
+    def bye_refusal(self, participant: Participant, message: Bye) -> Refusal | None:
+        """Return the refusal of a bye that names another run or incarnation."""
+        if message.run_id not in (UNSET, self._run_id):
+            return self._run_id_refusal(str(message.run_id))
+        if message.incarnation not in (UNSET, participant.join.incarnation):
+            return _incarnation_refusal(participant, str(message.incarnation))
+        return None
+
+    def has_farewell(self, name: str) -> bool:
+        """Tell whether a participant leaves as soon as its token is lost."""
+        participant = self.participants.get(name)
+        return participant is not None and participant.farewell is not None
+
+    def take_back_bye(self, name: str) -> Refusal | None:
+        """Drop the bye of a participant that goes on: it was somebody else's; return its refusal."""
+        participant = self.participants.get(name)
+        if participant is None or participant.farewell is None:
+            return None
+        participant.farewell = None
+        return _incarnation_refusal(participant, "missing")
+
+    def count_output(self, name: str) -> None:
+        """Count one output of a participant that has arrived."""
+        participant = self.participants.get(name)
+        if participant is None:
+            return
+        if participant.missing:
+            participant.missing -= 1
+        else:
+            participant.surplus += 1
+
+    def is_gating(self, name: str) -> bool:
+        """Tell whether a process gates, even one that seems dead: its outputs may arrive before it rejoins."""
+        participant = self.participants.get(name)
+        return participant is not None and participant.gating
+
+    def awaited(self) -> list[Participant]:
+        """Return the participants that must not lose any message; callable from any thread."""
+        return [p for p in list(self.participants.values()) if p.is_waited_for]
+
+    def mark_dead(self, name: str, wall_ns: int) -> Participant | None:
+        """Mark a participant as dead; it stays until it is removed or rejoins."""
+        participant = self.participants.get(name)
+        if participant is None or not participant.alive:
+            return None
+        participant.alive = participant.away = False
+        participant.since_wall_ns = wall_ns
+        return participant
+
+    def await_return(self, wall_ns: int, all_died: bool) -> None:
+        """Wait for all to come back to a world that was started again."""
+        for participant in self.participants.values():
+            participant.since_wall_ns = participant.joined_wall_ns = wall_ns
+            participant.alive = participant.alive and not all_died
+            participant.away = participant.is_waited_for and (participant.alive or all_died)
+
+    def away(self) -> list[Participant]:
+        """Return the participants that have not come back yet."""
+        return [p for p in self.participants.values() if p.away]
+
+    def waiting_for_return(self, wall_ns: int) -> tuple[Waiting, ...]:
+        """Return the same as entries of `clock`."""
+        return tuple(participant.waiting(wall_ns) for participant in self.away())
+
+    def substitute(self, name: str) -> Participant | None:
+        """Return a living participant that does all the work of another as well, None if there is none."""
+        served = self.participants[name].served_names
+        others = (p for p in self.participants.values() if p.name != name and p.alive)
+        return next((p for p in others if served <= p.served_names), None)
+
+    def duplicates(self, name: str) -> dict[str, set[str]]:
+        """Return the names that living participants serve in common with one, by participant."""
+        served = self.participants[name].served_names
+        others = (p for p in self.participants.values() if p.name != name and p.alive)
+        return {p.name: both for p in others if (both := served & p.served_names)}
+
+    def remove(self, name: str) -> Participant | None:
+        """Remove a participant that has said bye or is dropped."""
+        removed = self.participants.pop(name, None)
+        gone = (name, *(removed.join.serves if removed else ()))
+        self._expected = [expected for expected in self._expected if expected not in gone]
+        return removed
+
+    def absent(self) -> list[str]:
+        """Return the expected names that have not joined yet."""
+        present = {name for p in self.participants.values() for name in p.served_names}
+        return [name for name in self._expected if name not in present]
+
+    def blocking(self, need_ns: int) -> list[Participant]:
+        """Return the participants whose done for `need_ns` has not arrived."""
+        return [p for p in self.participants.values() if p.blocks(need_ns)]
+
+    def incomplete(self) -> list[Participant]:
+        """Return the participants whose outputs or done were lost, or are still on their way."""
+        return [p for p in self.participants.values() if p.incomplete]
+
+    def give_up_late(self) -> None:
+        """At a gate in realtime, give up outputs that were missing at the gate before: they are lost.
+
+        They are not requested again, and every later gate would count as a deadline miss of their sender.
+        """
+        for participant in self.participants.values():
+            if participant.incomplete and participant.was_incomplete:
+                participant.reset_counts()
+            participant.was_incomplete = participant.incomplete
+
+    def waiting_for(
+        self, need_ns: int, wall_ns: int, start_wall_ns: int, feeds: Callable[[str, str], bool] = lambda *_: False
+    ) -> tuple[Waiting, ...]:
+        """Return whom the world waits for, as entries of `clock`: first the dead, then by time without a done.
+
+        `feeds` tells whether one process reads another's outputs, and so may only be waiting itself.
+        """
+        absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
+        rank = {name: place for place, name in enumerate(self._expected)}
+        awaited = {p.name: p for p in (*self.away(), *self.blocking(need_ns))}.values()
+        late = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
+        waiting = []
+        for victim in late:  # it may only wait itself for the outputs of others that are late
+            read_by = victim.served_names if victim.gating and victim.alive and not victim.away else ()
+            others = (p for p in late if p is not victim and p.gating)
+            held_by = (p.name for p in others if any(feeds(w, r) for w in p.served_names for r in read_by))
+            waiting.append(victim.waiting(wall_ns, tuple(held_by)))
+        return (*absent, *waiting)
+
+
+def _incarnation_refusal(participant: Participant, found: str) -> Refusal:
+    return Refusal("incarnation", found, f"must be {participant.join.incarnation}, the newest to join")

@@ -1,0 +1,260 @@
+"""The injected faults of a run: planned by the scenario or by requests, begun and ended at their gates, published."""
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import msgspec
+
+from zsim.contract import keys
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Fault, Faults
+from zsim.runtime.link_faults import KINDS as LINK_KINDS
+from zsim.scenario import fault_kinds
+from zsim.scenario.fault_check import Known, flaws
+from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim.scenario.rights import WORLD
+from zsim.scenario.scenario import FAULTS_MAX
+from zsim.schema.checker import show
+from zsim.sensors.sensor_catalogue import declarations
+from zsim_world.fleet.fault_effects import Impairment
+from zsim_world.run.outbox import Refusal
+from zsim_world.run.participants import Participants
+from zsim_world.run.run_clock import Operation
+from zsim_world.run_state import PART, Saved
+
+NEVER_NS = 2**63 - 1  # a gate that does not come
+SELECTORS = ("id", "target", "kind")
+
+
+class FaultInjector:
+    """The faults of a run, applied to its fleet.
+
+    A fault that is requested begins with the gate that is integrated next: nobody can have worked on that yet, so a run
+    with the same faults at the same instants gives the same bits.
+
+    Args:
+        run: in which they act.
+        effects: of faults on the fleet.
+    """
+
+    SAVED: ClassVar[Saved] = {
+        "_faults": dict[int, Fault],
+        "_begun": set[int],
+        "_over": set[int],
+        "_count": int,
+        "_seq": int,
+        "_next_ns": int,
+        "_effects": PART,
+    }
+
+    def __init__(self, run: Participants, effects: Impairment) -> None:
+        self._scenario, self._clock, self._barrier, self._outbox = run.scenario, run.clock, run.barrier, run.outbox
+        self._effects = effects
+        self._kinds = fault_kinds.kinds_of(declarations(run.scenario.drones))
+        self._faults: dict[int, Fault] = {}
+        self._begun: set[int] = set()
+        self._over: set[int] = set()  # ended or cleared, kept for those who still work on gates in which it acted
+        self._count = self._seq = 0
+        self._of_links: tuple[Fault, ...] = ()
+        self._of_links_at: dict[int, tuple[Fault, ...]] = {}  # by gate, since the last change or integrated gate
+        for planned in run.scenario.faults:
+            self._plan(planned, "scenario")
+        self._next_ns = self._next_change_ns()
+        self._publish()
+
+    @property
+    def all(self) -> tuple[Fault, ...]:
+        """Return the faults that are planned, act, or have just ended, in order of their ids."""
+        return tuple(self._faults[number] for number in sorted(self._faults))
+
+    def of_links(self, gate_ns: int) -> tuple[Fault, ...]:
+        """Return the faults of links and radios that act in a gate; used for every command."""
+        if not self._of_links:
+            return ()
+        acting = self._of_links_at.get(gate_ns)
+        if acting is None:
+            acting = tuple(fault for fault in self._of_links if fault_kinds.acts(fault, gate_ns))
+            self._of_links_at[gate_ns] = acting
+        return acting
+
+    # Time
+
+    def apply(self, now_ns: int) -> None:
+        """Begin and end what does so at now_ns, before the gate after it is integrated."""
+        next_ns = now_ns + self._clock.gate_ns
+        self._of_links_at.clear()
+        if now_ns >= self._next_ns:
+            self._begin_and_end(now_ns)
+            self._effects.strike([fault for fault in self.all if fault_kinds.acts(fault, next_ns)])
+        self._effects.blow(now_ns, next_ns)
+
+    def _begin_and_end(self, now_ns: int) -> None:
+        for fault in self.all:
+            if fault.id not in self._begun and fault.from_ns <= now_ns:
+                self._begun.add(fault.id)
+                text = "begins"
+                if _is_instant(fault):
+                    immune = self._immunity(fault.target)
+                    text = f"has no effect: the process {immune}" if immune else ""
+                self._event("fault", fault, text)
+            if fault.id not in self._over and _end_ns(fault) <= now_ns:
+                self._over.add(fault.id)
+                if not _is_instant(fault):
+                    self._event("fault_end", fault, "is over")
+        self._remove_past(now_ns)
+        self._next_ns = self._next_change_ns()
+
+    def _immunity(self, process: str) -> str | None:
+        """Return why a process that takes part cannot be killed by a fault; None if it can."""
+        participant = self._barrier.participants.get(process)
+        if participant is None:
+            return None  # one that is not here yet, or whose work another does
+        if not participant.gating:
+            return "takes no part in the lockstep"
+        return None if participant.join.fingerprint else "does not run on zsim.runtime.runner"
+
+    def _late_ns(self) -> int:
+        """Return how far behind the newest gate a process may still work: the command delay and one period."""
+        periods = (p.join.period_ns for p in self._barrier.participants.values())
+        return self._clock.delay_ns + max(periods, default=0)
+
+    def _remove_past(self, now_ns: int) -> None:
+        """Remove what ended before any gate that a process may still work on."""
+        late_ns = self._late_ns()
+        past = [fault.id for fault in self.all if _end_ns(fault) + late_ns <= now_ns]
+        for number in past:
+            del self._faults[number]
+        self._begun.difference_update(past)
+        self._over.difference_update(past)
+        if past:
+            self._publish()
+
+    def _next_change_ns(self) -> int:
+        changes, late_ns = [NEVER_NS], self._late_ns()
+        for fault in self._faults.values():
+            if fault.id not in self._begun:
+                changes.append(fault.from_ns)
+            changes.append(_end_ns(fault) + (late_ns if fault.id in self._over else 0))
+        return min(changes)
+
+    # Requests
+
+    def operations(self) -> dict[str, Operation]:
+        """Return what each `op` on `world/control` that is about faults does."""
+        return {"fault_add": self._add, "fault_clear": self._clear}
+
+    def _add(self, request: ControlRequest) -> ControlAnswer:
+        args = {name: value for name, value in request.args.items() if value is not None}
+        refusal = self._refusal(args)
+        if refusal:
+            return ControlAnswer(False, str(refusal))
+        fault = self._plan(args, request.source)
+        self._publish()
+        self._next_ns = self._next_change_ns()
+        return ControlAnswer(True, result={"id": fault.id, "from_ns": fault.from_ns, "until_ns": fault.until_ns})
+
+    def _clear(self, request: ControlRequest) -> ControlAnswer | Refusal:
+        """End the faults of an id, a target or a kind, or all."""
+        args = {name: value for name, value in request.args.items() if value is not None}
+        unknown = [name for name in args if name not in SELECTORS]
+        if unknown:
+            return Refusal(unknown[0][:40], "not known", f"allowed: {', '.join(SELECTORS)}, or nothing")
+        selected = [fault for fault in self.all if fault.id not in self._over]
+        for name, value in args.items():
+            matching = [fault for fault in selected if getattr(fault, name) == value]
+            if not matching:
+                values = dict.fromkeys(str(getattr(fault, name)) for fault in selected)
+                allowed = f"one of {', '.join(values)}" if values else "left out: there is none"
+                return Refusal(name, show(value), f"must be {allowed}")
+            selected = matching
+        for fault in selected:
+            self._end(fault, request.source)
+        if selected:
+            self._publish()
+            self._next_ns = 0  # it takes effect before the next gate
+        return ControlAnswer(True, result={"cleared": [fault.id for fault in selected]})
+
+    def _end(self, fault: Fault, source: str) -> None:
+        if fault.id in self._begun:
+            fault = msgspec.structs.replace(fault, until_ns=self._clock.now_ns)
+            self._faults[fault.id] = fault
+            self._over.add(fault.id)
+        else:
+            del self._faults[fault.id]
+        self._event("fault_clear", fault, "is cleared", source)
+
+    def _refusal(self, args: Mapping[str, Any]) -> Refusal | str | None:
+        """Return the first reason against a fault."""
+        scenario = self._scenario
+        drones = tuple(drone.name for drone in scenario.drones)
+        clusters = tuple(cluster.name for cluster in scenario.clusters)
+        gating = (p.name for p in self._barrier.participants.values() if p.gating)
+        processes = (*scenario.expected(), *gating)
+        external = tuple(scenario.external())
+        known = Known(drones, clusters, processes, self._kinds, self._effects.rotors, external)
+        for path, text in flaws(args, known):
+            return f"{path or 'args'} {text}"
+        immune = self._immunity(args["target"]) if args["kind"] == PROCESS_KILL else None
+        if immune:
+            allowed = f"must be a process that a kill ends ({PROCESS_KILL})"
+            return Refusal("target", f"{show(args['target'])}, which {immune}", allowed)
+        return self._time_refusal(args.get("at_s"))
+
+    def _time_refusal(self, at_s: float | None) -> Refusal | None:
+        now_s, end_s = self._clock.now_ns / 1e9, self._scenario.duration_s
+        if at_s is not None and at_s < now_s:
+            return Refusal("at_s", f"{at_s:g}", f"must be >= {now_s:g}, the present, or left out")
+        if at_s is not None and at_s >= end_s:
+            return Refusal("at_s", f"{at_s:g}", f"must be < {end_s:g}, the end of the run")
+        if len(self._faults) >= FAULTS_MAX:
+            allowed = f"must be at most {FAULTS_MAX}, so clear some"
+            return Refusal("the number of faults that are planned or act", str(len(self._faults)), allowed)
+        return None
+
+    def _plan(self, args: Mapping[str, Any], source: str) -> Fault:
+        self._count += 1
+        fault = fault_kinds.planned(args, self._count, source, self._clock.now_ns, self._clock.gate_ns, self._kinds)
+        self._faults[fault.id] = fault
+        return fault
+
+    # Publication
+
+    def _publish(self) -> None:
+        """Publish the list, before the next gate."""
+        self._rank()
+        self._sort_links()
+        self._outbox.put(keys.FAULTS, Faults(self._clock.now_ns, self._seq, self.all))
+        self._seq += 1
+
+    def restored(self) -> None:
+        self._sort_links()
+
+    def _sort_links(self) -> None:
+        """Note which faults are of links."""
+        self._of_links = tuple(fault for fault in self.all if fault.kind in LINK_KINDS)
+        self._of_links_at.clear()
+
+    def _rank(self) -> None:
+        """Number those that are equal but for their end, and have not begun: they begin together."""
+        equal: Counter[tuple[str, str, int]] = Counter()
+        for fault in self.all:
+            if fault.id in self._begun:
+                continue
+            start = (fault.kind, fault.target, fault.from_ns)
+            if fault.rank != equal[start]:
+                self._faults[fault.id] = msgspec.structs.replace(fault, rank=equal[start])
+            equal[start] += 1
+
+    def _event(self, kind: str, fault: Fault, state: str, source: str = WORLD) -> None:
+        text = f"{fault.kind} of {fault.target} {state}".rstrip()
+        self._outbox.event(kind, fault.target, text, msgspec.structs.asdict(fault), source)
+
+
+def _is_instant(fault: Fault) -> bool:
+    """Tell whether a fault is over as soon as it has begun."""
+    kind = fault_kinds.KINDS.get(fault.kind)
+    return kind is not None and kind.lasts == "once"
+
+
+def _end_ns(fault: Fault) -> int:
+    return NEVER_NS if fault.until_ns is None else fault.until_ns

@@ -1,0 +1,351 @@
+"""All inputs of a world, as entries of its journal: applied in the same order, they give the same world to the bit.
+
+`Run.enter` is the only way in while a world runs: it applies an entry and notes it in the journal. A world that is
+started again applies the entries that it finds there. The messages of others are checked, kept, counted for their
+senders, and passed to the world where it acts on them.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import msgspec
+
+from zsim.contract import camera_messages, flight_messages, keys, messages, run_messages
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Join
+from zsim.errors import DecodeError
+from zsim.runtime.health import HealthMeter
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.message_history import MessageHistory
+
+PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
+OF_CAMERAS = (camera_messages.CameraInfo, camera_messages.Sightings)  # relayed too, from every process with a camera
+OF_DRIVERS = ("truth", "link")  # what they publish of an external drone beside its sensors
+
+ProgressCallback = Callable[[str, Any, str], None]
+"""Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), every tenth ("state",
+message, cluster), ("link", message, drone), and ("resumed", simulated time in ns, process); shows progress."""
+
+Sample = tuple[str, bytes]  # key and payload
+
+Handler = Callable[[Sample, int], None]
+"""Handles a message that arrived at a monotonic wall time [ns].
+
+Raises:
+    DecodeError: it is refused.
+"""
+
+
+class Entry(msgspec.Struct, array_like=True, tag_field="kind", tag=True):
+    """One input; wall times are monotonic."""
+
+    def apply(self, run: "Run") -> ControlAnswer | None:
+        """Let the world take it; a request is answered."""
+        raise NotImplementedError
+
+
+class Run:
+    """A world with its inputs, and the messages that are kept of it.
+
+    Args:
+        world: a flight, or a replay.
+        health: counts what is received and refused.
+        note: takes every entry that a world which goes on from the journal has to apply again.
+
+    Attributes:
+        history: of the messages that passed.
+        progress: shows progress.
+        on_done: called with name, incarnation and wall time of a done before the world has it.
+        on_health: called with the name of a process that has published its health.
+        phase: of the cluster whose state was read last.
+        handlers: of the keys that have come.
+    """
+
+    def __init__(
+        self, world: Coordinator, health: HealthMeter, note: Callable[[Entry], None] = lambda entry: None
+    ) -> None:
+        self.world = world
+        self.health = health
+        self.history = MessageHistory()
+        self.progress: ProgressCallback = lambda kind, message, about: None
+        self.on_done: Callable[[str, int, int], None] = lambda name, incarnation, wall_ns: None
+        self.on_health: Callable[[str], None] = lambda name: None
+        self.phase = ""
+        self._note = note
+        self._clock = world.clock
+        self._states: Counter[str] = Counter()
+        self.handlers: dict[str, Handler] = {}
+
+    def enter(self, entry: Entry) -> ControlAnswer | None:
+        """Apply an input, and note it in the journal.
+
+        What ends the run is not noted, unless that is its last gate: it continues from the journal. The world's own
+        messages are noted after the end as well, since they are numbered on.
+        """
+        answer = entry.apply(self)
+        kind, clock = type(entry), self._clock
+        is_last = kind is Advanced and clock.is_complete and self.world.failure is None
+        if clock.ended is None or is_last or kind is Published:
+            self._note(entry)
+        return answer
+
+    def learn_handler(self, key: str) -> Handler:
+        """Return the handler of a key's messages, and remember it: the same keys come at every gate."""
+        kind, (place, name, what) = messages.type_of(key), keys.parts(key)
+        if kind in messages.RELAYED or (kind in OF_CAMERAS and not keys.is_sensor(key)):
+            handler = self._relay
+        elif place == "drone" and name in self.world.external and (what in OF_DRIVERS or what.startswith("sensor/")):
+            handler = self._take_of_driver  # and not the world's
+        elif key.startswith("process/") or keys.is_command(key):
+            handler = self._hand_over
+        else:
+            handler = self._keep_foreign if kind is None else _refuse_key_of_world
+        if len(self.handlers) >= messages.KEYS_KEPT:
+            self.handlers.clear()
+        self.handlers[key] = handler
+        return handler
+
+    def _keep_foreign(self, sample: Sample, wall_ns: int) -> None:
+        """Keep a message on a key outside of the contract."""
+        self.history.passed.append(sample)
+        self.history.add_foreign(*sample)
+
+    def _hand_over(self, sample: Sample, wall_ns: int) -> None:
+        """Pass the world a message that it acts on; a join has to be admitted first."""
+        self.history.passed.append(sample)
+        key, payload = sample
+        message = messages.decode(key, payload)
+        self.history.add(key, payload, message.t_ns)
+        kind = type(message)
+        if kind is run_messages.Done:
+            self.on_done(keys.thing(key), message.incarnation, wall_ns)
+        if kind is not Join:
+            self.world.handle(key, message, wall_ns)
+        if kind is run_messages.Health:
+            self.on_health(keys.thing(key))
+            self.progress("health", message, keys.thing(key))
+
+    def _relay(self, sample: Sample, wall_ns: int) -> None:
+        """Keep an output that the world does not act on, and count it for the done of its sender."""
+        self.history.passed.append(sample)
+        key, payload = sample
+        kind = messages.type_of(key)
+        is_counted = kind in messages.RELAYED
+        head = _head(key, payload) if is_counted else messages.decode(key, payload)
+        if head.t_ns > self.world.now_ns:
+            raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self.world.now_ns}, the newest gate")
+        self.history.add(key, payload, head.t_ns)
+        if kind is flight_messages.ClusterState:
+            self._read_phase(key, payload)
+        source = head.controller if kind is run_messages.ClusterRequest else head.source
+        if not source and is_counted:
+            source = f"{'estimator' if kind is flight_messages.Estimate else 'controller'}.{keys.thing(key)}"
+        self.world.count_output(source)
+
+    def _read_phase(self, key: str, payload: bytes) -> None:
+        if self._states[key] % PHASE_EVERY == 0:
+            state: flight_messages.ClusterState = messages.decode_as(flight_messages.ClusterState, payload, key)
+            self.phase = state.phase
+            self.progress("state", state, keys.thing(key))
+        self._states[key] += 1
+
+    def _take_of_driver(self, sample: Sample, wall_ns: int) -> None:
+        """Keep what a driver publishes of its drone, unless the world refuses it."""
+        self.history.passed.append(sample)
+        key, payload = sample
+        drone = keys.thing(key)
+        try:
+            message = messages.decode(key, payload)
+            refusal = self.world.take_of_driver(drone, message)
+            if refusal is not None:
+                raise DecodeError(refusal)
+            self.history.add(key, payload, message.t_ns)
+            if type(message) is flight_messages.LinkState:
+                self.progress("link", message, drone)
+        except DecodeError as error:
+            self.history.add_foreign(key, payload)
+            self.refuse(f"driver.{drone}", key, error)
+
+    def refuse(self, source: str, key: str, error: DecodeError) -> None:
+        """Count a message that cannot be read, and publish why."""
+        self.health.refused += 1
+        self.world.outbox.refuse(source, key[:80], messages.fault_at(key, error))
+
+    def refuse_sample(self, sample: Sample, error: DecodeError) -> None:
+        """Refuse a message, but count it for its sender, so that its done is not taken to be short of an output."""
+        self.history.add_foreign(*sample)
+        self.refuse("somebody", sample[0], error)
+        with suppress(DecodeError):  # of an unknown sender
+            head = _head(*sample)
+            self.world.count_output(head.controller or head.source)
+
+
+class _Head(msgspec.Struct):
+    """What the world reads of messages that it only relays."""
+
+    t_ns: int
+    seq: int
+    source: str = ""
+    controller: str = ""  # of a ClusterRequest, whose source is the client
+
+
+_decode_head = msgspec.msgpack.Decoder(_Head).decode
+
+
+def _head(key: str, payload: bytes) -> _Head:
+    try:
+        return _decode_head(payload)
+    except messages.REFUSALS as error:
+        raise DecodeError(f"{key}: {error}; must be a map with t_ns and seq") from error
+
+
+def _refuse_key_of_world(sample: Sample, wall_ns: int) -> None:
+    raise DecodeError(f"{sample[0]}: only the world publishes here")
+
+
+class Taken(Entry, tag=0):
+    """A message that somebody else published."""
+
+    wall_ns: int
+    sample: Sample
+
+    def apply(self, run: Run) -> None:
+        sample = self.sample
+        run.health.received += 1
+        try:
+            handle = run.handlers.get(sample[0]) or run.learn_handler(sample[0])
+            handle(sample, self.wall_ns)
+        except DecodeError as error:
+            run.refuse_sample(sample, error)
+
+
+class Advanced(Entry, tag=1):
+    """Permission to advance by a gate, and whether it came too late."""
+
+    wall_ns: int
+    late: bool
+
+    def apply(self, run: Run) -> None:
+        run.world.statistics.world_misses += self.late
+        run.world.advance(self.wall_ns)
+
+
+class Died(Entry, tag=2):
+    """The death of a process."""
+
+    wall_ns: int
+    name: str
+
+    def apply(self, run: Run) -> None:
+        run.world.died(self.name, self.wall_ns)
+
+
+class Controlled(Entry, tag=3):
+    """A request on `world/control`."""
+
+    request: ControlRequest
+
+    def apply(self, run: Run) -> ControlAnswer:
+        return run.world.control(self.request)
+
+
+class GivenUp(Entry, tag=4):
+    """The outputs of a participant that are lost."""
+
+    name: str
+
+    def apply(self, run: Run) -> None:
+        run.world.give_up_outputs(self.name)
+
+
+class Published(Entry, tag=5):
+    """A message of the world's own that does not follow from other inputs, such as its clock while time stands."""
+
+    key: str
+    seq: int
+    payload: bytes
+
+    def apply(self, run: Run) -> None:
+        run.history.passed.append((self.key, self.payload))
+        run.history.add(self.key, self.payload, run.world.now_ns)
+        run.world.outbox.number_from(self.key, self.seq + 1)
+
+
+class Resumed(Entry, tag=6):
+    """A new process of the world that continues from here."""
+
+    wall_ns: int
+    all_died: bool
+
+    def apply(self, run: Run) -> None:
+        run.world.await_return(self.wall_ns, self.all_died)
+
+
+class Joined(Entry, tag=7):
+    """A join that was admitted."""
+
+    wall_ns: int
+    name: str
+    join: Join
+
+    def apply(self, run: Run) -> None:
+        run.world.handle(keys.process(self.name, "join"), self.join, self.wall_ns)
+
+
+class FalselyJoined(Entry, tag=8):
+    """A join in the place of another process, or of a stranger, without a process behind it."""
+
+    name: str
+    join: Join
+    reason: str
+
+    def apply(self, run: Run) -> None:
+        run.world.falsely_joined(self.name, self.join, self.reason)
+
+
+class NotShown(Entry, tag=9):
+    """A participant that has given no sign of being there."""
+
+    wall_ns: int
+    name: str
+    reason: str
+
+    def apply(self, run: Run) -> None:
+        run.world.not_shown(self.name, self.reason, self.wall_ns)
+
+
+class FellSilent(Entry, tag=10):
+    """A process that publishes its health no longer since a wall time, or does again (None)."""
+
+    name: str
+    since_wall_ns: int | None
+
+    def apply(self, run: Run) -> None:
+        run.world.silence_changed(self.name, self.since_wall_ns)
+
+
+class ReaderClosed(Entry, tag=11):
+    """A reader whose link was closed."""
+
+    text: str
+    data: dict[str, Any]
+
+    def apply(self, run: Run) -> None:
+        run.world.reader_closed(self.text, self.data)
+
+
+class Expired(Entry, tag=12):
+    """A process that has not come, or not come back, in its time."""
+
+    name: str
+
+    def apply(self, run: Run) -> None:
+        run.world.expired(self.name)
+
+
+_OfWorld = Advanced | Published | Resumed
+_OfOthers = Taken | Controlled | GivenUp | Joined | ReaderClosed
+_OfLosses = Died | FalselyJoined | NotShown | FellSilent | Expired
+encode = msgspec.msgpack.Encoder().encode
+decode = msgspec.msgpack.Decoder(list[_OfWorld | _OfOthers | _OfLosses]).decode

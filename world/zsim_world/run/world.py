@@ -1,0 +1,251 @@
+"""The world of a flight: integrates all drones, owns simulated time, applies commands and faults. No session, no clock.
+
+Participants and requests, which a replay has as well, are in `zsim_world.run.participants` and `.coordinator`.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, ClassVar
+
+from msgspec import UNSET
+
+from zsim import CONTRACT, __version__
+from zsim.contract import keys, messages
+from zsim.contract.fingerprint import TruthHash, fingerprint
+from zsim.contract.flight_messages import Status
+from zsim.contract.snapshot import State
+from zsim.contract.views import DroneView, ViewDrones
+from zsim.errors import UserCodeError
+from zsim.runtime.agent import Output
+from zsim.scenario import scenario_file
+from zsim.scenario.external_bodies import check_pace
+from zsim.scenario.rights import WORLD
+from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
+from zsim.sensors.sensor_catalogue import declarations
+from zsim_world.fleet.external_drones import ExternalDrones
+from zsim_world.fleet.fleet import DivergedError, Fleet
+from zsim_world.fleet.publication import GatePublication
+from zsim_world.run.commands import CommandIntake
+from zsim_world.run.coordinator import Coordinator
+from zsim_world.run.faults import FaultInjector
+from zsim_world.run_state import PART, Saved, saved_state
+
+DURATION_OVER = "the scenario's duration is over"  # why a run of full length ended
+
+
+class World(Coordinator):
+    """One flight.
+
+    Args:
+        scenario: resolved.
+        mode: "lockstep" or "realtime".
+        rate: simulated per wall seconds to pace at; 0 = as fast as possible.
+        wall_ns: monotonic wall time.
+        run_id: given by a launcher, and by tests that compare records.
+        changed: texts `a.b.c=value` by which the scenario was changed against its file, None: not known.
+
+    Raises:
+        ScenarioError: it has external drones, and the mode is "lockstep".
+
+    Attributes:
+        fleet: the drones.
+        drivers: what is published of the external ones among them.
+        queue: of the commands, with the commander of each drone.
+        faults: that are injected.
+        failure: what is to be raised once the end is published, None for a run that ended well.
+    """
+
+    SAVED: ClassVar[Saved] = {
+        "requests": int,
+        "left_early": list[str],
+        "clock": PART,
+        "outbox": PART,
+        "budgets": PART,
+        "barrier": PART,
+        "statistics": PART,
+        "fleet": PART,
+        "queue": PART,
+        "faults": PART,
+        "_publication": PART,
+        "drivers": PART,
+    }
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        mode: str = "lockstep",
+        rate: float = 0.0,
+        wall_ns: Callable[[], int] = lambda: 0,
+        run_id: str | None = None,
+        changed: Sequence[str] | None = None,
+    ) -> None:
+        check_pace(scenario, mode)
+        super().__init__(scenario, mode, rate, wall_ns, run_id, scenario.expected())
+        self._changed = UNSET if changed is None else tuple(changed)
+        self.fleet = Fleet(scenario)
+        self.drivers = ExternalDrones(self.fleet)
+        self.external = self.drivers.names
+        self.unpaced = frozenset(f"estimator.{drone}" for drone in self.external)
+        self._simulated = [i for i in range(self.fleet.count) if i not in self.drivers]
+        self.faults = FaultInjector(self, self.fleet.impairment)
+        self._intake = CommandIntake(self, self.fleet, self.drivers, self.faults.of_links)
+        self.queue = self._intake.queue
+        self._operations |= {**self._intake.operations(), **self.faults.operations()}
+        self._publication = GatePublication(self.fleet)
+        self._hash = TruthHash(len(self._simulated))
+        self._last_ns = round(scenario.duration_s * 1e9) // self.clock.gate_ns * self.clock.gate_ns
+        self.statistics.separation(self.fleet.closest_m())
+
+    def info(self) -> messages.Info:
+        """Return the message of `world/info`."""
+        s, env = self.scenario, self.scenario.environment
+        text, declared = scenario_file.to_text(s), declarations(s.drones)
+        user_sensors = tuple(messages.SensorInfo(name, each.message, each.fields) for name, each in declared.items())
+        return messages.Info(
+            t_ns=0,
+            seq=0,
+            contract=CONTRACT,
+            run_id=self.run_id,
+            federation=s.federation,
+            mode="lockstep" if self.clock.mode == "lockstep" else "realtime",
+            rate=self.clock.rate,
+            gate_ns=self.clock.gate_ns,
+            physics_dt_ns=round(s.time.physics_dt_ms * 1e6),
+            command_delay_ns=self.clock.delay_ns,
+            seed=s.seed,
+            origin=messages.Origin(env.latitude_deg, env.longitude_deg, env.height_m),
+            drones=tuple(
+                messages.DroneInfo(d.name, d.model, self.fleet.rotor_info(i), "external" if d.is_external else UNSET)
+                for i, d in enumerate(s.drones)
+            ),
+            clusters=tuple(messages.ClusterInfo(c.name, tuple(c.drones)) for c in s.clusters),
+            scenario=text,
+            scenario_sha256=scenario_file.sha256(text),
+            version=__version__,
+            fingerprint=fingerprint(),
+            user_sensors=user_sensors or UNSET,
+            sightings=self.fleet.has_sightings or UNSET,
+            module_folders=tuple(map(str, plugin.folders())) if s.own_code() else UNSET,
+            changed=self._changed,
+        )
+
+    # State
+
+    def checkpoint(self) -> State:
+        """Return all from which the run continues to the same bits, but the hash of its truth.
+
+        Nothing may be pending in the outbox.
+        """
+        self._hash.flush()
+        return saved_state(self)
+
+    def keep_truth(self, copy: Callable[[memoryview], object], hashed: Iterable[bytes] = ()) -> None:
+        """Copy the bytes of the truth hash to `copy` from now on; those before were `hashed`."""
+        self._hash.resume(hashed, copy)
+
+    # What arrives
+
+    def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
+        return self._intake.accept(drone, kind, message)
+
+    def take_of_driver(self, drone: str, message: Any) -> str | None:
+        former, refusal = self.drivers.status(self.names.index(drone)), self.drivers.take(drone, message, self.now_ns)
+        stopped = isinstance(message, Status) and message.state == "emergency"
+        if refusal is None and stopped and former and former.state not in ("landed", "emergency"):
+            self.outbox.notice("emergency", drone, f"the driver of {drone} reports an emergency", {"cause": "driver"})
+        return refusal
+
+    def release_drones(self, name: str) -> None:
+        self._intake.release_all(name)
+
+    # Time
+
+    def advance(self, wall_ns: int) -> None:
+        """Go to the next gate (or publish gate 0) and put all its messages into the outbox.
+
+        A state that is no longer finite, or a user's sensor that fails, ends the run at the gate before; see `failure`.
+        """
+        is_first = self.clock.state == "waiting"
+        if is_first:
+            self.clock.start(self.fleet.t_ns)
+        else:
+            self._begin_gate()
+        try:
+            if not is_first:
+                self.fleet.advance()
+            gate = self._publication.gate(self.queue.commanders()) if self._simulated else None
+        except DivergedError as error:
+            self._fail("diverged", error.drone, error, {})
+            return
+        except UserCodeError as error:
+            self._fail("failure", WORLD, error, {"on_death": "end"})
+            return
+        if not is_first:
+            self.clock.advance(self.fleet.t_ns)
+            self.statistics.separation(self.fleet.closest_m())
+            self._publish_incidents()
+        state = self.fleet.bodies.state
+        self._hash.add(self.now_ns, state[self._simulated] if self.external else state)
+        if gate is not None:
+            self.outbox.put(keys.GATE, gate)
+        self.statistics.gate(self.now_ns, wall_ns)
+        self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
+        if self.now_ns >= self._last_ns:
+            self.clock.complete(DURATION_OVER)
+
+    def _begin_gate(self) -> None:
+        """Apply what has arrived before the fleet is integrated to the next gate."""
+        if self.clock.mode == "realtime":
+            paced = [p for p in self.barrier.participants.values() if not p.served_names <= self.unpaced]
+            self.statistics.deadlines(paced, self.clock.required_ns)
+            self.barrier.give_up_late()
+        self._intake.apply(self.now_ns)
+        self.faults.apply(self.now_ns)
+        self.drivers.lead()
+
+    def _fail(self, kind: str, subject: str, error: DivergedError | UserCodeError, data: dict[str, Any]) -> None:
+        """End the run at the gate before this one."""
+        self.failure = error
+        self.outbox.event(kind, subject, str(error), data)
+        self.clock.complete(str(error))
+
+    def _publish_incidents(self) -> None:
+        for i, j in self.fleet.collisions():
+            name, other = self.names[i], self.names[j]
+            self.outbox.notice("collision", name, f"{name} and {other} collide", {"other": other})
+        for i, m in self.fleet.bumps():
+            name, other = self.names[i], self.scenario.environment.obstacles[m].name
+            self.outbox.notice("collision", name, f"{name} runs into {other}", {"other": other})
+        for each in self.fleet.incidents():
+            data = {**each.data, "commander": self.queue.commanders()[each.drone]}
+            self.outbox.notice(each.kind, self.names[each.drone], each.text, data)
+
+    def result(self) -> dict[str, Any]:
+        """Return the figures of the run so far."""
+        return {
+            "reason": self.ended,
+            "last_ns": self.now_ns,
+            **self.statistics.result(self.barrier.participants.values()),
+            "refused": self.outbox.refusals.count,
+            "requests": self.requests,
+            "requests_refused": self.outbox.refused_requests.count,
+            "events_left_out": self.outbox.left_out,
+            "truth_sha256": self._hash.hexdigest(),
+        }
+
+    def views(self, seq: int) -> list[Output]:
+        return [Output(keys.VIEW_DRONES, self.view(seq))]
+
+    def view(self, seq: int) -> ViewDrones:
+        """Return the compact state of all drones."""
+        truth = self.fleet.truth()
+        drones, commanders = [], self.queue.commanders()
+        for i, name in enumerate(self.names):
+            state, battery_percent, _ = self.fleet.status(i)
+            if status := self.drivers.status(i):
+                state, battery_percent = status.state, status.battery_percent
+            pose = (tuple(truth.position_m[i].tolist()), tuple(truth.orientation_wxyz[i].tolist()))
+            rotors = tuple(truth.rotor_rad_s[i, : self.fleet.rotors[i]].tolist())
+            drones.append(DroneView(name, *pose, rotors, state, battery_percent, commanders[i]))
+        wind = tuple(tuple(row) for row in self.fleet.wind_m_s.tolist())
+        return ViewDrones(self.now_ns, seq, tuple(drones), wind)

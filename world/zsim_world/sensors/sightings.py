@@ -1,0 +1,382 @@
+"""Sightings of hats without pictures: exposures between two gates, and a detector's errors.
+
+Each camera has a random stream; everything that falls due in a gate is computed in one compiled call. The errors are
+those of the detector on rendered pictures (tests compare them): of a hat's centre and apparent diameter in pixels,
+larger for small hats, for motion during the exposure and in low light; misses and false alarms. The same number of
+random numbers is drawn for every picture of a camera.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from zsim.contract.camera_messages import Seen
+from zsim.math.columns import Field, columns
+from zsim.math.compiled import Held, compiled, hold, inlined, kernel
+from zsim.math.random_streams import stream
+from zsim.math.rotation import Vector
+from zsim.scenario.obstacle import COLUMNS, row_of
+from zsim.scenario.scenario import Scenario
+from zsim.sensors.camera import Camera, Hats, SightingModel
+from zsim.sensors.camera_model import Lens, camera_pose, undistorted
+from zsim_world.physics.fleet_arrays import STATE
+from zsim_world.run_state import IN_PLACE, Saved
+from zsim_world.sensors.hats_in_view import CAMERA, VIEW, camera_row, hats_in_view, mounted, poses_between
+from zsim_world.sensors.noise import WORDS, fill, words
+
+NOISY_LIGHT = 0.4  # of a clear day, at which a picture's noise is half again of what it is by day; measured
+
+Array = NDArray[np.float64]
+
+
+class PictureSightings(NamedTuple):
+    """The sightings in one picture.
+
+    Attributes:
+        t_ns: when they are published.
+        drone: whose camera.
+        t_sample_ns: the middle of the exposure.
+        camera: its name.
+        seen: in an order that does not tell whose hats they are.
+    """
+
+    t_ns: int
+    drone: int
+    t_sample_ns: int
+    camera: str
+    seen: tuple[Seen, ...]
+
+
+class Surroundings(NamedTuple):
+    """The W cameras and what they look at, for compiled code; N drones."""
+
+    drones: NDArray[np.int64]  # (W,), whose each camera is
+    cameras: Array  # (W, CAMERA.size)
+    detectors: Array  # (W, DETECTOR.size)
+    hulls: Array  # (N,), radii [m]
+    hat_B: Vector  # centre of a hat [m]
+    diameter: float  # of a hat [m]
+    balls: Array  # (M, 3), centres of what only looks like a hat [m; W]
+    bare: NDArray[np.bool_]  # (N,), whether a hat can be seen at all
+    obstacles: Array  # (O, COLUMNS)
+
+
+class _Exposures(NamedTuple):
+    """When a camera takes pictures, and the delay until its sightings are published."""
+
+    drone: int
+    name: str
+    rate_hz: float
+    latency_ns: int
+
+    def at_ns(self, count: int) -> int:
+        """Return the instant of a picture."""
+        return round(count * 1e9 / self.rate_hz)
+
+    def publish(self, at_ns: int, seen: tuple[Seen, ...]) -> PictureSightings:
+        """Return the sightings in a picture of an instant."""
+        return PictureSightings(at_ns + self.latency_ns, self.drone, at_ns, self.name, seen)
+
+
+class SightingSampler:
+    """Makes the sightings of a fleet, gate by gate.
+
+    Args:
+        scenario: resolved; some drone has sightings.
+        hulls: radius of each drone's [m], (N,).
+    """
+
+    SAVED: ClassVar[Saved] = {
+        "_streams": IN_PLACE,
+        "_counts": list[int],
+        "_due_ns": list[int],
+        "_next_ns": int,
+        "_later": list[PictureSightings],
+        "_former": np.ndarray,
+        "_former_ns": int,
+    }
+
+    def __init__(self, scenario: Scenario, hulls: Array) -> None:
+        env = scenario.environment
+        hats = Hats() if env.hats is UNSET else env.hats
+        light = 1.0 if env.light is UNSET else env.light
+        watching = list(_watching(scenario))
+        self._exposures = [
+            _Exposures(i, name, camera.rate_hz, round((camera.latency_ms + model.latency_ms) * 1e6))
+            for i, name, camera, model in watching
+        ]
+        generators = [stream(scenario.seed, f"{scenario.drones[i].name}/sightings/{name}") for i, name, *_ in watching]
+        detectors = [
+            _detector(camera, model, hats, light, rng)
+            for (_, _, camera, model), rng in zip(watching, generators, strict=True)
+        ]
+        x, y, z = hats.position_m
+        surroundings = Surroundings(
+            np.array([i for i, *_ in watching], dtype=np.int64),
+            np.array([camera_row(camera) for *_, camera, _ in watching]).reshape(-1, CAMERA.size),
+            np.array(detectors).reshape(-1, DETECTOR.size),
+            hulls,
+            (float(x), float(y), float(z)),
+            hats.diameter_m,
+            np.array(hats.false_m, dtype=float).reshape(-1, 3),
+            np.array([drone.name not in hats.covered for drone in scenario.drones]),
+            np.array([row_of(each) for each in env.obstacles], dtype=float).reshape(-1, COLUMNS),
+        )
+        self._held = hold(surroundings)
+        self._streams = np.array([words(rng) for rng in generators], dtype=np.uint64).reshape(-1, WORDS.size)
+        self._counts = [0] * len(watching)
+        self._due_ns = [0] * len(watching)  # the next picture of each
+        self._next_ns = 0  # the soonest of all
+        self._later: list[PictureSightings] = []
+        self._gate_ns = round(scenario.time.gate_ms * 1e6)
+        self._former = np.empty((0, STATE.size))  # states of the last gate before a picture
+        self._former_ns = 0
+
+    def due(self, state: Array, now_ns: int) -> list[PictureSightings]:
+        """Return what is due by a gate, given the state of all drones there, (N, STATE.size or more)."""
+        if self._next_ns <= now_ns:
+            self._later += self._looked(state[:, : STATE.size].copy(), now_ns)
+        if self._next_ns <= now_ns + self._gate_ns:  # a picture before the next gate needs this state
+            self._former, self._former_ns = state[:, : STATE.size].copy(), now_ns
+        if not self._later:
+            return []
+        due = [sighting for sighting in self._later if sighting.t_ns <= now_ns]
+        self._later = [sighting for sighting in self._later if sighting.t_ns > now_ns]
+        return due
+
+    def _looked(self, now: Array, now_ns: int) -> list[PictureSightings]:
+        """Return the sightings in all pictures up to a gate."""
+        pictures = sorted(self._taken(now_ns))
+        self._next_ns = min(self._due_ns)
+        first = not len(self._former)
+        former, former_ns = (now, now_ns) if first else (self._former, self._former_ns)
+        which = np.array(pictures, dtype=np.int64)
+        seen: list[list[Seen]] = [[] for _ in pictures]
+        for row in look(which, former, former_ns, now, now_ns, self._held, self._streams).tolist():
+            seen[int(row[SEEN.picture])].append(_sighting(row))
+        return [self._exposures[w].publish(at_ns, tuple(of)) for (at_ns, w), of in zip(pictures, seen, strict=True)]
+
+    def _taken(self, now_ns: int) -> Iterator[tuple[int, int]]:
+        """Yield instant and camera of every picture up to a gate, and count it."""
+        due_ns, counts = self._due_ns, self._counts
+        for w, exposures in enumerate(self._exposures):
+            while due_ns[w] <= now_ns:
+                yield due_ns[w], w
+                counts[w] += 1
+                due_ns[w] = exposures.at_ns(counts[w])
+
+
+def _watching(scenario: Scenario) -> Iterator[tuple[int, str, Camera, SightingModel]]:
+    """Yield every camera of a simulated drone with a detector: drone, name, camera, detector."""
+    for i, drone in enumerate(scenario.drones):
+        model = drone.sensors.sightings
+        if model is not UNSET and not drone.is_external:
+            for name, camera in drone.sensors.cameras().items():
+                if name in model.cameras:
+                    yield i, name, camera, model
+
+
+def _detector(camera: Camera, model: SightingModel, hats: Hats, light: float, rng: np.random.Generator) -> Array:
+    """Return the row of a detector; its camera's misalignment is drawn first from its stream."""
+    row = np.zeros(DETECTOR.size)
+    misaligned_rad = math.radians(model.misalignment_deg)
+    R_BK = camera_pose(camera).R_BK @ _turned(misaligned_rad * rng.standard_normal(3))
+    row[DETECTOR.R_BK : DETECTOR.R_BK + 9] = R_BK.ravel()
+    row[DETECTOR.misaligned], row[DETECTOR.radius] = misaligned_rad, 0.5 * hats.diameter_m
+    row[DETECTOR.exposure] = camera.exposure_ms * 1e-3
+    row[DETECTOR.centre], row[DETECTOR.diameter] = model.centre_px, model.diameter_px
+    row[DETECTOR.noise] = model.noise_px2 * math.hypot(1.0, NOISY_LIGHT / light) / math.hypot(1.0, NOISY_LIGHT)
+    row[DETECTOR.blur_share], row[DETECTOR.diameter_min] = model.blur_share, model.diameter_min_px
+    row[DETECTOR.miss], row[DETECTOR.false] = model.miss, model.false_hz / camera.rate_hz
+    return row
+
+
+def _sighting(row: list[float]) -> Seen:
+    """Return the sighting of a row of SEEN."""
+    _, x, y, z, range_m, sigma, sigma_m = row
+    return Seen((x, y, z), range_m, sigma, sigma_m)
+
+
+def _turned(r: Array) -> Array:
+    """Return the rotation matrix of a small rotation vector [rad], to second order."""
+    x, y, z = r.tolist()
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    U, _, Vt = np.linalg.svd(np.eye(3) + K)
+    return U @ Vt
+
+
+@kernel()
+def look(
+    pictures: NDArray,
+    former: NDArray,
+    former_ns: int,
+    now: NDArray,
+    now_ns: int,
+    held: Held,
+    streams: NDArray,
+) -> NDArray:
+    """Return the sightings in some pictures, (M, SEEN.size).
+
+    Args:
+        pictures: instant [ns] and camera of each, by instant, (P, 2).
+        former, now: states of all drones at two gates, (N, STATE.size).
+        held: Surroundings, by `hold`.
+        streams: words of the cameras' random streams, (W, WORDS.size); moved on.
+    """
+    scene = held.content
+    hats = len(now) + len(scene.balls)
+    view, out = np.empty((hats, VIEW.size)), np.empty((len(pictures) * (hats + 1), SEEN.size))
+    poses, end = now, 0
+    for n in range(len(pictures)):
+        at_ns, w = pictures[n]
+        if n == 0 or at_ns != pictures[n - 1, 0]:
+            poses = poses_between(former, former_ns, now, now_ns, at_ns)
+        camera = mounted(scene.cameras[w])
+        fixed = (scene.hulls, scene.hat_B, scene.diameter, scene.balls, scene.bare, scene.obstacles)
+        hats_in_view(camera, int(scene.drones[w]), poses, *fixed, view)
+        first, end = end, detect(scene.detectors[w], camera.lens, view, streams[w], out, end)
+        out[first:end, SEEN.picture] = n
+    return out[:end]
+
+
+DETECTOR = columns(  # of one camera, and what it looks at
+    "DetectorColumns",
+    (
+        Field("R_BK", "1", 9),  # with the misalignment that nobody knows
+        Field("misaligned", "rad"),  # standard deviation
+        Field("radius", "m"),  # of a hat
+        Field("exposure", "s"),
+        Field("centre", "px"),  # standard deviations, as in SightingModel
+        Field("diameter", "px"),
+        Field("noise", "px^2"),  # in this light
+        Field("blur_share", "1"),
+        Field("diameter_min", "px"),
+        Field("miss", "1"),
+        Field("false", "1"),  # false alarms per picture
+    ),
+)
+SEEN = columns(  # a sighting
+    "SeenColumns",
+    (
+        Field("picture", "1"),  # its number among those of a call
+        Field("direction_B", "1", 3),
+        Field("range", "m"),
+        Field("sigma_direction", "rad"),
+        Field("sigma_range", "m"),
+    ),
+)
+DRAWS = 4  # normal numbers for each hat of a picture: two for its centre, one for its diameter, one for a miss
+FALSE_DRAWS = 4  # likewise for a false alarm: whether, where (2), how large
+DIAMETER_NOISE, DIAMETER_BLUR = 1.4, 2.8  # what noise and blur make of a diameter over that of a centre; measured
+ANGLE_MAX = 3.0  # rad, of an apparent diameter; pi is that of a ball that touches the lens
+SMALLEST = 0.1  # of a hat's apparent diameter, the least that is measured
+
+
+@inlined
+def _unit(normal: float) -> float:
+    """Return a uniform number between 0 and 1 from a standard normal one."""
+    return 0.5 * math.erfc(normal / math.sqrt(2.0))
+
+
+@inlined
+def _sigmas_px(model: NDArray, row: NDArray) -> tuple[float, float]:
+    """Return the standard deviations of a hat's centre and apparent diameter."""
+    scale = row[VIEW.scale]
+    noise = model[DETECTOR.noise] / (row[VIEW.angle] * scale)
+    blur = model[DETECTOR.blur_share] * row[VIEW.rate] * model[DETECTOR.exposure] * scale
+    centre = row[VIEW.centre] * math.hypot(noise, blur)
+    hidden = 0.5 * (row[VIEW.radius] - 1.0)
+    diameter = math.hypot(row[VIEW.radius] * DIAMETER_NOISE * noise, (1.0 + hidden) * DIAMETER_BLUR * blur)
+    return math.hypot(model[DETECTOR.centre], centre), math.hypot(model[DETECTOR.diameter], diameter)
+
+
+@inlined
+def _put(model: NDArray, to_K: Vector, range_m: float, sigma: float, sigma_m: float, out: NDArray) -> None:
+    """Write a sighting in a direction of K, of any length."""
+    length = math.sqrt(to_K[0] * to_K[0] + to_K[1] * to_K[1] + to_K[2] * to_K[2])
+    for k in range(3):
+        at = DETECTOR.R_BK + 3 * k
+        along = model[at] * to_K[0] + model[at + 1] * to_K[1] + model[at + 2] * to_K[2]
+        out[SEEN.direction_B + k] = along / length
+    out[SEEN.range], out[SEEN.sigma_direction], out[SEEN.sigma_range] = range_m, sigma, sigma_m
+
+
+@inlined
+def _range_m(model: NDArray, angle: float) -> float:
+    """Return the distance of a hat of an apparent diameter [rad]."""
+    return model[DETECTOR.radius] / math.sin(0.5 * min(angle, ANGLE_MAX))
+
+
+@inlined
+def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
+    """Write the sighting of a hat in view; False if it is missed by chance, or measured as too small."""
+    centre_px, diameter_px = _sigmas_px(model, row)
+    scale, angle = row[VIEW.scale], row[VIEW.angle]
+    measured = angle + diameter_px / scale * noise[2]
+    if measured * scale < model[DETECTOR.diameter_min] or _unit(noise[3]) < model[DETECTOR.miss]:
+        return False
+    measured = max(measured, SMALLEST * angle)
+    x, y, z = row[VIEW.direction_K], row[VIEW.direction_K + 1], row[VIEW.direction_K + 2]
+    across = math.hypot(x, z)
+    a, b = centre_px / scale * noise[0], centre_px / scale * noise[1]
+    to_K = (x + a * z / across - b * x * y / across, y + b * across, z - a * x / across - b * y * z / across)
+    range_m = _range_m(model, measured)
+    sigma = math.hypot(centre_px / scale, model[DETECTOR.misaligned])
+    sigma_m = range_m * diameter_px / (scale * measured)
+    _put(model, to_K, range_m, sigma, sigma_m, out)
+    return True
+
+
+@inlined
+def _see_nothing(model: NDArray, lens: Lens, noise: NDArray, out: NDArray) -> bool:
+    """Write a false alarm, a small blob anywhere in the picture; False if there is none in this one."""
+    if _unit(noise[0]) >= model[DETECTOR.false]:
+        return False
+    x, y = undistorted(lens, _unit(noise[1]) * lens.width - 0.5, _unit(noise[2]) * lens.height - 0.5)
+    size_px = model[DETECTOR.diameter_min] * (1.0 + 2.0 * _unit(noise[3]))
+    range_m = _range_m(model, size_px / lens.fx)
+    sigma = math.hypot(model[DETECTOR.centre] / lens.fx, model[DETECTOR.misaligned])
+    _put(model, (x, y, 1.0), range_m, sigma, range_m * model[DETECTOR.diameter] / size_px, out)
+    return True
+
+
+@inlined
+def _sort(out: NDArray, first: int, end: int) -> None:
+    """Sort sightings from left to right, so that their order does not tell whose hats they are."""
+    for m in range(first + 1, end):
+        for k in range(m, first, -1):
+            a, b = out[k - 1], out[k]
+            if math.atan2(a[SEEN.direction_B + 1], a[SEEN.direction_B]) >= math.atan2(
+                b[SEEN.direction_B + 1], b[SEEN.direction_B]
+            ):
+                break
+            for c in range(SEEN.size):
+                a[c], b[c] = b[c], a[c]
+
+
+@compiled
+def detect(model: NDArray, lens: Lens, view: NDArray, stream: NDArray, out: NDArray, first: int) -> int:
+    """Write a detector's sightings in a picture into rows of `out` from `first` on; return where they end.
+
+    Args:
+        model: (DETECTOR.size,).
+        lens: of the camera.
+        view: of all that may be a hat, (M, VIEW.size).
+        stream: words of the camera's random stream (WORDS.size,), moved on.
+        out: (first + M + 1 or more, SEEN.size).
+    """
+    drawn = np.empty(DRAWS * len(view) + FALSE_DRAWS)
+    fill(drawn, stream)
+    end = first
+    for m in range(len(view)):
+        noise = drawn[DRAWS * m : DRAWS * m + DRAWS]
+        if view[m, VIEW.seen] != 0.0 and _see(model, view[m], noise, out[end]):
+            end += 1
+    if model[DETECTOR.false] > 0.0 and _see_nothing(model, lens, drawn[DRAWS * len(view) :], out[end]):
+        end += 1
+    _sort(out, first, end)
+    return end

@@ -1,0 +1,288 @@
+"""The journal of a run on disk: all inputs of its world, in order, and checkpoints of its whole state.
+
+A world is a function of its scenario and its inputs. So one that is started again continues to the same bits, from a
+checkpoint and the inputs since. An entry is in the file, though not on the disk, before anything that follows from it
+is published; killing the process loses none.
+
+A folder has, with n counting from 0: `n.entries`, frames of entries; `n.checkpoint`, the state at their beginning, none
+for 0; `truth`, the bytes of the truth hash. A frame: length and CRC-32 of the content (little-endian, 32 bit each),
+then the content in msgpack.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from zsim.contract.messages import REFUSALS
+from zsim.contract.snapshot import State, pack, unpack
+from zsim.errors import DecodeError, RunError
+from zsim.output_folder import take_lock
+from zsim_world.run import inputs
+from zsim_world.run.inputs import Entry
+
+VERSION = 3  # of the files, and of the states in them
+CHECKPOINT_NS = 5_000_000_000  # simulated time between two; the history that a replay refills reaches back as far
+CHECKPOINT_WALL_NS = 1_000_000_000  # wall time between two at least: a checkpoint of 1000 drones has 20 MB
+CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the one before it is younger than the history
+HASHED_BYTES = 1 << 20  # of the truth in one go
+_FRAME = struct.Struct("<II")
+
+
+class _Head(msgspec.Struct, array_like=True):
+    """The first frame of each file."""
+
+    version: int
+    run_id: str
+    scenario_sha256: str
+
+    def __str__(self) -> str:
+        return f"version {self.version}, run {self.run_id!r}, scenario {self.scenario_sha256[:8]}"
+
+
+class Checkpoint(NamedTuple):
+    """A state of the world, None at the start of its run."""
+
+    state: State | None
+    truth_bytes: int
+
+
+class RunJournal:
+    """Reads and writes the journal of one run, or nothing without a folder.
+
+    Args:
+        folder: of this run alone; it is made.
+        run_id, scenario_sha256: of the run.
+        say: shows a line if the journal cannot be written any more.
+        all_died: whether all participants of a run that is continued have to be started again.
+    """
+
+    def __init__(
+        self,
+        folder: Path | None,
+        run_id: str = "",
+        scenario_sha256: str = "",
+        say: Callable[[str], None] = print,
+        all_died: bool = False,
+    ) -> None:
+        self.all_died = all_died
+        self._folder = folder or Path()
+        self._is_kept = folder is not None
+        self._head = _Head(VERSION, run_id, scenario_sha256)
+        self._say = say
+        self._entries: list[Entry] = []
+        self._file = self._truth = -1
+        self._number = 0
+        self._due_ns, self._due_wall_ns = CHECKPOINT_NS, 0
+        self._writer = ThreadPoolExecutor(1, "checkpoint")
+        self._written: Future[None] | None = None
+
+    # Writing
+
+    def note(self, entry: Entry) -> None:
+        """Add an entry, for `commit`."""
+        if self._is_kept:
+            self._entries.append(entry)
+
+    def commit(self) -> None:
+        """Write the entries to the file; to be called before anything is published that follows from them."""
+        if self._entries:
+            entries, self._entries = self._entries, []
+            self._guarded(lambda: _write(self._file, _framed(inputs.encode(entries))))
+
+    def keep_truth(self, data: memoryview) -> None:
+        """Append bytes of the truth hash."""
+        if self._is_kept:
+            self._guarded(lambda: _write(self._truth, data))
+
+    def is_due(self, now_ns: int, wall_ns: int) -> bool:
+        """Tell whether it is time for a checkpoint, by simulated time and a monotonic clock."""
+        due = now_ns >= self._due_ns and wall_ns >= self._due_wall_ns and self._is_kept
+        return due and (self._written is None or self._written.done())
+
+    def add_checkpoint(self, state: State, now_ns: int, wall_ns: int) -> None:
+        """Begin the next part of the journal with a state, which another thread writes."""
+        self._due_ns, self._due_wall_ns = now_ns + CHECKPOINT_NS, wall_ns + CHECKPOINT_WALL_NS
+        self.commit()
+        self._guarded(lambda: self._begin(self._number + 1, state))
+
+    def _begin(self, number: int, state: State) -> None:
+        former, truth_bytes = self._file, os.lseek(self._truth, 0, os.SEEK_CUR)
+        self._number = number
+        self._file = self._open_entries(number)
+        content = {"truth_bytes": truth_bytes, "state": state}
+        self._written = self._writer.submit(self._write_checkpoint, number, pack(content), former)
+
+    def _write_checkpoint(self, number: int, content: bytes, former: int) -> None:
+        """Put a checkpoint on disk after the files that it needs, and remove those that are no longer needed."""
+        place = self._folder / f"{number}.checkpoint"
+        os.fsync(former)
+        os.close(former)
+        os.fsync(self._truth)
+        file = os.open(place.with_suffix(".new"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+        try:
+            _write(file, _framed(msgspec.msgpack.encode(self._head)) + _framed(content))
+            os.fsync(file)
+        finally:
+            os.close(file)
+        place.with_suffix(".new").replace(place)
+        for former_place in self._folder.iterdir():
+            if former_place.stem.isdecimal() and int(former_place.stem) <= number - CHECKPOINTS_KEPT:
+                former_place.unlink()
+
+    def _open_entries(self, number: int) -> int:
+        file = os.open(self._folder / f"{number}.entries", os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        if not os.fstat(file).st_size:
+            _write(file, _framed(msgspec.msgpack.encode(self._head)))
+        return file
+
+    def _guarded(self, write: Callable[[], None]) -> None:
+        """Continue the run without a journal if it cannot be written."""
+        try:
+            write()
+        except OSError as error:
+            self._is_kept = False
+            why = f"{self._folder}: the journal cannot be written ({error.strerror})"
+            self._say(f"{why}; if the world dies now, the run ends")
+            self._entries.clear()
+            self.close()
+
+    def close(self) -> None:
+        """Write no more."""
+        with suppress(OSError):
+            self.commit()
+        self._writer.shutdown()
+        for file in (self._file, self._truth):
+            if file >= 0:
+                os.close(file)
+        self._file = self._truth = -1
+
+    def remove(self) -> None:
+        """Remove a journal that is closed and whose run is over."""
+        if not self._is_kept:
+            return
+        with suppress(OSError):
+            for place in self._folder.iterdir():
+                place.unlink()
+            self._folder.rmdir()
+
+    # Reading
+
+    def open(self) -> Checkpoint | None:
+        """Begin a journal, or open the one that is there; return the checkpoint to continue from, None for a start.
+
+        `entries` are the inputs since then.
+
+        Raises:
+            RunError: the journal there is of another run, or cannot be read.
+        """
+        if not self._is_kept:
+            return None
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._truth = os.open(self._folder / "truth", os.O_RDWR | os.O_CREAT, 0o644)
+            if not take_lock(self._truth):
+                raise RunError(f"{self._folder}: another world keeps its journal there; end that one")
+            found = self._newest()
+            self._file = self._open_entries(self._number)
+        except OSError as error:
+            raise RunError(f"{self._folder}: no journal can be kept there ({error.strerror})") from error
+        return found
+
+    def _newest(self) -> Checkpoint | None:
+        """Return the newest checkpoint but one: the history is refilled from there."""
+        numbers = sorted(int(place.stem) for place in self._folder.glob("*.entries"))
+        if not numbers:
+            return None
+        self._number = numbers[-1]
+        whole = [number for number in numbers if number == 0 or self._checkpoint(number)]
+        if not whole:
+            raise RunError(f"{self._folder}: no checkpoint is whole; the run cannot be gone on with")
+        self._first = whole[-2] if len(whole) > 1 else whole[0]
+        return self._checkpoint(self._first) if self._first else Checkpoint(None, 0)
+
+    def _checkpoint(self, number: int) -> Checkpoint | None:
+        """Return a checkpoint, None if it is not whole."""
+        with suppress(OSError, DecodeError):
+            frames = list(self._frames(self._folder / f"{number}.checkpoint"))
+            if frames:
+                content: dict[str, Any] = unpack(frames[0])
+                return Checkpoint(content["state"], content["truth_bytes"])
+        return None
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield the inputs since the checkpoint; nothing that follows from a broken end was ever published."""
+        for number in range(self._first, self._number + 1):
+            for frame in self._frames(self._folder / f"{number}.entries"):
+                yield from inputs.decode(frame)
+
+    def truth(self, size: int) -> Iterator[bytes]:
+        """Yield the first bytes of the truth hash, and drop the others, which the world appends again."""
+        os.ftruncate(self._truth, size)
+        os.lseek(self._truth, 0, os.SEEK_SET)
+        while data := os.read(self._truth, HASHED_BYTES):
+            yield data
+
+    def _frames(self, place: Path) -> Iterator[bytes]:
+        """Yield the frames of a file behind its head as far as they are whole, and cut off the rest.
+
+        Raises:
+            RunError: the file is of another run.
+        """
+        data, end = place.read_bytes(), 0
+        for frame in _whole_frames(data):
+            if end:
+                yield frame.content
+            else:
+                self._check(frame.content, place)
+            end = frame.end
+        if end < len(data):
+            os.truncate(place, end)
+
+    def _check(self, content: bytes, place: Path) -> None:
+        try:
+            head = msgspec.msgpack.decode(content, type=_Head)
+        except REFUSALS as error:
+            raise RunError(f"{place}: is no journal of a run ({error}); name another folder") from error
+        if head != self._head:
+            raise RunError(f"{place}: is of {head}; must be of {self._head}; name another folder")
+
+
+class _Frame(NamedTuple):
+    content: bytes
+    end: int
+
+
+def _whole_frames(data: bytes) -> Iterator[_Frame]:
+    """Yield the frames at the beginning of a file that are whole."""
+    at = 0
+    while len(data) - at >= _FRAME.size:
+        size, check = _FRAME.unpack_from(data, at)
+        content, at = data[at + _FRAME.size : at + _FRAME.size + size], at + _FRAME.size + size
+        if len(content) < size or zlib.crc32(content) != check:
+            return
+        yield _Frame(content, at)
+
+
+def journaled_run(folder: Path) -> str | None:
+    """Return the run of which a folder has the journal, None if it has none."""
+    for place in sorted(folder.glob("*.entries")):
+        with suppress(OSError, *REFUSALS):
+            return msgspec.msgpack.decode(next(_whole_frames(place.read_bytes())).content, type=_Head).run_id
+    return None
+
+
+def _framed(content: bytes) -> bytes:
+    return _FRAME.pack(len(content), zlib.crc32(content)) + content
+
+
+def _write(file: int, data: bytes | memoryview) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(file, view) :]

@@ -1,4 +1,0 @@
-"""The arrays that a fleet consists of, and the aircraft's parameters: what physics, sensors and firmware read.
-
-Imports zsim alone.
-"""

@@ -1,0 +1,516 @@
+"""A process's part in a run: join, done, health and bye; being superseded, and rejoining after a lost link.
+
+    participant = Participant(link, info, "console.1")
+    participant.announce()              join; the world admits it by an event on `world/event`
+    participant.tick()                  health once a second, and a new join after a lost link
+    participant.leave("closed")         bye
+
+Of several processes of one name the last that the world admits takes part. `AgentParticipant` is for a process that
+runs an agent: it also takes over the state of its predecessor and fetches what it has missed.
+"""
+
+import os
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from msgspec import UNSET, Struct
+
+from zsim.contract import keys, messages, run_messages, world_events
+from zsim.contract.fingerprint import join_of
+from zsim.contract.framing import Pairs
+from zsim.contract.snapshot import VERSION, pack, unpack
+from zsim.contract.world_events import ProcessEntry
+from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.health import HealthMeter
+from zsim.runtime.inbox import output_hold_ns
+from zsim.transport.connection import read_info
+from zsim.transport.session import RawSample, ReceivedSample, Session
+from zsim.transport.traffic import replay
+
+ANOTHER_RUN = "the world has begun another run"
+REPLAY_S = 2.0  # wall time; a hub answers a replay within milliseconds, over a lost link it never does
+REJOINS_MAX = 6  # unanswered rejoins before one counts as received; a router forwards nothing at first
+RETRY_S = 0.5  # wall time between two attempts at what the world has not answered
+ASKED_MAX = 10  # replays that may lack a lost message: the world also answers from what is still on its way to it
+RESUME_NS = 4_000_000_000  # simulated age up to which a snapshot can be used: the world keeps 5 s of history
+GATES_KEPT = 2  # gates of which the outputs are kept to answer a get (contract); more where the world runs ahead
+
+
+class Participant:
+    """One process in one run.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        name: process name, role.thing.
+        serves: names of processes whose work it does.
+        slack_ns: how far the world may be ahead of what it has reported as done; 0 for a process that never gates.
+        period_ns: how often an agent reports done; 0 for other processes.
+        calculates: whether its results depend on its arithmetic; otherwise its join states no fingerprint.
+
+    Attributes:
+        now_ns: simulated time of the newest clock received.
+        done_ns: newest gate that it is done with, -1 before the first.
+        health: counters that it publishes.
+        admitted: whether the world has admitted its newest incarnation.
+        must_rejoin: whether the world may have taken it for dead, or another process for it.
+        successor: host and pid of the process that has taken over the name; empty while it has the name.
+        end_reason: why it has nothing left to do in this run; empty while the run goes on.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        info: messages.Info,
+        name: str,
+        serves: tuple[str, ...] = (),
+        slack_ns: int = 0,
+        *,
+        period_ns: int = 0,
+        calculates: bool = True,
+    ) -> None:
+        self.name = name
+        self.now_ns = 0
+        self.done_ns = -1
+        self.health = HealthMeter(name.split(".", 1)[0], host=link.host, reads=link.reads)
+        self.admitted = self.must_rejoin = False
+        self.successor = self.end_reason = ""
+        self._link, self._info = link, info
+        self._slack_ns = slack_ns
+        self._join_of = partial(
+            join_of,
+            name,
+            link.host,
+            info.run_id,
+            period_ns=period_ns,
+            serves=tuple(each for each in serves if each != name),
+            calculates=calculates,
+            slack_ns=slack_ns,
+        )
+        self._process = link.host, os.getpid()
+        self._seq: dict[str, int] = {}
+        self.next_seq: Callable[[str], int] = self._count  # the number of the next message of a kind, from 0
+        self._incarnations: list[int] = []  # the newest last
+        self._renew_incarnation()
+        self._was_link_lost = self._has_left = False
+
+    def _count(self, kind: str) -> int:
+        self._seq[kind] = self._seq.get(kind, -1) + 1
+        return self._seq[kind]
+
+    def _renew_incarnation(self) -> None:
+        self.admitted = False
+        self._incarnation = secrets.randbits(62)
+        self._incarnations.append(self._incarnation)
+
+    @property
+    def gates(self) -> bool:
+        """Whether the world waits for it; it then announces itself once it has subscribed to all that it needs."""
+        return self._slack_ns > 0
+
+    @property
+    def superseded(self) -> bool:
+        """Whether another process has taken over the name."""
+        return bool(self.successor)
+
+    # What it publishes
+
+    def announce(self) -> None:
+        """Join the run, and follow the events and the link that decide whether to join again."""
+        self._link.declare_subscriber(keys.EVENT, self._on_event)
+        self._link.on_link(self._on_link)
+        self._link.declare_process(self.name)
+        self.join()
+
+    def join(self, again: bool = False) -> None:
+        """Publish join; `again` as a new incarnation."""
+        if again:
+            self._renew_incarnation()
+        self.publish("join", self._join_of(self._incarnation, self.next_seq("join"), self.now_ns))
+
+    def done(self, t_ns: int) -> None:
+        """Report, if the world waits for this process, that everything up to a gate is done."""
+        if self.gates:
+            self.publish("done", self._done(t_ns, 0))
+
+    def _done(self, t_ns: int, sent: int) -> run_messages.Done:
+        self.done_ns = max(self.done_ns, t_ns)
+        seq = self.next_seq("done")
+        return run_messages.Done(t_ns, seq, self._info.run_id, self._incarnation, t_ns, sent)
+
+    def leave(self, reason: str, failed: bool = False) -> None:
+        """Publish bye once, unless superseded; `failed` for a process that cannot go on."""
+        if self.superseded or self._has_left:
+            return
+        self._has_left = True
+        seq, of = self.next_seq("bye"), (self._info.run_id, self._incarnation)
+        self.publish("bye", run_messages.Bye(self.now_ns, seq, reason, failed or UNSET, *of))
+
+    def tick(self) -> None:
+        """Rejoin where that is needed, and publish health once a wall second; to be called more often."""
+        if self.must_rejoin:
+            self.must_rejoin = False
+            self.join(again=True)
+            if self.done_ns >= 0:  # the last done may have been lost, or was of the former incarnation
+                self.done(self.done_ns)
+        self.publish_health()
+
+    def publish_health(self) -> None:
+        """Publish health if the last is a wall second old."""
+        if self.health.due():
+            self.publish("health", self.health.message(self.now_ns, self.next_seq("health")))
+
+    def publish(self, kind: str, message: Struct) -> None:
+        """Publish a message on one of the process's own keys."""
+        self._link.put(keys.process(self.name, kind), message)
+
+    # What it is told
+
+    def update_clock(self, payload: bytes) -> run_messages.Clock | None:
+        """Follow the run by a message on `clock`; return it, None where it cannot be decoded."""
+        try:
+            clock: run_messages.Clock = messages.decode(keys.CLOCK, payload)
+        except DecodeError:
+            self.health.refused += 1
+            return None
+        self.now_ns = clock.t_ns
+        if clock.run_id != self._info.run_id:
+            self.end_reason = ANOTHER_RUN
+        elif clock.state == "stopped":
+            self.end_reason = run_messages.RUN_ENDED
+        return clock
+
+    def take_event(self, payload: bytes) -> None:
+        """Take a message on `world/event`."""
+        entry = self.entry_in(payload)
+        if entry is not None:
+            self.take_entry(entry)
+
+    def entry_in(self, payload: bytes) -> ProcessEntry | None:
+        """Return the entry of a process of this name that an event reports, None if it reports none."""
+        try:
+            event = world_events.read(payload)
+        except DecodeError:
+            return None  # not an event of the world
+        if event is None or event.subject != self.name or not isinstance(event.data, ProcessEntry):
+            return None
+        return event.data
+
+    def take_entry(self, entry: ProcessEntry) -> None:
+        """Take the news that the world has admitted a process of this name: this one, or one that replaces it.
+
+        What replaces an incarnation that is not admitted yet was admitted before it, and is itself replaced.
+        """
+        if self.is_own(entry):
+            self.admitted = True
+        elif not self.admitted or entry.incarnation in self._incarnations:
+            return
+        elif (entry.host, entry.pid) == self._process:
+            self.must_rejoin = True  # somebody else has joined under the identity of this process
+        else:
+            self.successor = f"{entry.host} (pid {entry.pid})"
+            self.end_reason = f"another process of this name joined from {self.successor}"
+
+    def is_own(self, entry: ProcessEntry) -> bool:
+        """Tell whether an entry is that of the newest incarnation of this process."""
+        return entry.incarnation == self._incarnation
+
+    def _on_event(self, sample: RawSample) -> None:
+        self.take_event(sample.payload)
+
+    def _on_link(self, up: bool) -> None:
+        self.must_rejoin = up and self._was_link_lost
+        self._was_link_lost = not up
+
+
+class AgentParticipant(Participant):
+    """The process of an agent in one run.
+
+    Whatever the world does not answer is asked for again, until it does (`settle`).
+
+    Args:
+        link: an open session.
+        info: of the run.
+        agent: whose name and sequence numbers it uses.
+        take_in: takes the messages that a replay brings.
+        say: called with lines for the user.
+        wall_s: monotonic wall time.
+        stopped: tells whether the process is to end.
+
+    Attributes:
+        published_ns: gate up to which the predecessor has published all outputs; they are not published again.
+        awaited: whether the world has still to admit this process.
+        failure: why it cannot take part any longer; None while it can.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        info: messages.Info,
+        agent: Agent,
+        take_in: Callable[[ReceivedSample], None],
+        say: Callable[[str], None],
+        wall_s: Callable[[], float] = time.monotonic,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        super().__init__(link, info, agent.name, agent.serves, period_ns=agent.period_ns)
+        self.next_seq = agent.next_seq
+        self._agent = agent
+        self._take_in = take_in
+        self._say = say
+        self._wall_s = wall_s
+        self._stopped = stopped
+        self._done_key = keys.process(agent.name, "done")
+        ahead = info.command_delay_ns // info.gate_ns
+        self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
+        self._unsent: Pairs = []
+        self._packs = True
+        self._resumed = False
+        self._unproved = 0  # rejoins left to publish until the world is seen to go on with this process …
+        self._proof_ns = 0  # … by coming to a gate beyond this one
+        self._missed_since_ns: int | None = None
+        self._asked_ns, self._asked = -1, 0
+        self._retry_s = 0.0
+        self.published_ns = -1
+        self.awaited = False
+        self.failure: RunError | None = None
+
+    # Taking over from a predecessor
+
+    def resume(self) -> int | None:
+        """Hand the agent the newest snapshot of its predecessor; return its time, None if none can be used.
+
+        The world's history must reach back to it: what came since is fetched and stepped through again.
+        """
+        for sample in self._last_values(keys.process(self.name, "snapshot")):
+            fresh = self._agent.checkpoint()
+            try:
+                snapshot: run_messages.Snapshot = messages.decode(sample.key, sample.payload)
+                self._restore(snapshot)
+            except Exception as error:  # anybody may have written it, and a user's class reads it
+                self._say(f"{self.name}: its former snapshot is of no use: {error or type(error).__name__}")
+                if fresh is not None:
+                    self._agent.resume(self._info, fresh)  # not half of the former state
+                continue
+            self._say(f"{self.name}: goes on from its snapshot of t = {snapshot.t_ns / 1e9:.2f} s")
+            self.done_ns = self.now_ns = snapshot.t_ns
+            self._resumed = True
+            return self.done_ns
+        return None
+
+    def _restore(self, snapshot: run_messages.Snapshot) -> None:
+        clocks = [messages.decode(sample.key, sample.payload) for sample in self._last_values(keys.CLOCK)]
+        age_ns = (clocks[0].t_ns if clocks else 0) - snapshot.t_ns
+        if not 0 <= age_ns <= RESUME_NS or snapshot.version != VERSION:
+            allowed = f"must be of version {VERSION}, and 0 to {RESUME_NS / 1e9:g} s old"
+            raise DecodeError(f"it is of version {snapshot.version}, and {age_ns / 1e9:.2f} s old; {allowed}")
+        self._agent.resume(self._info, unpack(snapshot.state))
+
+    def _last_values(self, key: str) -> list[ReceivedSample]:
+        """Return what the world has as the last value of a key, once there is a world that answers.
+
+        A world that has died is started again, and an agent that did not wait for it would lose its former state.
+        """
+        while not self._stopped():
+            found = self._link.get_surely(key)
+            if not found and self._link.get_surely(keys.INFO):  # there is a world, which may have come just now
+                found = self._link.get_surely(key)
+                if found is not None:
+                    return found
+            if found:
+                return found
+            time.sleep(RETRY_S)
+        return []
+
+    def warm_start(self) -> int | None:
+        """Hand the agent what its predecessor published last; return the time of it, None if there was none."""
+        for key in self._agent.warm_start_keys():
+            for sample in self._last_values(key):
+                try:
+                    message = messages.decode(key, sample.payload)
+                except DecodeError as error:
+                    self._say(f"{self.name}: cold start, the last value is of no use: {error}")
+                    continue
+                self._agent.warm_start(key, message)
+                self._agent.resume_seq(key, message.seq)
+                self.done_ns = self.now_ns = max(self.done_ns, message.t_ns)
+        if self.done_ns < 0:
+            return None
+        self._say(f"{self.name}: warm start from t = {self.done_ns / 1e9:.2f} s")
+        return self.done_ns
+
+    def check_reach(self, t_ns: int, snapshot_ns: int) -> None:
+        """Fail if the first gate that the world brings again is not the one after a snapshot."""
+        if t_ns > snapshot_ns + self._info.gate_ns:
+            what = f"the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are kept by nobody any more"
+            self.failure = BehindError(f"{self.name}: {what}; this one ends, start it again")
+
+    # Taking part
+
+    def enter(self) -> None:
+        """Join; the join is repeated, and no gate is stepped, until the world has admitted this process."""
+        self.awaited = True
+        self.join()
+        self._retry_s = self._wall_s() + RETRY_S
+
+    def publish_gate(self, t_ns: int, outputs: Sequence[Output]) -> None:
+        """Encode the outputs of a gate and the done that counts them, for `send`."""
+        self._kept.append((t_ns, outputs))
+        done = self._done(t_ns, _counted(outputs))
+        self.now_ns = self.done_ns
+        if t_ns <= self.published_ns:
+            return
+        self._unsent += [(key, messages.encode(message)) for key, message in outputs]
+        self._unsent.append((self._done_key, messages.encode(done)))
+
+    def publish_snapshot(self, t_ns: int) -> None:
+        """Encode the whole state of the agent after a gate, for `send`, if it offers one of plain values."""
+        state = self._agent.checkpoint()
+        if state is None or not self._packs:
+            return
+        try:
+            packed = pack(state)
+        except TypeError as error:
+            self._packs = False
+            self._say(f"{self.name}: {error}; no snapshots are published, and a death costs what it has come to know")
+            return
+        snapshot = run_messages.Snapshot(t_ns, self.next_seq("snapshot"), self.name, VERSION, packed)
+        self._unsent.append((keys.process(self.name, "snapshot"), messages.encode(snapshot)))
+
+    def send(self) -> None:
+        """Publish everything encoded since the last call in one go: many messages at once cost fewer wake-ups."""
+        if self._unsent:
+            unsent, self._unsent = self._unsent, []
+            self._link.put_all(unsent)
+
+    def outputs(self) -> list[list[object]]:
+        """Return [key, payload] of the outputs of the last gates, for a world that lost them with a link."""
+        return [[key, messages.encode(message)] for _, outputs in self._kept for key, message in outputs]
+
+    def take_entry(self, entry: ProcessEntry) -> None:
+        is_rejoining = self.must_rejoin
+        super().take_entry(entry)
+        if self.is_own(entry):
+            self._unproved = 0
+            if self.awaited:
+                self._begin(entry)
+        elif self.successor:
+            self.failure = SupersededError(
+                f"{self.name}: {self.end_reason}; this one ends. Give each process its own name."
+            )
+        elif self.must_rejoin and not is_rejoining:
+            self._say(f"{self.name}: somebody else has joined as this process; it joins again")
+            self.come_back()
+
+    def _begin(self, entry: ProcessEntry) -> None:
+        """Fetch what came since the state that was taken over, or since the predecessor."""
+        self.awaited = False
+        if self._resumed:
+            self.published_ns = entry.done_ns
+        elif self.done_ns >= 0:
+            self._link.put(self._done_key, self._done(self.done_ns, 0))
+        if self.done_ns >= 0:
+            self._catch_up(self.done_ns)
+        elif entry.former_pid is not None:
+            self._catch_up(max(entry.from_ns - 1, entry.done_ns))
+
+    # Catching up and coming back
+
+    @property
+    def owes(self) -> bool:
+        """Tell whether something was asked of the world that it has not answered yet."""
+        return self.must_rejoin or self._unproved > 0 or self.is_fetching
+
+    @property
+    def is_fetching(self) -> bool:
+        """Tell whether what came since a snapshot is still to be fetched."""
+        return self.awaited or self._missed_since_ns is not None
+
+    def ask_again(self, t_ns: int, missing: str) -> None:
+        """Fetch the rest of a gate of which messages did not come, as after a link that was cut."""
+        if t_ns != self._asked_ns:
+            self._asked_ns, self._asked, self._retry_s = t_ns, 0, 0.0
+            self._say(f"{self.name}: {missing} of t = {t_ns / 1e9:.2f} s did not come; asking for it again")
+        if self._asked >= ASKED_MAX:
+            what = f"{missing} of t = {t_ns / 1e9:.2f} s is kept by nobody any more"
+            self.failure = BehindError(f"{self.name}: {what}; this one ends, start it again")
+            return
+        self._missed_since_ns = t_ns - self._info.gate_ns
+        self.settle()
+
+    def come_back(self) -> None:
+        """Take part again as a new incarnation, now that the link is back."""
+        self._renew_incarnation()
+        self.must_rejoin = True
+        self._retry_s = 0.0
+        self.settle()
+
+    def _catch_up(self, since_ns: int) -> None:
+        self._missed_since_ns = since_ns
+        self._retry_s = 0.0
+        self.settle()
+
+    def settle(self) -> None:
+        """Ask again for what the world has not answered, unless it was asked a moment ago."""
+        if not self.owes or self._wall_s() < self._retry_s:
+            return
+        if self.must_rejoin:
+            self._rejoin()
+        elif self.awaited:
+            self.join()
+        elif self._unproved:
+            self._unproved -= 1
+            if self.done_ns > self._proof_ns:
+                self._unproved = 0
+            else:
+                self._publish_again()
+        if self._missed_since_ns is not None and not self.must_rejoin:
+            self._fetch(self._missed_since_ns)
+        self._retry_s = self._wall_s() + RETRY_S
+
+    def _rejoin(self) -> None:
+        """Join the run again, once a world answers that it is still the same one."""
+        info = read_info(self._link)
+        if info is None:
+            return
+        self.must_rejoin = False
+        if info.run_id != self._info.run_id:
+            self.failure = RunError(f"{self.name}: {ANOTHER_RUN}")
+            return
+        self._unproved, self._proof_ns = REJOINS_MAX, self.done_ns + GATES_KEPT * self._info.command_delay_ns
+        self._publish_again()
+
+    def _publish_again(self) -> None:
+        """Join, and repeat the outputs and dones that may have been lost."""
+        self.join()
+        for t_ns, outputs in self._kept:
+            for key, message in outputs:
+                self._link.put(key, message)
+            self._link.put(self._done_key, self._done(t_ns, _counted(outputs)))
+        self._missed_since_ns = self.done_ns
+
+    def ask_faults(self) -> None:
+        """Ask which faults are injected."""
+        for sample in self._link.get(keys.FAULTS):
+            self._take_in(sample)
+
+    def _fetch(self, since_ns: int) -> None:
+        self.ask_faults()
+        try:
+            wanted = (*self._agent.reads, *self._agent.repeats, keys.FAULTS)
+            held_ns = output_hold_ns(self._info) if self._agent.overhears else 0
+            for key, payload in replay(self._link, self.name, max(-1, since_ns - held_ns), wanted, REPLAY_S):
+                self._take_in(ReceivedSample(key, payload))
+        except NoWorldError:
+            return
+        self._missed_since_ns = None
+        self._asked += 1
+
+
+def _counted(outputs: Sequence[Output]) -> int:
+    """Return how many outputs the world counts."""
+    return sum(messages.is_output(key) for key, _ in outputs)

@@ -1,0 +1,53 @@
+"""One rate limiter for everything that repeats: requests, refusals, joins, lines on a terminal.
+
+Its clock is a parameter: simulated time where a rerun or a resumed world must allow the same, wall time elsewhere.
+"""
+
+import time
+from collections.abc import Callable
+
+SUBJECTS_MAX = 10_000  # remembered; whoever makes up names has no more than these cost
+
+
+class RateLimit:
+    """Allows each subject `burst` at once, and then one more each `period`: a token bucket.
+
+    Args:
+        period: in which one more is allowed, in the clock's unit.
+        burst: allowed at once.
+        now: the clock; by default monotonic wall time [s].
+    """
+
+    def __init__(self, period: float, burst: float = 1, now: Callable[[], float] = time.monotonic) -> None:
+        self.period = period
+        self._burst = burst
+        self._now = now
+        self._spent: dict[str, tuple[float, float]] = {}  # what counted, and when
+
+    def knows(self, subject: str) -> bool:
+        """Tell whether a subject has spent anything."""
+        return subject in self._spent
+
+    def allows(self, subject: str = "") -> bool:
+        """Tell whether a subject may spend one more."""
+        return self._counted(subject) <= self._burst - 1
+
+    def spend(self, subject: str = "") -> bool:
+        """Spend one; return False where none was left."""
+        now = self._now()  # not by `_counted`: some call this at each gate
+        spent, at = self._spent.get(subject, (0.0, 0))
+        counted = max(0.0, spent - (now - at) / self.period)
+        if counted > self._burst - 1:
+            return False
+        if len(self._spent) > SUBJECTS_MAX:
+            self._spent.clear()
+        self._spent[subject] = counted + 1, now
+        return True
+
+    def wait(self, subject: str = "") -> float:
+        """Return how long a subject has to wait until it may spend one more; 0 if it may now."""
+        return max(0.0, self._counted(subject) - (self._burst - 1)) * self.period
+
+    def _counted(self, subject: str) -> float:
+        spent, at = self._spent.get(subject, (0.0, 0))
+        return max(0.0, spent - (self._now() - at) / self.period)
