@@ -1,4 +1,4 @@
-"""What judges records and flies many runs in one process: report, sweep, export, rerun. Imports zsim, world, agents.
+"""Judging of records, and many runs in one process: report, sweep, export, rerun. Imports zsim, world and agents.
 
-`reading` has a record as arrays and messages; `in_process` and `rerun_bus` fly; the others show and write.
+`reading` has a record as arrays and messages, and the verdict on its flight; `in_process` flies.
 """

@@ -1,11 +1,9 @@
-"""A flight in this process: world, agents and what observes them on an in-memory bus, without Zenoh."""
+"""A flight in this process: world, agents and observers on an in-memory bus, without Zenoh."""
 
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
-
-from msgspec import Struct
 
 from zsim.contract import flight_messages, keys, run_messages
 from zsim.contract.framing import GateMessages
@@ -22,6 +20,43 @@ from zsim_agents.hosting import hosted
 from zsim_world.run.world import World
 
 
+def fly(
+    scenario: Scenario,
+    record: Path | None,
+    stop_reason: Callable[[], str | None] = lambda: None,
+    screen: Screen | None = None,
+    run_id: str | None = None,
+    changed: Sequence[str] | None = None,
+) -> str:
+    """Fly a scenario and record it; return why it ended.
+
+    Args:
+        scenario: resolved.
+        record: path of the record, None for no record.
+        stop_reason: called at every gate; a text ends the run.
+        screen: shows progress.
+        run_id: set only by tests that compare records.
+        changed: as of `World`.
+
+    Raises:
+        RunError: a failure has ended the run, of a user's class, or because the state of a drone was no longer finite;
+            the record is complete to its end.
+    """
+    progress = _Progress(scenario, screen) if screen else None
+    writer = None
+    try:
+        flight = InProcessFlight(scenario, run_id, changed)
+        writer = RecordWriter(record) if record else None  # after it: a refused scenario leaves no record in the way
+        flight.run([each for each in (writer, progress) if each], stop_reason)
+    finally:
+        for each in (progress, writer):
+            if each:
+                each.close()
+    if flight.world.failure:
+        raise flight.world.failure
+    return flight.world.ended or "ended"
+
+
 class FlightObserver(Protocol):
     """Receives messages of a flight, as a record writer does."""
 
@@ -32,13 +67,6 @@ class FlightObserver(Protocol):
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Receive the world's messages of a gate."""
         ...
-
-
-def agents(world: World) -> list[Agent]:
-    """Return the agents that a scenario expects as one, built from `world/info` as any process would."""
-    known = agent_names(world.scenario)
-    names = [name for name in world.scenario.expected() if name in known]
-    return [hosted(world.info(), world.scenario, names)] if names else []
 
 
 class InProcessFlight:
@@ -62,7 +90,7 @@ class InProcessFlight:
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)
         for name in set(scenario.expected()) - set(agent_names(scenario)):
             if lets_drop(scenario.processes.on_overdue or {}, name):
-                self.world.expired(name)  # nobody else can come here
+                self.world.expired(name)  # no other process can join
         self._agents = agents(self.world)
 
     def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:
@@ -72,7 +100,6 @@ class InProcessFlight:
             observers: receive every message.
             stop_reason: called at every gate; a text ends the run.
         """
-
         takes_message = [observer.add_message for observer in observers]
         takes_gate = [observer.add_gate for observer in observers]
 
@@ -96,45 +123,15 @@ class InProcessFlight:
                         self.world.clock.stop(reason)
                 bus.end()
         except UserCodeError:
-            if self.world.failure:  # else the scenario lets the run go on without who has failed
+            if self.world.failure:  # otherwise the run goes on without the failed agent, as the scenario says
                 raise
 
 
-def fly(
-    scenario: Scenario,
-    record: Path | None,
-    stop_reason: Callable[[], str | None] = lambda: None,
-    screen: Screen | None = None,
-    run_id: str | None = None,
-    changed: Sequence[str] | None = None,
-) -> str:
-    """Fly a scenario and record it; return why it ended.
-
-    Args:
-        scenario: resolved.
-        record: path of the record, None for no record.
-        stop_reason: called at every gate; a text ends the run.
-        screen: shows progress.
-        run_id: set only by tests that compare records.
-        changed: as of `World`.
-
-    Raises:
-        RunError: a failure has ended the run, of a user's class, or since the state of a drone was no longer finite;
-            the record is complete to its end.
-    """
-    progress = _Progress(scenario, screen) if screen else None
-    writer = None
-    try:
-        flight = InProcessFlight(scenario, run_id, changed)
-        writer = RecordWriter(record) if record else None  # after it: a refused scenario leaves no record in the way
-        flight.run([each for each in (writer, progress) if each], stop_reason)
-    finally:
-        for each in (progress, writer):
-            if each:
-                each.close()
-    if flight.world.failure:
-        raise flight.world.failure
-    return flight.world.ended or "ended"
+def agents(world: World) -> list[Agent]:
+    """Return the agents expected by a scenario as one, built from `world/info` as by any process."""
+    known = agent_names(world.scenario)
+    names = [name for name in world.scenario.expected() if name in known]
+    return [hosted(world.info(), world.scenario, names)] if names else []
 
 
 class _Progress:
@@ -157,11 +154,9 @@ class _Progress:
         """Show nothing: it holds truth, status and sensors only."""
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Show a message of a key that is watched."""
-        if key in self._watched:
-            self._show(key, message)
-
-    def _show(self, key: str, message: Struct) -> None:
+        """Show a message of a watched key."""
+        if key not in self._watched:
+            return
         if isinstance(message, flight_messages.ClusterState):
             self._phase = message.phase
             if line := self._reasons.line(keys.thing(key), message):

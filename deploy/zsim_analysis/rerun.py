@@ -1,31 +1,51 @@
 """`zsim rerun`: the run of a record flown again from its own inputs, and compared with the truth on record.
 
-First its world and its agents, with the inputs of others (operators, users' programs) from the record. Where truth
-differs, or the agents cannot be run again, the world alone, with all commands from the record: if that gives the
-recorded truth, the difference came from the agents.
+First its world and its agents are flown, with the inputs of others (operators, users' programs) from the record. If
+truth differs, or the agents cannot be run again, then the world alone, with all commands from the record: if that
+reproduces the recorded truth, the difference came from the agents.
 """
 
+import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from zsim import __version__
-from zsim.contract import messages
+from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.camera_messages import Sightings
 from zsim.contract.fingerprint import fingerprint
-from zsim.errors import RecordError, RunError
-from zsim.record import RecordReader
+from zsim.contract.framing import GateMessages
+from zsim.contract.run_messages import ControlRequest
+from zsim.errors import RecordError, RunError, RunFailedError
+from zsim.record import Recorded, RecordReader
+from zsim.runtime.agent import Agent, AgentGroup, Output
+from zsim.runtime.bus import Bus
+from zsim.runtime.inbox import NEVER_NS, Inbox, output_hold_ns
 from zsim.runtime.progress import PERIOD_S, Screen
 from zsim.runtime.rate_limit import RateLimit
 from zsim.scenario.fault_check import listed
+from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
-from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, RecordedRun, gates, open_run, recorded_agents
-from zsim_analysis.rerun_bus import RerunBus, TruthComparison
+from zsim.schema.message import Message
+from zsim_agents.hosting import hosted
+from zsim_analysis.reading.recorded_run import (
+    GateInputs,
+    RecordedAgents,
+    RecordedRun,
+    decode_or_none,
+    gates,
+    open_run,
+    recorded_agents,
+)
+from zsim_world.run.coordinator import FLIGHT_REQUESTS
 from zsim_world.run.world import World
 
 Say = Callable[[str], None]
 RecordState = Literal["whole", "cut", "damaged"]
+COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # of truth_sha256
+JOINED = ("join", "restart", "superseded")  # events of admitted joins
 
 
 class RerunResult(NamedTuple):
@@ -33,14 +53,14 @@ class RerunResult(NamedTuple):
 
     Attributes:
         compared: with the truth on record.
-        sha256: of what was result.
+        sha256: of the truth.
         until: why the comparison ended before the record, empty if it did not.
         refused: requests that were carried out on record and are refused now.
         first_output: the first output of an agent that differs, empty if none does.
         failure: of a user's code, empty if none failed.
     """
 
-    compared: TruthComparison
+    compared: "TruthComparison"
     sha256: str
     until: str
     refused: list[str]
@@ -49,7 +69,7 @@ class RerunResult(NamedTuple):
 
 
 def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
-    """Fly the run of a record again; return why truth is not the same, empty if it is, to the bit.
+    """Fly the run of a record again; return how truth differs from the record, empty if it is the same to the bit.
 
     Args:
         place: folder of the run, or its record.
@@ -70,39 +90,27 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
             reason = f"has drones whose bodies are external ({listed(external)}); they cannot be flown again"
             raise RunError(f"{place}: {reason}")
         agents = recorded_agents(record.reader, record.info, record.scenario)
+        nobody = agents._replace(processes=(), requests=(), failure="")
         _warn(record.info, agents, note)
         if commands_only or agents.why_not:
             why = "as asked" if commands_only else agents.why_not
             say(f"agents are not run again: {why}; the world alone, with all recorded commands")
-            return _judge(agents.truth_sha256, _fly(record, _without_agents(agents)), _state(record.reader), say)
+            return _judge(agents.truth_sha256, _fly(record, nobody), _state(record.reader), say)
         say(f"run again: world, {', '.join(map(str, agents.processes))}")
         again = _fly(record, agents)
         fault = _judge(agents.truth_sha256, again, _state(record.reader), say)
         if not fault and (agents.failure or again.failure):
             fault = _judge_failure(agents.failure, again.failure, say)
         if again.compared.first is not None:
-            _find_cause(again.first_output, _fly(record, _without_agents(agents)), say)
+            _find_cause(again.first_output, _fly(record, nobody), say)
         return fault
-
-
-def _judge_failure(recorded: str, failure: str, say: Say) -> str:
-    """Print whether a user's code that ended the run has failed again; return why it has not, empty if it has."""
-    if failure == recorded:
-        say(f"ended as on record: {failure}")
-        return ""
-    say(f"on record {recorded or 'no class of a user failed'}")
-    return f"flown again, {failure or 'it does not fail'}"
-
-
-def _without_agents(agents: RecordedAgents) -> RecordedAgents:
-    return agents._replace(processes=(), requests=(), failure="")
 
 
 def _warn(info: messages.Info, agents: RecordedAgents, note: Say) -> None:
     here = fingerprint()
-    if {info.fingerprint, *agents.fingerprints} != {here}:
-        others = ", ".join(sorted({info.fingerprint, *agents.fingerprints} - {here}))
-        note(f"recorded with another numeric fingerprint ({others}; here {here}): the same bits are not promised")
+    if others := {info.fingerprint, *agents.fingerprints} - {here}:
+        of = f"{', '.join(sorted(others))}; here {here}"
+        note(f"recorded with another numeric fingerprint ({of}): the same bits are not promised")
     if info.version != __version__:
         note(f"recorded by zsim {info.version}, flown again by {__version__}: the same bits are not promised")
 
@@ -114,19 +122,20 @@ def _fly(record: RecordedRun, agents: RecordedAgents) -> RerunResult:
     bus = RerunBus(world, agents, info, scenario)
     compared = TruthComparison(world.names)
     bus.join()
-    until = ""
-    with _progress(scenario.duration_s, "world and agents" if agents.processes else "world alone") as show:
-        due_ns = 0
+    until, due_ns, throttle, start_s = "", 0, RateLimit(PERIOD_S), time.monotonic()
+    line = {"state": "world and agents" if agents.processes else "world alone", "phase": "", "waiting_for": []}
+    with Screen(scenario.duration_s) as screen:
         for gate in gates(reader, world.names):
-            until = _fault(gate, due_ns, world.names)
-            if until:
+            if until := _fault(gate, due_ns, world.names):
                 break
             bus.fly_to(gate)
             compared.add(gate.t_ns, gate.truth, bus.truth)
             due_ns += world.clock.gate_ns
-            show(gate.t_ns)
+            if throttle.spend():
+                rate = gate.t_ns / 1e9 / max(1e-9, time.monotonic() - start_s)
+                screen.clock({"t_s": gate.t_ns / 1e9, "rate": rate, **line})
     if agents.failure and not bus.failure:
-        bus.answer_last()
+        bus.answer_all()
     if not compared.instants:
         raise RecordError(f"{reader.path}: {until or 'holds no truth'}; a run is flown again from its start")
     return RerunResult(compared, world.result()["truth_sha256"], until, bus.refused, bus.outputs.first, bus.failure)
@@ -140,20 +149,6 @@ def _fault(gate: GateInputs, due_ns: int, names: list[str]) -> str:
     return f"the record has no truth of {missing[0]} at {due_ns / 1e9:.2f} s" if missing else ""
 
 
-@contextmanager
-def _progress(duration_s: float, what: str) -> Iterator[Callable[[int], None]]:
-    """Yield a function that shows progress at an instant."""
-    throttle, start_s = RateLimit(PERIOD_S), time.monotonic()
-    with Screen(duration_s) as screen:
-
-        def show(t_ns: int) -> None:
-            if throttle.spend():
-                rate = t_ns / 1e9 / max(1e-9, time.monotonic() - start_s)
-                screen.clock({"t_s": t_ns / 1e9, "rate": rate, "state": what, "phase": "", "waiting_for": []})
-
-        yield show
-
-
 def _state(reader: RecordReader) -> RecordState:
     """Return the state of a record, as far as it was read."""
     if reader.damaged:
@@ -162,42 +157,308 @@ def _state(reader: RecordReader) -> RecordState:
 
 
 def _judge(recorded: str | None, result: RerunResult, state: RecordState, say: Say) -> str:
-    """Print how truth compares; return why it is not the same, empty if it is at all instants of a sound record."""
-    compared = result.compared
+    """Print how truth compares; return how it differs, empty if it is the same at all instants of a sound record."""
+    compared, until = result.compared, result.until
     for refusal in result.refused:
         say(f"was done on record, and is refused now: {refusal}")
-    if compared.first is None:
-        return _judge_same(recorded, result, state, say)
-    say(f"truth differs: first {compared.first}")
-    say(f"               last  {compared.last}; {compared.instants} instants compared")
-    if state == "damaged":
-        say("the record is damaged: what it lacks may be the difference")
-    return f"truth differs, first {compared.first}"
-
-
-def _judge_same(recorded: str | None, result: RerunResult, state: RecordState, say: Say) -> str:
-    """Print how far truth was compared, no instant of which differs; return why not to the end, empty if it was."""
-    if recorded == result.sha256 and not result.until:
+    if compared.first is not None:
+        say(f"truth differs: first {compared.first}")
+        say(f"               last  {compared.last}; {compared.instants} instants compared")
+        if state == "damaged":
+            say("the record is damaged: what it lacks may be the difference")
+        return f"truth differs, first {compared.first}"
+    if recorded == result.sha256 and not until:
         say(f"truth_sha256 is the same: {result.sha256}")
         return ""
-    reason = _end_of(recorded, result.until, state)
-    say(f"{reason}; truth is the same at all {result.compared.instants} instants before, to the bit")
-    return "" if recorded is None and not result.until and state != "damaged" else reason
-
-
-def _end_of(recorded: str | None, until: str, state: RecordState) -> str:
-    """Return why truth was compared no further."""
     condition = {"damaged": "is damaged", "cut": "was cut", "whole": "does not hold the whole run"}[state]
-    if until:
-        return f"{until}, for it {condition}"
-    return f"the record {condition} and " + (f"{recorded} cannot be shown" if recorded else "has no truth_sha256")
+    lacks = f"{recorded} cannot be shown" if recorded else "has no truth_sha256"
+    reason = f"{until}, for it {condition}" if until else f"the record {condition} and {lacks}"
+    say(f"{reason}; truth is the same at all {compared.instants} instants before, to the bit")
+    return "" if recorded is None and not until and state != "damaged" else reason
+
+
+def _judge_failure(recorded: str, failure: str, say: Say) -> str:
+    """Print whether a user's code that ended the run has failed again; return why it has not, empty if it has."""
+    if failure == recorded:
+        say(f"ended as on record: {failure}")
+        return ""
+    say(f"on record {recorded or 'no class of a user failed'}")
+    return f"flown again, {failure or 'it does not fail'}"
 
 
 def _find_cause(first_output: str, alone: RerunResult, say: Say) -> None:
-    """Print whether the world or the agents made the difference."""
-    if alone.compared.first is None:
-        say("the world alone, with all recorded commands, gives the recorded truth: the agents answer differently")
-        if first_output:
-            say(f"the first answer that differs is {first_output}")
-    else:
+    """Print whether the difference came from the world or from the agents."""
+    if alone.compared.first is not None:
         say(f"the world alone, with all recorded commands, differs too: first {alone.compared.first}")
+        return
+    say("the world alone, with all recorded commands, gives the recorded truth: the agents answer differently")
+    if first_output:
+        say(f"the first answer that differs is {first_output}")
+
+
+# Comparison
+
+
+class Difference(NamedTuple):
+    """The difference of two flights: when, of which drone, and how large [m, m/s, rad, rad/s]."""
+
+    t_ns: int
+    drone: str
+    position_m: float
+    velocity_m_s: float
+    angle_rad: float
+    rate_rad_s: float
+
+    def __str__(self) -> str:
+        angle_deg, rate_deg_s = math.degrees(self.angle_rad), math.degrees(self.rate_rad_s)
+        by = f"{self.position_m:.3g} m, {self.velocity_m_s:.3g} m/s, {angle_deg:.3g} deg, {rate_deg_s:.3g} deg/s"
+        return f"{self.drone} at {self.t_ns / 1e9:.3f} s by {by}"
+
+
+def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Difference | None:
+    """Return the difference of two true states; None if the COUNTED fields are the same to the bit.
+
+    Raises:
+        DecodeError: one of them is no truth.
+    """
+    key = keys.truth(drone)
+    a, b = messages.decode(key, recorded), messages.decode(key, flown)
+    if all(getattr(a, part) == getattr(b, part) for part in COUNTED):
+        return None
+    cosine = abs(sum(p * q for p, q in zip(a.orientation_wxyz, b.orientation_wxyz, strict=True)))
+    return Difference(
+        t_ns,
+        drone,
+        math.dist(a.position_m, b.position_m),
+        math.dist(a.velocity_m_s, b.velocity_m_s),
+        2 * math.acos(min(1.0, cosine)),
+        math.dist(a.angular_velocity_rad_s, b.angular_velocity_rad_s),
+    )
+
+
+class TruthComparison:
+    """Compares the truth of two flights gate by gate.
+
+    Attributes:
+        instants: compared so far.
+        first, last: the first and the last difference.
+    """
+
+    def __init__(self, drones: Sequence[str]) -> None:
+        self._drones = tuple(drones)
+        self.instants = 0
+        self.first: Difference | None = None
+        self.last: Difference | None = None
+
+    def add(self, t_ns: int, recorded: Mapping[str, bytes], flown: Mapping[str, bytes]) -> None:
+        """Compare the truth of a gate of both, by drone."""
+        self.instants += 1
+        for drone in self._drones:
+            if recorded[drone] != flown[drone] and (
+                differing := difference(t_ns, drone, recorded[drone], flown[drone])
+            ):
+                self.first = self.first or differing
+                self.last = differing
+
+
+class OutputComparison:
+    """Compares the outputs of agents with those on record; either may come first, within `match_within_ns`."""
+
+    def __init__(self, match_within_ns: int) -> None:
+        self._match_within_ns = match_within_ns
+        self._unmatched: dict[tuple[str, int, int], Message] = {}
+        self._first: tuple[int, str] | None = None
+
+    @property
+    def first(self) -> str:
+        """Return the first output that differs, or that only one of the two has, and when; empty if there is none."""
+        return f"{self._first[1]} at {self._first[0] / 1e9:.2f} s" if self._first else ""
+
+    def add(self, key: str, output: Any) -> None:
+        """Add an output of either."""
+        identity = (key, output.seq, output.t_ns)
+        other = self._unmatched.pop(identity, None)
+        if other is None:
+            self._unmatched[identity] = output
+        elif other != output:
+            self._note(output.t_ns, key)
+
+    def expire(self, t_ns: int) -> None:
+        """Count outputs as different whose counterpart has not come in time before t_ns."""
+        for identity in [identity for identity in self._unmatched if identity[2] < t_ns - self._match_within_ns]:
+            del self._unmatched[identity]
+            self._note(identity[2], identity[0])
+
+    def _note(self, t_ns: int, key: str) -> None:
+        self._first = min((t_ns, key), self._first or (t_ns, key))
+
+
+# Flight
+
+_Joined = tuple[str, int]  # name and incarnation
+Requests = dict[int, list[tuple[str, ControlRequest]]]  # control key and request, by the first gate that they affect
+
+
+class AgentsWithRequests(AgentGroup):
+    """Agents of one process that receive the recorded requests again."""
+
+    def __init__(self, agents: Agent, requests: Requests, hold_ns: int) -> None:
+        super().__init__([agents], hold_ns)
+        self._requests = requests
+
+    def step(self, t_ns: int) -> list[Output]:
+        for key, request in self._requests.pop(t_ns, ()):
+            if key in self.control_keys():
+                self.control(key, request)
+        return super().step(t_ns)
+
+
+class RerunBus(Bus):
+    """Flies a run again in a new world, with the given agents; without any, all commands come from the record.
+
+    Attributes:
+        truth: payloads at the newest gate, by drone.
+        refused: requests that were carried out on record and are refused now, as text.
+        outputs: of the agents, compared with those on record.
+    """
+
+    def __init__(self, world: World, agents: RecordedAgents, info: messages.Info, scenario: Scenario) -> None:
+        requests: defaultdict[int, list[tuple[str, ControlRequest]]] = defaultdict(list)
+        for key, request in agents.requests:
+            control = ControlRequest(request.op, request.args, request.source)
+            requests[request.t_ns].append((keys.cluster_control(keys.thing(key)), control))
+        hold_ns = output_hold_ns(info)
+        groups = [
+            AgentsWithRequests(hosted(info, scenario, process.members), dict(requests), hold_ns)
+            for process in agents.processes
+        ]
+        super().__init__(world, groups, lambda: 0, self._compare_output, self._keep_truth)
+        self._world = world
+        self._rerun = agents.names
+        self.truth: dict[str, bytes] = {}
+        self.refused: list[str] = []
+        self._admitted: set[_Joined] | None = None  # in this gate; None before the start, when it does not matter
+        self._withheld: dict[_Joined, run_messages.Join] = {}
+        self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)
+
+    def fly_to(self, gate: GateInputs) -> None:
+        """Receive the inputs of a gate, let the agents answer, and advance to that gate.
+
+        Raises:
+            RunError: an agent does not answer, since what it waits for is not on record.
+            RunFailedError: or since a user's code fails, which it did not at this gate on record.
+        """
+        self._admitted = _admitted(gate.inputs) if gate.t_ns else None
+        for recorded in gate.inputs:
+            self._feed(recorded)
+        self.answer_all()
+        waiting = [p.name for p in self._world.blocking() if p.name in self._rerun]
+        if waiting and self.failure:
+            raise RunFailedError(f"flown again, {self.failure}")
+        if waiting and self._world.clock.state != "waiting":
+            at = f"before {gate.t_ns / 1e9:.2f} s"
+            raise RunError(
+                f"{', '.join(waiting)} cannot answer {at}: what it waits for is not on record; --commands-only"
+            )
+        self.outputs.expire(gate.t_ns)
+        self._world.advance(0)
+        self._spread()
+        if self._world.now_ns != gate.t_ns:
+            reason = self._world.ended or "the gates are not those of the record"
+            raise RunError(f"flown again, the run ends at {self._world.now_ns / 1e9:.2f} s: {reason}")
+
+    @property
+    def failure(self) -> str:
+        """Return the first failure of a user's code, empty if there was none."""
+        return next((str(failure) for failure in self._failures.values()), "")
+
+    def answer_all(self) -> None:
+        """Let the agents answer all that they have received."""
+        while self._round():
+            pass
+
+    def _leave_failed(self, agent: Agent, inbox: Inbox) -> None:
+        """Stop feeding an agent that failed; the world continues as far as it did on record."""
+        inbox.start_after(NEVER_NS)
+
+    def _compare_output(self, key: str, message: Any) -> None:
+        if isinstance(message, (*messages.RELAYED, flight_messages.Command)):
+            self.outputs.add(key, message)
+
+    def _keep_truth(self, gate: GateMessages) -> None:
+        self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
+
+    def _update_faults(self, faults: run_messages.Faults) -> None:
+        if self._rerun:  # alone, the world receives the commands that resulted from them
+            super()._update_faults(faults)
+
+    def _feed(self, recorded: Recorded) -> None:
+        """Repeat what another process published; that of agents that are run again is compared."""
+        key, message = recorded.key, decode_or_none(recorded)
+        if message is None:  # the world refused it too
+            return
+        if key == keys.EVENT:
+            self._feed_event(message)
+        elif isinstance(message, messages.RELAYED):  # estimates, and outputs about clusters
+            role = "estimator" if isinstance(message, flight_messages.Estimate) else "controller"
+            is_request = isinstance(message, run_messages.ClusterRequest)
+            source = (message.controller if is_request else message.source) or f"{role}.{keys.thing(key)}"
+            if source in self._rerun:
+                self.outputs.add(key, message)
+            else:
+                self._hand_over(key, message, source)
+        elif isinstance(message, Sightings):  # no detector is run again: it would need the pictures
+            self._hand_over(key, message, message.source)
+        elif isinstance(message, flight_messages.Command):
+            if message.source in self._rerun:
+                self.outputs.add(key, message)
+            else:
+                self._world.handle(key, message, 0)
+        elif keys.thing(key) not in self._rerun:
+            self._feed_process(key, message)
+
+    def _feed_process(self, key: str, message: Any) -> None:
+        """Repeat a join, done or bye; a join only when it was admitted, as its event says."""
+        joined = (keys.thing(key), message.incarnation) if isinstance(message, run_messages.Join) else None
+        if joined is None or self._admitted is None or joined in self._admitted:
+            self._world.handle(key, message, 0)
+        else:
+            self._withheld[joined] = message
+
+    def _hand_over(self, key: str, message: Any, source: str) -> None:
+        """Pass what another process published to the agents that read it."""
+        for inbox in self._route(key).inboxes:
+            inbox.put(key, message)
+        self._world.count_output(source)
+
+    def _feed_event(self, event: run_messages.Event) -> None:
+        """Repeat what reached the world other than as a message: deaths, requests, and joins that were withheld."""
+        if event.kind in JOINED and event.source not in self._rerun:
+            joined = _joined(event)
+            if (join := self._withheld.pop(joined, None)) is not None:
+                self._world.handle(keys.process(joined[0], "join"), join, 0)
+        left = event.kind == "leave" and self._world.barrier.has_farewell(event.subject)
+        if (event.kind == "death" or left) and event.subject not in self._rerun:
+            self._world.died(event.subject, 0)
+        elif event.kind == "overdue" and event.subject not in self._rerun:
+            self._world.expired(event.subject)
+        elif event.kind == "control" and event.subject in FLIGHT_REQUESTS and event.data.get("ok"):
+            args = event.data.get("args")
+            request = ControlRequest(event.subject, args if isinstance(args, dict) else {}, event.source)
+            answer = self._world.control(request)
+            if not answer.ok:
+                self.refused.append(f"{event.subject} at {event.t_ns / 1e9:.2f} s: {answer.error}")
+
+
+def _joined(event: run_messages.Event) -> _Joined:
+    """Return name and incarnation of the process that an event says has joined."""
+    return event.subject, event.data.get("incarnation", -1)
+
+
+def _admitted(inputs: Sequence[Recorded]) -> set[_Joined]:
+    """Return the processes that were admitted before a gate and whose joins were published in that gate, too.
+
+    Their joins are repeated in place. A join that was withheld for longer has its event in a later gate.
+    """
+    events = (decode_or_none(recorded) for recorded in inputs if recorded.key == keys.EVENT)
+    return {_joined(event) for event in events if event is not None and event.kind in JOINED}

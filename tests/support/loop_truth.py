@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from zsim.contract import keys
 from zsim.record.record_reader import RecordReader
-from zsim_analysis.reading.flight import read_flight
 from zsim_analysis.reading.formation import Formation, formation
-from zsim_analysis.reading.recorded_flight import RecordedFlight, Track
+from zsim_analysis.reading.recorded_flight import RecordedFlight, Track, read_flight
 
 
 def offset_ns(record: Path, drone: str, rate: float) -> float:

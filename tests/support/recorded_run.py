@@ -70,3 +70,9 @@ def _some(info: inspect.Type) -> Any:
         return _some(info.types[0])
     simple = {inspect.BoolType: True, inspect.StrType: "text", inspect.IntType: 7, inspect.FloatType: 1.5}
     return {**simple, inspect.BytesType: jpeg()}.get(type(info), 7)
+
+
+def messages_on(run: Path, key: str) -> list[Any]:
+    """Return the messages of a key on the record of a run."""
+    with RecordReader(run / "run.mcap") as reader:
+        return [messages.decode(key, message.payload) for message in reader.messages({key})]

@@ -1,6 +1,9 @@
 """Rows of sweeps that were never flown, their errors being a function of the run."""
 
+import io
 from typing import Any
+
+from rich.console import Console
 
 from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
@@ -26,3 +29,10 @@ def made(of: SweepPlan, run: int, failure: str | None = None, **known: Any) -> R
 def well(of: SweepPlan, run: int) -> Row:
     more = {"ended": "over", "sim_s": 5.0, "wall_s": 0.5, "real_time_factor": 10.0}
     return made(of, run, truth_sha256=f"{run:064x}", min_separation_m=2 + 0.1 * (run % 7), collisions=0, **more)
+
+
+def printed(renderable: Any, width: int) -> str:
+    """Return what a terminal of so many columns shows."""
+    file = io.StringIO()
+    Console(file=file, width=width).print(renderable)
+    return file.getvalue()

@@ -1,7 +1,7 @@
 """Writes records of flights that never were, with errors known in closed form."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,12 @@ from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
 from zsim_agents.formation.spaces.scenario_space import cluster_space
+from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
 
 GATE_NS = 20_000_000
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
-Curve = Callable[[float, float], np.ndarray]
-"""A cluster variable vector (4n,) at t_s, given the phase 2*pi*f*t of the errors."""
+Entries = Iterable[tuple[str, Any, int]]
+"""Key, message and wall time of all that a run puts on the wire."""
 
 
 @dataclass
@@ -48,9 +49,22 @@ class Flown:
 
 def write(path: Path, flown: Flown) -> None:
     """Write the record of a flight."""
+    record(path, traffic(flown))
+
+
+def record(path: Path, entries: Entries) -> None:
+    """Write the record of messages."""
     with RecordWriter(path) as writer:
-        for key, message, wall_ns in traffic(flown):
+        for key, message, wall_ns in entries:
             writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+
+
+def flight(entries: Entries, answers: bool = False) -> RecordedFlight:
+    """Return the flight of messages, with estimates and commands if these are wanted."""
+    reader = FlightReader(answers)
+    for key, message, wall_ns in entries:
+        reader.add_message(key, message, wall_ns)
+    return reader.flight()
 
 
 def traffic(flown: Flown) -> Iterator[tuple[str, Message, int]]:

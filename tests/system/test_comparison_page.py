@@ -8,8 +8,9 @@ import synthetic_record
 from chromium import needs_browser
 from synthetic_record import Flown
 
-from zsim_analysis.report.comparison import ComparedRun
-from zsim_analysis.report.make_report import comparison_page, judge
+from zsim_analysis.report.comparison import comparison_page
+from zsim_analysis.report.comparison_figures import ComparedRun
+from zsim_analysis.report.make_report import judge
 
 WIDTH_PX = 1280
 HIDDEN_PX = "[...document.querySelectorAll('.wide')].map(each => each.scrollWidth - each.clientWidth)"

@@ -13,8 +13,8 @@ from federation import Federation
 from mavlink_programs import free_udp_ports
 from mixed_formation import SECOND_NS, Hardware, Mixed, Radio, true_rms
 
-from zsim_analysis.reading.flight import read_flight
 from zsim_analysis.reading.formation import formations_of
+from zsim_analysis.reading.recorded_flight import read_flight
 
 pytestmark = [pytest.mark.soak, pytest.mark.slow]
 

@@ -20,7 +20,7 @@ from forked_commands import USER_FAULT
 from refused import has_terms
 from wire import PATIENCE_S
 
-from zsim_analysis.sweep.sweep_folder import load, locked
+from zsim_analysis.sweep.sweep import load, locked
 
 pytestmark = pytest.mark.xdist_group("sweep")  # the undisturbed one is flown once
 

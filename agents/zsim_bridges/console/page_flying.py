@@ -29,11 +29,8 @@ from zsim_bridges.console.manual_flight import (
     geofence_of,
 )
 from zsim_bridges.console.picture import DronePoses, ghosts, short_names
-from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.run_monitor import RunMonitor
 from zsim_bridges.console.scene import LARGE_MAX, RunScene
-from zsim_bridges.console.time_monitor import TimeMonitor
-from zsim_bridges.console.view_buffer import ViewBuffer
 
 DIGITS = 2  # of a metre: finer than a pixel
 HEADING_DIGITS = 3  # of a radian
@@ -59,19 +56,15 @@ class PageFlying:
 
     def __init__(
         self,
-        run: ShownRun,
+        monitor: RunMonitor,
         client: CommandClient,
         name: str,
-        views: ViewBuffer,
-        time_monitor: TimeMonitor,
-        monitor: RunMonitor,
         scene: RunScene,
         pages: PageForms,
         note: Callable[[str, str], None] = lambda subject, why: None,
     ) -> None:
-        self._run = run
-        self._views = views
-        self._time_monitor = time_monitor
+        self._run = run = monitor.run
+        self._views = views = monitor.views
         self._monitor = monitor
         self._scene = scene
         self._pages = pages
@@ -128,8 +121,7 @@ class PageFlying:
         return DroneSight(seen.state, seen.commander, pose)
 
     def _run_sight(self) -> RunSight:
-        clock = self._time_monitor.clock
-        run = self._monitor.condition._replace(silent_s=self._time_monitor.silent_s)
+        clock, run = self._monitor.time_monitor.clock, self._monitor.now()
         silence, off = run.off() if run.silent_s else "", run._replace(silent_s=0.0).grounded()
         stands = clock is not None and clock.state != "running"
         return RunSight(off, clock.rate if clock else 1.0, stands, "" if off else silence)

@@ -30,6 +30,7 @@ class RunMonitor:
         world: where the run is, in words.
 
     Attributes:
+        views, time_monitor, run: as given.
         condition: of the run, at the last update.
         board: its alarms.
         flight: figures of the drones.
@@ -39,9 +40,9 @@ class RunMonitor:
     """
 
     def __init__(self, views: ViewBuffer, time_monitor: TimeMonitor, run: ShownRun, world: str = "") -> None:
-        self._views = views
-        self._time_monitor = time_monitor
-        self._run = run
+        self.views = views
+        self.time_monitor = time_monitor
+        self.run = run
         self._world = world
         self._members, self._single = run.members, run.single
         self._ended = ""
@@ -55,7 +56,7 @@ class RunMonitor:
 
     def end(self, reason: str) -> None:
         """Note that the run is over."""
-        self._ended = self._views.end or reason
+        self._ended = self.views.end or reason
 
     def unflyable(self) -> str:
         """Return why nothing can be flown in this run any more; a silent world does not count."""
@@ -63,7 +64,7 @@ class RunMonitor:
 
     def update(self, wall_s: float) -> list[PendingRequest]:
         """Take over the newest views; return the requests that were done meanwhile."""
-        views, clock = self._views, self._time_monitor.clock
+        views, clock = self.views, self.time_monitor.clock
         self._forget_future(views.drones.t_ns if views.drones else 0)
         drones = views.conditions()
         commanders = {name: drone.commander for name, drone in drones.items()}
@@ -80,9 +81,9 @@ class RunMonitor:
         end_s = self.record_s[1] if self.record_s else math.inf
         self.condition = RunCondition(
             clock=clock.state if clock else None,
-            silent_s=self._time_monitor.silent_s,
+            silent_s=self.time_monitor.silent_s,
             ended=self._ended,
-            replayed=self._run.is_replay,
+            replayed=self.run.is_replay,
             at_end=clock is not None and clock.state == "paused" and clock.t_ns >= end_s * 1e9 - ROUNDING_NS,
             drones={name: drone.state for name, drone in drones.items()},
             phases=phases,
@@ -105,18 +106,21 @@ class RunMonitor:
 
     def head(self, wall_s: float) -> dict[str, Any]:
         """Return the head of the page as plain data; called in another thread than `update`."""
-        t_ns = self._views.drones.t_ns if self._views.drones else 0
-        condition = self.condition._replace(silent_s=self._time_monitor.silent_s)
-        name, clock, rows = self._run.scenario.name, self._time_monitor.clock, self.board.rows(wall_s)
-        return page_head(name, condition, clock, t_ns, rows, self._single, self._world, self.record_s)
+        t_ns = self.views.drones.t_ns if self.views.drones else 0
+        name, clock, rows = self.run.scenario.name, self.time_monitor.clock, self.board.rows(wall_s)
+        return page_head(name, self.now(), clock, t_ns, rows, self._single, self._world, self.record_s)
+
+    def now(self) -> RunCondition:
+        """Return the condition with the present silence of the world."""
+        return self.condition._replace(silent_s=self.time_monitor.silent_s)
 
     def _forget_future(self, t_ns: int) -> None:
         """Remove alarms and losses of later times, if a replay has gone back."""
         if t_ns < self._t_ns:
             self.board.clear()
             self.fault_watch.clear()
-            self._views.begun.clear()
-            self._views.losses.now, self._views.failsafes = {}, {}
+            self.views.begun.clear()
+            self.views.losses.now, self.views.failsafes = {}, {}
         self._t_ns = t_ns
 
     def _reason(

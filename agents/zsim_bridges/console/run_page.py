@@ -127,9 +127,8 @@ class RunPage:
             lambda drones: self.flying.returns.request_drones(drones),
         )  # fmt: skip
         self.flying = PageFlying(
-            run, self._client, observer.name, self.views, self._time_monitor, self._monitor, self._scene,
-            self._page_forms, self._note_return,
-        )  # fmt: skip
+            self._monitor, self._client, observer.name, self._scene, self._page_forms, self._note_return
+        )
 
     def close(self) -> None:
         """Send nothing any more."""

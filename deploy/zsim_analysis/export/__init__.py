@@ -2,9 +2,7 @@
 
     export(DIR, Format.CSV, OUT, MessageSelection())     writes OUT, all of it or nothing
 
-`selection` chooses messages, `message_columns` lays them out as tables, which `tables` and `matlab` write; the modules
-of Foxglove draw. `make_export` puts files in their place. Imports zsim_analysis.reading. This file needs no extra: the
-command line has the formats from it.
+Imports zsim_analysis.reading. This file needs no extra packages: the command line takes the formats from it.
 """
 
 from enum import StrEnum

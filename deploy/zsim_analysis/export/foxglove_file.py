@@ -1,48 +1,71 @@
-"""Writes the Foxglove file of a record and its layout, in order of time and in bounded memory.
+"""Writes the Foxglove file of a record, in order of time and in bounded memory: its topics, and when each is written.
 
-Foxglove reads all of it. Rerun draws no scenes; it has the transforms, poses, points, fixes, log and numbers, and shows
-them by a blueprint (rerun_blueprint).
+Foxglove shows all of it; Rerun reads the transforms, poses, points, fixes, pictures, log and numbers.
 """
 
-import re
+import math
 import signal
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from itertools import chain
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from itertools import chain, groupby
+from os import SEEK_CUR, SEEK_END, SEEK_SET
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
+import foxglove
 import msgspec
-from foxglove import layouts
+import numpy as np
+from foxglove.channels import (
+    CameraCalibrationChannel,
+    CompressedImageChannel,
+    FrameTransformsChannel,
+    LocationFixChannel,
+    LogChannel,
+    PointCloudChannel,
+    PoseInFrameChannel,
+    SceneUpdateChannel,
+)
+from foxglove.messages import PoseInFrame
 
 from zsim.contract import keys, messages
-from zsim.contract.camera_messages import CameraInfo
-from zsim.contract.messages import Info
+from zsim.contract.camera_messages import CameraImage, CameraInfo
+from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth
+from zsim.contract.messages import Gps, Info
+from zsim.contract.run_messages import Event
+from zsim.drone_colours import colours_of
 from zsim.errors import NotTrustedError
+from zsim.math.frames import heading
 from zsim.record import Recorded, RecordReader
 from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import cross_layout
-from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_analysis.export.foxglove_scene import Instant, RotorDisc, instants, is_drawn
-from zsim_analysis.export.foxglove_topics import DRONES, ESTIMATES, FORMATIONS, GROUND, LOG, TRAILS, FoxgloveFile
-from zsim_analysis.export.selection import DecodedMessages, MessageSelection, subject
+from zsim_analysis.export import foxglove_messages as made
+from zsim_analysis.export.columns import DecodedMessages, MessageSelection, subject
+from zsim_analysis.export.foxglove_messages import GREY, MAGENTA, TRAIL_STEP_NS, NumericMessageType, RotorDisc
 from zsim_analysis.reading.recorded_run import decode_or_none, scenario_of, search_modules
 
+TF, LOG, DRONES, GROUND, TRAILS = "/tf", "/log", "/scene/drones", "/scene/ground", "/scene/trails"
+FORMATIONS, ESTIMATES = "/scene/formations", "/scene/estimates"
+POINTS, DESIRED = "/points/drones", "/points/desired"
+SCENE_STEP_NS = 100_000_000  # between two messages of a scene or of points
+DRAWN = (Truth, Estimate, Status, Gps, ClusterState, Event, CameraImage, CameraInfo)
 LATEST_NS = 2**32 * 10**9  # Foxglove counts seconds in 32 bits
-ARM_M = 0.1785  # m, the AR.Drone's, where the scenario is not known
-ROTOR_RADIUS = 0.57  # of the arm, where the rotors are not known: 0.102 m at the AR.Drone's 0.1785 m
+ARM_M = 0.1785  # m, the AR.Drone's, if the scenario is not known
+ROTOR_RADIUS = 0.57  # of the arm, if the rotors are not known: 0.102 m at the AR.Drone's 0.1785 m
 
 
 class ConvertedRun(NamedTuple):
-    """What was written of a run.
+    """The content of a written file.
 
     Attributes:
         topics: messages by topic.
         variables: by cluster, the fields of its numbers.
-        rotors: of every drone.
-        refused: messages that could not be read.
+        rotors: of every drone, in the order of the scenario.
+        refused: number of messages that could not be read.
     """
 
     topics: dict[str, int]
@@ -52,59 +75,33 @@ class ConvertedRun(NamedTuple):
 
 
 def convert(
-    reader: RecordReader,
-    selection: MessageSelection,
-    path: Path,
-    layout_path: Path,
-    progress: Callable[[int, int], None],
+    reader: RecordReader, selection: MessageSelection, path: Path, progress: Callable[[int, int], None]
 ) -> ConvertedRun:
-    """Write the MCAP file and its layout; return what is in the file, and how many messages could not be read.
-
-    Args:
-        reader: of the record.
-        selection: which of its messages.
-        path: of the MCAP file, new.
-        layout_path: of the layout, new.
-        progress: called with the number of messages that have been read, and of how many.
-    """
-    wanted = [key for key in selection.keys(reader) if is_drawn(key)]
+    """Write the MCAP file; return its content. `progress` is called with the number of messages read, and of all."""
+    wanted = [key for key in selection.keys(reader) if messages.type_of(key) in DRAWN or key == keys.INFO]
     total = sum(reader.topics()[key] for key in wanted)
     recorded = reader.last(keys.INFO)
     info = decode_or_none(recorded) if recorded else None
     search_modules(reader.path, info)
     scenario = scenario_of(info)
-    drones = [subject(key) for key in wanted if key.startswith("drone/")]
     decoded = DecodedMessages(selection.messages(reader, wanted), _decode, lambda done: progress(done, total))
-    rotors = _rotors(info, scenario, dict.fromkeys(drones))
+    rotors = _rotors(info, scenario, dict.fromkeys(subject(key) for key in wanted if key.startswith("drone/")))
     file = FoxgloveFile(path, rotors, _spaces(scenario))
     with deferred_signals() as check:
         try:
-            for instant in chain(_cameras_before(reader, selection, wanted), instants(decoded)):
+            for instant in chain(_cameras_before(reader, selection, wanted), _instants(decoded)):
                 file.write(instant)
                 check()
         finally:
             file.close()
-    layout_path.write_text(layout(file.counts, file.variables()) + "\n", encoding="utf-8")
     return ConvertedRun(dict(sorted(file.counts.items())), file.variables(), rotors, decoded.refused)
-
-
-def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: Iterable[str]) -> Iterator[Instant]:
-    """Yield how cameras see by what they said before the first time that is selected: they may say it once only."""
-    from_ns = round((selection.from_s or 0.0) * 1e9)
-    of_cameras = [key for key in wanted if messages.type_of(key) is CameraInfo]
-    known: dict[str, CameraInfo] = {}
-    for recorded in reader.messages(of_cameras) if from_ns and of_cameras else ():
-        if recorded.t_ns < from_ns and (info := _decode(recorded)) is not None:
-            known[recorded.key] = msgspec.structs.replace(info, t_ns=from_ns)
-    if known:
-        yield Instant(from_ns, cameras=list(known.items()))
 
 
 @contextmanager
 def deferred_signals() -> Iterator[Callable[[], None]]:
-    """Yield a function that handles the SIGINT or SIGTERM that has come since.
+    """Yield a function that handles SIGINT or SIGTERM received since.
 
-    What their handlers raise would, within a call of the library, be printed there and lost.
+    What their handlers raise within a call of the library would be printed there and lost.
     """
     came: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
@@ -129,10 +126,10 @@ def _decode(recorded: Recorded) -> Any:
     return decode_or_none(recorded) if recorded.t_ns < LATEST_NS else None
 
 
-def _rotors(info: Info | None, scenario: Scenario | None, present: dict[str, None]) -> dict[str, list[RotorDisc]]:
+def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, None]) -> dict[str, list[RotorDisc]]:
     """Return the rotors of every drone on record, in the order of the scenario.
 
-    Of a drone whose rotors `world/info` does not name, they stand in a cross.
+    If `world/info` does not name a drone's rotors, they are assumed in a cross.
     """
     arms_m = {drone.name: drone.arm_m for drone in scenario.drones} if scenario else {}
     named = {drone.name: drone.rotors for drone in info.drones} if info else {}
@@ -149,135 +146,297 @@ def _spaces(scenario: Scenario | None) -> dict[str, ClusterSpace]:
     if scenario is None:
         return spaces
     for cluster in scenario.clusters:
-        try:
+        with suppress(ValueError, NotTrustedError):
             spaces[cluster.name] = scenario_space(scenario, cluster)
-        except (ValueError, NotTrustedError):
-            continue
     return spaces
 
 
-Line = Literal["solid", "dashed"]
-CURVES: tuple[tuple[str, str, Line], ...] = (
-    ("desired", "#000000", "dashed"),
-    ("estimated", "#e69f00", "solid"),
-    ("true", "#0072b2", "solid"),
-)
-PLOTS_MAX = 12  # variables that are plotted: those of the paper's three drones
-TAB = 3  # plots in a tab
-DRONE_PLOTS = (
-    ("altitude (m)", "true_z_m"),
-    ("error of the estimate (m)", "error_m"),
-    ("battery (%)", "battery_percent"),
-)
-DRONES_MAX = 12  # drones that are plotted
-PICTURES, CALIBRATION = "_camera/image", "_camera/calibration"  # ends of topics
-PICTURES_MAX = 6  # cameras that are shown: those of the paper's three drones
+@dataclass
+class Instant:
+    """Messages of one time: the last one of each key, but all events and all of cameras."""
+
+    t_ns: int
+    truth: dict[str, Truth] = field(default_factory=dict)
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    status: dict[str, Status] = field(default_factory=dict)
+    gps: dict[str, Gps] = field(default_factory=dict)
+    states: dict[str, ClusterState] = field(default_factory=dict)
+    events: list[Event] = field(default_factory=list)
+    pictures: list[tuple[str, CameraImage]] = field(default_factory=list)
+    cameras: list[tuple[str, CameraInfo]] = field(default_factory=list)
+
+    def add(self, key: str, message: Any) -> None:
+        """Add a message of a type that is drawn."""
+        match message:
+            case Event():
+                self.events.append(message)
+            case CameraImage():
+                self.pictures.append((key, message))
+            case CameraInfo():
+                self.cameras.append((key, message))
+            case Truth():
+                self.truth[subject(key)] = message
+            case Estimate():
+                self.estimates[subject(key)] = message
+            case Status():
+                self.status[subject(key)] = message
+            case Gps():
+                self.gps[subject(key)] = message
+            case ClusterState():
+                self.states[subject(key)] = message
 
 
-def layout(topics: Iterable[str], variables: Mapping[str, Sequence[str]]) -> str:
-    """Return the layout as JSON.
+def _instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
+    """Gather messages, which come in order of time, by their time; `world/info` is left out."""
+    drawn = ((recorded.key, message) for recorded, message in decoded if not isinstance(message, Info))
+    for t_ns, group in groupby(drawn, key=lambda pair: pair[1].t_ns):
+        instant = Instant(t_ns)
+        for key, message in group:
+            instant.add(key, message)
+        yield instant
 
-    Args:
-        topics: of the file.
-        variables: by cluster, the fields of its numbers.
+
+def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: Iterable[str]) -> Iterator[Instant]:
+    """Yield the newest calibrations from before the selected times, since cameras may publish them only once."""
+    from_ns = round((selection.from_s or 0.0) * 1e9)
+    of_cameras = [key for key in wanted if messages.type_of(key) is CameraInfo]
+    known: dict[str, CameraInfo] = {}
+    for recorded in reader.messages(of_cameras) if from_ns and of_cameras else ():
+        if recorded.t_ns < from_ns and (info := _decode(recorded)) is not None:
+            known[recorded.key] = msgspec.structs.replace(info, t_ns=from_ns)
+    if known:
+        yield Instant(from_ns, cameras=list(known.items()))
+
+
+class FoxgloveFile:
+    """An MCAP file that is being written; rotors by drone in the order of the scenario, spaces by cluster.
+
+    Attributes:
+        counts: messages by topic.
     """
-    present = set(topics)
-    drones = sorted(
-        topic.split("/")[2] for topic in present if topic.startswith("/drone/") and topic.endswith("/numbers")
-    )
-    tabs = [tab for cluster, fields in variables.items() for tab in _cluster_tabs(cluster, fields, len(variables) > 1)]
-    tabs += [layouts.TabItem(title="drones", content=_drone_plots(drones[:DRONES_MAX]))] if drones else []
-    pictures = sorted(topic for topic in present if topic.endswith(PICTURES))
-    tabs += [layouts.TabItem(title="cameras", content=_pictures(pictures[:PICTURES_MAX]))] if pictures else []
-    left = _column((3, _scene(present)), (1, layouts.LogPanel(config=layouts.LogConfig(topic_to_render=LOG))))
-    parts = [(2, layouts.TabContainer(tabs=tabs))] if tabs else []
-    right = _column(*parts, (1, _states(variables, drones[:DRONES_MAX])))
-    items = [layouts.SplitItem(proportion=1, content=side) for side in (left, right)]
-    return layouts.Layout(content=layouts.SplitContainer(direction="row", items=items)).to_json()
+
+    def __init__(
+        self, path: Path, rotors: Mapping[str, Sequence[RotorDisc]], spaces: Mapping[str, ClusterSpace]
+    ) -> None:
+        self._context = foxglove.Context()
+        self._checked_file = CheckedFile(path)
+        self._file = foxglove.open_mcap(self._checked_file, context=self._context)
+        self._rotors = rotors
+        self._spaces = spaces
+        self._colours = colours_of(rotors)
+        self._channels: dict[str, Any] = {}
+        self._variables: dict[str, NumericMessageType] = {}
+        self._drone = NumericMessageType("Drone", made.DRONE_NUMBERS, ("state",))
+        self._trails = made.DroneTrails()
+        self._status: dict[str, Status] = {}
+        self._next_ns: dict[str, int] = {}
+        self._has_static_scene = False
+        self.counts: Counter[str] = Counter()
+
+    def close(self) -> None:
+        """End the file.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        self._file.close()
+        self._checked_file.close()
+
+    def variables(self) -> dict[str, tuple[str, ...]]:
+        """Return the names of the numeric fields of each cluster."""
+        return {name: numbers.numbers for name, numbers in self._variables.items()}
+
+    def write(self, instant: Instant) -> None:
+        """Write all messages of an instant.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        self._checked_file.check()
+        self._status.update(instant.status)
+        if not self._has_static_scene and instant.truth:
+            self._log(DRONES, SceneUpdateChannel, made.drones(instant.t_ns, self._rotors), instant.t_ns)
+            self._log(GROUND, SceneUpdateChannel, made.ground(instant.t_ns), instant.t_ns)
+            self._has_static_scene = True
+        self._write_frames(instant)
+        for name in dict.fromkeys([*instant.truth, *instant.estimates]):
+            self._write_drone(instant, name)
+        for name, gps in instant.gps.items():
+            fix = made.location_fix(gps, name, self._colours.get(name, GREY))
+            self._log(f"/drone/{name}/gps", LocationFixChannel, fix, gps.t_ns)
+        for name, state in instant.states.items():
+            self._write_cluster(instant, name, state)
+        for event in instant.events:
+            self._log(LOG, LogChannel, made.log_line(event), event.t_ns)
+        for key, info in instant.cameras:
+            drone, camera = _camera_of(key)
+            calibration = made.camera_calibration(info, made.camera_frame(drone, camera))
+            self._log(f"/drone/{drone}/{camera}_camera/calibration", CameraCalibrationChannel, calibration, info.t_ns)
+            placed = [(made.camera_frame(drone, camera), info.position_m, info.orientation_wxyz)]
+            self._log(TF, FrameTransformsChannel, made.transforms(info.t_ns, placed, made.frame(drone)), info.t_ns)
+        for key, image in instant.pictures:
+            drone, camera = _camera_of(key)
+            picture = made.compressed_image(image, made.camera_frame(drone, camera))
+            self._log(f"/drone/{drone}/{camera}_camera/image", CompressedImageChannel, picture, image.t_ns)
+        self._write_scene(instant)
+
+    def _write_frames(self, instant: Instant) -> None:
+        frames = [(made.frame(d), t.position_m, t.orientation_wxyz) for d, t in instant.truth.items()]
+        estimates = instant.estimates.items()
+        frames += [(f"{made.frame(d)}/estimate", e.position_m, e.orientation_wxyz) for d, e in estimates]
+        for name, state in instant.states.items():
+            for end, values in (("", state.value), ("/desired", state.desired)):
+                placed = made.cluster_frame(state.names, values)
+                frames += [(f"cluster/{name}{end}", *placed)] if placed else []
+        if frames:
+            self._log(TF, FrameTransformsChannel, made.transforms(instant.t_ns, frames), instant.t_ns)
+
+    def _write_drone(self, instant: Instant, name: str) -> None:
+        at, t_ns = made.timestamp(instant.t_ns), instant.t_ns
+        truth, estimate = instant.truth.get(name), instant.estimates.get(name)
+        for topic, state in ((f"/drone/{name}/pose", truth), (f"/drone/{name}/estimate", estimate)):
+            if state is not None:
+                placed = made.pose(state.position_m, state.orientation_wxyz)
+                message = PoseInFrame(timestamp=at, frame_id=made.WORLD, pose=placed)
+                self._log(topic, PoseInFrameChannel, message, t_ns)
+        status = self._status.get(name)
+        values = made.drone_numbers(truth, estimate, status)
+        encoded = self._drone.encode(values, (status.state if status else "",))
+        self._log(f"/drone/{name}/numbers", self._drone, encoded, t_ns)
+
+    def _write_cluster(self, instant: Instant, name: str, state: ClusterState) -> None:
+        if name not in self._variables:
+            tidied = [made.tidy(each) for each in state.names]
+            fields = [f"{what}_{each}" for what in ("desired", "estimated", "true") for each in tidied]
+            kind = NumericMessageType(f"Cluster_{made.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
+            self._variables[name] = kind
+        numbers = self._variables[name]
+        values = [*state.desired, *state.value, *self._true(instant, name, state), state.margin]
+        if len(values) == len(numbers.numbers):  # if the number of variables changes, only the first ones are written
+            encoded = numbers.encode(values, (state.phase, state.reason))
+            self._log(f"/cluster/{name}/variables", numbers, encoded, instant.t_ns)
+
+    def _true(self, instant: Instant, name: str, state: ClusterState) -> Sequence[float]:
+        """Return the true cluster variables, NaN if they are unknown or singular."""
+        unknown = [math.nan] * len(state.names)
+        space = self._spaces.get(name)
+        if space is None or space.names != state.names or not all(drone in instant.truth for drone in state.drones):
+            return unknown
+        truths = [instant.truth[drone] for drone in state.drones]
+        yaw = heading([truth.orientation_wxyz for truth in truths])
+        try:
+            return space.forward(np.array([truth.position_m for truth in truths]), yaw).tolist()
+        except SingularClusterError:
+            return unknown
+
+    def _write_scene(self, instant: Instant) -> None:
+        t_ns, truth = instant.t_ns, instant.truth
+        if truth and self._is_due(TRAILS, t_ns, TRAIL_STEP_NS):
+            self._log(TRAILS, SceneUpdateChannel, self._trails.update(t_ns, truth, self._colours), t_ns)
+        if truth and self._is_due(POINTS, t_ns):
+            places = [(state.position_m, self._colours.get(d, GREY)) for d, state in truth.items()]
+            self._log(POINTS, PointCloudChannel, made.points(t_ns, places), t_ns)
+        if instant.states and self._is_due(FORMATIONS, t_ns):
+            desired = {c: m for c, state in instant.states.items() if (m := self._places(c, state)) is not None}
+            scene = made.formations(t_ns, instant.states, truth, desired)
+            self._log(FORMATIONS, SceneUpdateChannel, scene, t_ns)
+            if desired:
+                places = [(place, MAGENTA) for each in desired.values() for place in each.tolist()]
+                self._log(DESIRED, PointCloudChannel, made.points(t_ns, places), t_ns)
+        if instant.estimates and self._is_due(ESTIMATES, t_ns):
+            scene = made.ellipsoids(t_ns, instant.estimates, self._colours)
+            self._log(ESTIMATES, SceneUpdateChannel, scene, t_ns)
+
+    def _places(self, name: str, state: ClusterState) -> Any:
+        """Return the desired positions of a cluster's drones (n, 3), None if they are unknown or singular."""
+        space = self._spaces.get(name)
+        if space is None or space.names != state.names or not any(state.desired):
+            return None
+        try:
+            return space.inverse(np.array(state.desired))[0]
+        except SingularClusterError:
+            return None
+
+    def _is_due(self, topic: str, t_ns: int, step_ns: int = SCENE_STEP_NS) -> bool:
+        if t_ns < self._next_ns.get(topic, 0):
+            return False
+        self._next_ns[topic] = (t_ns // step_ns + 1) * step_ns
+        return True
+
+    def _log(self, topic: str, channel: Any, message: Any, t_ns: int) -> None:
+        """Log a message on a topic, whose channel, or type of numbers, is that of its first message."""
+        if topic not in self._channels:
+            if isinstance(channel, NumericMessageType):
+                schema = foxglove.Schema(name=channel.name, encoding="protobuf", data=channel.schema)
+                new = foxglove.Channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
+            else:
+                new = channel(topic, context=self._context)
+            self._channels[topic] = new
+        self._channels[topic].log(message, log_time=t_ns)
+        self.counts[topic] += 1
 
 
-def _scene(topics: set[str]) -> layouts.ThreeDeePanel:
-    shown = {
-        topic: layouts.BaseRendererSceneUpdateTopicSettings(visible=True)
-        for topic in (DRONES, GROUND, TRAILS, FORMATIONS, ESTIMATES)
-        if topic in topics
-    }
-    camera = layouts.ThreeDeeCameraState(distance=35.0, phi=60.0, theta_offset=45.0, perspective=True)
-    config = layouts.ThreeDeeConfig(follow_tf="world", camera_state=camera, topics=dict(shown))
-    return layouts.ThreeDeePanel(config=config, title="scene")
+def _camera_of(key: str) -> tuple[str, str]:
+    """Return drone and camera of a camera's key."""
+    _, drone, what = keys.parts(key)
+    return drone, what.split("/")[1]
 
 
-def _cluster_tabs(cluster: str, fields: Sequence[str], several: bool) -> list[layouts.TabItem]:
-    """Return tabs of three variables each: place, attitude, the drones' headings, and the shape, of the paper's."""
-    names = [field.removeprefix("desired_") for field in fields if field.startswith("desired_")][:PLOTS_MAX]
-    groups = [names[i : i + TAB] for i in range(0, len(names), TAB)]
-    before = f"{cluster}: " if several else ""
-    return [
-        layouts.TabItem(
-            title=before + ", ".join(group), content=_column(*((1, _variable(cluster, name)) for name in group))
-        )
-        for group in groups
-    ]
+class CheckedFile:
+    """A file for a library that prints a failed write, at every further write again, rather than raise it.
 
+    After a failed write, nothing more is written.
 
-def _variable(cluster: str, name: str) -> layouts.PlotPanel:
-    series = [
-        layouts.PlotSeries(
-            value=_path(f"/cluster/{cluster}/variables", f"{what}_{name}"),
-            label=what,
-            color=tint,
-            line_style=style,
-            enabled=True,
-        )
-        for what, tint, style in CURVES
-    ]
-    return _plot(name, series)
+    Raises:
+        OSError: it cannot be created.
+    """
 
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("xb")
+        self._failure: OSError | None = None
+        self._at = self._end = 0  # position and end of the file as the library knows them
 
-def _drone_plots(drones: Sequence[str]) -> layouts.SplitContainer:
-    panels = [
-        _plot(
-            title,
-            [layouts.PlotSeries(value=_path(f"/drone/{d}/numbers", field), label=d, enabled=True) for d in drones],
-        )
-        for title, field in DRONE_PLOTS
-    ]
-    return _column(*((1, panel) for panel in panels))
+    def write(self, data: bytes | bytearray) -> int:
+        """Write bytes; return how many."""
+        self._try(self._file.write, data)
+        self._at += len(data)
+        self._end = max(self._end, self._at)
+        return len(data)
 
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Set the position; return it."""
+        self._try(self._file.seek, offset, whence)
+        self._at = offset + {SEEK_SET: 0, SEEK_CUR: self._at, SEEK_END: self._end}[whence]
+        return self._at
 
-def _pictures(topics: Sequence[str]) -> layouts.SplitContainer:
-    """Return a panel for each camera, with what its pixels mean."""
-    modes = {
-        topic: layouts.ImageModeConfig(
-            image_topic=topic, calibration_topic=f"{topic.removesuffix(PICTURES)}{CALIBRATION}"
-        )
-        for topic in topics
-    }
-    return _column(
-        *(
-            (1, layouts.ImagePanel(config=layouts.ImageConfig(image_mode=mode), title=topic.split("/", 2)[2]))
-            for topic, mode in modes.items()
-        )
-    )
+    def flush(self) -> None:
+        """Write what is buffered."""
+        self._try(self._file.flush)
 
+    def check(self) -> None:
+        """Raise the error of a failed write.
 
-def _plot(title: str, series: list[layouts.PlotSeries]) -> layouts.PlotPanel:
-    config = layouts.PlotConfig(paths=series, is_synced=True, x_axis_val="timestamp", show_legend=True)
-    return layouts.PlotPanel(config=config, title=title)
+        Raises:
+            OSError: a write has failed.
+        """
+        if self._failure is not None:
+            raise self._failure
 
+    def close(self) -> None:
+        """End the file.
 
-def _states(clusters: Iterable[str], drones: Iterable[str]) -> layouts.StateTransitionsPanel:
-    paths = [(_path(f"/cluster/{name}/variables", "phase"), name) for name in clusters]
-    paths += [(_path(f"/drone/{name}/numbers", "state"), name) for name in drones]
-    series = [layouts.StateTransitionsSeries(value=value, label=label, enabled=True) for value, label in paths]
-    return layouts.StateTransitionsPanel(config=layouts.StateTransitionsConfig(paths=series, is_synced=True))
+        Raises:
+            OSError: a write has failed.
+        """
+        self.flush()
+        try:
+            self._file.close()
+        finally:
+            self.check()
 
-
-def _column(*parts: tuple[float, layouts.Content]) -> layouts.SplitContainer:
-    items = [layouts.SplitItem(proportion=share, content=content) for share, content in parts]
-    return layouts.SplitContainer(direction="column", items=items)
-
-
-def _path(topic: str, field: str) -> str:
-    """Return a message path; a topic with characters that have a meaning in paths is quoted."""
-    return f"{topic}.{field}" if re.fullmatch(r"[\w/]+", topic) else f'"{topic}".{field}'
+    def _try(self, act: Callable[..., object], *args: Any) -> None:
+        if self._failure is None:
+            try:
+                act(*args)
+            except OSError as error:
+                self._failure = error

@@ -1,49 +1,59 @@
-"""Foxglove's messages of a run, and typed messages of numbers, which Foxglove plots and Rerun keeps as scalars. Pure.
+"""Messages of Foxglove made from those of a run: transforms, numbers, fixes, pictures, log, points and scenes. Pure.
 
-Numbers are encoded as protobuf, https://protobuf.dev/programming-guides/encoding, with a `FileDescriptorSet` of
-google/protobuf/descriptor.proto as schema. Only two kinds of fields are needed, so protobuf's library is not.
+Numbers are typed messages, which Foxglove plots and Rerun keeps as scalars. They are encoded as protobuf,
+https://protobuf.dev/programming-guides/encoding, with a `FileDescriptorSet` of google/protobuf/descriptor.proto as
+schema. Since only two kinds of fields are needed, protobuf's library is not.
+
+Foxglove shows, at any time, only the last message of a topic; so each scene is the whole of what it shows.
 """
 
 import math
 import re
 import struct
-from collections.abc import Iterable, Sequence
-from typing import Any, Final
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from foxglove.messages import (
     CameraCalibration,
+    Color,
     CompressedImage,
+    CubePrimitive,
+    CylinderPrimitive,
     FrameTransform,
     FrameTransforms,
+    LinePrimitive,
+    LinePrimitiveLineType,
     LocationFix,
     LocationFixPositionCovarianceType,
     Log,
     LogLevel,
     PackedElementField,
     PackedElementFieldNumericType,
+    Point3,
     PointCloud,
+    Pose,
+    Quaternion,
+    SceneEntity,
+    SceneUpdate,
+    SpherePrimitive,
+    TextPrimitive,
+    Timestamp,
+    Vector3,
 )
 
 from zsim.contract.camera_messages import CameraImage, CameraInfo
-from zsim.contract.flight_messages import Estimate, Status, Truth
+from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth
 from zsim.contract.messages import Gps
 from zsim.contract.run_messages import Event
-from zsim.math.frames import heading, quaternion_from_rpy
-from zsim_analysis.export.foxglove_scene import (
-    WORLD,
-    colour,
-    frame,
-    pose,
-    quaternion,
-    rgb,
-    timestamp,
-    vector,
-)
-from zsim_analysis.export.message_columns import Values
+from zsim.drone_colours import colours_of, rgb
+from zsim.math.frames import heading, principal_axes, quaternion_from_rpy
+from zsim_analysis.export.columns import Values
 
 PACKAGE: Final = "zsim"
-DISTORTION_MODEL = "plumb_bob"  # k1, k2, p1, p2, k3, as OpenCV has them
+WORLD = "world"
+DISTORTION_MODEL = "plumb_bob"  # k1, k2, p1, p2, k3, as in OpenCV
 _BYTES, _EIGHT = 2, 1  # wire types: bytes after their length, eight bytes
 _DOUBLE, _STRING = 1, 9  # FieldDescriptorProto.Type
 _OPTIONAL = 1  # FieldDescriptorProto.Label
@@ -58,65 +68,39 @@ DRONE_NUMBERS = (
     "sigma_m",
     "battery_percent",
 )
-LEVELS = {  # of events; the others are information
-    "refused": LogLevel.Warning,
-    "fingerprint": LogLevel.Warning,
-    "outputs_missing": LogLevel.Warning,
-    "fault": LogLevel.Warning,
-    "landing": LogLevel.Warning,
-    "death": LogLevel.Error,
-    "failure": LogLevel.Error,
-    "overdue": LogLevel.Error,
-    "collision": LogLevel.Error,
-    "emergency": LogLevel.Error,
-    "flip": LogLevel.Error,
-    "impact": LogLevel.Error,
-    "touchdown": LogLevel.Error,
-    "battery": LogLevel.Error,
-    "diverged": LogLevel.Error,
-}
+WARNINGS = ("refused", "fingerprint", "outputs_missing", "fault", "landing")  # kinds of events; others: information
+FALLS = ("collision", "emergency", "flip", "impact", "touchdown", "battery")
+FAILURES = (*FALLS, "death", "failure", "overdue", "diverged")
 _POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 4)])
 
-FramePose = tuple[str, Any, Any]  # a frame's name, its position in W and its orientation
+FramePose = tuple[str, Any, Any]  # a frame's name, its position and its orientation in the parent frame
+Vector = Sequence[float] | Values
 
 
 class NumericMessageType:
-    """A message of float64 fields, then of text fields; an unknown number is NaN.
-
-    Args:
-        name: of the message, a protobuf identifier.
-        numbers: names of the numeric fields, protobuf identifiers.
-        texts: names of the text fields.
-    """
+    """A message of float64 fields, then of text fields, named by protobuf identifiers; unknown numbers are NaN."""
 
     def __init__(self, name: str, numbers: Sequence[str], texts: Sequence[str] = ()) -> None:
         self.name = f"{PACKAGE}.{name}"
         self.numbers = tuple(numbers)
-        self.texts = tuple(texts)
-        tags = range(1, len(self.numbers) + 1)
-        self._heads = [_key(tag, _EIGHT) for tag in tags]
-        self._text_keys = [_key(len(self.numbers) + place, _BYTES) for place in range(1, len(self.texts) + 1)]
-        self.schema = _file(name, [*((n, _DOUBLE) for n in self.numbers), *((t, _STRING) for t in self.texts)])
+        self._number_keys = [_key(tag, _EIGHT) for tag in range(1, len(numbers) + 1)]
+        self._text_keys = [_key(len(numbers) + place, _BYTES) for place in range(1, len(texts) + 1)]
+        fields = [*((each, _DOUBLE) for each in numbers), *((each, _STRING) for each in texts)]
+        described = b"".join(_bytes(2, _field(*field, place)) for place, field in enumerate(fields, start=1))
+        file = (
+            _bytes(1, f"{PACKAGE}/{name}.proto".encode())
+            + _bytes(2, PACKAGE.encode())
+            + _bytes(4, _bytes(1, name.encode()) + described)
+            + _bytes(12, b"proto3")
+        )
+        self.schema = _bytes(1, file)  # a FileDescriptorSet of this one message
 
     def encode(self, numbers: Iterable[float], texts: Iterable[str] = ()) -> bytes:
         """Return a message of values in the order of the fields."""
-        parts = [head + _FLOAT.pack(value) for head, value in zip(self._heads, numbers, strict=True)]
+        parts = [key + _FLOAT.pack(value) for key, value in zip(self._number_keys, numbers, strict=True)]
         encoded = [text.encode() for text in texts]
         parts += [key + _varint(len(text)) + text for key, text in zip(self._text_keys, encoded, strict=True)]
         return b"".join(parts)
-
-
-def _file(name: str, fields: Iterable[tuple[str, int]]) -> bytes:
-    """Return a FileDescriptorSet of one message with fields of these names and types, counted from 1."""
-    described = b"".join(_bytes(2, _field(*field, place)) for place, field in enumerate(fields, start=1))
-    message = _bytes(1, name.encode()) + described
-    file = (
-        _bytes(1, f"{PACKAGE}/{name}.proto".encode())
-        + _bytes(2, PACKAGE.encode())
-        + _bytes(4, message)
-        + _bytes(12, b"proto3")
-    )
-    return _bytes(1, file)
 
 
 def _field(name: str, kind: int, number: int) -> bytes:
@@ -134,7 +118,7 @@ def _key(field: int, wire_type: int) -> bytes:
 
 
 def _varint(value: int) -> bytes:
-    """Return seven bits a byte, the lowest first, the eighth bit set where more follow."""
+    """Return seven bits per byte, the lowest first, the eighth bit set where more follow."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -143,24 +127,13 @@ def _varint(value: int) -> bytes:
     return bytes(out)
 
 
-def transforms(t_ns: int, frames: Iterable[FramePose], parent: str = WORLD) -> FrameTransforms:
-    """Return where frames are in another, W unless it is given."""
-    at = timestamp(t_ns)
-    frame_transforms = [
-        FrameTransform(
-            timestamp=at,
-            parent_frame_id=parent,
-            child_frame_id=child,
-            translation=vector(position),
-            rotation=quaternion(orientation),
-        )
-        for child, position, orientation in frames
-    ]
-    return FrameTransforms(transforms=frame_transforms)
+def tidy(name: str) -> str:
+    """Return a name as part of a protobuf identifier."""
+    return re.sub(r"\W", "_", name)
 
 
 def drone_numbers(truth: Truth | None, estimate: Estimate | None, status: Status | None) -> list[float]:
-    """Return the values of DRONE_NUMBERS, NaN where one is not known."""
+    """Return the values of DRONE_NUMBERS, NaN where one is unknown."""
     nothing = [math.nan] * 3
     true = list(truth.position_m) if truth else nothing
     estimated = list(estimate.position_m) if estimate else nothing
@@ -177,13 +150,64 @@ def drone_numbers(truth: Truth | None, estimate: Estimate | None, status: Status
     ]
 
 
-def tidy(name: str) -> str:
-    """Return a name as part of a protobuf identifier."""
-    return re.sub(r"\W", "_", name)
+# Parts of messages
+
+
+def timestamp(t_ns: int) -> Timestamp:
+    return Timestamp(t_ns // 10**9, t_ns % 10**9)
+
+
+def vector(v: Vector) -> Vector3:
+    x, y, z = map(float, v)
+    return Vector3(x=x, y=y, z=z)
+
+
+def quaternion(wxyz: Vector) -> Quaternion:
+    w, x, y, z = map(float, wxyz)
+    return Quaternion(x=x, y=y, z=z, w=w)
+
+
+def pose(position: Vector, wxyz: Vector = (1.0, 0.0, 0.0, 0.0)) -> Pose:
+    return Pose(position=vector(position), orientation=quaternion(wxyz))
+
+
+def colour(text: str, opacity: float = 1.0) -> Color:
+    """Return the colour of `#rrggbb`."""
+    red, green, blue = (part / 255 for part in rgb(text))
+    return Color(r=red, g=green, b=blue, a=opacity)
+
+
+def frame(drone: str) -> str:
+    """Return the name of a drone's frame B."""
+    return f"drone/{drone}"
+
+
+def camera_frame(drone: str, camera: str) -> str:
+    """Return the name of a camera's frame: x to the right of the picture, y down, z ahead."""
+    return f"{frame(drone)}/{camera}_camera"
+
+
+# Messages
+
+
+def transforms(t_ns: int, frames: Iterable[FramePose], parent: str = WORLD) -> FrameTransforms:
+    """Return the poses of frames in another one."""
+    at = timestamp(t_ns)
+    frame_transforms = [
+        FrameTransform(
+            timestamp=at,
+            parent_frame_id=parent,
+            child_frame_id=child,
+            translation=vector(position),
+            rotation=quaternion(orientation),
+        )
+        for child, position, orientation in frames
+    ]
+    return FrameTransforms(transforms=frame_transforms)
 
 
 def cluster_frame(names: Sequence[str], values: Sequence[float]) -> tuple[Values, Values] | None:
-    """Return position and orientation of a cluster's frame, None where it has none or it is not known yet."""
+    """Return position and orientation of a cluster's frame, None if it has none or it is not known yet."""
     if not any(values) or not set(FRAME) <= set(names):
         return None
     x_c = np.array([values[names.index(name)] for name in FRAME])
@@ -191,7 +215,7 @@ def cluster_frame(names: Sequence[str], values: Sequence[float]) -> tuple[Values
 
 
 def location_fix(gps: Gps, drone: str, tint: str) -> LocationFix:
-    """Return the position that a drone's GPS measured, in the drone's colour."""
+    """Return the position measured by a drone's GPS, in the drone's colour."""
     variance = gps.sigma_m**2
     return LocationFix(
         timestamp=timestamp(max(0, gps.t_sample_ns)),
@@ -212,7 +236,7 @@ def compressed_image(image: CameraImage, frame_id: str) -> CompressedImage:
 
 
 def camera_calibration(info: CameraInfo, frame_id: str) -> CameraCalibration:
-    """Return what a camera's pixels mean; it is no part of a stereo pair."""
+    """Return the calibration of a camera, which is not part of a stereo pair."""
     return CameraCalibration(
         timestamp=timestamp(info.t_ns),
         frame_id=frame_id,
@@ -228,14 +252,14 @@ def camera_calibration(info: CameraInfo, frame_id: str) -> CameraCalibration:
 
 def log_line(event: Event) -> Log:
     """Return an event as a line of the log."""
-    level = LEVELS.get(event.kind, LogLevel.Info)
+    level = LogLevel.Warning if event.kind in WARNINGS else LogLevel.Info
+    level = LogLevel.Error if event.kind in FAILURES else level
     text = f"{event.kind}: {event.text}"
     return Log(timestamp=timestamp(event.t_ns), level=level, message=text, name=event.source, file=event.subject)
 
 
 def points(t_ns: int, coloured: Iterable[tuple[Sequence[float], str]]) -> PointCloud:
     """Return coloured points in W."""
-    rows = [(position, (*(round(255 * part) for part in rgb(tint)), 255)) for position, tint in coloured]
     kinds = PackedElementFieldNumericType
     fields = [PackedElementField(name=n, offset=4 * i, type=kinds.Float32) for i, n in enumerate("xyz")]
     fields += [
@@ -248,5 +272,169 @@ def points(t_ns: int, coloured: Iterable[tuple[Sequence[float], str]]) -> PointC
         pose=pose((0.0, 0.0, 0.0)),
         point_stride=_POINT.itemsize,
         fields=fields,
-        data=np.array(rows, _POINT).tobytes(),
+        data=np.array([(position, (*rgb(tint), 255)) for position, tint in coloured], _POINT).tobytes(),
     )
+
+
+# Scenes
+
+MAGENTA, DARK, GREY = "#d4008f", "#30363d", "#8c959f"
+TRAIL_S = 20.0  # simulated time covered by a trail
+TRAIL_STEP_NS = 500_000_000  # between two points of a trail, and two messages of trails
+SIGMAS = 2.0  # half axes of an estimate's ellipsoid in standard deviations
+LINE_PX = 2.0  # width of lines on the screen
+GROUND_M, GROUND_STEP_M = 50, 5  # half width of the grid on the ground, and its spacing
+
+
+class RotorDisc(NamedTuple):
+    """A rotor as it is drawn: its place in B, and its radius."""
+
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
+class BodyBox(NamedTuple):
+    """A box of a drone's body: middle and size in B, in arm lengths, and colour."""
+
+    middle: tuple[float, float, float]
+    size: tuple[float, float, float]
+    colour: str
+
+
+BODY = (
+    BodyBox((0.0, 0.0, 0.0), (1.0, 0.4, 0.3), DARK),
+    BodyBox((0.35, 0.0, 0.1), (0.5, 0.3, 0.2), MAGENTA),  # the nose, as of an AR.Drone's hat over battery and camera
+)
+
+
+def arm_of(discs: Iterable[RotorDisc]) -> float:
+    """Return the length [m] of the longest arm of a drone."""
+    return max(math.hypot(disc.x_m, disc.y_m) for disc in discs)
+
+
+def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> SceneUpdate:
+    """Return the drones, each in its own frame, so that they are written once; `rotors` are theirs, by name."""
+    at = timestamp(t_ns)
+    return SceneUpdate(entities=[_drone(at, name, rotors[name], tint) for name, tint in colours_of(rotors).items()])
+
+
+def _drone(at: Timestamp, name: str, discs: Sequence[RotorDisc], mark: str) -> SceneEntity:
+    arm_m = arm_of(discs)
+    cubes = [
+        CubePrimitive(
+            pose=pose([arm_m * each for each in box.middle]),
+            size=vector([arm_m * each for each in box.size]),
+            color=colour(box.colour),
+        )
+        for box in BODY
+    ]
+    cylinders = [
+        CylinderPrimitive(
+            pose=pose((disc.x_m, disc.y_m, 0.2 * arm_m)),
+            size=vector((2 * disc.radius_m, 2 * disc.radius_m, 0.03 * arm_m)),
+            bottom_scale=1.0,
+            top_scale=1.0,
+            color=colour(mark, 0.5),
+        )
+        for disc in discs
+    ]
+    ends = [end for disc in discs for end in ((0.0, 0.0, 0.0), (disc.x_m, disc.y_m, 0.0))]
+    arms = LinePrimitive(
+        type=LinePrimitiveLineType.LineList,
+        pose=pose((0, 0, 0)),
+        thickness=0.1 * arm_m,
+        points=[_point(end) for end in ends],
+        color=colour(DARK),
+    )
+    label = TextPrimitive(
+        pose=pose((0, 0, 2 * arm_m)),
+        billboard=True,
+        font_size=12.0,
+        scale_invariant=True,
+        color=colour(mark),
+        text=name,
+    )
+    parts: dict[str, Any] = {"cubes": cubes, "cylinders": cylinders, "lines": [arms], "texts": [label]}
+    return SceneEntity(timestamp=at, id=name, frame_id=frame(name), frame_locked=True, **parts)
+
+
+def ground(t_ns: int) -> SceneUpdate:
+    """Return a grid on the ground."""
+    marks = range(-GROUND_M, GROUND_M + 1, GROUND_STEP_M)
+    ends = [end for a in marks for end in ((a, -GROUND_M, 0), (a, GROUND_M, 0))]
+    ends += [end for a in marks for end in ((-GROUND_M, a, 0), (GROUND_M, a, 0))]
+    grid = _line(ends, colour(GREY, 0.4), LinePrimitiveLineType.LineList, 1.0)
+    return SceneUpdate(entities=[_entity(timestamp(t_ns), "ground", lines=[grid])])
+
+
+def formations(
+    t_ns: int, states: Mapping[str, ClusterState], truth: Mapping[str, Truth], desired_m: Mapping[str, Values]
+) -> SceneUpdate:
+    """Return for each cluster the outline of its drones, and ghosts at their desired places (n, 3), if known."""
+    at, entities = timestamp(t_ns), []
+    for name, state in states.items():
+        lines, ghosts = [], []
+        places = [truth[drone].position_m for drone in state.drones if drone in truth]
+        if len(places) > 1:
+            lines.append(_line(places, colour(DARK), LinePrimitiveLineType.LineLoop))
+        if name in desired_m:
+            lines.append(_line(desired_m[name], colour(MAGENTA, 0.6), LinePrimitiveLineType.LineLoop))
+            ghosts = [
+                SpherePrimitive(pose=pose(place), size=vector((0.5, 0.5, 0.2)), color=colour(MAGENTA, 0.3))
+                for place in desired_m[name]
+            ]
+        entities.append(_entity(at, name, lines=lines, spheres=ghosts))
+    return SceneUpdate(entities=entities)
+
+
+def ellipsoids(t_ns: int, estimates: Mapping[str, Estimate], colours: Mapping[str, str]) -> SceneUpdate:
+    """Return the ellipsoids of two standard deviations of the estimated positions."""
+    at, entities = timestamp(t_ns), []
+    for name, estimate in estimates.items():
+        sigma_m, axes = principal_axes(np.array(estimate.covariance).reshape(6, 6)[:3, :3])
+        shown = SpherePrimitive(
+            pose=pose(estimate.position_m, axes),
+            size=vector([2.0 * SIGMAS * each for each in sigma_m]),
+            color=colour(colours.get(name, GREY), 0.25),
+        )
+        entities.append(_entity(at, name, spheres=[shown]))
+    return SceneUpdate(entities=entities)
+
+
+class DroneTrails:
+    """The last seconds of each drone's path."""
+
+    def __init__(self) -> None:
+        self._paths: dict[str, deque[Sequence[float]]] = {}
+        self._length = round(TRAIL_S * 1e9) // TRAIL_STEP_NS + 1
+
+    def update(self, t_ns: int, truth: Mapping[str, Truth], colours: Mapping[str, str]) -> SceneUpdate:
+        """Add the positions of an instant, return the trails."""
+        at, entities = timestamp(t_ns), []
+        for name, state in truth.items():
+            path = self._paths.setdefault(name, deque(maxlen=self._length))
+            path.append(state.position_m)
+            trail = _line(path, colour(colours.get(name, GREY), 0.7), LinePrimitiveLineType.LineStrip)
+            entities.append(_entity(at, name, lines=[trail]))
+        return SceneUpdate(entities=entities)
+
+
+def _point(v: Vector) -> Point3:
+    x, y, z = map(float, v)
+    return Point3(x=x, y=y, z=z)
+
+
+def _line(points: Iterable[Any], tint: Color, kind: LinePrimitiveLineType, width_px: float = LINE_PX) -> LinePrimitive:
+    return LinePrimitive(
+        type=kind,
+        pose=pose((0, 0, 0)),
+        thickness=width_px,
+        scale_invariant=True,
+        points=[_point(each) for each in points],
+        color=tint,
+    )
+
+
+def _entity(at: Timestamp, name: str, **parts: Any) -> SceneEntity:
+    return SceneEntity(timestamp=at, id=name, frame_id=WORLD, **parts)

@@ -1,4 +1,4 @@
-"""Makes an export: record in, files of other tools out; they are there only when all is written.
+"""Makes an export: record in, files of other tools out, which appear when all of them are complete.
 
 Ctrl-C and full disks leave nothing that looks finished.
 """
@@ -10,14 +10,14 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from zsim import __version__
 from zsim.errors import ReportError
 from zsim.record import RecordReader
 from zsim.record.record_reader import record_at, record_notes
 from zsim_analysis.export import Format
-from zsim_analysis.export.selection import DecodedMessages, MessageSelection, TableSurvey, batches, hat_by_hat
+from zsim_analysis.export.columns import DecodedMessages, MessageSelection, TableSurvey, batches
 
 DEFAULTS = {  # names beside the record
     Format.CSV: "csv",
@@ -26,15 +26,15 @@ DEFAULTS = {  # names beside the record
     Format.FOXGLOVE: "foxglove.mcap",
 }
 MANIFEST = "export.json"  # marks a folder of tables
-MATLAB = b"MATLAB 5.0 MAT-file Platform: "  # as SciPy begins a file; MATLAB itself has a comma in it
+MATLAB = b"MATLAB 5.0 MAT-file Platform: "  # SciPy's first bytes of a file; MATLAB's own have a comma
 MCAP, MCAP_LIBRARY = b"\x89MCAP", b"foxglove-sdk"  # a file for Foxglove names its library; a record names zsim
 HEAD_MAX = 200  # bytes within which an MCAP file has named its library
 LAYOUT = "-layout.json"  # end of the name of the file beside one for Foxglove
 BLUEPRINT = ".rbl"  # likewise, for Rerun
-RERUN = b"RRF2"  # as Rerun's files begin
-RUN_FILES = ("run.mcap", "scenario.yaml", "summary.json", "report.html")  # what no export may replace
+RERUN = b"RRF2"  # first bytes of Rerun's files
+RUN_FILES = ("run.mcap", "scenario.yaml", "summary.json", "report.html")  # files that no export may replace
 
-Progress = Callable[[int, int], None]  # messages read so far, of how many
+Progress = Callable[[int, int], None]  # messages read so far, and their number
 
 
 class ExportResult(NamedTuple):
@@ -43,7 +43,7 @@ class ExportResult(NamedTuple):
     Attributes:
         paths: that were written.
         tables: name and rows of each table, or topic and messages.
-        notes: what a reader has to know: whether the record was cut or damaged, and what was left out.
+        notes: what a reader should know: whether the record was cut or damaged, and what was left out.
     """
 
     paths: tuple[Path, ...]
@@ -60,13 +60,13 @@ def export(
     progress: Progress = lambda done, of: None,
     by_name: bool = False,
 ) -> ExportResult:
-    """Write the record of a run in the form of another tool, all of it or nothing.
+    """Write the record of a run in the format of another tool, all of it or nothing.
 
     Args:
         run: its folder, or its record.
         form: of the output.
-        out: where, None for the usual place beside the record.
-        selection: which messages, None for all.
+        out: where, None for the default place beside the record.
+        selection: of messages, None for all.
         force: replace what an earlier export has written.
         progress: called now and then.
         by_name: whether each drone, cluster and process has tables of its own, of CSV and Parquet.
@@ -93,51 +93,57 @@ def _tables(
     progress: Progress,
     by_name: bool,
 ) -> ExportResult:
+    from zsim_analysis.export.table_files import MatFile, TableFolder
+
     survey = TableSurvey(reader, selection)
     total = sum(survey.rows.values())
     messages = selection.messages(reader, survey.wanted)
     decoded = DecodedMessages(messages, survey.decode, lambda done: progress(done, total))
     with placed(target) as (new,):
-        sink = _sink(form, new, survey)
-        with sink:
-            for batch in batches(hat_by_hat(decoded), sink.columns, by_name):
+        if form is not Format.MAT:
+            new.mkdir()
+        with MatFile(new, survey) if form is Format.MAT else TableFolder(new, form.value, survey) as sink:
+            for batch in batches(decoded, survey.width, by_name):
                 sink.write(batch)
             written = sink.finish()
         if not written:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
-        notes = [*record_notes(reader), *_refused(decoded.refused), *_left_out(survey.pictures)]
+        notes = [*record_notes(reader), *_refused(decoded.refused)]
+        if survey.pictures:
+            notes.append(f"{survey.pictures} pictures are left out: a table holds none; --format foxglove has them")
         if form is not Format.MAT:
-            (new / MANIFEST).write_bytes(_manifest(reader, selection, written, notes))
+            content = {
+                "record": str(reader.path.resolve()),
+                "zsim": __version__,
+                "keys": selection.expressions or ("**",),
+                "from_s": selection.from_s,
+                "to_s": selection.to_s,
+                "complete": reader.complete,
+                "notes": notes,
+                "tables": {table.file: {"rows": table.rows, "columns": table.columns} for table in written},
+            }
+            # by json, not msgspec: a path may hold bytes that are not UTF-8
+            (new / MANIFEST).write_bytes(f"{json.dumps(content, indent=2)}\n".encode())
     return ExportResult((target,), {table.file: table.rows for table in written}, notes)
-
-
-def _sink(form: Format, new: Path, survey: TableSurvey) -> Any:
-    if form is Format.MAT:
-        from zsim_analysis.export.matlab import MatFile
-
-        return MatFile(new, survey)
-    from zsim_analysis.export.table_folder import TableFolder
-
-    new.mkdir()
-    return TableFolder(new, form.value, survey.fields)
 
 
 def _foxglove(
     reader: RecordReader, selection: MessageSelection, target: Path, force: bool, progress: Progress
 ) -> ExportResult:
-    from zsim_analysis.export import rerun_blueprint
+    from zsim_analysis.export import viewers
     from zsim_analysis.export.foxglove_file import convert
 
     beside = (target.with_name(f"{target.stem}{LAYOUT}"), target.with_suffix(BLUEPRINT))
-    targets = (target, *(beside if rerun_blueprint.is_available() else beside[:1]))
+    targets = (target, *(beside if viewers.has_rerun() else beside[:1]))
     for path in targets:
         check_free(path, force, reader.path)
     with placed(*targets) as (new, new_layout, *new_blueprint):
-        run = convert(reader, selection, new, new_layout, progress)
+        run = convert(reader, selection, new, progress)
         if not run.topics:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
+        new_layout.write_text(viewers.layout(run) + "\n", encoding="utf-8")
         for path in new_blueprint:
-            rerun_blueprint.write_blueprint(path, target.stem, run.topics, run.variables, run.rotors)
+            viewers.write_blueprint(path, target.stem, run)
     return ExportResult(targets, run.topics, [*record_notes(reader), *_refused(run.refused)])
 
 
@@ -145,11 +151,8 @@ def _refused(count: int) -> list[str]:
     return [f"{count} messages on record are not what their key promises and were left out"] if count else []
 
 
-def _left_out(pictures: int) -> list[str]:
-    return [f"{pictures} pictures are left out: a table holds none; --format foxglove has them"] if pictures else []
-
-
 def _nothing(reader: RecordReader, selection: MessageSelection) -> str:
+    """Return why there is nothing to export."""
     count = sum(reader.topics().values())
     if not count:
         return "holds no message; there is nothing to export"
@@ -159,23 +162,8 @@ def _nothing(reader: RecordReader, selection: MessageSelection) -> str:
     return " ".join(["has no message", *criteria, f"that can be exported; it holds {count} messages"])
 
 
-def _manifest(reader: RecordReader, selection: MessageSelection, written: list[Any], notes: list[str]) -> bytes:
-    """Return the content of export.json: what tables were made from, and their columns."""
-    content = {
-        "record": str(reader.path.resolve()),
-        "zsim": __version__,
-        "keys": selection.expressions or ("**",),
-        "from_s": selection.from_s,
-        "to_s": selection.to_s,
-        "complete": reader.complete,
-        "notes": notes,
-        "tables": {table.file: {"rows": table.rows, "columns": table.columns} for table in written},
-    }
-    return f"{json.dumps(content, indent=2)}\n".encode()  # not msgspec's: a path may hold bytes that are no UTF-8
-
-
 def check_free(target: Path, force: bool, record: Path) -> None:
-    """Refuse to replace what must stay.
+    """Refuse a target that must not be replaced.
 
     Raises:
         ReportError: the target exists and `force` is not set; or it is the record, or no export.
@@ -212,14 +200,9 @@ def _is_export(file: Path) -> bool:
     return file.name not in RUN_FILES and (head.startswith(MATLAB) or (head.startswith(MCAP) and MCAP_LIBRARY in head))
 
 
-def _reason(error: OSError) -> str:
-    """Return the reason alone, without the text that libraries add to it."""
-    return os.strerror(error.errno) if error.errno else str(error)
-
-
 @contextmanager
 def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
-    """Yield a path for each file or folder that is to be written; put them in place together at the end.
+    """Yield a temporary path for each file or folder to be written; move them to their targets together at the end.
 
     Existing ones are replaced: call `check_free` first.
 
@@ -232,12 +215,13 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
             yield written
             _put_in_place(written, targets)
     except OSError as error:
-        raise ReportError(f"{targets[0]}: cannot be written ({_reason(error)}); make room and export again") from error
+        reason = os.strerror(error.errno) if error.errno else error  # without the text that libraries add to it
+        raise ReportError(f"{targets[0]}: cannot be written ({reason}); make room and export again") from error
 
 
 @contextmanager
 def _beside(target: Path) -> Iterator[Path]:
-    """Yield a new folder beside a target; it is removed at the end, as are parents that were made and are empty."""
+    """Yield a new folder beside a target; at the end it is removed, as are new parents that are still empty."""
     made = [parent for parent in target.parents if not parent.exists()]
     folder = target.parent / f".export-{secrets.token_hex(4)}"  # TemporaryDirectory leaves it if Ctrl-C comes within
     try:
@@ -252,14 +236,14 @@ def _beside(target: Path) -> Iterator[Path]:
 
 def _put_in_place(written: Sequence[Path], targets: Sequence[Path]) -> None:
     """Put all files or folders in place; after a failure or Ctrl-C the old ones are back."""
-    olds = [new.with_name(f"{new.name}.old") for new in written]
+    moves = [(new, target, new.with_name(f"{new.name}.old")) for new, target in zip(written, targets, strict=True)]
     try:
-        for new, target, old in zip(written, targets, olds, strict=True):
+        for new, target, old in moves:
             if target.exists():
                 target.replace(old)
             new.replace(target)
     except BaseException:
-        for new, target, old in zip(written, targets, olds, strict=True):
+        for new, target, old in moves:
             if not new.exists() and target.exists():
                 target.replace(new)
             if old.exists():

@@ -1,16 +1,21 @@
-"""How well each drone is estimated, and how well it flies its commands: both against its truth. Pure."""
+"""Errors of single drones against their truth: of estimates and of flown velocities; distances between drones. Pure."""
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
+from zsim.errors import ZsimError
 from zsim.math.frames import wrap_angle
+from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim_analysis.reading.formation import common_instants
 from zsim_analysis.reading.recorded_flight import Array, DroneEstimates, RecordedFlight, Track, VelocityCommands
 
 SIGMAS = 2.0  # half width of the band that is drawn, in standard deviations
 DEGREES = 6  # of freedom of a drone's NEES: position and velocity
-ESTIMATES_MAX = 200_000  # judged of a flight: a second of work
+ESTIMATES_MAX = 200_000  # of a flight, which take a second to evaluate
 POSITION, YAW = (0, 1, 2), 3  # columns of errors and velocities: x, y, z, heading
+INSTANTS = 1500  # at which distances are computed, spread over the flight: more than a figure has pixels
 
 
 class EstimateErrors(NamedTuple):
@@ -18,8 +23,8 @@ class EstimateErrors(NamedTuple):
 
     Attributes:
         t_s: (K,) simulated time.
-        error: (K, 4) x, y, z in W [m], heading the short way [rad].
-        sigma: (K, 4) standard deviations that the estimator states of them.
+        error: (K, 4) x, y, z in W [m], heading wrapped to ±π [rad].
+        sigma: (K, 4) their standard deviations as stated by the estimator.
         nees: (K,) normalised error squared of position and velocity, eᵀ P⁻¹ e; NaN where P is singular. Its mean is
             DEGREES where the stated covariance is true [Bar-Shalom, Li, Kirubarajan 2001, 5.4.2].
     """
@@ -30,16 +35,16 @@ class EstimateErrors(NamedTuple):
     nees: Array
 
     def share_inside(self, rows: np.ndarray) -> Array:
-        """Return which share (4,) of the errors at some instants is within SIGMAS standard deviations."""
+        """Return the share (4,) of the errors at some instants that are within SIGMAS standard deviations."""
         return np.mean(np.abs(self.error[rows]) <= SIGMAS * self.sigma[rows], axis=0)
 
 
 class VelocityResponse(NamedTuple):
-    """Commanded and flown velocity of one drone at C instants, a new command each.
+    """Commanded and flown velocity of one drone at C instants, those of its commands.
 
     Attributes:
         t_s: (C,) simulated time.
-        commanded, flown: (C, 4) forward, left, up [m/s], yaw rate [rad/s]; flown by the true heading.
+        commanded, flown: (C, 4) forward, left, up [m/s], yaw rate [rad/s], by the true heading.
     """
 
     t_s: Array
@@ -48,21 +53,21 @@ class VelocityResponse(NamedTuple):
 
 
 def estimate_errors(flight: RecordedFlight) -> dict[str, EstimateErrors]:
-    """Return the errors of the estimates of every drone whose truth is known and that has estimates on record.
+    """Return the errors of the estimates of every drone that has both truth and estimates on record.
 
-    Of very many, at every n-th instant of truth, the same ones of all drones.
+    Of more than ESTIMATES_MAX estimates, every n-th instant of truth is evaluated, the same for all drones.
     """
-    own = {track.name: track for track in flight.tracks if not track.external}
     step = 1 + sum(len(each.t_ns) for each in flight.estimates.values()) // ESTIMATES_MAX
-    errors = {name: _errors(own[name], each, step) for name, each in flight.estimates.items() if name in own}
-    return {name: errors[name] for name in own if name in errors and len(errors[name].t_s)}
+    own = [track for track in flight.tracks if not track.external and track.name in flight.estimates]
+    errors = {track.name: _errors(track, flight.estimates[track.name], step) for track in own}
+    return {name: each for name, each in errors.items() if len(each.t_s)}
 
 
 def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:
-    """Return the velocities of every drone whose truth is known and that was flown by velocity commands."""
-    own = {track.name: track for track in flight.tracks if not track.external}
-    responses = {name: _response(own[name], each) for name, each in flight.commands.items() if name in own}
-    return {name: responses[name] for name in own if name in responses and len(responses[name].t_s)}
+    """Return the velocities of every drone that has both truth and velocity commands on record."""
+    own = [track for track in flight.tracks if not track.external and track.name in flight.commands]
+    responses = {track.name: _response(track, flight.commands[track.name]) for track in own}
+    return {name: each for name, each in responses.items() if len(each.t_s)}
 
 
 def _errors(track: Track, estimates: DroneEstimates, step: int) -> EstimateErrors:
@@ -100,3 +105,61 @@ def _in_heading(v_W: Array, yaw: Array) -> Array:
     """Return velocities (K, 3) forward, left and up, of those in W."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.column_stack([c * v_W[:, 0] + s * v_W[:, 1], c * v_W[:, 1] - s * v_W[:, 0], v_W[:, 2]])
+
+
+class Distances(NamedTuple):
+    """True distances of the drones at K instants.
+
+    Attributes:
+        t_s: (K,) simulated time.
+        pairs: names of the drones of each pair, in the order of the columns of `between`.
+        between: (K, P) [m] of every pair; without columns if there are more pairs than requested.
+        nearest: (K, N) [m] of each drone to its nearest neighbour.
+    """
+
+    t_s: Array
+    pairs: tuple[tuple[str, str], ...]
+    between: Array
+    nearest: Array
+
+
+class Separations(NamedTuple):
+    """Limits of distances [m]: the controllers' margin and alarm, and where two hulls touch; None if unknown."""
+
+    margin_m: float | None
+    alarm_m: float | None
+    touch_m: float | None
+
+
+def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
+    """Return the distances of simulated drones, of each pair if there are at most `pairs_max`; None below two."""
+    tracks = [track for track in flight.tracks if len(track.t_ns) and not track.external]
+    t_ns, places = common_instants(tracks)
+    if len(tracks) < 2 or not len(t_ns):
+        return None
+    rows = np.unique(np.linspace(0, len(t_ns) - 1, INSTANTS).astype(int))
+    p_W = np.stack([track.p_W[place[rows]] for track, place in zip(tracks, places, strict=True)], axis=1)
+    nearest = np.full(p_W.shape[:2], np.inf)
+    between, pairs = [], []
+    for i, j in combinations(range(len(tracks)), 2):
+        apart = np.linalg.norm(p_W[:, i] - p_W[:, j], axis=1)
+        nearest[:, i] = np.minimum(nearest[:, i], apart)
+        nearest[:, j] = np.minimum(nearest[:, j], apart)
+        if len(tracks) * (len(tracks) - 1) // 2 <= pairs_max:
+            between.append(apart)
+            pairs.append((tracks[i].name, tracks[j].name))
+    columns = np.column_stack(between) if between else np.zeros((len(rows), 0))
+    return Distances(t_ns[rows] / 1e9, tuple(pairs), columns, nearest)
+
+
+def separations(flight: RecordedFlight) -> Separations:
+    """Return the limits of distances by the scenario of a flight: the largest of its clusters, and of its two hulls."""
+    gains = [cluster.gains for cluster in flight.scenario.clusters] if flight.scenario else []
+    margin_m = max((each.separation_min_m for each in gains), default=None)
+    alarm_m = max((each.separation_alarm_m for each in gains), default=None)
+    drones = flight.scenario.drones if flight.scenario else ()
+    try:
+        radii_m = sorted(vehicle_of(drone.model).airframe.hull_radius_m for drone in drones)
+    except ZsimError:  # a model of the user's that is not here
+        radii_m = []
+    return Separations(margin_m, alarm_m, sum(radii_m[-2:]) if len(radii_m) > 1 else None)

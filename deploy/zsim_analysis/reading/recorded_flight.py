@@ -1,15 +1,31 @@
-"""A flight as arrays: what was recorded of its drones, its formations, its events and its processes. Pure."""
+"""A flight as arrays: tracks, estimates, commands, cluster states, events and processes.
 
+`read_flight` makes them in one pass over a record; `FlightReader` makes them from messages while the flight is flown in
+this process.
+"""
+
+from array import array
+from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
+from sys import intern
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
+from zsim.contract import keys
+from zsim.contract.flight_messages import Covariance, Quaternion
+from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import ClusterRequest, Event
-from zsim.record import Completeness
+from zsim.contract.run_messages import Bye, ClusterRequest, Event, Join
+from zsim.record import Completeness, RecordReader, completeness
 from zsim.scenario.scenario import Scenario
+from zsim.schema.message import Vector3
+from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -19,15 +35,15 @@ TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
 
 @dataclass
 class Track:
-    """One drone as it truly flew, W and B as in the contract.
+    """True motion of one drone, W and B as in the contract.
 
     Attributes:
-        t_ns: (T,) instants of truth, ascending, without doubles.
+        t_ns: (T,) instants of truth, ascending and unique.
         truth: (T, 13) position [m], velocity [m/s], orientation w first, angular velocity [rad/s; B].
         status_t_ns: (S,) instants of status.
         states: (S,) state of the firmware by name.
         battery_percent: (S,).
-        external: whether it is the pose that a driver has published: the best that it had, not the truth.
+        external: the body is external, so that `truth` is the pose published by its driver, which is an estimate.
     """
 
     name: str
@@ -50,7 +66,7 @@ class Track:
 
     @property
     def yaw_rate(self) -> Array:
-        """Return the rate (T,) [rad/s] at which it turns about the vertical."""
+        """Return the angular velocity about the vertical axis of W (T,) [rad/s]."""
         w, x, y, z = self.truth[:, 6:10].T
         up_B = np.column_stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
         return np.sum(up_B * self.truth[:, 10:13], axis=1)
@@ -58,10 +74,10 @@ class Track:
 
 @dataclass
 class DroneEstimates:
-    """What the estimator of one drone published.
+    """Published estimates of one drone.
 
     Attributes:
-        t_ns: (E,) ascending, without doubles.
+        t_ns: (E,) ascending and unique.
         p_W: (E, 3) position [m].
         v_W: (E, 3) velocity [m/s].
         yaw, yaw_sigma: (E,) heading and its standard deviation [rad].
@@ -78,13 +94,13 @@ class DroneEstimates:
 
 @dataclass
 class VelocityCommands:
-    """The velocities that one drone was to fly, sent by those who flew it.
+    """Velocity commands of one drone that were sent by its commander.
 
     Attributes:
-        t_ns: (C,) ascending, without doubles.
+        t_ns: (C,) ascending and unique.
         velocity: (C, 3) [m/s] as sent.
         yaw_rate: (C,) [rad/s].
-        in_W: (C,) the velocity is in W; else x is forward and y left by the sender's idea of the heading.
+        in_W: (C,) whether the velocity is in W; otherwise x is forward and y left by the sender's estimated heading.
     """
 
     t_ns: Times
@@ -95,11 +111,11 @@ class VelocityCommands:
 
 @dataclass
 class ClusterStates:
-    """What the controller of one cluster published: K instants, n names.
+    """Published states of one cluster's controller: K instants, n variables.
 
     Attributes:
         reasons: (K,) why it waits or is held.
-        requests: that it took, from others than its plan.
+        requests: accepted and refused, from sources other than its plan.
     """
 
     name: str
@@ -115,7 +131,7 @@ class ClusterStates:
 
 @dataclass
 class RecordedProcess:
-    """A process that joined."""
+    """A process that joined the run."""
 
     name: str
     role: str = ""
@@ -129,15 +145,15 @@ class RecordedProcess:
 
 @dataclass
 class RecordedFlight:
-    """Everything of a record that a report needs; what is not on record is None or empty.
+    """A flight with all that a report needs of it; fields that are not on record are None or empty.
 
     Attributes:
-        messages: on record, all keys.
+        messages: number on record, over all keys.
         completeness: of the record.
-        wall_s: wall time from the first truth to the last, as they reached the recorder.
-        began_ns: wall time of the first truth, nanoseconds since 1970; None where nothing flew.
-        undecoded: payloads that are not of the type of their key.
-        estimates, commands: by drone; empty where they were not asked for.
+        wall_s: wall time from the first to the last truth message, by the recorder's clock.
+        began_ns: wall time of the first truth message, nanoseconds since 1970; None without truth.
+        undecoded: number of payloads that are not of the type of their key.
+        estimates, commands: by drone; empty unless requested.
     """
 
     info: Info | None
@@ -156,7 +172,7 @@ class RecordedFlight:
 
     @property
     def end(self) -> dict[str, Any] | None:
-        """Return the data of the world's last `end` event, None if there is none on record."""
+        """Return the data of the world's last `end` event, None without one."""
         return next((event.data for event in reversed(self.events) if event.kind == "end"), None)
 
     @property
@@ -173,3 +189,321 @@ class RecordedFlight:
     def last_ns(self) -> int:
         """Return the last instant of truth."""
         return max((int(track.t_ns[-1]) for track in self.tracks if len(track.t_ns)), default=0)
+
+
+def read_flight(path: Path, answers: bool = False, motion: bool = True) -> RecordedFlight:
+    """Return the flight of a record.
+
+    Args:
+        path: of the record.
+        answers: include the drones' estimates and velocity commands.
+        motion: include all truth and status messages; otherwise those of one instant per second.
+
+    Raises:
+        RecordError: no such record.
+    """
+    with RecordReader(path) as reader:
+        flight = FlightReader(answers)
+        wanted = [key for key in reader.topics() if flight.handler(key)]
+        if motion:
+            for message in reader.messages(wanted, by_time=False):
+                flight.add(message.key, message.payload, message.wall_ns)
+            whole = completeness(reader)
+        else:
+            sampled = {key for key in wanted if keys.leaf(key) in ("truth", "status")}
+            others = {key for key in wanted if keys.parts(key)[0] != "drone"}
+            whole = completeness(reader, others, sampled, flight.add)
+        recorded = flight.flight(sum(reader.topics().values()), whole)
+        search_modules(path, recorded.info)
+        return recorded
+
+
+class _Truth(Struct):
+    """The fields of a truth message that are read."""
+
+    t_ns: int
+    position_m: Vector3
+    velocity_m_s: Vector3
+    orientation_wxyz: Quaternion
+    angular_velocity_rad_s: Vector3
+
+
+class _Status(Struct):
+    t_ns: int
+    state: str
+    battery_percent: float
+    commander: str | None = None
+
+
+class _State(Struct):
+    t_ns: int
+    phase: str
+    names: tuple[str, ...]
+    value: tuple[float, ...]
+    desired: tuple[float, ...]
+    drones: tuple[str, ...] = ()
+    reason: str = ""
+
+
+class _Estimate(Struct):
+    t_ns: int
+    position_m: Vector3
+    velocity_m_s: Vector3
+    yaw_rad: float
+    covariance: Covariance
+    yaw_sigma_rad: float
+
+
+class _Velocity(Struct):
+    t_ns: int
+    source: str
+    velocity_m_s: Vector3
+    yaw_rate_rad_s: float
+    frame: str = "heading"
+
+
+class _Rows:
+    """Rows of numbers with their times, stored compactly."""
+
+    def __init__(self, width: int, kind: str = "f") -> None:
+        self.t_ns, self.values, self._width = array("q"), array(kind), width
+
+    def by_time(self) -> tuple[Times, np.ndarray]:
+        """Return times (R,) [ns], ascending and unique, and rows (R, width)."""
+        t_ns, first = np.unique(np.array(self.t_ns, np.int64), return_index=True)
+        return t_ns, np.array(self.values).reshape(-1, self._width)[first]
+
+
+class _StatusRows:
+    """Status of one drone."""
+
+    def __init__(self) -> None:
+        self.t_ns, self.battery = array("q"), array("d")
+        self.states: list[str] = []
+
+    def by_time(self) -> tuple[Times, list[str], Array]:
+        """Return times (S,) [ns], ascending and unique, states (S,) and charge (S,) [%]."""
+        t_ns, first = np.unique(np.array(self.t_ns, np.int64), return_index=True)
+        return t_ns, [self.states[i] for i in first], np.array(self.battery)[first]
+
+
+class _StateRows:
+    """States of one cluster by columns: the names in each message of a large formation outweigh its values."""
+
+    def __init__(self) -> None:
+        self._names: tuple[str, ...] = ()
+        self._drones: tuple[str, ...] = ()
+        self._clear()
+
+    def _clear(self) -> None:
+        self._times, self._value, self._desired = array("q"), array("d"), array("d")
+        self._phases: list[str] = []
+        self._reasons: list[str] = []
+
+    def add(self, state: _State) -> None:
+        """Add a state; one with another number of variables replaces all earlier ones."""
+        count = len(state.names)
+        if not len(state.value) == len(state.desired) == count > 0:
+            return
+        if count != len(self._names):
+            self._clear()
+        self._names, self._drones = state.names, state.drones
+        self._times.append(state.t_ns)
+        self._value.extend(state.value)
+        self._desired.extend(state.desired)
+        self._phases.append(intern(state.phase))
+        self._reasons.append(intern(state.reason))
+
+    def states(self, name: str, drones: tuple[str, ...], requests: list[ClusterRequest]) -> ClusterStates:
+        """Return all states by time, the last one of each instant."""
+        count = len(self._times)
+        t_ns, places = np.unique(np.array(self._times, np.int64)[::-1], return_index=True)
+        last = count - 1 - places
+        return ClusterStates(
+            name=name,
+            drones=drones or self._drones,
+            names=self._names,
+            t_ns=t_ns,
+            value=np.array(self._value).reshape(count, len(self._names))[last],
+            desired=np.array(self._desired).reshape(count, len(self._names))[last],
+            phases=[self._phases[i] for i in last],
+            reasons=[self._reasons[i] for i in last],
+            requests=requests,
+        )
+
+
+_Handler = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
+
+
+class FlightReader:
+    """Collects a flight message by message; with `answers`, the drones' estimates and velocity commands, too."""
+
+    def __init__(self, answers: bool = False) -> None:
+        self._answers = answers
+        self._infos: list[Info] = []
+        self._events: list[Event] = []
+        self._truth: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(TRUTH_WIDTH, "d"))
+        self._status: defaultdict[str, _StatusRows] = defaultdict(_StatusRows)
+        self._commanders: defaultdict[str, list[tuple[int, str]]] = defaultdict(list)
+        self._estimates: defaultdict[str, _Rows] = defaultdict(lambda: _Rows(3 + 3 + 1 + 1 + 36))
+        self._commands: defaultdict[tuple[str, str], _Rows] = defaultdict(lambda: _Rows(3 + 1 + 1))
+        self._states: defaultdict[str, _StateRows] = defaultdict(_StateRows)
+        self._requests: defaultdict[str, list[ClusterRequest]] = defaultdict(list)
+        self._processes: dict[str, RecordedProcess] = {}
+        self._first_wall_ns: int | None = None
+        self._last_wall_ns = 0
+        self._undecoded = 0
+        self._handlers: dict[str, _Handler | None] = {}
+
+    def handler(self, key: str) -> _Handler | None:
+        """Return the decoder of a key's messages and what stores them, None for keys that no report needs."""
+        if key not in self._handlers:
+            group, _, what = keys.parts(key)
+            kinds: dict[str, tuple[type[Struct], Callable[[str, Any], None]]] = {
+                keys.INFO: (Info, lambda _, message: self._infos.append(message)),
+                keys.EVENT: (Event, lambda _, message: self._events.append(message)),
+                "process/join": (Join, self._add_process),
+                "process/bye": (Bye, self._add_process),
+                "drone/truth": (_Truth, self._add_truth),
+                "drone/sensor/status": (_Status, self._add_status),
+                "cluster/state": (_State, lambda name, message: self._states[name].add(message)),
+                "cluster/request": (ClusterRequest, lambda name, message: self._requests[name].append(message)),
+            }
+            if self._answers:
+                kinds["drone/estimate"] = (_Estimate, self._add_estimate)
+                kinds["drone/cmd/velocity"] = (_Velocity, self._add_command)
+            kind, store = kinds.get(f"{group}/{what}" if what else key, (None, None))
+            self._handlers[key] = (msgspec.msgpack.Decoder(kind), store) if kind and store else None
+        return self._handlers[key]
+
+    def add(self, key: str, payload: bytes, wall_ns: int = 0) -> None:
+        """Add a message of a record; one that cannot be decoded is counted. `wall_ns` is needed for truth only."""
+        handler = self.handler(key)
+        if handler is None:
+            return
+        decoder, store = handler
+        try:
+            message = decoder.decode(payload)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            self._undecoded += 1
+            return
+        if isinstance(message, _Truth):
+            if self._first_wall_ns is None:
+                self._first_wall_ns = wall_ns
+            self._last_wall_ns = wall_ns
+        store(keys.parts(key)[1], message)
+
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Add a message, not encoded, of a flight in this process."""
+        if handler := self.handler(key):
+            handler[1](keys.parts(key)[1], message)
+
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+        """Add the world's messages of a gate of a flight in this process."""
+        self._first_wall_ns, self._last_wall_ns = self._first_wall_ns or wall_ns, wall_ns
+        for key, payload in gate.pairs:
+            if handler := self.handler(key):
+                handler[1](keys.parts(key)[1], handler[0].decode(payload))
+
+    def flight(self, messages: int = 0, completeness: Completeness | None = None) -> RecordedFlight:
+        """Return the flight after all messages have been added; the arguments describe its record, if any."""
+        info = self._infos[-1] if self._infos else None
+        names = [drone.name for drone in info.drones] if info else sorted(self._truth)
+        external = {drone.name for drone in info.drones if drone.body is not msgspec.UNSET} if info else set[str]()
+        members = {c.name: c.drones for c in info.clusters} if info else dict.fromkeys(self._states, ())
+        return RecordedFlight(
+            info=info,
+            scenario=scenario_of(info),
+            tracks=[
+                Track(name, *self._truth[name].by_time(), *self._status[name].by_time(), name in external)
+                for name in names
+            ],
+            clusters=[
+                self._states[name].states(name, drones, self._requests[name]) for name, drones in members.items()
+            ],
+            events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
+            processes=list(self._processes.values()),
+            messages=messages,
+            completeness=completeness or Completeness(),
+            wall_s=(self._last_wall_ns - (self._first_wall_ns or 0)) / 1e9,
+            undecoded=self._undecoded,
+            began_ns=self._first_wall_ns,
+            estimates={drone: _estimates(*rows.by_time()) for drone, rows in self._estimates.items()},
+            commands=self._flown_commands(),
+        )
+
+    def _add_truth(self, name: str, truth: _Truth) -> None:
+        rows = self._truth[name]
+        rows.t_ns.append(truth.t_ns)
+        rows.values.extend(truth.position_m)
+        rows.values.extend(truth.velocity_m_s)
+        rows.values.extend(truth.orientation_wxyz)
+        rows.values.extend(truth.angular_velocity_rad_s)
+
+    def _add_status(self, name: str, status: _Status) -> None:
+        rows = self._status[name]
+        rows.t_ns.append(status.t_ns)
+        rows.states.append(status.state)
+        rows.battery.append(status.battery_percent)
+        if self._answers:
+            commanders, commander = self._commanders[name], status.commander or ""
+            if not commanders or commanders[-1][1] != commander:
+                commanders.append((status.t_ns, commander))
+
+    def _add_estimate(self, drone: str, estimate: _Estimate) -> None:
+        rows = self._estimates[drone]
+        rows.t_ns.append(estimate.t_ns)
+        rows.values.extend(estimate.position_m)
+        rows.values.extend(estimate.velocity_m_s)
+        rows.values.extend((estimate.yaw_rad, estimate.yaw_sigma_rad))
+        rows.values.extend(estimate.covariance)
+
+    def _add_command(self, drone: str, command: _Velocity) -> None:
+        rows = self._commands[drone, command.source]
+        rows.t_ns.append(command.t_ns)
+        rows.values.extend(command.velocity_m_s)
+        rows.values.extend((command.yaw_rate_rad_s, command.frame == "world"))
+
+    def _add_process(self, name: str, message: Join | Bye) -> None:
+        process = self._processes.setdefault(name, RecordedProcess(name))
+        if isinstance(message, Bye):
+            process.left = message.reason
+            return
+        process.role, process.host, process.pid = message.role, message.host, message.pid
+        process.version, process.fingerprint = message.version, message.fingerprint
+        process.incarnations += 1
+        process.left = ""
+
+    def _flown_commands(self) -> dict[str, VelocityCommands]:
+        """Return the commands of each drone's commander by time; those of other sources were not obeyed."""
+        kept: defaultdict[str, list[tuple[Times, np.ndarray]]] = defaultdict(list)
+        for (drone, source), rows in self._commands.items():
+            t_ns, values = rows.by_time()
+            obeyed = _obeyed(t_ns, source, self._commanders[drone])
+            kept[drone].append((t_ns[obeyed], values[obeyed]))
+        flown = {}
+        for drone, parts in kept.items():
+            t_ns, first = np.unique(np.concatenate([times for times, _ in parts]), return_index=True)
+            rows = np.concatenate([values for _, values in parts])[first].astype(np.float64)
+            flown[drone] = VelocityCommands(t_ns, rows[:, :3], rows[:, 3], rows[:, 4] > 0)
+        return flown
+
+
+def _estimates(t_ns: Times, rows: np.ndarray) -> DroneEstimates:
+    p_W, v_W, yaw, sigma, covariance = np.split(rows.astype(np.float64), (3, 6, 7, 8), axis=1)
+    return DroneEstimates(t_ns, p_W, v_W, yaw[:, 0], sigma[:, 0], covariance.reshape(-1, 6, 6))
+
+
+def _obeyed(t_ns: Times, source: str, commanders: list[tuple[int, str]]) -> NDArray[np.bool_]:
+    """Return which commands (C,) of a source were obeyed.
+
+    Those are obeyed whose source the next status names as commander, or that were sent while no commander was named.
+    """
+    if not commanders:
+        return np.ones(len(t_ns), bool)
+    since_ns = np.array([t for t, _ in commanders])
+    place = np.searchsorted(since_ns, t_ns, side="right") - 1
+    named = np.array([name for _, name in commanders])
+    following = named[np.minimum(place + 1, len(named) - 1)]
+    now = named[np.maximum(place, 0)]
+    return (now == source) | ((now == "") & np.isin(following, ("", source)))

@@ -1,18 +1,22 @@
-"""The record of a run, opened to be played back or flown again: its messages, who took part, and each gate's inputs.
+"""The record of a run, opened to be played back or flown again: its messages, its processes, and each gate's inputs.
 
 The order of a record is the order in which messages passed the world: what stands before the clock of a gate was
 received before that gate was integrated.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, Struct
 
 from zsim.contract import keys, messages, run_messages
+from zsim.contract.flight_messages import LinkState
 from zsim.errors import DecodeError, RecordError, ZsimError
 from zsim.record import Recorded, RecordReader
 from zsim.record.record_reader import record_at
@@ -23,7 +27,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim_agents.hosting import agents_of
 
-# events of a process that did not take part all the time
+# events of a process that was absent for a part of the run
 ABSENCES = ("death", "failure", "restart", "superseded", "doubled", "drop", "leave")
 PROCESS_MESSAGES = ("join", "done", "bye")  # from processes to the world
 
@@ -46,23 +50,19 @@ def open_run(place: Path) -> Iterator[RecordedRun]:
         ScenarioError: this version cannot read its scenario.
     """
     with RecordReader(record_at(place)) as reader:
-        info = _info(reader)
+        recorded = reader.last(keys.INFO)
+        if recorded is None:
+            raise RecordError(f"{reader.path}: has no world/info, so that its run is unknown")
+        try:
+            info = messages.decode(keys.INFO, recorded.payload)
+        except DecodeError as error:
+            raise RecordError(f"{reader.path}: {error}; the record is of another version") from error
         search_modules(reader.path, info)
         yield RecordedRun(reader, info, scenario_file.from_text(info.scenario))
 
 
-def _info(reader: RecordReader) -> messages.Info:
-    recorded = reader.last(keys.INFO)
-    if recorded is None:
-        raise RecordError(f"{reader.path}: has no world/info; the run that it is of is not known")
-    try:
-        return messages.decode(keys.INFO, recorded.payload)
-    except DecodeError as error:
-        raise RecordError(f"{reader.path}: {error}; the record is of another version") from error
-
-
 def search_modules(record: Path, info: messages.Info | None) -> None:
-    """Let modules that a run's scenario names be found where the run found them, beside its record, or where we are."""
+    """Search modules named by a run's scenario where the run found them, beside its record, and in this folder."""
     recorded = info.module_folders if info and info.module_folders is not UNSET else ()
     plugin.search(*map(Path, recorded), record.parent, Path.cwd())
 
@@ -106,8 +106,74 @@ def command_age_ms(path: Path) -> dict[str, float] | None:
     return {"p50": float(p50), "p99": float(p99), "max": float(ages.max())}
 
 
+class DriverLink(Struct, frozen=True):
+    """Quality of the link to one external drone over a run; None for figures that its driver did not report.
+
+    Attributes:
+        peer: address of the aircraft.
+        age_max_ms: largest reported age of the newest datagram, in wall time.
+        loss_mean_percent, loss_max_percent: of the datagrams sent by the aircraft.
+        round_trip_ms: median.
+        lost: number of times that the link was lost, which is after a second of silence.
+        lost_s: total duration of the losses, simulated time.
+        refused: datagrams that were malformed or of another sender, over all consecutive drivers.
+    """
+
+    peer: str
+    age_max_ms: float | None
+    loss_mean_percent: float | None
+    loss_max_percent: float | None
+    round_trip_ms: float | None
+    lost: int
+    lost_s: float
+    refused: int
+
+    def __str__(self) -> str:
+        figures = (
+            ("loss {:.1f} %", self.loss_mean_percent),
+            ("at most {:.1f} %", self.loss_max_percent),
+            ("age at most {:.0f} ms", self.age_max_ms),
+            ("round trip {:.0f} ms", self.round_trip_ms),
+        )
+        known = [text.format(value) for text, value in figures if value is not None]
+        lost = f"lost {self.lost} times, for {self.lost_s:.1f} s" if self.lost else "never lost"
+        refused = [f"{self.refused} messages refused"] if self.refused else []
+        return ", ".join([self.peer, *known, lost, *refused])
+
+
+def driver_links(path: Path) -> dict[str, DriverLink]:
+    """Return the links of a record by drone, from the reports that drivers published once a second.
+
+    Raises:
+        RecordError: no such record.
+    """
+    reports: defaultdict[str, list[LinkState]] = defaultdict(list)
+    with RecordReader(path) as reader:
+        for key, report in _read(reader, "drone/*/link"):
+            reports[keys.thing(key)].append(report)
+    return {drone: _link(of_drone) for drone, of_drone in sorted(reports.items())}
+
+
+def _link(reports: Sequence[LinkState]) -> DriverLink:
+    pairs = list(pairwise(reports))
+    ages, losses, trips = (
+        [value for report in reports if (value := getattr(report, name)) is not None]
+        for name in ("age_ms", "loss_percent", "round_trip_ms")
+    )
+    return DriverLink(
+        peer=reports[-1].peer,
+        age_max_ms=max(ages, default=None),
+        loss_mean_percent=sum(losses) / len(losses) if losses else None,
+        loss_max_percent=max(losses, default=None),
+        round_trip_ms=median(trips) if trips else None,
+        lost=sum(before.state != "lost" and after.state == "lost" for before, after in pairs),
+        lost_s=sum(after.t_ns - before.t_ns for before, after in pairs if before.state == "lost") / 1e9,
+        refused=sum(before.refused for before, after in pairs if after.seq == 0) + reports[-1].refused,
+    )
+
+
 class AgentProcess(NamedTuple):
-    """A process of zsim's agents: its name, and the names of all the agents that it ran."""
+    """A process of zsim's agents: its name, and the names of all agents that it ran."""
 
     name: str
     members: tuple[str, ...]
@@ -121,12 +187,12 @@ class RecordedAgents(NamedTuple):
     """The agents that took part in a run.
 
     Attributes:
-        processes: those whose agents can be run again; empty if there is a reason not to.
+        processes: whose agents can be run again; empty if there is a reason not to.
         why_not: that reason.
         requests: to their controllers, in order.
         fingerprints: numeric, of these processes.
-        truth_sha256: as the world reported it at the end of the run, None if the record has no end.
-        failure: of a user's code in one of these processes, which ended the run; empty if none did.
+        truth_sha256: as reported by the world at the end of the run, None if the record has no end.
+        failure: of a user's code in one of these processes, by which the run ended; empty if there was none.
     """
 
     processes: tuple[AgentProcess, ...]
@@ -143,35 +209,33 @@ class RecordedAgents(NamedTuple):
 
 
 def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenario) -> RecordedAgents:
-    """Return the agents that took part in the run of a record."""
+    """Return the agents that took part in the run of a record.
+
+    Processes of others do not announce a numeric fingerprint, or serve names that are no agents of the scenario.
+    """
     known = set(agents_of(scenario)) if scenario.drones else set()
     joins = [(keys.thing(key), join) for key, join in _read(reader, "process/*/join")]
-    ours = [(name, join) for name, join in joins if _is_ours(name, join, known)]
-    unsorted = [AgentProcess(name, (*join.serves, name)) for name, join in dict(ours).items()]
-    processes = tuple(sorted(unsorted, key=_by_role))
+    ours = [(name, j) for name, j in joins if j.version and j.fingerprint and {name, *j.serves} <= known]
+    processes = [AgentProcess(name, (*join.serves, name)) for name, join in dict(ours).items()]
+    roles = [*AGENTS]
+    processes.sort(key=lambda process: (roles.index(process.name.partition(".")[0]), process.name))
     names = frozenset(name for process in processes for name in process.members)
     events: list[run_messages.Event] = [event for _, event in _read(reader, keys.EVENT)]
-    why_not = _reason(info, scenario, events, names)
-    requests = tuple(_read(reader, "cluster/*/request"))
-    fingerprints = frozenset(join.fingerprint for _, join in ours)
-    sha256 = next((event.data.get("truth_sha256") for event in reversed(events) if event.kind == "end"), None)
-    failure = next((event.text for event in events if _is_end_by_failure(event, names)), "")
-    return RecordedAgents(() if why_not else processes, why_not, requests, fingerprints, sha256, failure)
+    why_not = _why_not(info, scenario, events, names)
+    return RecordedAgents(
+        processes=() if why_not else tuple(processes),
+        why_not=why_not,
+        requests=tuple(_read(reader, "cluster/*/request")),
+        fingerprints=frozenset(join.fingerprint for _, join in ours),
+        truth_sha256=next((e.data.get("truth_sha256") for e in reversed(events) if e.kind == "end"), None),
+        failure=next((event.text for event in events if _ends_by_failure(event, names)), ""),
+    )
 
 
-def _by_role(process: AgentProcess) -> tuple[int, str]:
-    return [*AGENTS].index(process.name.partition(".")[0]), process.name
-
-
-def _is_ours(name: str, join: run_messages.Join, known: set[str]) -> bool:
-    """Return whether a process was one of zsim's agents: others do not announce a numeric fingerprint."""
-    return bool(join.version and join.fingerprint) and {name, *join.serves} <= known
-
-
-def _reason(
+def _why_not(
     info: messages.Info, scenario: Scenario, events: Sequence[run_messages.Event], names: frozenset[str]
 ) -> str:
-    """Return why the agents are not run again, empty if they can be."""
+    """Return why the agents cannot be run again, empty if they can."""
     if info.mode == "realtime":
         return "in realtime it is not in the scenario when they answered"
     if not names:
@@ -179,31 +243,29 @@ def _reason(
     if any(fault.get("kind") == PROCESS_KILL for fault in scenario.faults):
         return f"a {PROCESS_KILL} was planned"
     for event in events:
-        if event.kind == "end" or _is_end_by_failure(event, names):
+        at, is_ours = f"at {event.t_ns / 1e9:.2f} s", event.subject in names
+        if event.kind == "end" or _ends_by_failure(event, names):
             break
-        if event.kind in ABSENCES and event.subject in names:
-            return f"{event.kind} of {event.subject} at {event.t_ns / 1e9:.2f} s"
-        if event.kind == "outputs_missing" and event.subject in names:
-            return f"outputs of {event.subject} were lost at {event.t_ns / 1e9:.2f} s"
-        if event.kind == "join" and event.subject in names and event.data.get("from_ns", 0):
-            return f"{event.subject} joined at {event.t_ns / 1e9:.2f} s, after the start"
-        if event.kind == "control" and event.data.get("ok") and _is_kill_request(event):
-            return f"a {PROCESS_KILL} was asked for at {event.t_ns / 1e9:.2f} s"
+        if event.kind in ABSENCES and is_ours:
+            return f"{event.kind} of {event.subject} {at}"
+        if event.kind == "outputs_missing" and is_ours:
+            return f"outputs of {event.subject} were lost {at}"
+        if event.kind == "join" and is_ours and event.data.get("from_ns", 0):
+            return f"{event.subject} joined {at}, after the start"
+        is_fault = event.kind == "control" and event.data.get("ok") and event.subject == "fault_add"
+        fault = event.data.get("args") if is_fault else None
+        if isinstance(fault, dict) and fault.get("kind") == PROCESS_KILL:
+            return f"a {PROCESS_KILL} was asked for {at}"
     return ""
 
 
-def _is_end_by_failure(event: run_messages.Event, names: frozenset[str]) -> bool:
-    """Return whether a user's code in one of these agents has failed, and the run ended by that."""
+def _ends_by_failure(event: run_messages.Event, names: frozenset[str]) -> bool:
+    """Return whether the run ended by this failure of a user's code in one of these agents."""
     return event.kind == "failure" and event.subject in names and event.data.get("on_death") == "end"
 
 
-def _is_kill_request(event: run_messages.Event) -> bool:
-    args = event.data.get("args")
-    return event.subject == "fault_add" and isinstance(args, dict) and args.get("kind") == PROCESS_KILL
-
-
 def _read(reader: RecordReader, expression: str) -> Iterator[tuple[str, Any]]:
-    """Yield key and message on an expression, as they were written; the world too refused those that are left out."""
+    """Yield key and message on an expression in the order of the record; invalid ones, refused by the world, not."""
     wanted = [key for key in reader.topics() if keys.matches(expression, key)]
     for recorded in reader.messages(wanted, by_time=False):
         if (message := decode_or_none(recorded)) is not None:
@@ -215,7 +277,7 @@ class GateInputs(NamedTuple):
 
     Attributes:
         t_ns: of the gate.
-        inputs: received by the world since the gate before, in order.
+        inputs: received by the world since the previous gate, in order.
         truth: payloads at the gate, by drone.
     """
 
@@ -236,7 +298,7 @@ def gates(reader: RecordReader, drones: list[str]) -> Iterator[GateInputs]:
             truth[truth_keys[recorded.key]] = recorded.payload
         elif recorded.key != keys.CLOCK:
             inputs.append(recorded)
-        elif recorded.t_ns > last_ns and truth:  # while time stands, the clock of a gate is repeated
+        elif recorded.t_ns > last_ns and truth:  # the clock of a gate is repeated while time stands still
             yield GateInputs(recorded.t_ns, inputs, truth)
             inputs, truth, last_ns = [], {}, recorded.t_ns
 

@@ -1,11 +1,12 @@
-"""What a flight did not do of its plan, and the incidents of its drones: so that no report hides them.
+"""The verdict on a flight: which steps of its plan it did not fly, and the incidents of its drones. Pure but `verdict`.
 
-Pure. Order of this file: what is judged; drones (incidents, missions, collisions, overrides); formations
-(engagement, holds, requests, the target and the trajectory of the plan, the window).
+Order of this file: shortfalls, the window of the statistics, and how both are written; then drones (incidents,
+collisions, missions, overrides) and formations (engagement, holds, requests, target and trajectory of the plan).
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.run_messages import Event
 from zsim.errors import NotTrustedError
+from zsim.record import Completeness
 from zsim.record.completeness import SECOND_NS
 from zsim.scenario.rights import WORLD
 from zsim.scenario.role_table import agent_names, lets_drop
@@ -23,35 +25,35 @@ from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, plan_of,
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, Reference, variable_of
-from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight
-from zsim_analysis.reading.window_text import percent_text, seconds_text, span_text
+from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, read_flight
 
+NOT_AS_PLANNED = "NOT AS PLANNED"
 ENGAGES_S = 20.0  # chosen: a formation engages 4 to 12 s after its take-off; a run may end before
-MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second, and m or rad by which a reference at rest never moves
-HELD_MAX_S = 2.0  # chosen: four times what a formation waits after a fault; held for longer, it has left its plan
-LATE_MAX_S = 1.0  # chosen: two tries of a step of the plan; what more is missing of a reference is reported
+MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second; m or rad by which a reference at rest never moves
+HELD_MAX_S = 2.0  # chosen: four times the wait after a fault; a formation held for longer has left its plan
+LATE_MAX_S = 1.0  # chosen: two attempts at a step of the plan; if more of a reference is missing, it is reported
 SAMPLE_NS = 100_000_000  # of a reference that is compared with the plan's
 STRAYED_M, STRAYED_S = 5.0, 3  # chosen: twice the least distance of drones, and successive seconds so far away
-SETTLED_S = 10.0  # chosen: from its engagement a formation may take so long until its drones are in their places
+SETTLED_S = 10.0  # chosen: time from its engagement that a formation has until its drones are in their places
 SAME = 1e-3  # m or rad within which the reference is the plan's: both are computed by the same formulas
-CONTROLLER, CONSOLE = "controller.", "console"  # how names begin: of who flies by the plan, and of operators' programs
+CONTROLLER, CONSOLE = "controller.", "console"  # prefixes of names: of controllers, and of operators' programs
 INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  # events of drones
-CRASHES = ("emergency", "flip", "impact", "touchdown")  # of them those by which a drone comes down
-ONE_HIT_NS = 500_000_000  # chosen: a touchdown is part of an impact that is found as near as this
+CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents by which a drone comes down
+ONE_HIT_NS = 500_000_000  # chosen: a touchdown within this time of an impact is part of it
 LEADS = ("hold", "land", "target", "trajectory")  # requests by which a formation leaves its plan
 
 
 class Shortfall(Struct, frozen=True):
-    """One thing that a flight did not do, or that happened to it.
+    """A deviation of a flight from its plan, or an incident.
 
     Attributes:
         kind: of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (not flown
-            to its end), strayed (far from its place), override (others flew it); of a cluster: plan (a step refused to
-            the end, or flown in part), engagement (never), held (for long), request (others led it), early (the run
-            ended before it was due), window (it holds instants at which a cluster was not engaged); collision; process
-            (one that was expected died, failed, or never came); record (not all of it is there).
+            to its end), strayed (far from its place), override (flown by others); of a cluster: plan (a step refused to
+            the end, or flown in part), engagement (never), held (for long), request (led by others), early (the run
+            ended before it was due), window (contains instants at which a cluster was not engaged); collision; process
+            (an expected one died, failed, or never joined); record (incomplete).
         subject: the cluster, the drone, the process, or "record"; of a collision both, as "drone1, drone2".
-        t_s: since when, simulated time.
+        t_s: its beginning, simulated time.
         fails: the flight is no example of its plan; the command ends with code 1.
     """
 
@@ -62,39 +64,103 @@ class Shortfall(Struct, frozen=True):
     fails: bool
 
 
+class Verdict(Struct, frozen=True):
+    """Completeness of a record, and shortfalls of its flight."""
+
+    completeness: Completeness
+    shortfalls: list[Shortfall]
+
+
+def verdict(record: Path) -> Verdict:
+    """Return the verdict on the flight of a record, the same as in its report, without reading all of its motion.
+
+    Raises:
+        RecordError: no such record.
+    """
+    flight = read_flight(record, motion=False)
+    return Verdict(flight.completeness, shortfalls(flight, window_of(flight)[0]))
+
+
 def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Shortfall]:
-    """Return what a flight did not do, what matters most first; empty for one that flew its plan."""
+    """Return the shortfalls of a flight, failures first; empty for one that flew its plan."""
     lines = [*_incidents(flight), *_collisions(flight), *_missions(flight)]
     lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
-    lines += [*_overrides(flight), *_of_processes(flight), *_of_record(flight)]
+    lines += [*_overrides(flight), *_processes(flight)]
+    if not flight.completeness.complete:
+        text = f"the record is {flight.completeness}"
+        lines.append(Shortfall("record", "record", flight.last_ns / 1e9, text, True))
     return sorted(lines, key=lambda line: not line.fails)
 
 
-def _of_record(flight: RecordedFlight) -> Iterator[Shortfall]:
-    if not flight.completeness.complete:
-        yield Shortfall("record", "record", flight.last_ns / 1e9, f"the record is {flight.completeness}", True)
+def marks_of(lines: Sequence[Shortfall]) -> list[tuple[str, bool]]:
+    """Return a line for each shortfall, and whether the flight fails by it."""
+    return [(f"{NOT_AS_PLANNED if each.fails else 'note'}: {each.text}", each.fails) for each in lines]
 
 
-def _of_processes(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield the expected processes without which the run went on, or which ended it, unless the scenario says drop."""
+def window_of(flight: RecordedFlight) -> tuple[tuple[float, float], str]:
+    """Return the window of a flight's statistics [s], and a note if it is not the one of the scenario."""
+    return window(flight.scenario.report.window_s if flight.scenario else None, flight.last_ns / 1e9)
+
+
+def window(wanted_s: tuple[float, float] | None, length_s: float) -> tuple[tuple[float, float], str]:
+    """Return the window of the statistics [s] of a run, and a note if it is not the one of the scenario.
+
+    Without one in the scenario: the last two thirds of the run.
+    """
+    default = (length_s / 3, length_s)
+    if wanted_s is None:
+        return default, ""
+    start, end = wanted_s
+    if end <= length_s:
+        return wanted_s, ""
+    if start < length_s:
+        return (start, length_s), f"The run ended at {length_s:.2f} s, inside the window {span_text(wanted_s)}."
+    return default, (
+        f"The run ended at {length_s:.2f} s, before the window {span_text(wanted_s)}; "
+        "the last two thirds of what there is are used."
+    )
+
+
+def phase_shares(t_s: Array, phases: list[str], window_s: tuple[float, float]) -> dict[str, float]:
+    """Return the shares of a window's instants at which a formation was in each phase, the greatest first."""
+    rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1])).tolist()
+    return {phase: count / len(rows) for phase, count in Counter(phases[row] for row in rows).most_common()}
+
+
+def seconds_text(t_s: float) -> str:
+    """Return a time [s] with two decimals at most."""
+    return f"{t_s:.2f}".rstrip("0").rstrip(".")
+
+
+def span_text(span_s: tuple[float, float]) -> str:
+    """Return a span of time [s], with its unit."""
+    return f"{seconds_text(span_s[0])} to {seconds_text(span_s[1])} s"
+
+
+def percent_text(share: float) -> str:
+    """Return a share in percent, rounded to 100 or 0 only if it is exactly that."""
+    percent = 100 * share if share in (0.0, 1.0) else min(max(100 * share, 0.1), 99.9)
+    return f"{percent:.3g}"
+
+
+def _processes(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield the expected processes that were lost for good, unless the scenario says drop."""
     scenario = flight.scenario
     expected = {*scenario.expected(), *agent_names(scenario), WORLD} if scenario else set()
     actions = scenario.processes if scenario else Processes()
-    dropped = {event.subject for event in flight.events if event.kind == "drop"}  # and nobody else does their work
+    dropped = {event.subject for event in flight.events if event.kind == "drop"}  # without a replacement
     for event in flight.events:
         if event.kind == "end":
-            return  # who dies after it has taken part
+            return  # deaths after it do not matter
         if event.subject not in expected:
             continue
         is_death = event.kind == "death" and (event.data.get("on_death") == "end" or event.subject in dropped)
         allowed = actions.on_overdue or {} if event.kind == "overdue" else actions.on_death
         t_s = event.t_ns / 1e9
+        text = event.text if event.kind == "failure" else f"{event.text}, at {t_s:.2f} s"
         if event.kind == "leave":
-            yield Shortfall(
-                "process", event.subject, t_s, f"{event.text}, at {t_s:.2f} s", bool(event.data.get("fails"))
-            )
+            yield Shortfall("process", event.subject, t_s, text, bool(event.data.get("fails")))
         elif (is_death or event.kind in ("failure", "overdue")) and not lets_drop(allowed, event.subject):
-            text = event.text if event.kind == "failure" else f"{event.text}, at {t_s:.2f} s"
             yield Shortfall("process", event.subject, t_s, text, True)
 
 
@@ -102,7 +168,7 @@ def _of_processes(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield a line for each drone that had an incident, with the first one of each kind in the order of time."""
+    """Yield a line for each drone that had incidents, with the first one of each kind by time."""
     by_drone: dict[str, list[Event]] = {}
     for event in flight.events:
         if event.kind in INCIDENTS:
@@ -114,10 +180,10 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
             del first["touchdown"]
         parts = [_incident_text(event) for event in sorted(first.values(), key=lambda event: (event.t_ns, event.seq))]
         text = f"{drone}: {', '.join(parts)}{_active_faults(drone, (events[0].t_ns, events[0].seq), flight)}"
-        fails = any(not _is_silence_of_others(event) for event in events)
+        fails = any(not _is_pilots_silence(event) for event in events)
         yield Shortfall(events[0].kind, drone, events[0].t_ns / 1e9, text, fails)
     reported = {*by_drone, *(event.subject for event in flight.events if event.data.get("mode") == "emergency")}
-    for track in flight.tracks:  # a record of a version that has no such events
+    for track in flight.tracks:  # records of versions without these events
         if track.name not in reported and not track.external and track.states and track.states[-1] == "emergency":
             t_s = float(track.status_t_ns[-1]) / 1e9
             yield Shortfall("emergency", track.name, t_s, f"{track.name} ended in an emergency", True)
@@ -125,31 +191,36 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 def _incident_text(event: Event) -> str:
     at, data = f"at {seconds_text(event.t_ns / 1e9)} s", event.data
-    if event.kind == "emergency":
-        if data.get("cause") == "command":
+    match event.kind:
+        case "emergency" if data.get("cause") == "command":
             whose = "operator's emergency" if event.source.startswith(CONSOLE) else "emergency"
             return f"ended by: {whose} {at} ({event.source})"
-        return f"emergency {at} ({'its driver reported it' if data.get('cause') == 'driver' else 'tilted too far'})"
-    if event.kind == "impact":
-        return f"hit {data.get('other', 'something')} at {data.get('speed_m_s', 0.0):.1f} m/s {at}"
-    if event.kind == "landing":
-        charge = data.get("charge_percent")
-        why = f"{data.get('commander') or 'its commander'} fell silent"
-        return f"landed by itself {at} ({why if charge is None else f'{charge:.1f} % of charge left'})"
-    if event.kind == "touchdown":
-        return f"touched {data.get('other', 'something')} in flight {at}"
-    return f"upside down {at}" if event.kind == "flip" else f"no charge left {at}"
+        case "emergency":
+            cause = "its driver reported it" if data.get("cause") == "driver" else "tilted too far"
+            return f"emergency {at} ({cause})"
+        case "impact":
+            return f"hit {data.get('other', 'something')} at {data.get('speed_m_s', 0.0):.1f} m/s {at}"
+        case "landing":
+            charge = data.get("charge_percent")
+            why = f"{data.get('commander') or 'its commander'} fell silent"
+            return f"landed by itself {at} ({why if charge is None else f'{charge:.1f} % of charge left'})"
+        case "touchdown":
+            return f"touched {data.get('other', 'something')} in flight {at}"
+        case "flip":
+            return f"upside down {at}"
+        case _:
+            return f"no charge left {at}"
 
 
-def _is_silence_of_others(event: Event) -> bool:
-    """Return whether a drone landed since a program that is no controller let it be."""
+def _is_pilots_silence(event: Event) -> bool:
+    """Return whether a drone landed because a program other than a controller stopped sending commands."""
     commander = str(event.data.get("commander") or "")
     silent = event.kind == "landing" and event.data.get("cause") == "silence"
     return silent and not commander.startswith(CONTROLLER)
 
 
 def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> str:
-    """Return which injected faults of a drone, or of all, were active at an instant: (t_ns, number of the event)."""
+    """Return the injected faults of a drone, or of all, that were active at an instant: (t_ns, number of the event)."""
     active: dict[object, str] = {}
     for each in flight.events:
         if (each.t_ns, each.seq) > at:
@@ -157,9 +228,8 @@ def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> s
         if each.kind == "fault" and each.data.get("target") in (drone, "world"):
             source = each.data.get("source") or "somebody"
             whose = "the scenario's" if source == "scenario" else f"{source}'s"
-            active[each.data.get("id")] = (
-                f"{whose} fault {each.data.get('kind')} since {seconds_text(each.t_ns / 1e9)} s"
-            )
+            since = seconds_text(each.t_ns / 1e9)
+            active[each.data.get("id")] = f"{whose} fault {each.data.get('kind')} since {since} s"
         elif each.kind in ("fault_end", "fault_clear"):
             active.pop(each.data.get("id"), None)
     return f"; {', '.join(active.values())}" if active else ""
@@ -178,37 +248,39 @@ def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 def _missions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield for each drone that its newest mission, of those that a bridge reported, was not flown to its end."""
+    """Yield each drone whose newest mission, of those reported by a bridge, was not flown to its end."""
     newest = {event.subject: event for event in flight.events if event.kind == "mission"}
     for drone, event in newest.items():
         data, t_s = event.data, event.t_ns / 1e9
-        if data.get("state") == "finished":
-            continue
-        why = f"{data.get('reason')}, at {seconds_text(t_s)} s" if data.get("reason") else "the run ended"
-        text = f"{drone}: flew {data.get('done')} of {data.get('items')} mission items; {why}"
-        yield Shortfall("mission", drone, t_s, text, bool(data.get("failsafe")))
+        if data.get("state") != "finished":
+            why = f"{data.get('reason')}, at {seconds_text(t_s)} s" if data.get("reason") else "the run ended"
+            text = f"{drone}: flew {data.get('done')} of {data.get('items')} mission items; {why}"
+            yield Shortfall("mission", drone, t_s, text, bool(data.get("failsafe")))
 
 
 def _overrides(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield for each drone of a cluster who beside its controller flew it, or had it land."""
+    """Yield each drone of a planned cluster that others than its controller flew, or landed."""
     members = {drone for states in flight.clusters for drone in states.drones if _plan(flight.scenario, states.name)}
     for drone in sorted(members):
-        parts = list(_interventions(drone, flight))
-        if parts:
+        if parts := list(_interventions(drone, flight)):
             more = f" (and {len(parts) - 1} more)" if len(parts) > 1 else ""
             yield Shortfall("override", drone, parts[0].from_ns / 1e9, f"{drone}: {parts[0].text}{more}", False)
 
 
 class _Intervention(NamedTuple):
-    """That another than its controller flew a drone, or had it land: from when until when [ns]."""
+    """A time [ns] in which others than its controller flew a drone, or landed it."""
 
     from_ns: int
     until_ns: int
     text: str
 
+    def covers(self, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which instants it covers."""
+        return (self.from_ns <= t_ns) & (t_ns <= self.until_ns)
+
 
 def _interventions(drone: str, flight: RecordedFlight) -> Iterator[_Intervention]:
-    """Yield who beside its controller flew a drone, or had it land, in the order of time."""
+    """Yield the interventions of others than its controller in the flight of a drone, by time."""
     own = [event for event in flight.events if event.subject == drone]
     for place, event in enumerate(own):
         if event.source.startswith(CONTROLLER):
@@ -226,21 +298,26 @@ def _interventions(drone: str, flight: RecordedFlight) -> Iterator[_Intervention
 # Formations
 
 
+def _line(states: ClusterStates, kind: str, t_s: float, text: str, fails: bool = False) -> Shortfall:
+    return Shortfall(kind, states.name, t_s, f"{states.name}: {text}", fails)
+
+
 def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[float, float]) -> Iterator[Shortfall]:
     if not states.phases:
         return
     refused = [*_refused(states)]
     yield from refused
-    if "engaged" in states.phases:
-        yield from _strayed(states, flight)
-        yield from _held(states, flight)
-        yield from _requests(states, flight.scenario)
-        yield from _not_begun(states, flight)
-        if not refused:
-            yield from _reference_flown(states, flight)
-        yield from _outside(states, window_s)
-    else:
+    if "engaged" not in states.phases:
         yield from _never_engaged(states, takeoff_s(flight.scenario, states.name), flight.last_ns / 1e9)
+        return
+    yield from _strayed(states, flight)
+    yield from _held(states, flight)
+    yield from _requests(states, flight.scenario)
+    yield from _not_begun(states, flight)
+    plan, planned = _plan(flight.scenario, states.name), None if refused else _planned(states, flight.scenario)
+    if planned and plan:
+        yield from (_trajectory_flown if plan.trajectory else _target_reached)(states, planned, plan)
+    yield from _outside(states, window_s)
 
 
 def _refused(states: ClusterStates) -> Iterator[Shortfall]:
@@ -256,15 +333,27 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
         last = place + 1 == len(states.reasons)
         engaged = states.phases[place] in ("engaged", "held")
         if engaged and (last or states.phases[place + 1] == "landing"):
-            text = f"{states.name}: the {op} of the plan was refused to the end: {why}"
-            yield Shortfall("plan", states.name, begun[1], text, True)
+            yield _line(states, "plan", begun[1], f"the {op} of the plan was refused to the end: {why}", True)
+
+
+def _never_engaged(states: ClusterStates, due_s: float | None, end_s: float) -> Iterator[Shortfall]:
+    phase = states.phases[-1]
+    if due_s is None:
+        yield _line(states, "window", 0.0, "never engaged; it has no plan to take off by")
+    elif due_s >= end_s:
+        yield _line(states, "early", end_s, f"the run ended before its take-off at {seconds_text(due_s)} s")
+    elif end_s - due_s < ENGAGES_S:
+        after = seconds_text(end_s - due_s)
+        yield _line(states, "early", end_s, f"never engaged; the run ended {after} s after its take-off, {phase}")
+    else:
+        why = f": {states.reasons[-1]}" if states.reasons[-1] else ""
+        yield _line(states, "engagement", due_s, f"never engaged, {phase} to the end{why}", True)
 
 
 def _strayed(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield which drones truly were far from where their engaged formation wanted them, and for how long.
+    """Yield the drones that truly were far from their places in the engaged formation, and for how long.
 
-    Their estimates may say otherwise, and the controller believes these. What others flew meanwhile was theirs to
-    decide.
+    Their estimates, which the controller relies on, may say otherwise. Interventions of others do not count.
     """
     cluster = _cluster(flight.scenario, states.name)
     if flight.scenario is None or cluster is None:
@@ -285,7 +374,7 @@ def _strayed(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfal
         t_ns, at, mine = np.intersect1d(states.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True)
         away_m = np.linalg.norm(track.p_W[mine] - places_W[at, i], axis=1)
         for act in _interventions(drone, flight):
-            away_m[(act.from_ns <= t_ns) & (t_ns <= act.until_ns)] = 0.0
+            away_m[act.covers(t_ns)] = 0.0
         stretches = np.split(np.arange(len(t_ns)), np.flatnonzero(np.diff(away_m > STRAYED_M)) + 1)
         long = [each for each in stretches if len(each) >= STRAYED_S and away_m[each[0]] > STRAYED_M]
         if long:
@@ -296,9 +385,9 @@ def _strayed(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfal
 
 
 def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield for how long, in all, a formation that had been engaged was held, but at its own request.
+    """Yield for how long, in all, a formation was held after its engagement, other than on request.
 
-    What it was held while others than its controller flew a drone of it, or had one land, was theirs to decide.
+    Holds during interventions of others in the flight of its drones are reported, and do not fail.
     """
     phases = np.array(states.phases)
     rows = np.flatnonzero(phases == "held")
@@ -307,44 +396,41 @@ def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
         return
     t_ns, nexts = states.t_ns[rows], np.minimum(rows + 1, len(phases) - 1)
     lengths_s = (states.t_ns[nexts] - t_ns) / 1e9
-    acts = [act for drone in states.drones for act in _interventions(drone, flight)]
-    by_others = np.any([(act.from_ns <= t_ns) & (t_ns <= act.until_ns) for act in acts], axis=0) if acts else t_ns < 0
+    by_others = np.zeros(len(rows), bool)
+    for act in (act for drone in states.drones for act in _interventions(drone, flight)):
+        by_others |= act.covers(t_ns)
     span_s = (float(t_ns[0]) / 1e9, float(states.t_ns[nexts[-1]]) / 1e9)
     length = seconds_text(float(lengths_s.sum()))
-    text = f"{states.name}: held for {length} s, from {span_text(span_s)}: {states.reasons[rows[0]]}"
+    text = f"held for {length} s, from {span_text(span_s)}: {states.reasons[rows[0]]}"
     if by_others.any():
         text += f"; {seconds_text(float(lengths_s[by_others].sum()))} s of it while others flew or landed its drones"
-    yield Shortfall("held", states.name, span_s[0], text, float(lengths_s[~by_others].sum()) > HELD_MAX_S)
+    yield _line(states, "held", span_s[0], text, float(lengths_s[~by_others].sum()) > HELD_MAX_S)
 
 
 def _requests(states: ClusterStates, scenario: Scenario | None) -> Iterator[Shortfall]:
-    """Yield what others than the plan asked of a formation that has one."""
-    plan = _plan(scenario, states.name)
+    """Yield the requests of others to a formation that has a plan."""
     asked = [each for each in states.requests if each.ok and each.op in LEADS]
-    if asked and plan and plan.takeoff_s is not None:
+    if asked and takeoff_s(scenario, states.name) is not None:
         first = ", ".join(f"{each.op} at {seconds_text(each.t_ns / 1e9)} s ({each.source})" for each in asked[:3])
         more = f" and {len(asked) - 3} more" if len(asked) > 3 else ""
-        yield Shortfall("request", states.name, asked[0].t_ns / 1e9, f"{states.name}: asked {first}{more}", False)
+        yield _line(states, "request", asked[0].t_ns / 1e9, f"asked {first}{more}")
 
 
 def _not_begun(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield the later steps of the plan that were not due before the run ended."""
+    """Yield the steps of the plan that were not due before the run ended."""
     plan, end_s = _plan(flight.scenario, states.name), flight.last_ns / 1e9
     if plan is None or plan.takeoff_s is None:
         return
-    steps = {"trajectory": plan.trajectory and plan.trajectory.start_s, "landing": plan.land_s}
-    for step, due_s in steps.items():
+    for step, due_s in (("trajectory", plan.trajectory and plan.trajectory.start_s), ("landing", plan.land_s)):
         if due_s is not None and due_s >= end_s:
-            text = f"{states.name}: the run ended before its {step} at {seconds_text(due_s)} s"
-            yield Shortfall("early", states.name, end_s, text, False)
+            yield _line(states, "early", end_s, f"the run ended before its {step} at {seconds_text(due_s)} s")
     follows = plan.trajectory is not None and plan.trajectory.start_s < end_s
     if plan.target and not follows and _moves(states):
-        text = f"{states.name}: the run ended before its reference was at the target"
-        yield Shortfall("early", states.name, end_s, text, False)
+        yield _line(states, "early", end_s, "the run ended before its reference was at the target")
 
 
 def _moves(states: ClusterStates) -> bool:
-    """Return whether the reference moves at the end, and not since the guard parts drones, or the formation is held."""
+    """Return whether the reference moves at the end, and not due to a hold or because the guard separates drones."""
     last = states.t_ns > states.t_ns[-1] - MOVES_NS
     phases = {phase for phase, row in zip(states.phases, last, strict=True) if row}
     moved = float(np.ptp(states.desired[last], axis=0).max())
@@ -352,7 +438,7 @@ def _moves(states: ClusterStates) -> bool:
 
 
 class PlannedReference(NamedTuple):
-    """What the plan leads a formation along: a reference from start_s on, in the variables (entries of c) it names."""
+    """The reference of a plan from start_s on, and the variables (entries of c) that it names."""
 
     space: ClusterSpace
     reference: Reference
@@ -372,7 +458,7 @@ class PlannedReference(NamedTuple):
 
 
 def _planned(states: ClusterStates, scenario: Scenario | None) -> PlannedReference | None:
-    """Return the trajectory of a cluster's plan, else its target; None without one, or where it was refused."""
+    """Return the trajectory of a cluster's plan, else its target; None without one, or if it was refused."""
     cluster = _cluster(scenario, states.name)
     if scenario is None or cluster is None or cluster.plan.takeoff_s is None:
         return None
@@ -399,26 +485,16 @@ def _planned(states: ClusterStates, scenario: Scenario | None) -> PlannedReferen
     return PlannedReference(space, reference, start_s, entries) if reference else None
 
 
-def _reference_flown(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield what is missing of the trajectory, or of the way to the target, that the plan asks for."""
-    planned, plan = _planned(states, flight.scenario), _plan(flight.scenario, states.name)
-    if planned is None or plan is None:
-        return
-    if plan.trajectory is not None:
-        yield from _trajectory_flown(states, planned, plan)
-    else:
-        yield from _target_reached(states, planned, plan)
-
-
 def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: ClusterPlan) -> Iterator[Shortfall]:
+    """Yield which part of the plan's trajectory was not flown."""
     t_s, whole_s = states.t_ns / 1e9 - planned.start_s, planned.reference.duration_s
     run_s, land_s = float(t_s[-1]), np.inf if plan.land_s is None else plan.land_s - planned.start_s
     due_s = min(np.inf if whole_s is None else whole_s, land_s, run_s)
     if due_s <= 0.0:
-        return  # the run ended before it, which is said elsewhere, or its landing is planned before it
+        return  # the run ended before it, see `_not_begun`, or its landing is planned before it
     if whole_s is not None and run_s < min(whole_s, land_s):
-        text = f"{states.name}: the run ended at {seconds_text(run_s)} of {seconds_text(whole_s)} s of its trajectory"
-        yield Shortfall("early", states.name, run_s + planned.start_s, text, False)
+        text = f"the run ended at {seconds_text(run_s)} of {seconds_text(whole_s)} s of its trajectory"
+        yield _line(states, "early", run_s + planned.start_s, text)
     rows = _sampled(states, np.flatnonzero((t_s >= 0.0) & (t_s <= due_s)))
     at_s, on = t_s[rows], planned.flown(states, rows)
     refusals = _waits(states, "trajectory", planned.start_s)
@@ -438,84 +514,60 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
         parted = flown_s - (span_s[1] - span_s[0]) > LATE_MAX_S
         length = f"for {seconds_text(round(flown_s, 1))} s in all, at the longest " if parted else ""
         text = f"its trajectory was flown {length}from {seconds_text(span_s[0])} to {seconds_text(span_s[1])} of {of}"
-    if refusals:
-        first_s, last_s, why = refusals
-        text += f"; it was refused from {span_text((first_s, last_s))}: {why}"
     led = any(each.ok and each.op in LEADS and each.t_ns / 1e9 < planned.start_s + due_s for each in states.requests)
-    yield Shortfall("plan", states.name, planned.start_s, f"{states.name}: {text}", not led)
+    yield _line(states, "plan", planned.start_s, f"{text}{refusals}", not led)
 
 
 def _target_reached(states: ClusterStates, planned: PlannedReference, plan: ClusterPlan) -> Iterator[Shortfall]:
+    """Yield that the reference reached the plan's target late, or landed before."""
     engaged_ns = states.t_ns[states.phases.index("engaged")]
-    rows = np.flatnonzero(states.t_ns >= engaged_ns)
-    on = planned.flown(states, rows := _sampled(states, rows))
-    name, led = states.name, any(each.ok and each.op in LEADS for each in states.requests)
-    due_s = None if plan.target_over_s is None else float(engaged_ns) / 1e9 + plan.target_over_s
-    if on.any():
-        late_s = 0.0 if due_s is None else float(states.t_ns[rows[on]][0]) / 1e9 - due_s
-        if late_s > LATE_MAX_S and due_s is not None:
-            waits = _waits(states, "target", 0.0)
-            why = f"; it was refused from {span_text(waits[:2])}: {waits[2]}" if waits else ""
-            text = f"{name}: its reference was at the target {seconds_text(round(late_s, 1))} s after it was due{why}"
-            yield Shortfall("plan", name, due_s, text, not led)
-    elif states.phases[-1] in ("landing", "idle"):
-        yield Shortfall(
-            "plan", name, float(engaged_ns) / 1e9, f"{name}: it landed before it was at its target", not led
-        )
+    rows = _sampled(states, np.flatnonzero(states.t_ns >= engaged_ns))
+    on = planned.flown(states, rows)
+    led, engaged_s = any(each.ok and each.op in LEADS for each in states.requests), float(engaged_ns) / 1e9
+    if not on.any():
+        if states.phases[-1] in ("landing", "idle"):
+            yield _line(states, "plan", engaged_s, "it landed before it was at its target", not led)
+    elif plan.target_over_s is not None:
+        due_s = engaged_s + plan.target_over_s
+        late_s = float(states.t_ns[rows[on]][0]) / 1e9 - due_s
+        if late_s > LATE_MAX_S:
+            late = seconds_text(round(late_s, 1))
+            text = f"its reference was at the target {late} s after it was due{_waits(states, 'target', 0.0)}"
+            yield _line(states, "plan", due_s, text, not led)
 
 
 def _sampled(states: ClusterStates, rows: NDArray[np.intp], every_ns: int = SAMPLE_NS) -> NDArray[np.intp]:
-    """Return of these rows the first in every so many nanoseconds."""
+    """Return the first of these rows in each interval of `every_ns`."""
     return rows[np.unique(states.t_ns[rows] // every_ns, return_index=True)[1]]
 
 
-def _waits(states: ClusterStates, op: str, from_s: float) -> tuple[float, float, str] | None:
-    """Return from when to when [s], and why at first, a step of the plan was refused after from_s; None if never."""
-    rows = np.flatnonzero(states.t_ns / 1e9 >= from_s)
-    found = [(row, step[1]) for row in rows.tolist() if (step := waiting_step(states.reasons[row])) and step[0] == op]
-    found = [each for each in found if states.phases[each[0]] == "engaged"]
+def _waits(states: ClusterStates, op: str, from_s: float) -> str:
+    """Return in words when, and why at first, a step of the plan was refused after from_s; empty if it was not."""
+    rows = np.flatnonzero(states.t_ns / 1e9 >= from_s).tolist()
+    steps = [(row, waiting_step(states.reasons[row])) for row in rows if states.phases[row] == "engaged"]
+    found = [(row, step[1]) for row, step in steps if step and step[0] == op]
     if not found:
-        return None
-    return float(states.t_ns[found[0][0]]) / 1e9, float(states.t_ns[found[-1][0]]) / 1e9, found[0][1]
+        return ""
+    first, last = (float(states.t_ns[found[place][0]]) / 1e9 for place in (0, -1))
+    return f"; it was refused from {span_text((first, last))}: {found[0][1]}"
 
 
 def _outside(states: ClusterStates, window_s: tuple[float, float]) -> Iterator[Shortfall]:
-    shares = phase_shares(states.t_ns / 1e9, states.phases, window_s)
+    """Yield the phases of the window in which the formation was not engaged."""
+    t_s = states.t_ns / 1e9
+    shares = phase_shares(t_s, states.phases, window_s)
     others = {phase: share for phase, share in shares.items() if phase != "engaged"}
     if others:
         rest = ", ".join(f"{phase} {percent_text(share)} %" for phase, share in others.items())
         part = f"engaged in {percent_text(shares.get('engaged', 0.0))} % of the window only ({rest})"
         text = part if "engaged" in shares else f"never engaged within the window ({rest})"
-        t_s = states.t_ns / 1e9
-        rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1]))
-        first = next(row for row in rows.tolist() if states.phases[row] != "engaged")
-        yield Shortfall("window", states.name, float(t_s[first]), f"{states.name}: {text}", False)
-
-
-def phase_shares(t_s: Array, phases: list[str], window_s: tuple[float, float]) -> dict[str, float]:
-    """Return at which shares of a window's instants a formation was in each of its phases, the greatest first."""
-    rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1])).tolist()
-    return {phase: count / len(rows) for phase, count in Counter(phases[row] for row in rows).most_common()}
-
-
-def _never_engaged(states: ClusterStates, due_s: float | None, end_s: float) -> Iterator[Shortfall]:
-    name, phase = states.name, states.phases[-1]
-    if due_s is None:
-        yield Shortfall("window", name, 0.0, f"{name}: never engaged; it has no plan to take off by", False)
-    elif due_s >= end_s:
-        text = f"{name}: the run ended before its take-off at {seconds_text(due_s)} s"
-        yield Shortfall("early", name, end_s, text, False)
-    elif end_s - due_s < ENGAGES_S:
-        text = f"{name}: never engaged; the run ended {seconds_text(end_s - due_s)} s after its take-off, {phase}"
-        yield Shortfall("early", name, end_s, text, False)
-    else:
-        why = f": {states.reasons[-1]}" if states.reasons[-1] else ""
-        text = f"{name}: never engaged, {phase} to the end{why}"
-        yield Shortfall("engagement", name, due_s, text, True)
+        rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1])).tolist()
+        first = next(row for row in rows if states.phases[row] != "engaged")
+        yield _line(states, "window", float(t_s[first]), text)
 
 
 def takeoff_s(scenario: Scenario | None, cluster: str) -> float | None:
-    """Return when a cluster's plan takes it off [s]; None without a plan."""
+    """Return the planned take-off of a cluster [s]; None without a plan."""
     plan = _plan(scenario, cluster)
     return plan.takeoff_s if plan else None
 

@@ -5,9 +5,7 @@
     compare(DIRS, OUT)   one page of several runs, side by side
     terminal_text(summary)   shortfalls and errors of the formations, for the terminal
 
-`summary`, `tables` and `comparison` compute; `figures` draw; `make_report` puts together, on `pages` that look and are
-written alike.
 Imports zsim_analysis.reading, matplotlib and jinja2.
 """
 
-FORMATS = ("pdf", "svg")  # that a figure may have beside its PNG file
+FORMATS = ("pdf", "svg")  # of figures, beside PNG

@@ -1,7 +1,8 @@
-"""Several runs side by side: how their scenarios and their results differ. Pure."""
+"""Several runs side by side: how their scenarios and results differ, and the page that shows it."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from os.path import relpath
 from pathlib import Path
@@ -9,45 +10,78 @@ from typing import Any
 
 import msgspec
 
-from zsim_analysis.reading.formation import Formation
-from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.reading.window_text import span_text
-from zsim_analysis.report.summary import RunSummary
+from zsim.errors import ReportError
+from zsim.record.record_reader import RECORD
+from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.shortfall import span_text
+from zsim_analysis.report.comparison_figures import UNPLANNED, ComparedRun, clusters, comparison_figures, parameters
+from zsim_analysis.report.make_report import Picture, facts, judge, sources, template, write_page
+from zsim_analysis.report.summary import STATISTICS
 
 ABSENT = "–"
-UNPLANNED = "†"  # behind the name of a run that did not fly as planned
-RUNS_PER_TABLE = 2  # beside each other with all their statistics: what the page is wide enough for
+RUNS_PER_TABLE = 2  # beside each other with all their statistics: as many as fit the page
 THERE = "there"  # cell of an item with a name, such as a drone, that another run does not have
+NAMED, NAMES_MAX = 3, 100  # runs in the page's file name, and characters of their names
+MARK, MARK_WITHIN = b": comparison</title>", 4_000  # of a page of ours, within its first bytes
 
 
-@dataclass
-class ComparedRun:
-    """One of several runs.
+def compare(
+    directories: Sequence[Path],
+    out: Path,
+    progress: Callable[[str], None] = lambda _: None,
+    formats: Sequence[str] = (),
+) -> list[ComparedRun]:
+    """Read the records of several runs and write the page that compares them.
 
-    Attributes:
-        name: unique among the runs.
+    Args:
+        directories: of the runs, at least two.
+        out: of the page; an earlier one is replaced when the new one is complete.
+        progress: called with a text at each step.
+        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written into a folder beside the page.
+
+    Raises:
+        RecordError: one of them has no record, or no drone moves on it.
+        ReportError: a run is given twice, or the page cannot be written, or would replace something else.
     """
+    places = [directory.resolve() for directory in directories]
+    for number, directory in enumerate(directories):
+        if places[number] in places[:number]:
+            raise ReportError(f"{directory}: is given twice; a run is compared with others")
+    if out.exists() and MARK not in _head(out):
+        raise ReportError(f"{out}: exists and is no comparison of runs; give --out another place")
+    runs = []
+    for name, directory in zip(run_names(directories), directories, strict=True):
+        judged = judge(directory / RECORD, lambda text, name=name: progress(f"{name}: {text}"))
+        runs.append(ComparedRun(name, directory, *judged))
+    write_page(out, comparison_figures(runs), partial(comparison_page, runs), progress, formats)
+    return runs
 
-    name: str
-    directory: Path
-    flight: RecordedFlight
-    formations: list[Formation]
-    summary: RunSummary
 
-    @property
-    def label(self) -> str:
-        """Return its name with a mark if it did not fly as planned: what tables and figures call it."""
-        return self.name if self.summary.as_planned else f"{self.name} {UNPLANNED}"
+def comparison_path(directories: Sequence[Path]) -> Path:
+    """Return the default place of the comparison of runs: beside the first, under a name that no other one has."""
+    names = [name.replace("/", "-") for name in run_names(directories)]
+    more = f"-and-{len(names) - NAMED}-more" if len(names) > NAMED else ""
+    stem = f"compare-{'-'.join(names[:NAMED])[:NAMES_MAX]}{more}"
+    folder, own = directories[0].resolve().parent, runs_id(directories).encode()
+    path, number = folder / f"{stem}.html", 1
+    while MARK in (head := _head(path)) and own not in head:
+        number += 1
+        path = folder / f"{stem}-{number}.html"
+    return path
 
-    def formation(self, cluster: str) -> Formation | None:
-        """Return a cluster's formation, None if this run has none that can be judged."""
-        return next((formation for formation in self.formations if formation.name == cluster), None)
+
+def _head(page: Path) -> bytes:
+    """Return the beginning of a file, empty if there is none."""
+    if not page.is_file():
+        return b""
+    with page.open("rb") as file:
+        return file.read(MARK_WITHIN)
 
 
 def run_names(directories: Sequence[Path]) -> list[str]:
-    """Return short names, no two the same: the folders' own, with as many parents as it takes, then a number.
+    """Return short unique names: the folders' own, with as many parents as are needed, then a number.
 
-    What is no UTF-8 is a question mark: matplotlib can draw nothing else.
+    Bytes that are not UTF-8 become question marks, since matplotlib cannot draw them.
     """
     paths = [directory.resolve() for directory in directories]
     longest = max(len(path.parts) for path in paths)
@@ -58,27 +92,28 @@ def run_names(directories: Sequence[Path]) -> list[str]:
     return [f"{path.name} ({number})" for number, path in enumerate(paths, start=1)]
 
 
-def table_groups(runs: Sequence[ComparedRun]) -> list[Sequence[ComparedRun]]:
-    """Return runs in groups that have room beside each other in a table of errors."""
-    return [runs[start : start + RUNS_PER_TABLE] for start in range(0, len(runs), RUNS_PER_TABLE)]
-
-
 def runs_id(directories: Sequence[Path]) -> str:
-    """Return an identifier of these runs in this order: the same wherever their folders are moved together."""
+    """Return an identifier of these runs in this order, which does not change if their folders are moved together."""
     paths = [directory.resolve() for directory in directories]
     places = "\0".join(relpath(path, paths[0].parent) for path in paths)
     return sha256(places.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
-def clusters(runs: Iterable[ComparedRun]) -> list[str]:
-    """Return the clusters of all runs, in the order of their first run."""
-    return list(dict.fromkeys(formation.name for run in runs for formation in run.formations))
-
-
-def parameters(runs: Iterable[ComparedRun], cluster: str) -> list[str]:
-    """Return the variables of a cluster in all runs."""
-    judged = (run.summary.clusters.get(cluster) for run in runs)
-    return list(dict.fromkeys(name for each in judged if each for name in each.errors))
+def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) -> str:
+    """Return the page."""
+    groups = [runs[start : start + RUNS_PER_TABLE] for start in range(0, len(runs), RUNS_PER_TABLE)]
+    return template("comparison.html.j2").render(
+        runs=runs,
+        runs_id=runs_id([run.directory for run in runs]),
+        facts=fact_rows(runs),
+        notes=notes(runs),
+        statistics=list(STATISTICS),
+        unplanned=UNPLANNED if any(not run.summary.as_planned for run in runs) else "",
+        tables={name: [(group, statistics_rows(group, name)) for group in groups] for name in clusters(runs)},
+        scenario=scenario_rows(runs),
+        without=[run.name for run in runs if run.flight.scenario is None],
+        figures=sources(pictures),
+    )
 
 
 @dataclass(frozen=True)
@@ -86,7 +121,7 @@ class ComparisonRow:
     """A line of a table with a cell per run.
 
     Attributes:
-        differs: the cells are not all the same.
+        differs: whether the cells differ.
     """
 
     name: str
@@ -97,34 +132,58 @@ class ComparisonRow:
         return len(set(self.cells)) > 1
 
 
-def scenario_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
-    """Return the fields in which the resolved scenarios differ, by path; a field that a run does not have is absent.
+def fact_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
+    """Return the facts of each run's own page, and more in which runs differ, a line for each label."""
+    columns = [
+        dict(
+            [
+                *facts(run.summary),
+                ("Drones", f"{len(run.flight.tracks)}"),
+                ("Clusters", ", ".join(f"{c.name} of {len(c.drones)}" for c in run.flight.clusters) or "none"),
+                ("Scenario's hash", run.flight.info.scenario_sha256[:16] if run.flight.info else "not known"),
+                ("Messages", f"{run.summary.record.messages}"),
+            ]
+        )
+        for run in runs
+    ]
+    names = dict.fromkeys(name for column in sorted(columns, key=len, reverse=True) for name in column)
+    return [ComparisonRow(name, tuple(column.get(name, ABSENT) for column in columns)) for name in names]
 
-    The fields of a drone, or of another item with a name, that some runs do not have are left out.
+
+def statistics_rows(runs: Sequence[ComparedRun], cluster: str) -> list[ComparisonRow]:
+    """Return a line per variable of a cluster, with a cell for each of the STATISTICS of each run."""
+    rows = []
+    for name in parameters(runs, cluster):
+        judged = [run.summary.clusters.get(cluster) for run in runs]
+        errors = [each.errors.get(name) if each else None for each in judged]
+        values = [getattr(each, statistic, None) for each in errors for statistic in STATISTICS.values()]
+        cells = tuple(ABSENT if value is None else f"{value:.4f}" for value in values)
+        rows.append(ComparisonRow(f"{name} ({unit(name)})", cells))
+    return rows
+
+
+def scenario_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
+    """Return the fields in which the resolved scenarios differ, by path; fields that a run does not have are absent.
+
+    Named items, such as drones, that some runs do not have are listed without their fields.
     """
     flat = [dict(flattened(msgspec.to_builtins(run.flight.scenario))) if run.flight.scenario else {} for run in runs]
     paths = dict.fromkeys(path for each in flat for path in each)
-    partly = tuple(f"{path}." for path in paths if _is_partly(path, flat))
-    shown = [path for path in paths if not path.startswith(partly) and _differ(path, flat)]
+    partial_paths = [path for path in paths if any(path not in each for each in flat)]
+    items = tuple(f"{path}." for path in partial_paths if any(each.get(path) == THERE for each in flat))
     return [
-        ComparisonRow(path, tuple(_text(each[path]) if path in each else ABSENT for each in flat)) for path in shown
+        ComparisonRow(path, tuple(_text(each[path]) if path in each else ABSENT for each in flat))
+        for path in paths
+        if not path.startswith(items)
+        and (path in partial_paths or any(each[path] != flat[0][path] for each in flat))  # their texts may be alike
     ]
 
 
-def _differ(path: str, flat: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether a field does not have the same value in all runs; its text may be the same."""
-    return any(path not in each for each in flat) or any(each[path] != flat[0][path] for each in flat)
-
-
-def _is_partly(path: str, flat: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether a path is an item with a name that only some of the runs have."""
-    return any(each.get(path) == THERE for each in flat) and any(path not in each for each in flat)
-
-
 def flattened(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
-    """Yield path and value of every leaf; items that have a name go by it, so that their order makes no difference.
+    """Yield path and value of every leaf; named items are identified by their names, whatever their order.
 
-    Items without a name go by their number, each with all its fields as one value; an empty list yields nothing.
+    Items without names are identified by their numbers, each with all its fields as one value; empty lists are left
+    out.
     """
     if isinstance(value, Mapping):
         for name, item in value.items():
@@ -149,41 +208,29 @@ def _text(value: Any) -> str:
 
 
 def notes(runs: Sequence[ComparedRun]) -> list[str]:
-    """Return what a reader has to know before comparing: what only some runs have, and which are the same flight."""
-    own = [f"{run.name}: {note}" for run in runs for note in run.summary.notes]
-    short = [
+    """Return what a reader should know: shortfalls, identical flights, what only some runs have, notes of each run."""
+    lines = [
         f"{run.name}: {'not as planned: ' * each.fails}{each.text}" for run in runs for each in run.summary.shortfalls
     ]
-    return [*short, *_alike(runs), *_drones(runs), *_clusters(runs), *_windows(runs), *own]
-
-
-def _alike(runs: Sequence[ComparedRun]) -> list[str]:
-    """Return which runs flew the same bits."""
     by_hash: dict[str, list[str]] = {}
     for run in runs:
         by_hash.setdefault(run.summary.truth_sha256, []).append(run.name)
-    return [f"{_listed(names)} flew the same bits." for names in by_hash.values() if len(names) > 1]
-
-
-def _drones(runs: Sequence[ComparedRun]) -> list[str]:
-    every = dict.fromkeys(track.name for run in runs for track in run.flight.tracks)
-    return _missing("Drone", every, {run.name: {track.name for track in run.flight.tracks} for run in runs})
-
-
-def _clusters(runs: Sequence[ComparedRun]) -> list[str]:
-    every = clusters(runs)
-    lines = _missing("Cluster", every, {run.name: {each.name for each in run.formations} for run in runs})
-    for cluster in every:
-        conventions = {each.names for run in runs if (each := run.formation(cluster))}
-        if len(conventions) > 1:
+    lines += [f"{_listed(names)} flew the same bits." for names in by_hash.values() if len(names) > 1]
+    lines += _missing("Drone", {run.name: [track.name for track in run.flight.tracks] for run in runs})
+    lines += _missing("Cluster", {run.name: [formation.name for formation in run.formations] for run in runs})
+    for cluster in clusters(runs):
+        if len({each.names for run in runs if (each := run.formation(cluster))}) > 1:
             lines.append(f"Cluster {cluster} does not have the same variables in all runs; each has its own.")
-    return lines
+    if len({run.summary.window_s for run in runs}) > 1:
+        ranges = "; ".join(f"{run.name}: {span_text(run.summary.window_s)}" for run in runs)
+        lines.append(f"The windows of the statistics differ ({ranges}).")
+    return [*lines, *(f"{run.name}: {note}" for run in runs for note in run.summary.notes)]
 
 
-def _missing(what: str, every: Iterable[str], there: Mapping[str, set[str]]) -> list[str]:
+def _missing(what: str, there: Mapping[str, Sequence[str]]) -> list[str]:
     """Return a line for the drones or clusters that the same runs have and the others do not."""
     groups: dict[tuple[str, ...], list[str]] = {}
-    for name in every:
+    for name in dict.fromkeys(name for names in there.values() for name in names):
         having = tuple(run for run, names in there.items() if name in names)
         if len(having) < len(there):
             groups.setdefault(having, []).append(name)
@@ -191,14 +238,6 @@ def _missing(what: str, every: Iterable[str], there: Mapping[str, set[str]]) -> 
         f"{what}{'s' * (len(names) > 1)} {_listed(names)}: in {_listed(having)} only."
         for having, names in groups.items()
     ]
-
-
-def _windows(runs: Sequence[ComparedRun]) -> list[str]:
-    windows = {run.summary.window_s for run in runs}
-    if len(windows) < 2:
-        return []
-    ranges = "; ".join(f"{run.name}: {span_text(run.summary.window_s)}" for run in runs)
-    return [f"The windows of the statistics differ ({ranges})."]
 
 
 def _listed(names: Sequence[str]) -> str:

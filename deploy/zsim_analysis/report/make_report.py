@@ -1,63 +1,48 @@
-"""Makes the report of a run: record in; summary.json, figures/*.png and report.html out. Makes comparisons of several.
+"""Makes the report of a run: record in; summary.json, figures/*.png and report.html out.
 
-A page has everything in it, figures included; it loads nothing from the network.
+A page contains everything, figures included; it loads nothing from the network. What writes it serves comparisons and
+sweeps as well.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import base64
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
-from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
+
+from zsim.drone_colours import colours_of
 from zsim.errors import RecordError, ReportError
 from zsim.record.record_reader import RECORD
-from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.reading.driver_links import link_text
-from zsim_analysis.reading.flight import read_flight
-from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
-from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.reading.window_text import seconds_text, span_text
-from zsim_analysis.report.comparison import (
-    ABSENT,
-    UNPLANNED,
-    ComparedRun,
-    ComparisonRow,
-    clusters,
-    notes,
-    parameters,
-    run_names,
-    runs_id,
-    scenario_rows,
-    table_groups,
+from zsim_analysis.reading.drone_errors import distances, estimate_errors, separations, velocity_responses
+from zsim_analysis.reading.formation import Formation, formations_of, goal_errors
+from zsim_analysis.reading.recorded_flight import RecordedFlight, read_flight
+from zsim_analysis.reading.shortfall import seconds_text, span_text
+from zsim_analysis.report import FORMATS
+from zsim_analysis.report.drone_figures import (
+    PAIRS_MAX,
+    draw_distances,
+    draw_drones,
+    draw_estimates,
+    draw_plan,
+    draw_velocities,
 )
-from zsim_analysis.report.figures.comparison_figures import comparison_figures
-from zsim_analysis.report.figures.report_figures import figures
-from zsim_analysis.report.pages import Picture, sources, template, write_page, write_report
-from zsim_analysis.report.paper import PAPER_NOTE
-from zsim_analysis.report.summary import EventLine, RunSummary, summarise
-from zsim_analysis.report.tables import PAPER_COLUMN, error_table
+from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
+from zsim_analysis.report.formation_figures import ROWS_MAX, draw_errors, draw_parameters, numbered, parameter_groups
+from zsim_analysis.report.paper import PAPER_NOTE, flies_paper_test
+from zsim_analysis.report.summary import PAPER_COLUMN, EventLine, RunSummary, error_table, summarise
 
-STATISTICS = ("est. std", "true std", "true RMS", "true mean")
 FAULTS_MAX = 6  # at the head of a page
-NAMED, NAMES_MAX = 3, 100  # runs whose names the page's own name holds, and characters of them
-MARK, MARK_WITHIN = b": comparison</title>", 4_000  # of a page of ours, within its first bytes
+REFERENCE = (
+    "Estimate − desired is what the controller sees; truth − desired is what the drones do. Until the formation is "
+    "engaged, the controller takes its own estimate as the desired value."
+)
+GOAL = "(a) Against the target of the plan; the climb from the ground is in z_c. "
+SPREAD = "Of the variables that have no row: median, 5 to 95 % and extremes of truth − desired. "
 
-
-def judge(
-    record: Path, progress: Callable[[str], None] = lambda _: None, answers: bool = False
-) -> tuple[RecordedFlight, list[Formation], RunSummary]:
-    """Return what a record holds, with the drones' estimates and commands if asked for, and its figures of merit.
-
-    Raises:
-        RecordError: there is no record, or it holds no truth of any drone.
-    """
-    progress("reading the record")
-    flight = read_flight(record, answers)
-    if all(len(track.t_ns) == 0 for track in flight.tracks):
-        content = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
-        raise RecordError(f"{record}: {content} ({flight.completeness}); there is nothing to report")
-    progress("computing the formation's errors")
-    formations = formations_of(flight)
-    return flight, formations, summarise(flight, formations, record)
+Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 
 
 def make_report(
@@ -78,6 +63,121 @@ def make_report(
     drawings = figures(flight, formations, summary)
     write_report(directory, summary.json(), drawings, partial(page, summary), progress, formats)
     return summary
+
+
+def judge(
+    record: Path, progress: Callable[[str], None] = lambda _: None, answers: bool = False
+) -> tuple[RecordedFlight, list[Formation], RunSummary]:
+    """Return the flight of a record, its formations and its summary.
+
+    Args:
+        record: its path.
+        progress: called with a text at each step.
+        answers: include the drones' estimates and velocity commands.
+
+    Raises:
+        RecordError: there is no record, or it holds no truth of any drone.
+    """
+    progress("reading the record")
+    flight = read_flight(record, answers)
+    if all(len(track.t_ns) == 0 for track in flight.tracks):
+        content = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
+        raise RecordError(f"{record}: {content} ({flight.completeness}); there is nothing to report")
+    progress("computing the formation's errors")
+    formations = formations_of(flight)
+    return flight, formations, summarise(flight, formations, record)
+
+
+# Figures, in the order of the page
+
+
+def figures(flight: RecordedFlight, formations: Sequence[Formation], summary: RunSummary) -> Iterator[ReportFigure]:
+    """Yield the figures for which the record has data, with a mark if the flight has shortfalls."""
+    for figure in _unmarked(flight, formations, summary.window_s):
+        if summary.shortfalls:
+            found = [each.text for each in summary.shortfalls if each.fails or summary.as_planned]
+            more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+            head, colour = ("Note", DARK) if summary.as_planned else ("Not as planned", VERMILION)
+            mark_figure(figure.drawing, f"{head}{more}", found[0], colour)
+        yield figure
+
+
+def _unmarked(
+    flight: RecordedFlight, formations: Sequence[Formation], window_s: tuple[float, float]
+) -> Iterator[ReportFigure]:
+    for i, formation in enumerate(formations):  # the first cluster's have names without the cluster's
+        yield from _of_cluster(flight, formation, window_s, f"_{formation.name}" if i else "")
+    marks = time_marks(flight, formations[0] if formations else None)
+    colours = colours_of([track.name for track in flight.tracks])
+    has_truth = any(len(track.t_ns) for track in flight.tracks)
+    if has_truth:
+        yield ReportFigure(
+            "plan_view.png",
+            "Plan view",
+            "True paths from above, squares where they begin and dots where they end; black: desired centroid; grey: "
+            "the formation at some instants of simulated time.",
+            draw_plan(flight, formations),
+        )
+    if apart := distances(flight, PAIRS_MAX):
+        what = "every two drones" if apart.pairs else "each drone to the nearest other one: median, 5 to 95 %, extremes"
+        yield ReportFigure(
+            "distances.png",
+            "Distances between drones",
+            f"True distance of {what}; below the first line the controller's guard parts them.",
+            draw_distances(apart, separations(flight), colours, marks),
+        )
+    if has_truth:
+        yield ReportFigure(
+            "drones.png",
+            "Drones",
+            "True altitude, state of the firmware and battery of every drone.",
+            draw_drones(flight, marks),
+        )
+    if errors := estimate_errors(flight):
+        yield ReportFigure(
+            "estimates.png",
+            "Estimates",
+            "Estimate − truth with the band of two standard deviations that the estimator states, and NEES, the error "
+            "of position and velocity squared and divided by its covariance: 6 on average where that is true. Shares "
+            "and means, above the panels, are those of the window; the axes hold all since the engagement, and what is "
+            "larger before it leaves them.",
+            draw_estimates(errors, colours, window_s, marks),
+        )
+    if responses := velocity_responses(flight):
+        yield ReportFigure(
+            "velocities.png",
+            "Commanded and flown velocity",
+            "By the drone's heading. Flown: in truth; commanded: as sent by whoever flew the drone, without the delay "
+            "of the link. Of many drones: median, 5 to 95 % and extremes of the difference.",
+            draw_velocities(responses, colours, marks),
+        )
+
+
+def _of_cluster(
+    flight: RecordedFlight, formation: Formation, window_s: tuple[float, float], suffix: str
+) -> Iterator[ReportFigure]:
+    marks, goal = time_marks(flight, formation), goal_errors(formation, flight.scenario)
+    paper = flies_paper_test(flight, formation.name) and not marks.has(TAKE_OVER)
+    reference, window = ("(b)", "(c)") if goal else ("(a)", "(b)")
+    large = SPREAD if len(formation.names) > ROWS_MAX else ""
+    yield ReportFigure(
+        f"figure_5_errors{suffix}.png",
+        f"Formation parameters' errors{numbered(5, paper)}",
+        f"{GOAL if goal else ''}{reference} Against the reference, the whole run. {window} The window of the "
+        f"statistics, on an axis of its own. {large}{REFERENCE}",
+        draw_errors(formation, window_s, marks, goal),
+    )
+    for file, number, what, names in parameter_groups(formation.names):
+        shown = ", ".join(names) if len(names) <= ROWS_MAX else f"of the {len(names)} variables those that move most"
+        yield ReportFigure(
+            f"{file}{suffix}.png",
+            f"{what}{numbered(number, paper)}",
+            f"Desired, measured (from the estimates) and true {shown}.",
+            draw_parameters(formation, names, marks),
+        )
+
+
+# Page
 
 
 def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
@@ -101,6 +201,10 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
     seed = "–" if summary.seed is None else summary.seed
     separation = summary.min_separation_m
     versions = dict.fromkeys(version for name, version in summary.versions.items() if name != "report")
+    misses = "not known"
+    if summary.deadline_misses is not None:
+        by = ", ".join(f"{name} {count}" for name, count in summary.deadline_misses_by.items() if count)
+        misses = f"{summary.deadline_misses} of {summary.deadlines or 0}{f' ({by})' if by else ''}"
     return [
         ("Scenario", f"{summary.scenario or 'not known'}, seed {seed}"),
         ("Changed", changed_text(summary.changed)),
@@ -112,9 +216,9 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         *(("Injected faults", text) for text in _faults(summary.events)),
         ("Record", summary.record.state),
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
-        ("Deadlines missed", _misses(summary)),
+        ("Deadlines missed", misses),
         ("Command age", ages),
-        *((f"Link of {drone}", link_text(link)) for drone, link in summary.links.items()),
+        *((f"Link of {drone}", str(link)) for drone, link in summary.links.items()),
         ("Least separation", "no two drones in the air" if separation is None else f"{separation:.2f} m in truth"),
         ("Truth", f"SHA-256 {summary.truth_sha256}"),
         ("Fingerprint", summary.fingerprint or "not known"),
@@ -122,12 +226,12 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def changed_text(changed: Sequence[str] | None) -> str:
-    """Return what was changed of a scenario's file, in words."""
+    """Return the differences of a scenario from its file in words."""
     return "not known" if changed is None else ", ".join(changed) or "nothing: as in its file"
 
 
 def date_text(date: str | None) -> str:
-    """Return a date of ISO 8601 as a reader has it, to the minute."""
+    """Return a date of ISO 8601 to the minute, for readers."""
     return f"{date[:16].replace('T', ' ')} UTC" if date else "not known"
 
 
@@ -144,7 +248,7 @@ def _planned(summary: RunSummary) -> str:
 
 
 def _faults(events: Sequence[EventLine]) -> Iterator[str]:
-    """Yield in one text which faults were injected, and when, if any were."""
+    """Yield one text about the injected faults, if there were any."""
     begun = [event for event in events if event.kind == "fault"]
     faults = [f"{event.text.removesuffix(' begins')} at {seconds_text(event.t_s)} s" for event in begun[:FAULTS_MAX]]
     more = [f"{len(begun) - FAULTS_MAX} more"] if len(begun) > FAULTS_MAX else []
@@ -152,128 +256,114 @@ def _faults(events: Sequence[EventLine]) -> Iterator[str]:
         yield ", ".join([*faults, *more])
 
 
-def _misses(summary: RunSummary) -> str:
-    if summary.deadline_misses is None:
-        return "not known"
-    by = ", ".join(f"{name} {count}" for name, count in summary.deadline_misses_by.items() if count)
-    return f"{summary.deadline_misses} of {summary.deadlines or 0}{f' ({by})' if by else ''}"
+def template(name: str, package: str = "zsim_analysis.report") -> Template:
+    """Return a page's template, which may include others from its own package and from this one."""
+    return Environment(
+        loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+    ).get_template(name)
 
 
-def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) -> str:
-    """Return the page."""
-    return template("comparison.html.j2").render(
-        runs=runs,
-        runs_id=runs_id([run.directory for run in runs]),
-        facts=fact_rows(runs),
-        notes=notes(runs),
-        statistics=STATISTICS,
-        unplanned=UNPLANNED if any(not run.summary.as_planned for run in runs) else "",
-        tables={cluster: _statistics_tables(runs, cluster) for cluster in clusters(runs)},
-        scenario=scenario_rows(runs),
-        without=[run.name for run in runs if run.flight.scenario is None],
-        figures=sources(pictures),
-    )
+def sources(pictures: Iterable[Picture]) -> list[tuple[ReportFigure, str]]:
+    """Return each figure with its PNG file as a data URI, so that the page needs no other file."""
+    return [(figure, "data:image/png;base64," + base64.b64encode(png).decode()) for figure, png in pictures]
 
 
-def fact_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
-    """Return the lines at the head of each run's own page, and more in which runs differ, a line for each label."""
-    columns = [dict([*facts(run.summary), *_more(run)]) for run in runs]
-    names = dict.fromkeys(name for column in sorted(columns, key=len, reverse=True) for name in column)
-    return [ComparisonRow(name, tuple(column.get(name, ABSENT) for column in columns)) for name in names]
+# Files
 
 
-def _more(run: ComparedRun) -> list[tuple[str, str]]:
-    summary, flight = run.summary, run.flight
-    return [
-        ("Drones", f"{len(flight.tracks)}"),
-        ("Clusters", ", ".join(f"{c.name} of {len(c.drones)}" for c in flight.clusters) or "none"),
-        ("Scenario's hash", flight.info.scenario_sha256[:16] if flight.info else "not known"),
-        ("Messages", f"{summary.record.messages}"),
-    ]
-
-
-def _statistics_tables(
-    runs: Sequence[ComparedRun], cluster: str
-) -> list[tuple[Sequence[ComparedRun], list[ComparisonRow]]]:
-    """Return the runs and the lines of each table of a cluster's errors."""
-    return [(group, statistics_rows(group, cluster)) for group in table_groups(runs)]
-
-
-def statistics_rows(runs: Sequence[ComparedRun], cluster: str) -> list[ComparisonRow]:
-    """Return a line per variable of a cluster, with as many cells for each run as there are STATISTICS."""
-    rows = []
-    for name in parameters(runs, cluster):
-        cells: list[str] = []
-        for run in runs:
-            judged = run.summary.clusters.get(cluster)
-            cells += _cells(judged.errors.get(name) if judged else None)
-        rows.append(ComparisonRow(f"{name} ({unit(name)})", tuple(cells)))
-    return rows
-
-
-def _cells(errors: ParameterErrors | None) -> list[str]:
-    if errors is None:
-        return [ABSENT] * len(STATISTICS)
-    values = (errors.est_std, errors.true_std, errors.true_rms, errors.true_mean)
-    return [ABSENT if value is None else f"{value:.4f}" for value in values]
-
-
-def comparison_path(directories: Sequence[Path]) -> Path:
-    """Return where the comparison of runs is written: beside the first of them, by a name that no other one has."""
-    names = [name.replace("/", "-") for name in run_names(directories)]
-    more = f"-and-{len(names) - NAMED}-more" if len(names) > NAMED else ""
-    stem = f"compare-{'-'.join(names[:NAMED])[:NAMES_MAX]}{more}"
-    folder = directories[0].resolve().parent
-    numbered = (folder / f"{stem}{'' if number == 1 else f'-{number}'}.html" for number in count(1))
-    return next(path for path in numbered if not _is_of_other_runs(path, directories))
-
-
-def _is_of_other_runs(page: Path, directories: Sequence[Path]) -> bool:
-    """Return whether an existing page compares other runs than these."""
-    head = _head(page)
-    return MARK in head and runs_id(directories).encode() not in head
-
-
-def _head(page: Path) -> bytes:
-    """Return the beginning of a file, empty where there is none."""
-    if not page.is_file():
-        return b""
-    with page.open("rb") as file:
-        return file.read(MARK_WITHIN)
-
-
-def compare(
-    directories: Sequence[Path],
-    out: Path,
-    progress: Callable[[str], None] = lambda _: None,
+def write_report(
+    directory: Path,
+    summary: bytes,
+    figures: Iterable[ReportFigure],
+    page: Callable[[Sequence[Picture]], str],
+    progress: Callable[[str], None],
     formats: Sequence[str] = (),
-) -> list[ComparedRun]:
-    """Read the records of several runs and write the page that compares them.
+) -> None:
+    """Write DIR/summary.json, DIR/figures/*.png and DIR/report.html, all or none of them.
+
+    Files of these figures in other formats, from an earlier report, are removed: they show another drawing.
 
     Args:
-        directories: of the runs, at least two.
-        out: of the page; an earlier one is replaced when the new one is whole.
+        directory: of the run or the sweep.
+        summary: content of summary.json.
+        figures: drawn one by one.
+        page: makes the page from the pictures.
         progress: called with a text at each step.
-        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written into a folder beside the page.
+        formats: of `zsim_analysis.report.FORMATS`, in which figures are written beside their PNG files.
 
     Raises:
-        RecordError: one of them has no record, or no drone moves on it.
-        ReportError: a run is given twice, or the page cannot be written, or would replace something else.
+        ReportError: the directory cannot be written.
     """
-    _check(directories, out)
-    runs = []
-    for name, directory in zip(run_names(directories), directories, strict=True):
-        judged = judge(directory / RECORD, lambda text, name=name: progress(f"{name}: {text}"))
-        runs.append(ComparedRun(name, directory, *judged))
-    write_page(out, comparison_figures(runs), partial(comparison_page, runs), progress, formats)
-    return runs
+    with _put_in_place(directory, directory, directory / "figures") as new:
+        pictures = _render(figures, new / "figures", progress, formats)
+        for figure, png in pictures:
+            (new / "figures" / figure.name).write_bytes(png)
+        (new / "summary.json").write_bytes(summary)
+        (new / "report.html").write_text(page(pictures), encoding="utf-8")
+    _remove_others(pictures, directory / "figures", formats)
 
 
-def _check(directories: Sequence[Path], out: Path) -> None:
-    """Refuse to compare a run with itself, and to replace a file that is no comparison."""
-    places = [directory.resolve() for directory in directories]
-    for place, directory in enumerate(directories):
-        if places[place] in places[:place]:
-            raise ReportError(f"{directory}: is given twice; a run is compared with others")
-    if out.exists() and MARK not in _head(out):
-        raise ReportError(f"{out}: exists and is no comparison of runs; give --out another place")
+def write_page(
+    out: Path,
+    figures: Iterable[ReportFigure],
+    page: Callable[[Sequence[Picture]], str],
+    progress: Callable[[str], None],
+    formats: Sequence[str] = (),
+) -> None:
+    """Write one page; an earlier one is replaced when the new one is complete. Arguments and errors as `write_report`.
+
+    Figures in other formats are written into a folder beside the page, NAME-figures.
+    """
+    folder = f"{out.stem}-figures"
+    with _put_in_place(out.parent, out, out.parent / folder) as new:
+        pictures = _render(figures, new / folder, progress, formats)
+        (new / out.name).write_text(page(pictures), encoding="utf-8")
+    _remove_others(pictures, out.parent / folder, formats)
+
+
+def _render(
+    figures: Iterable[ReportFigure], folder: Path, progress: Callable[[str], None], formats: Sequence[str]
+) -> list[Picture]:
+    """Render figures one by one, and write their files in other formats into a new folder."""
+    folder.mkdir()
+    pictures = []
+    for figure in figures:
+        progress(f"drawing {figure.name}")
+        pictures.append((figure, figure.png()))
+        for form in formats:
+            (folder / figure.name).with_suffix(f".{form}").write_bytes(figure.vector(form))
+    progress("writing the page")
+    return pictures
+
+
+def _remove_others(pictures: Iterable[Picture], folder: Path, formats: Sequence[str]) -> None:
+    """Remove files of figures in formats other than these."""
+    for figure, _ in pictures:
+        for form in set(FORMATS) - set(formats):
+            if (earlier := (folder / figure.name).with_suffix(f".{form}")).is_file():
+                earlier.unlink()
+
+
+@contextmanager
+def _put_in_place(directory: Path, report: Path, figures: Path) -> Iterator[Path]:
+    """Yield a folder whose files are moved into a directory when all are complete: a full disk or Ctrl-C leaves none.
+
+    Raises:
+        ReportError: the directory cannot be written, and the line begins with `report`; or `figures` in it is a link,
+            through which files elsewhere would be written and removed.
+    """
+    if figures.is_symlink():
+        raise ReportError(f"{figures}: is a symbolic link to {figures.readlink()}; must be a folder, remove the link")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=directory, prefix=".report-") as folder:
+            yield Path(folder)
+            for path in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
+                target = directory / path.relative_to(folder)
+                target.parent.mkdir(exist_ok=True)
+                path.replace(target)
+    except OSError as error:
+        raise ReportError(f"{report}: the report cannot be written ({error.strerror})") from error

@@ -1,4 +1,4 @@
-"""What the paper printed of its tests, and which flights stand beside them: by what they flew, not by a name. Pure.
+"""Results printed in the paper, and which flights are comparable with them: by what they flew, not by a name. Pure.
 
 I. Mas, S. Curi, R. Sanchez Pena, Open-source Multi-UAV Simulator for the ROS Environment.
 """
@@ -11,7 +11,6 @@ import numpy as np
 from msgspec import UNSET
 
 from zsim.scenario.scenario import Cluster, ClusterPlan, Drone, Scenario
-from zsim.sensors.sensor import Sensor
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK
 from zsim_agents.formation.expression import Expression, ExpressionError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
@@ -41,7 +40,7 @@ PAPER_NOTE = (
     "Compare the column est. std with the paper, and judge the flight by the columns of the truth."
 )
 
-# Equation (3): the final position that Test 1 regulates to; m and rad.
+# Equation (3): the final position of Test 1; m and rad.
 TEST_1_TARGET = {
     "x_c": 5.0,
     "y_c": -5.0,
@@ -64,15 +63,15 @@ TEST_2_REFERENCE = {
     "q": "4",
     "beta": "pi/4",
 }
-COMPARED_S = (0.0, 7.0, 31.0, 88.0, 140.0)  # at which expressions are the same that have the same values; chosen
+COMPARED_S = (0.0, 7.0, 31.0, 88.0, 140.0)  # chosen: expressions with equal values at these times are the same
 ROBOTS = 3
-TOLERANCE = 1e-3  # of a target that is written with fewer digits
+TOLERANCE = 1e-3  # of a target written with fewer digits
 SETTLED_S, JUDGED_S = 100.0, 200.0  # from the take-off to the window, and the window: of scenarios/step.yaml
 GUST_MAX_M_S = 0.5  # of scenarios/step.yaml; the paper names no wind
 
 
 def paper_table_of(flight: RecordedFlight, formation: Formation, window_s: tuple[float, float]) -> Mapping[str, float]:
-    """Return Table I for a formation that flew Test 1 over a whole window of it; empty for any other flight."""
+    """Return Table I for a formation that flew Test 1 over a complete window; empty for any other flight."""
     scenario, whole = flight.scenario, flight.completeness.complete
     faults = any(event.kind == "fault" for event in flight.events)
     if not whole or faults or scenario is None or scenario.report.window_s != window_s:
@@ -81,13 +80,14 @@ def paper_table_of(flight: RecordedFlight, formation: Formation, window_s: tuple
 
 
 def paper_table(scenario: Scenario, cluster: str) -> Mapping[str, float]:
-    """Return Table I for a cluster that a scenario sends to fly Test 1, for long enough; empty for any other one."""
-    flies = any(each.name == cluster and _is_test_1(scenario, each) for each in scenario.clusters)
+    """Return Table I for a cluster whose scenario is Test 1, and lasts long enough; empty for any other one."""
+    own = [each for each in scenario.clusters if each.name == cluster]
+    flies = any(_is_set_up(scenario, c) and _is_judged(scenario, c.plan) and _is_led(c) for c in own)
     return PAPER_TABLE_1 if flies else {}
 
 
 def flies_paper_test(flight: RecordedFlight, cluster: str) -> bool:
-    """Return whether a cluster flew one of the paper's tests, for whatever time and whatever window it is judged in."""
+    """Return whether a cluster flew one of the paper's tests, for any time, and whatever the window."""
     scenario = flight.scenario
     if scenario is None or any(event.kind == "fault" for event in flight.events):
         return False
@@ -95,12 +95,8 @@ def flies_paper_test(flight: RecordedFlight, cluster: str) -> bool:
     return any(_is_led(each) or _is_along_equation_4(each.plan) for each in own)
 
 
-def _is_test_1(scenario: Scenario, cluster: Cluster) -> bool:
-    return _is_set_up(scenario, cluster) and _is_judged(scenario, cluster.plan) and _is_led(cluster)
-
-
 def _is_set_up(scenario: Scenario, cluster: Cluster) -> bool:
-    """Return whether a cluster of three has the paper's drones and sensors, in calm air and without faults."""
+    """Return whether a cluster of three has the paper's drones and sensors, calm air and no faults."""
     wind = scenario.environment.wind
     calm = not any(wind.steady_m_s) and wind.gust_m_s <= GUST_MAX_M_S
     as_printed = all(_is_printed(scenario.drone(name)) for name in cluster.drones)
@@ -108,7 +104,7 @@ def _is_set_up(scenario: Scenario, cluster: Cluster) -> bool:
 
 
 def _is_along_equation_4(plan: ClusterPlan) -> bool:
-    """Return whether a plan leads along equation (4), however it is written."""
+    """Return whether a plan's trajectory equals equation (4), however it is written."""
     trajectory = plan.trajectory
     if trajectory is None or trajectory.waypoints or set(trajectory.expressions) != set(TEST_2_REFERENCE):
         return False
@@ -127,23 +123,20 @@ def _is_along_equation_4(plan: ClusterPlan) -> bool:
 
 
 def _is_printed(drone: Drone) -> bool:
-    """Return whether a drone is an AR.Drone as it stands, with the noise of the paper and no detector."""
+    """Return whether a drone is an unmodified AR.Drone with the noise of the paper and no detector."""
     sensors = drone.sensors
     plain = Drone(name=drone.name, position_m=drone.position_m, yaw_deg=drone.yaw_deg, sensors=sensors)
     more = sensors.own is not UNSET or sensors.sightings is not UNSET
-    noise = {name: getattr(sensors, name) for name in STOCK}
-    return drone == plain and not more and noise == _printed(sensors.as_printed)
-
-
-def _printed(as_printed: bool) -> dict[str, Sensor]:
-    """Return the settings of the paper's sensors by name."""
-    over = AS_PRINTED if as_printed else {}
-    sections = {name: {**section, **over.get(name, {})} for name, section in PRESETS["paper"].items()}
-    return {name: msgspec.convert(section, STOCK[name].settings) for name, section in sections.items()}
+    over = AS_PRINTED if sensors.as_printed else {}
+    printed = {
+        name: msgspec.convert({**section, **over.get(name, {})}, STOCK[name].settings)
+        for name, section in PRESETS["paper"].items()
+    }
+    return drone == plain and not more and {name: getattr(sensors, name) for name in STOCK} == printed
 
 
 def _is_judged(scenario: Scenario, plan: ClusterPlan) -> bool:
-    """Return whether the window lies in the run, after the formation has settled, and is as long as the paper's."""
+    """Return whether the window is within the run, after the formation has settled, and as long as the paper's."""
     window_s = scenario.report.window_s
     if window_s is None or plan.takeoff_s is None:
         return False
@@ -153,7 +146,7 @@ def _is_judged(scenario: Scenario, plan: ClusterPlan) -> bool:
 
 
 def _is_led(cluster: Cluster) -> bool:
-    """Return whether a cluster of ROBOTS is led from the ground to equation (3)."""
+    """Return whether the plan of a cluster of ROBOTS leads from the ground to equation (3)."""
     plan = cluster.plan
     if plan.takeoff_s is None or plan.trajectory is not None:
         return False

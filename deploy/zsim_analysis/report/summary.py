@@ -1,26 +1,41 @@
-"""summary.json: what a run was and how well it flew, beside what the paper printed."""
+"""summary.json: what a run was and how well it flew; and its tables of errors, for the page and the terminal."""
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 from msgspec import UNSET, Struct
+from rich.box import HEAVY_HEAD
+from rich.console import Group
+from rich.text import Text
 
 from zsim import __version__
+from zsim.contract.fingerprint import TruthHash
 from zsim.contract.run_messages import Event
-from zsim_analysis.reading.driver_links import DriverLink, driver_links
+from zsim.errors import printable
+from zsim.terminal.fitted_table import Column, FittedTable
+from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m
-from zsim_analysis.reading.recorded_flight import RecordedFlight, RecordedProcess
-from zsim_analysis.reading.recorded_run import command_age_ms
-from zsim_analysis.reading.shortfall import Shortfall, phase_shares, shortfalls
-from zsim_analysis.reading.verdict import window_of
-from zsim_analysis.reading.window_text import percent_text
+from zsim_analysis.reading.recorded_flight import TRUTH_WIDTH, RecordedFlight
+from zsim_analysis.reading.recorded_run import DriverLink, command_age_ms, driver_links
+from zsim_analysis.reading.shortfall import (
+    NOT_AS_PLANNED,
+    Shortfall,
+    marks_of,
+    percent_text,
+    phase_shares,
+    shortfalls,
+    span_text,
+    window_of,
+)
 from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table_of
-from zsim_analysis.report.record_facts import RecordFacts, facts_of_record
 
-EVENTS_PER_KIND = 100  # a flood of refusals must not push a restart out of the list
+STATISTICS = {"est. std": "est_std", "true std": "true_std", "true RMS": "true_rms", "true mean": "true_mean"}
+EVENTS_PER_KIND = 100  # so that many refusals do not push a restart out of the list
 EVENTS_MAX = 1000
 
 
@@ -39,9 +54,9 @@ class ClusterErrors(Struct, frozen=True):
 
     Attributes:
         drones: of the cluster.
-        errors: over the instants of the window at which it was engaged; None each where it never was.
-        paper_std: Table I beside a flight of Test 1, else empty.
-        engaged_share: of the window's instants, those at which it was engaged; None without any.
+        errors: over the instants of the window at which it was engaged; None each if it never was.
+        paper_std: Table I beside a flight of Test 1, otherwise empty.
+        engaged_share: share of the window's instants at which it was engaged; None without any.
         phases: shares of the window's instants by phase.
     """
 
@@ -53,7 +68,7 @@ class ClusterErrors(Struct, frozen=True):
 
     @property
     def part(self) -> str:
-        """Return of which part of the window the errors are; empty where they are of all of it."""
+        """Describe the part of the window over which the errors are; empty if it is all of it."""
         if self.engaged_share in (None, 1.0):
             return ""
         if not self.engaged_share:
@@ -61,15 +76,44 @@ class ClusterErrors(Struct, frozen=True):
         return f"errors are over the {percent_text(self.engaged_share)} % of the window in which it was engaged"
 
 
+class RecordFacts(Struct, frozen=True):
+    """The record from which the report was made.
+
+    Attributes:
+        complete: nothing that the world published is missing, nor the end of the run.
+        state: that, and what is missing, in words.
+        gates: on record.
+        gates_missing: by the clocks.
+        gaps: runs of missing gates: their number, and the first and the last of them.
+        messages_missing: of the world, by their sequence numbers.
+        undecoded: messages that are not of the type of their key.
+        truth_instants: truth messages in the hash: those of simulated drones.
+        truth_missing: truth messages that a complete run of this length would have in addition.
+        truth_sha256: as TruthHash of all truth messages, by time, then in the order of the drones.
+    """
+
+    messages: int
+    complete: bool
+    state: str
+    gates: int
+    gates_missing: int
+    gaps: list[dict[str, float]]
+    messages_missing: int
+    undecoded: int
+    truth_instants: int
+    truth_missing: int
+    truth_sha256: str
+
+
 class RunSummary(Struct, frozen=True):
-    """The content of summary.json; None where the record does not show a value.
+    """The content of summary.json; None if the record does not show a value.
 
     Attributes:
         date: when it was flown, to the second in UTC (ISO 8601).
-        changed: texts `a.b.c=value` by which the scenario was changed against its file.
-        as_planned: the flight did what its plan says, as far as the run went; `shortfalls` has what it did not do.
+        changed: texts `a.b.c=value` by which the scenario differs from its file.
+        as_planned: the flight followed its plan, as far as the run went; `shortfalls` has the deviations.
         links: to the aircraft that flew as external drones, by drone.
-        window_note: why the window is not that of the scenario, empty where it is.
+        window_note: why the window is not that of the scenario, empty if it is.
     """
 
     scenario: str | None
@@ -110,10 +154,9 @@ class RunSummary(Struct, frozen=True):
 
 
 def summarise(flight: RecordedFlight, formations: list[Formation], record: Path) -> RunSummary:
-    """Return the summary of a flight; what the world did not report before it ended is computed from the record."""
-    end = flight.end or {}
-    info = flight.info
-    record_facts = facts_of_record(flight, end.get("last_ns", flight.last_ns))
+    """Return the summary of a flight; figures that the world did not report at its end are computed from the record."""
+    end, info = flight.end or {}, flight.info
+    facts = _record_facts(flight, end.get("last_ns", flight.last_ns))
     window_s, window_note = window_of(flight)
     short = shortfalls(flight, window_s)
     as_planned = not any(each.fails for each in short)
@@ -128,20 +171,25 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         for f in formations
     }
     wall_s, span_s = end.get("wall_s", flight.wall_s), (flight.last_ns - flight.first_ns) / 1e9
-    sim_s = end.get("sim_s", span_s if flight.replay_of else flight.last_ns / 1e9)
-    lines, left_out = _lines(flight.events)
+    lines, left_out = _event_lines(flight.events)
+    participant = ("name", "role", "host", "pid", "incarnations", "left")
+    began = datetime.fromtimestamp(flight.began_ns // 10**9, UTC).isoformat() if flight.began_ns else None
     return RunSummary(
         scenario=flight.scenario.name if flight.scenario else None,
         seed=info.seed if info else None,
         mode=info.mode if info else None,
         run_id=info.run_id if info else None,
-        date=_date(flight.began_ns) if flight.began_ns else None,
+        date=began.replace("+00:00", "Z") if began else None,
         changed=list(info.changed) if info and info.changed is not UNSET else None,
-        versions=_versions(flight),
+        versions={
+            **({"world": info.version} if info else {}),
+            **{process.name: process.version for process in flight.processes if process.version},
+            "report": __version__,
+        },
         fingerprint=info.fingerprint if info else None,
         real_time_factor=end.get("real_time_factor", span_s / wall_s if wall_s > 0 else None),
         wall_s=wall_s,
-        sim_s=sim_s,
+        sim_s=end.get("sim_s", span_s if flight.replay_of else flight.last_ns / 1e9),
         ended=_ended(flight),
         as_planned=as_planned,
         shortfalls=short,
@@ -158,33 +206,38 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         paper_table_1=PAPER_TABLE_1,
         events=lines,
         events_left_out=left_out,
-        participants=[_participant(process) for process in flight.processes],
-        truth_sha256=end.get("truth_sha256", record_facts.truth_sha256),
-        record=record_facts,
-        notes=_notes(flight, record_facts, formations, window_s, window_note),
+        participants=[{name: getattr(each, name) for name in participant} for each in flight.processes],
+        truth_sha256=end.get("truth_sha256", facts.truth_sha256),
+        record=facts,
+        notes=list(_notes(flight, facts, formations, window_s, window_note)),
     )
 
 
-def _date(wall_ns: int) -> str:
-    return datetime.fromtimestamp(wall_ns // 10**9, UTC).isoformat().replace("+00:00", "Z")
-
-
-def _notes(
-    flight: RecordedFlight,
-    record: RecordFacts,
-    formations: list[Formation],
-    window_s: tuple[float, float],
-    window_note: str,
-) -> list[str]:
-    """Return what a reader has to know of the figures."""
-    notes = [
-        *_record_notes(flight),
-        *_truth_notes(record, (flight.end or {}).get("truth_sha256")),
-        window_note,
-        *_formation_notes(flight, formations, window_s),
-        *_fingerprint_notes(flight),
-    ]
-    return [note for note in notes if note]
+def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
+    """Return the facts of the record of a flight whose last known instant is `last_ns`."""
+    tracks, state = [track for track in flight.tracks if not track.external], flight.completeness
+    t_ns = np.concatenate([track.t_ns for track in tracks] or [np.zeros(0, np.int64)])
+    states = np.concatenate([track.truth for track in tracks] or [np.zeros((0, TRUTH_WIDTH))])
+    drone = np.repeat(np.arange(len(tracks)), [len(track.t_ns) for track in tracks])
+    order, truth = np.lexsort((drone, t_ns)), TruthHash(len(t_ns))
+    truth.add(t_ns[order], states[order])
+    gate_ns, missing = flight.info.gate_ns if flight.info else None, 0
+    if gate_ns and len(t_ns):  # a flight has truth from 0 or the first gate on, a replay from where it was begun
+        first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns)
+        missing = max(0, len(tracks) * ((last_ns - first_ns) // gate_ns + 1) - len(t_ns))
+    return RecordFacts(
+        messages=flight.messages,
+        complete=state.complete,
+        state=str(state),
+        gates=state.gates,
+        gates_missing=state.gates_missing,
+        gaps=[{"gates": g.gates, "from_s": g.from_ns / 1e9, "to_s": g.to_ns / 1e9} for g in state.gaps],
+        messages_missing=state.messages_missing,
+        undecoded=flight.undecoded,
+        truth_instants=len(t_ns),
+        truth_missing=missing,
+        truth_sha256=truth.hexdigest(),
+    )
 
 
 def _ended(flight: RecordedFlight) -> str:
@@ -195,7 +248,7 @@ def _ended(flight: RecordedFlight) -> str:
     return f"the record {'ends here at' if flight.completeness.closed else 'was cut after'} {at}: no end is on record"
 
 
-def _lines(events: list[Event]) -> tuple[list[EventLine], dict[str, int]]:
+def _event_lines(events: list[Event]) -> tuple[list[EventLine], dict[str, int]]:
     """Return the first events of every kind, and how many of each kind were left out."""
     kept: Counter[str] = Counter()
     left_out: Counter[str] = Counter()
@@ -209,63 +262,143 @@ def _lines(events: list[Event]) -> tuple[list[EventLine], dict[str, int]]:
     return lines, dict(left_out)
 
 
-def _versions(flight: RecordedFlight) -> dict[str, str]:
-    world = {"world": flight.info.version} if flight.info else {}
-    own = {process.name: process.version for process in flight.processes if process.version}
-    return {**world, **own, "report": __version__}
-
-
-def _participant(process: RecordedProcess) -> dict[str, Any]:
-    return {name: getattr(process, name) for name in ("name", "role", "host", "pid", "incarnations", "left")}
-
-
-def _record_notes(flight: RecordedFlight) -> list[str]:
-    notes = []
+def _notes(
+    flight: RecordedFlight,
+    record: RecordFacts,
+    formations: list[Formation],
+    window_s: tuple[float, float],
+    window_note: str,
+) -> Iterator[str]:
+    """Yield what a reader should know about the figures."""
     if flight.replay_of:
-        notes.append(f"This is a replay of run {flight.replay_of}, no flight of its own.")
+        yield f"This is a replay of run {flight.replay_of}, no flight of its own."
     if flight.end is None:
-        notes.append("The world did not report the run's end; times and command age are worked out from the record.")
+        yield "The world did not report the run's end; times and command age are worked out from the record."
     if not flight.completeness.complete:
-        notes.append(f"The record is {flight.completeness}.")
+        yield f"The record is {flight.completeness}."
     if flight.undecoded:
-        notes.append(f"{flight.undecoded} messages on record are not what their key promises and were passed over.")
+        yield f"{flight.undecoded} messages on record are not what their key promises and were passed over."
     if flight.info is None:
-        notes.append("world/info is not on record: scenario, seed and the order of the drones are not known.")
+        yield "world/info is not on record: scenario, seed and the order of the drones are not known."
     elif flight.scenario is None:
-        notes.append("The scenario on record cannot be read by this version.")
-    return notes
-
-
-def _truth_notes(record: RecordFacts, reported: str | None) -> list[str]:
-    notes = []
+        yield "The scenario on record cannot be read by this version."
     if record.truth_missing:
         expected = record.truth_missing + record.truth_instants
-        notes.append(f"{record.truth_missing} of {expected} truth messages are not on record.")
+        yield f"{record.truth_missing} of {expected} truth messages are not on record."
+    reported = (flight.end or {}).get("truth_sha256")
     if reported and reported != record.truth_sha256:
-        notes.append(f"The truth on record has the hash {record.truth_sha256}, the world reported {reported}.")
-    return notes
-
-
-def _formation_notes(flight: RecordedFlight, formations: list[Formation], window_s: tuple[float, float]) -> list[str]:
-    notes = []
+        yield f"The truth on record has the hash {record.truth_sha256}, the world reported {reported}."
+    if window_note:
+        yield window_note
     judged = {formation.name for formation in formations}
     external = {track.name for track in flight.tracks if track.external}
     for cluster in flight.clusters:
         if own := [drone for drone in cluster.drones if drone in external]:
             are = f"{', '.join(own)}, whose {'body is' if len(own) == 1 else 'bodies are'} external"
-            notes.append(f"Cluster {cluster.name} has {are}: nobody knows its truth, and no figure is against it.")
+            yield f"Cluster {cluster.name} has {are}: nobody knows its truth, and no figure is against it."
         if cluster.name not in judged:
-            notes.append(f"Cluster {cluster.name} published no state that can be judged: no table of it.")
+            yield f"Cluster {cluster.name} published no state that can be judged: no table of it."
     for formation in formations:
         if not formation.within(window_s).any():
-            notes.append(f"Cluster {formation.name} published no state inside the window.")
+            yield f"Cluster {formation.name} published no state inside the window."
     if not flight.clusters:
-        notes.append("The scenario has no cluster: there is no table of errors.")
-    return notes
-
-
-def _fingerprint_notes(flight: RecordedFlight) -> list[str]:
+        yield "The scenario has no cluster: there is no table of errors."
     own = flight.info.fingerprint if flight.info else ""
-    others = [p.name for p in flight.processes if own and p.fingerprint and p.fingerprint != own]
-    text = "computed with another numeric fingerprint than the world; the same bits are not promised."
-    return [f"{', '.join(others)} {text}"] if others else []
+    if others := [p.name for p in flight.processes if own and p.fingerprint and p.fingerprint != own]:
+        text = "computed with another numeric fingerprint than the world; the same bits are not promised."
+        yield f"{', '.join(others)} {text}"
+
+
+# Tables of errors, of a large formation first by groups of parameters
+
+PAPER_COLUMN = "paper std"
+COLUMNS = {  # by their names on the page: as on the terminal, and the statistic
+    "parameter": (Column("parameter", "name"), ""),
+    PAPER_COLUMN: (Column("paper\nstd", worth=4, right=True), ""),
+    "est. std": (Column("est.\nstd", worth=3, right=True), "est_std"),
+    "est. mean": (Column("est.\nmean", worth=1, right=True), "est_mean"),
+    "true std": (Column("true\nstd", right=True), "true_std"),
+    "true RMS": (Column("true\nRMS", right=True), "true_rms"),
+    "true mean": (Column("true\nmean", worth=2, right=True), "true_mean"),
+}
+GROUP_COLUMNS = {
+    "parameters": (Column("parameters", "name"), ""),
+    "count": (Column("count", worth=1, right=True), ""),
+    "est. RMS": (Column("est.\nRMS", worth=2, right=True), "est_rms"),
+    "true RMS": COLUMNS["true RMS"],
+    "worst": (Column("worst", worth=3, right=True), ""),
+    "of": (Column("of", "name"), ""),
+}
+SINGLY_MAX = 24  # parameters of a formation that need no table by groups: of 6 drones
+FRAME = {"x_c": "position", "y_c": "position", "z_c": "position"} | dict.fromkeys(("roll", "pitch", "yaw"), "attitude")
+
+
+class ErrorTable(Struct, frozen=True):
+    """Columns and rows of text; `rest` has every parameter if the rows are of groups."""
+
+    columns: list[str]
+    rows: list[list[str]]
+    rest: "ErrorTable | None" = None
+
+
+def error_table(cluster: ClusterErrors) -> ErrorTable:
+    """Return a cluster's errors: a row per parameter, or per group of them if there are many."""
+    columns = [column for column in COLUMNS if column != PAPER_COLUMN or cluster.paper_std]  # beside Test 1 only
+    rows = []
+    for name, errors in cluster.errors.items():
+        printed = cluster.paper_std.get(name)
+        paper = ["" if printed is None else f"{printed:g}"] if cluster.paper_std else []
+        values = [getattr(errors, statistic) for _, statistic in COLUMNS.values() if statistic]
+        rows.append([f"{name} ({unit(name)})", *paper, *map(_number, values)])
+    single = ErrorTable(columns, rows)
+    if len(cluster.errors) <= SINGLY_MAX:
+        return single
+    return ErrorTable(list(GROUP_COLUMNS), list(_group_rows(cluster)), single)
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4f}"
+
+
+def _group_rows(cluster: ClusterErrors) -> Iterator[list[str]]:
+    """Yield a row per group: its size, the root of its mean square errors, and the parameter with the largest RMS."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name in cluster.errors:
+        kind = FRAME.get(name) or ("headings" if name.startswith("phi") else "shape")
+        groups.setdefault((kind, unit(name)), []).append(name)
+    for (kind, measure), names in groups.items():
+        est, true = ([getattr(cluster.errors[name], each) for name in names] for each in ("est_rms", "true_rms"))
+        known = {name: value for name, value in zip(names, true, strict=True) if value is not None}
+        worst = max(known, key=lambda name: known[name]) if known else ""
+        rest = (_number(_together(est)), _number(_together(true)), _number(known.get(worst)), worst or "–")
+        yield [f"{kind} ({measure})", str(len(names)), *rest]
+
+
+def _together(values: Sequence[float | None]) -> float | None:
+    """Return the root of the mean square of the known values."""
+    known = [value for value in values if value is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else None
+
+
+def terminal_text(summary: RunSummary) -> Group:
+    """Return the shortfalls of a flight, and a table of errors for each cluster, for the terminal."""
+    notes = [(f"note: {summary.window_note}", False)] if summary.window_note else []
+    marks = [*marks_of(summary.shortfalls), *notes]
+    lines = [Text(printable(mark), style="bold red" if fails else "yellow") for mark, fails in marks]
+    return Group(*lines, *(table(summary, name) for name in summary.clusters))
+
+
+def table(summary: RunSummary, cluster: str) -> FittedTable:
+    """Return the errors of one cluster, beside the paper's Table I for Test 1, for the terminal."""
+    judged = summary.clusters[cluster]
+    content = error_table(judged)
+    title = f"Formation errors of {cluster} from {span_text(summary.window_s)}"
+    beside = ", beside Table I of the paper" if judged.paper_std else ""
+    mark = "" if summary.as_planned else f" ({NOT_AS_PLANNED})"
+    caption = "est. = estimate − desired, true = truth − desired"
+    if judged.part:
+        caption += f"; {judged.part}"
+    if content.rest:
+        caption += f"; all {len(content.rest.rows)} parameters: report.html, summary.json"
+    columns = [{**COLUMNS, **GROUP_COLUMNS}[column][0] for column in content.columns]
+    return FittedTable(columns, content.rows, f"{title}{beside}{mark}", caption, lines=HEAVY_HEAD)

@@ -1,6 +1,6 @@
-"""The workers of a sweep on several hosts: those of a Dask cluster that is running already.
+"""The workers of a sweep on several hosts: those of a running Dask cluster.
 
-Dask flies a run again whose worker died, and gives up a run in which several of them died.
+Dask repeats a run whose worker died, and gives up a run in which several workers died.
 """
 
 import asyncio
@@ -17,24 +17,20 @@ from zsim import __version__
 from zsim.errors import RunError, reason_of
 from zsim_analysis.sweep.sweep_run import Row, Task, failed_row, fly
 
-AHEAD = 2  # tasks per thread of the cluster, so that none of them waits for us
-CONNECT_S = 5.0  # wall time after which a scheduler that does not answer is an error
+AHEAD = 2  # tasks per thread of the cluster, so that none of them idles
+CONNECT_S = 5.0  # wall time within which a scheduler must answer
 
 _alone = threading.Lock()
 
 
 def fly_alone(task: Task) -> Row:
-    """Fly a run, one at a time in a process: threads of one process would only wait for each other."""
+    """Fly a run, one at a time in each process, whose threads would only wait for each other."""
     with _alone:
         return fly(task)
 
 
 class DaskPool:
     """Flies tasks on a Dask cluster.
-
-    Args:
-        address: of the scheduler, e.g. tcp://192.0.2.1:8786.
-        say: called with a line about the cluster.
 
     Raises:
         RunError: no scheduler answers there, or a worker has another zsim than this host.
@@ -43,35 +39,31 @@ class DaskPool:
     def __init__(self, address: str, say: Callable[[str], None]) -> None:
         self._address = address
         self._say = say
-        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what ends the sweep is raised here
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors that end the sweep are raised
         try:
-            asyncio.run(_connect(address))  # first, since a client without a scheduler is slow to give up
+            asyncio.run(_connect(address))  # first, since a client takes long to give up
             self._client: Any = Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise RunError(f"--dask {address}: no scheduler ({reason}); start `dask scheduler` there") from error
 
     def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
-        """Yield the rows of tasks as they are finished; when closed, the cluster forgets the rest.
+        """Yield the rows of tasks as they are finished; when closed, the cluster drops the rest.
 
         Raises:
             RunError: the cluster is gone, or rows cannot be recorded.
         """
+        pending: dict[str, Task] = {}
         try:
             with self._client:
-                yield from self._rows(tasks)
+                self._await_workers()
+                flying: Any = _as_completed(loop=self._client.loop)
+                self._fill(flying, pending, tasks)
+                for future in flying:
+                    yield self._row(future, pending.pop(future.key))
+                    self._fill(flying, pending, tasks)
         except (OSError, CancelledError) as error:  # broken links are OSErrors too
             raise RunError(f"--dask {self._address}: the cluster is gone; the same command goes on") from error
-
-    def _rows(self, tasks: Iterator[Task]) -> Generator[Row]:
-        self._await_workers()
-        flying = _as_completed(loop=self._client.loop)
-        pending: dict[str, Task] = {}
-        self._fill(flying, pending, tasks)
-        for future in flying:
-            task = pending.pop(future.key)
-            yield self._row(future, task)
-            self._fill(flying, pending, tasks)
 
     def _await_workers(self) -> None:
         if not self._client.nthreads():
@@ -85,7 +77,7 @@ class DaskPool:
         self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._address}")
 
     def _fill(self, flying: Any, pending: dict[str, Task], tasks: Iterator[Task]) -> None:
-        """Keep as many tasks in the cluster as its workers are to have; new workers may come at any time."""
+        """Submit tasks up to AHEAD per thread of the cluster; new workers may join at any time."""
         while len(pending) < AHEAD * sum(self._client.nthreads().values()):
             task = next(tasks, None)
             if task is None:
@@ -101,7 +93,7 @@ class DaskPool:
             return failed_row(task, "several workers died of it, see Dask's allowed-failures")
         except CancelledError:
             raise
-        except Exception as error:  # what `fly` raises is an error that every further run would have too
+        except Exception as error:  # raised by `fly`: every further run would fail as well
             raise RunError(f"--dask {self._address}: {reason_of(error)}") from error
 
 

@@ -1,33 +1,49 @@
-"""The plan of a sweep, and its design: the runs, the values that each of them has, and the scenarios of them."""
+"""The plan of a sweep, and its design: what varies, the values of each run, and their scenarios.
+
+An axis is seeds, values of a field in turn, or values drawn for each run. The combinations of all fields with values in
+turn are the points of the grid.
+"""
 
 import copy
+import itertools
+import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import msgspec
-from msgspec import Struct
+import numpy as np
+from msgspec import UNSET, Struct
 
 from zsim import __version__
-from zsim.errors import ScenarioError
+from zsim.errors import DocumentError, ScenarioError
+from zsim.math.random_streams import stream
 from zsim.scenario import overrides, scenario_file
 from zsim.scenario.external_bodies import check_pace
-from zsim.scenario.overrides import whole_path
+from zsim.scenario.overrides import NOTHING, steps_of, whole_path
 from zsim.scenario.scenario import Scenario
 from zsim.scenario.scenario_file import EXAMPLE
 from zsim.schema import plugin, yaml_file
-from zsim.schema.checker import first_lines
+from zsim.schema.checker import first_fault, first_lines, show
 from zsim_agents.hosting import check_classes
-from zsim_analysis.sweep.axes import SEED, Axis, Draw, FieldPath, Grid, Seeds, field_path, is_inside, parse, text_of
-from zsim_analysis.sweep.metrics import check_metrics
 
 PLAN = "plan.json"
+METRICS = "report.metrics"  # names the user's function that computes metrics of a run
 RUNS_MAX = 1_000_000
-_VALUE = re.compile(r" is [^;]*")  # in a fault: what differs from run to run where values are drawn
+SEED = "seed"
+SHOWN_MAX = 24  # characters of a value in a table or figure
+SEEDS = 2**32  # exclusive limit of drawn seeds: ten digits that a person can type
+SYNTAX = "seed, seed=paired, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
+PAIRED = "paired"
+FieldPath = tuple[str | int, ...]  # steps to a field of a scenario from the top
+_SEED_TYPE = get_type_hints(Scenario, include_extras=True)[SEED]
 _DEFAULT_SEED: int = next(f.default for f in msgspec.structs.fields(Scenario) if f.name == SEED)
+_DRAWN = re.compile(r"\s*([a-z]+)\((.*)\)\s*")
+_VALUE = re.compile(r" is [^;]*")  # the part of a fault that differs from run to run if values are drawn
 
 
 class SweepPlan(Struct, frozen=True, kw_only=True):
@@ -37,9 +53,9 @@ class SweepPlan(Struct, frozen=True, kw_only=True):
         source: name of the scenario's file, for messages.
         document: the file with the overrides of the command line, presets not yet expanded.
         vary: texts of `--vary`, in their order.
-        runs: how many; a plan of more runs begins with the same ones.
+        runs: their number; a plan with more runs begins with the same ones.
         records: whether every run keeps its record.
-        changed: texts `a.b.c=value` that the command line has changed of the file; None: not known.
+        changed: texts `a.b.c=value` by which the command line differs from the file; None: not known.
         version: of zsim; another one need not give the same numbers.
     """
 
@@ -53,7 +69,7 @@ class SweepPlan(Struct, frozen=True, kw_only=True):
 
 
 def difference(old: SweepPlan, new: SweepPlan) -> str | None:
-    """Return in which way two plans are not the same sweep, None if `new` continues `old`."""
+    """Return how two plans differ, None if `new` continues `old`."""
     if old.version != new.version:
         return f"it was begun by zsim {old.version}, this is {new.version}"
     if old.document != new.document:
@@ -80,13 +96,188 @@ def is_sweep(folder: Path) -> bool:
     return (folder / PLAN).is_file()
 
 
+# Axes
+
+
+class Seeds(Struct, frozen=True):
+    """A distinct seed for every run or, paired, for every run of a combination: all combinations have the same ones.
+
+    Attributes:
+        paired: drawn values are the same for all combinations, too.
+        values: the seeds; none: they are drawn from the scenario's own.
+    """
+
+    path: str = SEED
+    paired: bool = False
+    values: tuple[int, ...] = ()
+
+    def draw(self, seed: int, count: int) -> list[int]:
+        """Return the first seeds, drawn from a scenario's seed; a larger count begins with the same ones."""
+        if self.values:
+            return list(self.values[:count])
+        rng = stream(seed, "sweep/seed")
+        seeds: dict[int, None] = {}
+        while len(seeds) < count:
+            seeds[int(rng.integers(SEEDS))] = None
+        return list(seeds)
+
+
+class Grid(Struct, frozen=True):
+    """Values of a field, each flown equally often."""
+
+    path: str
+    values: tuple[Any, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Return abbreviated and unique names of the values."""
+        return _distinct(self.values)
+
+
+class Draw(Struct, frozen=True):
+    """Values of a field drawn anew for every run: uniform from low to high, or normal of mean and std."""
+
+    path: str
+    kind: str
+    first: float
+    second: float
+
+    def draw(self, seed: int, count: int) -> list[float]:
+        """Return the values of the first runs; each field has a stream of its own."""
+        rng = stream(seed, f"sweep/{self.path}")
+        of_kind: dict[str, Callable[..., np.ndarray]] = {"uniform": rng.uniform, "normal": rng.normal}
+        return of_kind[self.kind](self.first, self.second, count).tolist()
+
+
+Axis = Seeds | Grid | Draw
+
+
+def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
+    """Return the axis of a text of `--vary`, for a raw document.
+
+    Raises:
+        ValueError: it is not of the form of SYNTAX, or its path is ambiguous.
+    """
+    path, equals, values = text.partition("=")
+    if text.strip() == SEED:
+        return Seeds()
+    if not equals or not path.strip():
+        raise ValueError(f"is no variation; must be {SYNTAX}")
+    path = whole_path(path.strip(), document)
+    if path == SEED:
+        return _seeds(values)
+    drawn = _DRAWN.fullmatch(values)
+    return _draw(path, drawn[1], drawn[2]) if drawn else Grid(path, _grid_values(values))
+
+
+def _seeds(text: str) -> Seeds:
+    if text.strip() == PAIRED:
+        return Seeds(paired=True)
+    seeds = _grid_values(text)
+    for seed in seeds:
+        if fault := first_fault(seed, _SEED_TYPE):
+            raise ValueError(f"{fault[1]}; or give seed={PAIRED}, which draws them")
+    return Seeds(paired=True, values=seeds)
+
+
+def _grid_values(text: str) -> tuple[Any, ...]:
+    try:
+        values = yaml_file.value(f"[{text}]")
+    except ValueError as error:
+        raise ValueError(f"{error}; must be {SYNTAX}") from error
+    if not values:
+        raise ValueError(f"gives no value; must be {SYNTAX}")
+    for a, b in itertools.combinations(values, 2):
+        if a == b and isinstance(a, bool) == isinstance(b, bool):
+            raise ValueError(f"gives {show(a)} twice; every value once")
+    return tuple(values)
+
+
+def _draw(path: str, kind: str, arguments: str) -> Draw:
+    if kind not in ("uniform", "normal"):
+        raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
+    try:
+        first, second = (float(part) for part in arguments.split(","))
+    except ValueError:
+        raise ValueError(f"has {kind}({arguments[:40]}); must hold two numbers") from None
+    span = second - first if kind == "uniform" else second
+    if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
+        need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
+        raise ValueError(f"has {kind}({arguments[:40]}); must be finite numbers with {need}")
+    return Draw(path, kind, first, second)
+
+
+def text_of(value: Any) -> str:
+    """Return a value as `--set` takes it, in one line."""
+    return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def _distinct(values: Sequence[Any]) -> list[str]:
+    """Return abbreviated values; those that are cut to the same text as their differing part, or with their number."""
+    names = [_cut(f"{value:g}" if isinstance(value, float) else text_of(value)) for value in values]
+    for short in [name for name, count in Counter(names).items() if count > 1]:
+        alike = [place for place, name in enumerate(names) if name == short]
+        parts = _differing([text_of(values[place]) for place in alike])
+        others = {name for name in names if name != short}
+        is_distinct = len({*parts, *others}) == len(parts) + len(others)
+        for place, part in zip(alike, parts, strict=True):
+            names[place] = part if is_distinct else f"{short} ({place + 1})"
+    return names
+
+
+def _differing(texts: Sequence[str]) -> list[str]:
+    """Return texts from the first word in which they differ on, cut; short ones are whole."""
+    if all(len(text) <= SHOWN_MAX for text in texts):
+        return list(texts)
+    letters = enumerate(zip(*texts, strict=False))
+    whole = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
+    start = max(texts[0].rfind(mark, 0, whole) for mark in " ,[{:") + 1
+    return [_cut(f"…{text[start:]}" if start else text) for text in texts]
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= SHOWN_MAX else f"{text[: SHOWN_MAX - 1]}…"
+
+
+def field_path(document: dict[str, Any], path: str) -> FieldPath:
+    """Return the steps to a field from the top; list entries count from 0, whether given by index or by name.
+
+    Args:
+        document: raw, not changed; steps to fields that it does not have are kept as text.
+        path: as `--set` takes it.
+    """
+    steps: list[str | int] = []
+    value: Any = document
+    for text in steps_of(path):
+        step: str | int = text
+        if isinstance(value, list):
+            names = [entry.get("name") if isinstance(entry, dict) else None for entry in value]
+            if text in names:
+                step = names.index(text)
+            elif re.fullmatch(r"[0-9]{1,9}", text):
+                step = int(text)
+            value = value[step] if isinstance(step, int) and step < len(value) else None
+        else:
+            value = value.get(step) if isinstance(value, dict) else None
+        steps.append(step)
+    return tuple(steps)
+
+
+def is_inside(one: FieldPath, other: FieldPath) -> bool:
+    """Return whether one field is part of the other."""
+    return len(one) > len(other) and one[: len(other)] == other
+
+
+# Design
+
+
 class SweepDesign:
-    """Everything that follows from a plan; runs and points count from 0.
+    """The runs of a plan; runs and points count from 0.
 
     Attributes:
         axes: what varies.
-        points: how many combinations of the grid's values there are; run i flies the i-th, then the first again.
-        seeds: how they vary, None where all runs have the scenario's own.
+        points: number of combinations of the grid's values; run i flies the i-th, then the first again.
+        seeds: how they vary, None if all runs have the scenario's own.
         paired: the n-th runs of all combinations have the same seed.
     """
 
@@ -100,7 +291,7 @@ class SweepDesign:
 
     @property
     def seed(self) -> int:
-        """Return the scenario's own seed, from which seeds and values are drawn; a faulty one is not flown."""
+        """Return the scenario's own seed, from which seeds and values are drawn; an invalid one is never flown."""
         seed = self.plan.document.get(SEED)
         return seed if isinstance(seed, int) and seed >= 0 else _DEFAULT_SEED
 
@@ -118,11 +309,11 @@ class SweepDesign:
         return {grid.path: grid.values[place] for grid, place in self._places(point)}
 
     def names(self, point: int) -> dict[str, str]:
-        """Return the values of a point in short by path, no two values of a field alike."""
+        """Return the abbreviated values of a point by path, unique for each field."""
         return {grid.path: self._names[grid.path][place] for grid, place in self._places(point)}
 
     def _places(self, point: int) -> list[tuple[Grid, int]]:
-        """Return the axes of the grid, each with the place of a point's value in it."""
+        """Return the axes of the grid, each with the index of a point's value."""
         places = []
         for grid in reversed(self._grids):
             point, place = divmod(point, len(grid.values))
@@ -134,7 +325,7 @@ class SweepDesign:
         return {grid.path: grid.names for grid in self._grids}
 
     def values(self, run: int) -> dict[str, Any]:
-        """Return what a run sets, by path, in the order of the axes."""
+        """Return the values that a run sets, by path, in the order of the axes."""
         at, draw = self.at(self.point(run)), run // self.points if self.paired else run
         return {axis.path: at[axis.path] if axis.path in at else self._drawn[axis.path][draw] for axis in self.axes}
 
@@ -150,9 +341,10 @@ class SweepDesign:
         Raises:
             ScenarioError: with every fault, a line each.
         """
-        document = copy.deepcopy(self.plan.document)
-        assigned = [_assign(document, path, value) for path, value in self.values(run).items()]
-        faults = [fault for fault in assigned if fault]
+        document, faults = copy.deepcopy(self.plan.document), []
+        for path, value in self.values(run).items():
+            fault = overrides.apply(document, f"{path}={text_of(value)}", lambda _, value=value: copy.deepcopy(value))
+            faults += [f"--vary {fault.removeprefix('--set ')}"] if fault else []
         try:
             scenario = scenario_file.resolve(document, self.plan.source)
         except ScenarioError as error:
@@ -160,16 +352,16 @@ class SweepDesign:
         if faults:
             raise ScenarioError(faults)
         check_classes(scenario, self.plan.source)
-        check_metrics(scenario, self.plan.source)
+        if scenario.report.metrics is not UNSET:
+            try:
+                plugin.load_function(scenario.report.metrics, f"{self.plan.source}: {METRICS}")
+            except DocumentError as error:
+                raise ScenarioError(error.faults) from error
         check_pace(scenario, "lockstep")
         return scenario
 
     def faults(self, progress: Callable[[int, int], None] = lambda run, of: None) -> list[str]:
-        """Return the faults of every combination: each point of the grid, each run where values are drawn.
-
-        Args:
-            progress: called with the number of the combination that is checked, and how many there are.
-        """
+        """Return the faults of every combination: each point of the grid, each run if values are drawn."""
         drawn = any(isinstance(axis, Draw) for axis in self.axes)
         checked = self.plan.runs if drawn else min(self.plan.runs, self.points)
         runs_of: dict[str, tuple[str, list[int]]] = {}
@@ -177,15 +369,21 @@ class SweepDesign:
             progress(run, checked)
             for fault in _faults(self.scenario, run):
                 runs_of.setdefault(_VALUE.sub(" is …", fault), (fault, []))[1].append(run)
-        return [self._with_runs(fault, runs, checked) for fault, runs in runs_of.values()]
+        lines = []
+        for fault, runs in runs_of.values():
+            values = {path: value for path, value in self.values(runs[0]).items() if path != SEED}
+            first = ", ".join(f"{path}={text_of(value)}" for path, value in values.items())
+            some = f" (in {len(runs)} of {checked} combinations, first {first})"
+            lines.append(fault if len(runs) == checked else f"{fault}{some}")
+        return lines
 
-    def _with_runs(self, fault: str, runs: list[int], checked: int) -> str:
-        """Return a fault with the combinations that have it, unless all of them do."""
-        if len(runs) == checked:
-            return fault
-        values = {path: value for path, value in self.values(runs[0]).items() if path != SEED}
-        first = ", ".join(f"{path}={text_of(value)}" for path, value in values.items())
-        return f"{fault} (in {len(runs)} of {checked} combinations, first {first})"
+
+def _faults(make: Callable[[int], Scenario], run: int) -> list[str]:
+    try:
+        make(run)
+    except ScenarioError as error:
+        return error.faults
+    return []
 
 
 def make_plan(
@@ -204,14 +402,14 @@ def make_plan(
         source: name of the scenario's file, for messages.
         document: raw; see `read_document`.
         vary: texts of `--vary`.
-        runs: how many, None: as many as the grid has combinations, of each seed that is given.
+        runs: their number, None: as many as the grid has combinations, for each given seed.
         records: whether every run keeps its record.
-        progress: called with the number of the combination that is checked, and how many there are.
+        progress: called with the number of the combination that is checked, and their number.
         earlier_faults: of the overrides, reported with the others.
         changed: as of the plan.
 
     Raises:
-        ScenarioError: with every fault of the variations and of the scenarios that result, a line each.
+        ScenarioError: with every fault of the variations and of the resulting scenarios, a line each.
     """
     texts, vary_faults = _parsed(vary, document)
     faults = [*earlier_faults, *vary_faults]
@@ -232,20 +430,18 @@ def make_plan(
 
 
 def _parsed(vary: list[str], document: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Return the texts of `--vary` that are valid, and a fault for each of the others."""
+    """Return the valid texts of `--vary`, and a fault for each of the others."""
     fields: dict[FieldPath, str] = {}
     faults = []
     for text in vary:
-        shown = _shown(text)
         try:
             path = parse(text, document).path
         except ValueError as error:
-            faults.append(f"--vary {shown}: {error}")
+            faults.append(f"--vary {_shown(text)}: {error}")
             continue
         steps = field_path(document, path)
-        fault = _overlap(path, steps, fields)
-        if fault:
-            faults.append(f"--vary {shown}: {fault}")
+        if fault := _overlap(path, steps, fields):
+            faults.append(f"--vary {_shown(text)}: {fault}")
         else:
             fields[steps] = text
     return list(fields.values()), faults
@@ -280,20 +476,6 @@ def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
     if all_known and runs > points and all(isinstance(axis, Grid) for axis in design.axes):
         return [f"--runs is {runs}; must be {points}, for further ones would have the same bits, or add --vary seed"]
     return []
-
-
-def _faults(make: Callable[[int], Scenario], run: int) -> list[str]:
-    try:
-        make(run)
-    except ScenarioError as error:
-        return error.faults
-    return []
-
-
-def _assign(document: dict[str, Any], path: str, value: Any) -> str | None:
-    """Set a field of a document to a copy of a value; return the fault if there is one."""
-    fault = overrides.apply(document, f"{path}={text_of(value)}", lambda _: copy.deepcopy(value))
-    return f"--vary {fault.removeprefix('--set ')}" if fault else None
 
 
 def read_document(path: Path, set_texts: list[str], **values: Any) -> tuple[dict[str, Any], list[str]]:

@@ -1,7 +1,7 @@
 """The worker processes of a sweep on this host: one that dies is replaced, and its run is flown again.
 
-A worker flies one run after the other, so that imports and kernels are loaded once. `ProcessPoolExecutor` would not do:
-it breaks as a whole when a worker dies, and does not show which run was fatal.
+A worker flies many runs, so that imports and kernels are loaded once. `ProcessPoolExecutor` would break as a whole when
+a worker dies, without showing which run was fatal.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 READY = "ready"
 SAFE_PATH = "PYTHONSAFEPATH"  # environment variable of Python
-DEATHS_MAX = 3  # of workers in one run, or one after the other before they are ready
-EXIT_S = 5.0  # wall time that an idle worker has to exit by itself
+DEATHS_MAX = 3  # of workers in one run, or consecutively before they are ready
+EXIT_S = 5.0  # wall time within which an idle worker exits by itself
 
 
 def work(link: Connection) -> None:
-    """Fly the tasks received on a link and send back their rows; `None` ends it, as the launcher's death does.
+    """Fly the tasks received on a link and send back their rows, until `None` is received or the launcher dies.
 
-    An exception that is sent back is an error that every further run would have too.
+    An exception is sent back if every further run would fail as well.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it reaches every process of the terminal; the launcher acts on it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher, which receives it as well, handles it
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_exit_with_launcher, name="launcher-monitor", daemon=True).start()
     warnings.simplefilter("ignore", RuntimeWarning)  # a state that overflows is reported in the run's row
@@ -61,13 +61,13 @@ def _exit_with_launcher() -> None:
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextlib.contextmanager
 def _safe_path() -> Iterator[None]:
-    """Let interpreters that are started import nothing from the working folder first."""
+    """Start interpreters that do not import from the working folder first."""
     former = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"
     try:
@@ -79,7 +79,7 @@ def _safe_path() -> Iterator[None]:
 
 
 class WorkerProcess:
-    """One process and the task that it flies."""
+    """One process and its current task."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -92,13 +92,13 @@ class WorkerProcess:
         self.task: Task | None = None
 
     def send(self, task: Task) -> None:
-        """Send a task; a worker that died meanwhile shows at `receive`."""
+        """Send a task; the death of a worker is noticed by `receive`."""
         self.task = task
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.link.send(task)
 
     def receive(self) -> Row | str | RuntimeError | None:
-        """Return its next message; None when it is dead."""
+        """Return its next message; None if it is dead."""
         try:
             return self.link.recv()
         except (EOFError, OSError):
@@ -106,7 +106,7 @@ class WorkerProcess:
             return None
 
     def stop(self) -> None:
-        """End the process, at once if it flies a task."""
+        """End the process, immediately if it flies a task."""
         if self.task is None:
             with contextlib.suppress(OSError):
                 self.link.send(None)
@@ -122,12 +122,7 @@ class WorkerProcess:
 
 
 class ProcessPool:
-    """Flies tasks on worker processes.
-
-    Args:
-        count: of workers.
-        say: called with a line about a worker that died.
-    """
+    """Flies tasks on worker processes."""
 
     def __init__(self, count: int, say: Callable[[str], None]) -> None:
         self._count = count
@@ -138,7 +133,7 @@ class ProcessPool:
         self._deaths_at_start = 0
 
     def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
-        """Yield the rows of tasks as they are finished; at the end, or when closed, no worker is left.
+        """Yield the rows of tasks as they are finished; when exhausted or closed, all workers have ended.
 
         Raises:
             RunError: workers cannot start, or rows cannot be recorded.
@@ -182,7 +177,7 @@ class ProcessPool:
         worker.stop()
 
     def _on_death(self, worker: WorkerProcess) -> Iterator[Row]:
-        """Replace a dead worker; a run in which several died gets a failed row."""
+        """Replace a dead worker; a run in which DEATHS_MAX workers died gets a failed row."""
         del self._workers[worker.link]
         worker.link.close()
         self._deaths_at_start += not worker.ready

@@ -1,104 +1,43 @@
-"""Flies a whole sweep: plan in; finished runs in a folder, and their table, out; a live line on the terminal."""
+"""Flies a whole sweep into its folder: plan in; finished runs, and their table, out; a live line on the terminal.
 
+The folder of a sweep:
+
+    plan.json        what is flown
+    journal.jsonl    finished runs that are not in the table yet, a line of JSON each
+    sweep.parquet    finished runs, a row each
+    runs/000012/     record of run 12, if records are kept
+"""
+
+import os
+import sys
 import time
-from collections.abc import Callable, Generator, Iterator
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
+import msgspec
+import pyarrow as pa
+import pyarrow.parquet as pq
 from msgspec import Struct
 from rich.console import Console
 from rich.live import Live
-from rich.text import Text
 
+from zsim.errors import ReportError, RunError, printable
+from zsim.output_folder import no_locks, refuse_others, take_lock
 from zsim.runtime.progress import cell
 from zsim.runtime.rate_limit import RateLimit
-from zsim_analysis.sweep.design import SweepPlan
+from zsim_analysis.sweep.design import PLAN, SEED, Axis, Grid, SweepDesign, SweepPlan, difference, is_sweep
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
-from zsim_analysis.sweep.sweep_folder import SweepFolder, locked
-from zsim_analysis.sweep.sweep_run import Row, Task
+from zsim_analysis.sweep.sweep_run import FIXED, Row, Task
 
-PLAIN_S = 10.0  # wall time between two lines where no terminal is
+JOURNAL, TABLE, RUNS, LOCK = "journal.jsonl", "sweep.parquet", "runs", ".lock"
+NEW_PLAN = f".{PLAN}.new"
+PLAN_METADATA = b"zsim_sweep"  # key of the plan in the table's metadata
+PLAIN_S = 10.0  # wall time between two lines without a terminal
 BAR = 20  # characters
-UNMEASURED_MAX = 5  # lines about runs without figures of the user's own
-
-
-class SweepScreen:
-    """Shows how far a sweep is, while it is entered.
-
-    Args:
-        total: runs of the plan.
-        done: of them before this start.
-        now_s: monotonic wall time.
-    """
-
-    def __init__(
-        self, total: int, done: int, console: Console | None = None, now_s: Callable[[], float] = time.monotonic
-    ) -> None:
-        self.console = console or Console(stderr=True)
-        self._total = total
-        self._before = self._done = done
-        self._failed = 0
-        self._unmeasured = 0
-        self._now_s = now_s
-        self._start_s = now_s()
-        self._throttle = RateLimit(PLAIN_S)
-        self._live = Live(console=self.console, get_renderable=self._text, refresh_per_second=5, transient=True)
-
-    def __enter__(self) -> "SweepScreen":
-        self._start_s = self._now_s()
-        if self.console.is_terminal:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.console.is_terminal:
-            self._live.stop()
-        elif self._done > self._before:
-            self.say(self.line())
-
-    def say(self, text: str) -> None:
-        """Show a line that stays."""
-        self.console.print(cell(text), soft_wrap=True)
-
-    def finished(self, failed: bool) -> None:
-        """Count a run."""
-        self._done += 1
-        self._failed += failed
-        if not self.console.is_terminal and self._done < self._total and self._throttle.spend():
-            self.say(self.line())
-
-    def unmeasured(self, run: int, reason: str) -> None:
-        """Show a line about a run that has no figures of the user's own, for the first such runs."""
-        self._unmeasured += 1
-        if self._unmeasured <= UNMEASURED_MAX:
-            more = "; further ones are in the table" if self._unmeasured == UNMEASURED_MAX else ""
-            self.say(f"run {run}: {reason}{more}")
-
-    def line(self) -> str:
-        """Return runs done, runs per hour since the start, and time to go at that rate."""
-        filled = int(BAR * self._done / self._total)
-        text = f"{'█' * filled}{'░' * (BAR - filled)} {self._done} / {self._total} runs"
-        flown, elapsed_s = self._done - self._before, self._now_s() - self._start_s
-        if flown and elapsed_s > 0:
-            text += f"  {3600 * flown / elapsed_s:,.0f} runs/h"
-            if self._done < self._total:
-                text += f"  {span((self._total - self._done) * elapsed_s / flown)} to go"
-        elif self._done < self._total:
-            text += f"  the first ones are flying, {span(elapsed_s)}"
-        return text + (f"  {self._failed} failed" if self._failed else "")
-
-    def _text(self) -> Text:
-        return cell(self.line())
-
-
-def span(seconds: float) -> str:
-    """Return a time as text, to the second below an hour."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+UNMEASURED_MAX = 5  # lines about runs without metrics of the user
+_TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
 
 class SweepRequest(Struct, frozen=True):
@@ -128,31 +67,28 @@ class WorkerPool(Protocol):
 
 
 def sweep(request: SweepRequest) -> list[Row]:
-    """Fly what the folder does not hold yet; return all that it holds then, also after Ctrl-C.
+    """Fly the runs that the folder does not hold yet; return all that it then holds, also after Ctrl-C.
 
     Raises:
         RunError: the folder holds something else, or cannot be written; workers cannot start.
         KeyboardInterrupt: the finished runs are in the table.
     """
-    with locked(request.out, request.plan, request.force) as folder:
+    plan = request.plan
+    with locked(request.out, plan, request.force) as folder:
         done = {row["run"] for row in folder.compact()}
-        missing = [run for run in range(request.plan.runs) if run not in done]
-        with SweepScreen(request.plan.runs, len(done)) as screen:
-            _say_start(folder, len(done), screen.say)
+        missing = [run for run in range(plan.runs) if run not in done]
+        with SweepScreen(plan.runs, len(done)) as screen:
+            points = folder.design.points
+            over = f" over {points} combinations" if points > 1 else ""
+            screen.say(f"{plan.source}: {plan.runs} runs{over}, into {folder.path}")
+            if done:
+                screen.say(f"{len(done)} of them {'is' if len(done) == 1 else 'are'} done already")
             try:
                 if missing:
                     _fly(folder, _pool(request, len(missing), screen.say), missing, screen)
             finally:
                 rows = folder.compact()
     return rows
-
-
-def _say_start(folder: SweepFolder, done: int, say: Callable[[str], None]) -> None:
-    plan, points = folder.plan, folder.design.points
-    over = f" over {points} combinations" if points > 1 else ""
-    say(f"{plan.source}: {plan.runs} runs{over}, into {folder.path}")
-    if done:
-        say(f"{done} of them {'is' if done == 1 else 'are'} done already")
 
 
 def _pool(request: SweepRequest, missing: int, say: Callable[[str], None]) -> WorkerPool:
@@ -163,7 +99,7 @@ def _pool(request: SweepRequest, missing: int, say: Callable[[str], None]) -> Wo
     return DaskPool(request.dask, say)
 
 
-def _fly(folder: SweepFolder, pool: WorkerPool, missing: list[int], screen: SweepScreen) -> None:
+def _fly(folder: "SweepFolder", pool: WorkerPool, missing: list[int], screen: "SweepScreen") -> None:
     with folder.journal() as journal, closing(pool.rows(_tasks(folder, missing))) as rows:
         for row in rows:
             journal.append(row)
@@ -172,8 +108,8 @@ def _fly(folder: SweepFolder, pool: WorkerPool, missing: list[int], screen: Swee
                 screen.unmeasured(row["run"], row["metrics_failure"])
 
 
-def _tasks(folder: SweepFolder, runs: list[int]) -> Iterator[Task]:
-    """Yield the tasks of some runs, each made when it is asked for."""
+def _tasks(folder: "SweepFolder", runs: list[int]) -> Iterator[Task]:
+    """Yield the tasks of some runs, each made on demand."""
     design = folder.design
     for run in runs:
         values = design.values(run)
@@ -184,3 +120,289 @@ def _tasks(folder: SweepFolder, runs: list[int]) -> Iterator[Task]:
             scenario=design.scenario(run),
             record=str(folder.record(run).absolute()) if folder.plan.records else None,
         )
+
+
+class SweepScreen:
+    """Shows the progress of a sweep while it is entered."""
+
+    def __init__(
+        self, total: int, done: int, console: Console | None = None, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.console = console or Console(stderr=True)
+        self._total = total
+        self._before = self._done = done
+        self._failed = 0
+        self._unmeasured = 0
+        self._now_s = now_s
+        self._start_s = now_s()
+        self._throttle = RateLimit(PLAIN_S)
+        self._live = Live(
+            console=self.console, get_renderable=lambda: cell(self.line()), refresh_per_second=5, transient=True
+        )
+
+    def __enter__(self) -> "SweepScreen":
+        self._start_s = self._now_s()
+        if self.console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.console.is_terminal:
+            self._live.stop()
+        elif self._done > self._before:
+            self.say(self.line())
+
+    def say(self, text: str) -> None:
+        """Show a line that stays."""
+        self.console.print(cell(text), soft_wrap=True)
+
+    def finished(self, failed: bool) -> None:
+        """Count a run."""
+        self._done += 1
+        self._failed += failed
+        if not self.console.is_terminal and self._done < self._total and self._throttle.spend():
+            self.say(self.line())
+
+    def unmeasured(self, run: int, reason: str) -> None:
+        """Show a line about a run without metrics of the user, for the first such runs."""
+        self._unmeasured += 1
+        if self._unmeasured <= UNMEASURED_MAX:
+            more = "; further ones are in the table" if self._unmeasured == UNMEASURED_MAX else ""
+            self.say(f"run {run}: {reason}{more}")
+
+    def line(self) -> str:
+        """Return runs done, runs per hour since the start, and the remaining time at that rate."""
+        filled = int(BAR * self._done / self._total)
+        text = f"{'█' * filled}{'░' * (BAR - filled)} {self._done} / {self._total} runs"
+        flown, elapsed_s = self._done - self._before, self._now_s() - self._start_s
+        if flown and elapsed_s > 0:
+            text += f"  {3600 * flown / elapsed_s:,.0f} runs/h"
+            if self._done < self._total:
+                text += f"  {span((self._total - self._done) * elapsed_s / flown)} to go"
+        elif self._done < self._total:
+            text += f"  the first ones are flying, {span(elapsed_s)}"
+        return text + (f"  {self._failed} failed" if self._failed else "")
+
+
+def span(seconds: float) -> str:
+    """Return a time as text, to the second below an hour."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+# The folder
+
+
+class SweepFolder:
+    """A sweep on disk."""
+
+    def __init__(self, path: Path, plan: SweepPlan) -> None:
+        self.path = path
+        self.plan = plan
+        self.design = SweepDesign(plan)
+
+    def record(self, run: int) -> Path:
+        """Return the folder of a run's record."""
+        return self.path / RUNS / f"{run:06d}"
+
+    def journal(self) -> "Journal":
+        """Return the journal, opened to be continued."""
+        return Journal(self.path / JOURNAL)
+
+    def rows(self) -> list[Row]:
+        """Return the finished runs in their order."""
+        rows = {row["run"]: row for row in (*read_table(self.path / TABLE), *read_journal(self.path / JOURNAL))}
+        return [rows[run] for run in sorted(rows)]
+
+    def compact(self) -> list[Row]:
+        """Put all finished runs into the table, and return it; a crash in between loses nothing.
+
+        Raises:
+            ReportError: the table cannot be written.
+        """
+        rows = self.rows()
+        write_table(self.path / TABLE, rows, self.plan, self.design.axes)
+        (self.path / JOURNAL).unlink(missing_ok=True)
+        return rows
+
+
+def load(path: Path) -> SweepFolder:
+    """Return the sweep in a folder.
+
+    Raises:
+        RunError: its plan cannot be read.
+    """
+    try:
+        return SweepFolder(path, msgspec.json.decode((path / PLAN).read_bytes(), type=SweepPlan))
+    except (OSError, msgspec.MsgspecError, ValueError) as error:
+        raise RunError(f"{path / PLAN}: cannot be read ({error}); it is to be the plan of a sweep") from error
+
+
+@contextmanager
+def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFolder]:
+    """Yield the folder of a sweep, new or continued, locked against other sweeps.
+
+    Args:
+        path: of the folder.
+        plan: of the sweep.
+        force: accept one that holds other files; a run, or another sweep, is always refused.
+
+    Raises:
+        RunError: another sweep is at work there, or it holds something else.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        if not is_sweep(path):
+            if (path / "run.mcap").exists() or (path / TABLE).exists():
+                raise RunError(f"{path}: holds something else already; give --out another folder")
+            refuse_others(path, (LOCK, NEW_PLAN), force, "sweep into")
+        lock = (path / LOCK).open("w")
+    except OSError as error:
+        raise RunError(f"{path}: cannot be made ({error.strerror}); give --out another folder") from error
+    with lock:
+        if not take_lock(lock):
+            raise RunError(f"{path}: another sweep is at work there; give --out another folder")
+        if warning := no_locks(path):
+            print(printable(warning), file=sys.stderr)
+        _write_plan(path, plan)
+        yield SweepFolder(path, plan)
+
+
+def _write_plan(path: Path, plan: SweepPlan) -> None:
+    """Write the plan, unless the folder holds another sweep; a sweep without a finished run may be replaced."""
+    try:
+        content = msgspec.json.format(msgspec.json.encode(plan), indent=2) + b"\n"
+    except UnicodeEncodeError as error:
+        character = error.object[error.start : error.end][:1]
+        reason = f"cannot be written ({character!a} is no character); give text in UTF-8"
+        raise RunError(f"{path / PLAN}: {reason}") from error
+    if is_sweep(path):
+        present = load(path)
+        other = difference(present.plan, msgspec.json.decode(content, type=SweepPlan))  # both as decoded from JSON
+        if other and present.rows():
+            raise RunError(f"{path}: holds another sweep ({other}); give --out another folder")
+    new = path / NEW_PLAN
+    try:
+        new.write_bytes(content)
+        new.replace(path / PLAN)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written ({error.strerror}); give --out another folder") from error
+
+
+class Journal:
+    """Appends rows, each on the disk before its run counts as finished; a line that a crash has cut is dropped.
+
+    Raises:
+        RunError: it cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            whole = path.read_bytes().rfind(b"\n") + 1
+            os.ftruncate(self._file, whole)
+            os.lseek(self._file, whole, os.SEEK_SET)
+        except OSError as error:
+            raise self._error(error) from error
+
+    def __enter__(self) -> "Journal":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._file)
+
+    def append(self, row: Row) -> None:
+        """Add a row; when this returns, the row survives the process and a loss of power.
+
+        Raises:
+            RunError: it cannot be written.
+        """
+        line = msgspec.json.encode(row) + b"\n"
+        try:
+            while line:
+                line = line[os.write(self._file, line) :]
+            os.fsync(self._file)
+        except OSError as error:
+            raise self._error(error) from error
+
+    def _error(self, error: OSError) -> RunError:
+        return RunError(f"{self._path}: cannot be written ({error.strerror}); what is finished so far is kept")
+
+
+def read_journal(path: Path) -> list[Row]:
+    """Return the whole lines of a journal, none if there is no such file."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return []
+    return msgspec.json.Decoder().decode_lines(content[: content.rfind(b"\n") + 1])
+
+
+def write_table(path: Path, rows: Iterable[Row], plan: SweepPlan, axes: Sequence[Axis]) -> None:
+    """Write the rows in the order of the runs, all or nothing.
+
+    Raises:
+        ReportError: it cannot be written.
+    """
+    ordered = sorted(rows, key=lambda row: row["run"])
+    schema = _schema(ordered, axes).with_metadata({PLAN_METADATA: msgspec.json.encode(plan)})
+    json_columns = [field.name for field in schema if field.metadata]
+    plain = [{**row, **{name: msgspec.json.encode(row[name]).decode() for name in json_columns}} for row in ordered]
+    new = path.with_name(f".{path.name}.new")
+    try:
+        with new.open("wb") as file:
+            pq.write_table(pa.Table.from_pylist(plain, schema), file)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    except OSError as error:
+        raise ReportError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def read_table(path: Path) -> list[Row]:
+    """Return the rows of a table, none if there is no such file; empty cells are None.
+
+    Raises:
+        ReportError: it is no such table.
+    """
+    if not path.exists():
+        return []
+    try:
+        with path.open("rb") as file:  # Arrow takes a path with a colon for an address
+            table = pq.read_table(file)
+    except (OSError, pa.ArrowException) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ReportError(f"{path}: cannot be read ({reason}); remove it to go on") from error
+    json_columns = [field.name for field in table.schema if field.metadata]
+    rows = table.to_pylist()
+    for row in rows:
+        row.update({name: msgspec.json.decode(row[name]) for name in json_columns})
+    return rows
+
+
+def _schema(rows: Sequence[Row], axes: Sequence[Axis]) -> pa.Schema:
+    """Return the columns: inputs, results, then the errors in the order of their first occurrence."""
+    fixed = [
+        (name, next(_TYPES[each] for each in (*getattr(kind, "__args__", ()), kind) if each in _TYPES))
+        for name, kind in FIXED.items()
+    ]
+    varied = [(axis.path, _varied_type(axis)) for axis in axes if axis.path != SEED]
+    known = {*FIXED, *(path for path, _ in varied)}
+    errors = {name: (name, pa.float64()) for row in rows for name in row if name not in known}
+    fields = [*fixed[:3], *varied, *fixed[3:], *errors.values()]
+    mixed = {b"encoding": b"json"}  # of values of different types
+    return pa.schema([pa.field(name, kind or pa.string(), metadata=None if kind else mixed) for name, kind in fields])
+
+
+def _varied_type(axis: Axis) -> pa.DataType | None:
+    """Return the type of a column whose values are all of one kind, None for any others."""
+    if not isinstance(axis, Grid):
+        return pa.float64()
+    kinds = {type(value) for value in axis.values}
+    if kinds <= {int, float}:
+        return _TYPES[float if float in kinds else int]
+    return _TYPES.get(kinds.pop()) if len(kinds) == 1 else None

@@ -1,11 +1,21 @@
-"""One run of a sweep: its task, the row of the table with its results, and how it is flown in this process.
+"""One run of a sweep: its task, how it is flown in this process, and its row of the table.
 
-It is judged as `zsim report` does, without a record on disk.
+It is judged as by `zsim report`, without a record on disk. `report.metrics` names a function of the user that computes
+further figures from the flight:
+
+    def metrics(flight: RecordedFlight) -> float | Mapping[str, float]
+
+A number becomes the column `metrics.` and the function's name, a mapping a column `metrics.NAME` for each of its names.
+The unit at the end of a name, as in scenarios (`overshoot_m`), is shown in tables and figures. NaN, infinity and None
+are empty. An exception of the function becomes the run's `metrics_failure`, and nothing else is lost.
 """
 
+import math
+import re
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from numbers import Real
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
@@ -15,17 +25,22 @@ import numpy as np
 from msgspec import UNSET, Struct
 
 from zsim.contract.fingerprint import fingerprint
-from zsim.errors import RecordError, reason_of
+from zsim.errors import DocumentError, RecordError, ReportError, reason_of
 from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
+from zsim.schema.checker import show
 from zsim_analysis.in_process import InProcessFlight
-from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import Formation, formations_of
-from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
 from zsim_analysis.reading.shortfall import CRASHES
 from zsim_analysis.report.summary import RunSummary, summarise
-from zsim_analysis.sweep.metrics import NO_METRICS, metrics_of
+from zsim_analysis.sweep.design import METRICS
+
+METRIC = "metrics."  # prefix of the columns of the user's metrics
+METRICS_MAX = 100  # of one function
+_NAME = re.compile(r"[A-Za-z]\w{0,63}", re.ASCII)
 
 Row = dict[str, Any]
 """Values by column; the columns are `FIXED`, the varied paths, when each cluster was engaged (`engaged_column`),
@@ -39,7 +54,7 @@ class Task(Struct, frozen=True):
         run: its number.
         point: of the grid.
         varied: values by path, without the seed.
-        scenario: resolved, its seed being the run's.
+        scenario: resolved, with the run's seed.
         record: folder for the record, None to keep none.
     """
 
@@ -51,22 +66,22 @@ class Task(Struct, frozen=True):
 
 
 class RunResult(Struct, frozen=True, kw_only=True):
-    """The columns that every run has, in their order; None where a failed run has no value.
+    """The columns that every run has, in their order; None if a failed run has no value.
 
     Attributes:
         date: when it was flown (ISO 8601, UTC).
         failure: why it did not end well, None if it did.
-        ended: the reason that the world gave.
+        ended: the reason given by the world.
         wall_s: wall time of the flight.
         collisions: contacts between drones, and with obstacles.
         crashed: whether a drone was stopped in the air, flipped, hit something hard, or touched the ground in flight.
         engaged: whether every cluster was engaged at some instant of the judged window, None without a cluster.
         engaged_throughout: whether every cluster was engaged at every instant of it, None without a cluster.
-        as_planned: whether the flight did what its plan says.
-        shortfall: the first thing that it did not do.
-        metrics_failure: why it has no figures of the user's own, None if it has, or none are asked for.
+        as_planned: whether the flight followed its plan.
+        shortfall: the first deviation by which it did not.
+        metrics_failure: why it has no metrics of the user, None if it has, or none are requested.
         window_from_s, window_to_s: the judged window.
-        window_note: why it is not that of the scenario, empty where it is.
+        window_note: why it is not that of the scenario, empty if it is.
         host: where it was flown.
         fingerprint: numeric; equal ones promise equal bits.
     """
@@ -121,100 +136,22 @@ def fly(task: Task) -> Row:
     """Return the row of a run; an error of the run is in its row and does not end the sweep.
 
     Raises:
-        RecordError, OSError: its record cannot be written, so the record of no other run could be.
+        RecordError, OSError: its record cannot be written, nor could that of any other run.
     """
     where = {"host": socket.gethostname(), "fingerprint": fingerprint()}
     try:
         with _record(task) as writer:
             flight, diverged = fly_scenario(task.scenario, writer)
         formations = formations_of(flight)
-        summary = summarise(flight, formations, Path())  # the end event has all that the record would be needed for
+        summary = summarise(flight, formations, Path())  # the end event makes the record unnecessary
     except (RecordError, OSError):
         raise
     except Exception as error:  # of any type: the scenario caused it
         return failed_row(task, reason_of(error), **where)
     engaged = engaged_s(formations, summary.window_s)
-    return _row(task, flight, summary, engaged, diverged, where)
-
-
-def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[RecordedFlight, Exception | None]:
-    """Fly a scenario; return the flight, and the error by which it diverged if it did.
-
-    A flight for a user's metrics has the drones' estimates and commands, too.
-
-    Args:
-        scenario: resolved.
-        writer: records every message as well.
-    """
-    flight, reader = InProcessFlight(scenario), FlightReader(answers=scenario.report.metrics is not UNSET)
-    flight.run([reader, writer] if writer else [reader])
-    return reader.flight(), flight.world.failure
-
-
-@contextmanager
-def _record(task: Task) -> Iterator[RecordWriter | None]:
-    """Yield the writer of the record, None where none is kept; an incomplete record keeps the name .part."""
-    if task.record is None:
-        yield None
-        return
-    folder = Path(task.record)
-    writer = _begun(folder, task.scenario)
-    try:
-        yield writer
-    except (RecordError, OSError):
-        with suppress(RecordError):
-            writer.close()
-        raise
-    except Exception:
-        _keep(writer, folder)
-        raise
-    _keep(writer, folder)
-
-
-def _begun(folder: Path, scenario: Scenario) -> RecordWriter:
-    """Return the writer of a new record, replacing what an earlier attempt left there."""
-    part = _part(folder)
-    for leftover in (folder, part):
-        rmtree(leftover, ignore_errors=True)
-    try:
-        part.mkdir(parents=True)
-        (part / "scenario.yaml").write_text(scenario_file.to_text(scenario), encoding="utf-8")
-    except OSError as error:
-        raise RecordError(
-            f"{part}: cannot be written ({error.strerror}); make room, the same command goes on"
-        ) from error
-    return RecordWriter(part / "run.mcap")
-
-
-def _keep(writer: RecordWriter, folder: Path) -> None:
-    writer.close()
-    _part(folder).rename(folder)
-
-
-def _part(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name}.part")
-
-
-def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dict[str, float | None]:
-    """Return the first instant [s] of a window at which each cluster was engaged, None where it never was."""
-    return {each.name: _engaged_s(each, window_s) for each in formations}
-
-
-def _engaged_s(formation: Formation, window_s: tuple[float, float]) -> float | None:
-    rows = np.flatnonzero(formation.within(window_s))
-    return next((float(formation.t_s[row]) for row in rows if formation.phases[row] == "engaged"), None)
-
-
-def _row(
-    task: Task,
-    flight: RecordedFlight,
-    summary: RunSummary,
-    engaged: dict[str, float | None],
-    diverged: Exception | None,
-    where: dict[str, str],
-) -> Row:
     clusters = [cluster.name for cluster in task.scenario.clusters]
-    metrics = NO_METRICS if diverged else metrics_of(task.scenario, flight)
+    shares = {name: each.engaged_share for name, each in summary.clusters.items()}
+    metrics, metrics_failure = ({}, None) if diverged else metrics_of(task.scenario, flight)
     result = RunResult(
         run=task.run,
         point=task.point,
@@ -229,10 +166,10 @@ def _row(
         collisions=sum(event.kind == "collision" for event in flight.events),
         crashed=any(event.kind in CRASHES for event in flight.events),
         engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
-        engaged_throughout=all(_is_engaged_throughout(summary, name) for name in clusters) if clusters else None,
+        engaged_throughout=all(shares.get(name) == 1.0 for name in clusters) if clusters else None,
         as_planned=summary.as_planned,
         shortfall=next((each.text for each in summary.shortfalls if each.fails), None),
-        metrics_failure=metrics.failure,
+        metrics_failure=metrics_failure,
         window_from_s=summary.window_s[0],
         window_to_s=summary.window_s[1],
         window_note=summary.window_note,
@@ -240,28 +177,95 @@ def _row(
         **where,
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
-    if not diverged:
-        columns.update(_errors(summary, engaged))
-    return make_row(result, task.varied, {**columns, **metrics.columns})
+    errors = {} if diverged else _errors(summary, engaged)
+    return make_row(result, task.varied, {**columns, **errors, **metrics})
 
 
-def _is_engaged_throughout(summary: RunSummary, cluster: str) -> bool:
-    judged = summary.clusters.get(cluster)
-    return judged is not None and judged.engaged_share == 1.0
+def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[RecordedFlight, Exception | None]:
+    """Fly a resolved scenario; return the flight, and the error by which it diverged if it did.
+
+    A flight for metrics of the user has the drones' estimates and commands, too.
+    """
+    flight, reader = InProcessFlight(scenario), FlightReader(answers=scenario.report.metrics is not UNSET)
+    flight.run([reader, writer] if writer else [reader])
+    return reader.flight(), flight.world.failure
+
+
+@contextmanager
+def _record(task: Task) -> Iterator[RecordWriter | None]:
+    """Yield the writer of the record, None if none is kept; an incomplete record keeps the suffix .part."""
+    if task.record is None:
+        yield None
+        return
+    folder = Path(task.record)
+    part = folder.with_name(f"{folder.name}.part")
+    for leftover in (folder, part):  # of an earlier attempt
+        rmtree(leftover, ignore_errors=True)
+    try:
+        part.mkdir(parents=True)
+        (part / "scenario.yaml").write_text(scenario_file.to_text(task.scenario), encoding="utf-8")
+    except OSError as error:
+        reason = f"cannot be written ({error.strerror}); make room, the same command goes on"
+        raise RecordError(f"{part}: {reason}") from error
+    writer = RecordWriter(part / "run.mcap")
+    try:
+        yield writer
+    except (RecordError, OSError):
+        with suppress(RecordError):
+            writer.close()
+        raise
+    except Exception:
+        writer.close()
+        part.rename(folder)
+        raise
+    writer.close()
+    part.rename(folder)
+
+
+def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dict[str, float | None]:
+    """Return the first instant [s] of a window at which each cluster was engaged, None if it never was."""
+    rows = {each.name: np.flatnonzero(each.judged(window_s)) for each in formations}
+    return {each.name: float(each.t_s[rows[each.name][0]]) if len(rows[each.name]) else None for each in formations}
 
 
 def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, float | None]:
     """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster.
 
-    Those of a cluster that was not engaged are None, and all of a flight that was not as planned: drones on the ground,
-    or that hover in place of a trajectory, hold no formation that was asked for, and one that fell errs for less long.
+    Those of a cluster that was not engaged are None, and all of a flight that was not as planned: drones that stay on
+    the ground, or hover instead of following a trajectory, do not hold the requested formation, and a drone that fell
+    errs for a shorter time.
     """
     columns: dict[str, float | None] = {}
     for i, (name, cluster) in enumerate(summary.clusters.items()):
-        prefix = "errors" if i == 0 else f"clusters.{name}.errors"
+        prefix, counts = "errors" if i == 0 else f"clusters.{name}.errors", engaged[name] is not None
         for parameter, errors in cluster.errors.items():
             for statistic, value in msgspec.structs.asdict(errors).items():
-                columns[f"{prefix}.{parameter}.{statistic}"] = (
-                    value if engaged[name] is not None and summary.as_planned else None
-                )
+                columns[f"{prefix}.{parameter}.{statistic}"] = value if counts and summary.as_planned else None
     return columns
+
+
+def metrics_of(scenario: Scenario, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
+    """Return the metrics of a flight by the user's function, by column, or in one line why there are none."""
+    name = scenario.report.metrics
+    if name is UNSET:
+        return {}, None
+    try:
+        returned = plugin.load_function(name, METRICS)(flight)
+        named = returned if isinstance(returned, Mapping) else {name.partition(":")[2]: returned}
+        if len(named) > METRICS_MAX:
+            raise ReportError(f"returned {len(named)} numbers; must be at most {METRICS_MAX}")
+        return dict(_metric(key, value) for key, value in named.items()), None
+    except DocumentError as error:
+        return {}, error.faults[0]
+    except (Exception, SystemExit) as error:  # of any type: the user's function raised it
+        return {}, f"{METRICS} {name}: {reason_of(error)}"
+
+
+def _metric(key: Any, value: Any) -> tuple[str, float | None]:
+    """Return column and number of a name and its value, as returned by a user's function."""
+    if not (isinstance(key, str) and _NAME.fullmatch(key)):
+        raise ReportError(f"returned the name {show(key)}; must be a letter and up to 63 letters, digits and _")
+    if value is not None and not isinstance(value, Real):
+        raise ReportError(f"returned {show(str(type(value).__name__))} for {key}; must be a number or None")
+    number = math.nan if value is None else float(value)
+    return f"{METRIC}{key}", number if math.isfinite(number) else None

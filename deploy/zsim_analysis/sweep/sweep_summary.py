@@ -1,44 +1,73 @@
-"""What the summary of a sweep holds: of each point of its grid, distributions and confidence intervals. Pure."""
+"""summary.json of a sweep: distributions and confidence intervals at each point of its grid; names of fields. Pure.
 
+`SweepResults` has the rows in columns, from which summary, tables and figures are made.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import msgspec
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
+from scipy.special import betaincinv, stdtrit
 
+from zsim.errors import ScenarioError
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.sweep.intervals import ConfidenceInterval
+from zsim_analysis.report.paper import PAPER_TABLE_1, paper_table
+from zsim_analysis.report.summary import STATISTICS
+from zsim_analysis.sweep.design import Draw, SweepDesign
+from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
+
+Samples = NDArray[np.float64]
+
+LEVEL = 0.95  # of all intervals
+RUNS_MIN = 5  # chosen: of two runs Student's interval is nine times as wide as their distance; fewer are listed
+SEPARATION = "min_separation_m"
+_FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # in a text, but not in a name such as drone1
+_COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # of a parameter: its cluster's name, and its own
 
 
-class FormationParameter(Struct, frozen=True):
-    """A variable of a formation.
+class ConfidenceInterval(Struct, frozen=True):
+    """A value with the ends of its confidence interval, which are NaN for too few samples."""
 
-    Attributes:
-        cluster: the formation's name, None where there is only one.
+    value: float
+    low: float
+    high: float
+
+
+def mean_interval(samples: Samples, level: float = LEVEL) -> ConfidenceInterval:
+    """Return the mean of samples (n,) with Student's interval: mean ± t(n − 1) s / √n; none below RUNS_MIN samples.
+
+    It holds for normal samples, and for others by the central limit theorem as n grows.
     """
+    n = len(samples)
+    middle = float(np.mean(samples)) if n else math.nan
+    if n < RUNS_MIN:
+        return ConfidenceInterval(middle, math.nan, math.nan)
+    half = float(stdtrit(n - 1, (1 + level) / 2) * np.std(samples, ddof=1) / math.sqrt(n))
+    return ConfidenceInterval(middle, middle - half, middle + half)
 
-    name: str
-    cluster: str | None = None
 
-    @property
-    def unit(self) -> str:
-        """Return the unit, m or rad."""
-        return unit(self.name)
+def share_interval(count: int, of: int, level: float = LEVEL) -> ConfidenceInterval:
+    """Return count / of with the exact interval of Clopper and Pearson (Biometrika 26, 1934); of > 0.
 
-    @property
-    def titled(self) -> str:
-        """Return the name with its unit, and the cluster's where one is needed."""
-        return self.labelled(f"{self.name} ({self.unit})")
-
-    def labelled(self, text: str) -> str:
-        """Return a text about the variable, with the cluster's name where one is needed."""
-        return f"{self.cluster}: {text}" if self.cluster else text
+    It covers the true share at least as often as `level` says, whatever the share and the number of runs.
+    """
+    tail = (1 - level) / 2
+    low = float(betaincinv(count, of - count + 1, tail)) if count else 0.0
+    high = float(betaincinv(count + 1, of - count, 1 - tail)) if count < of else 1.0
+    return ConfidenceInterval(count / of, low, high)
 
 
 class Distribution(Struct, frozen=True):
-    """How a quantity is distributed over runs of a point.
+    """The distribution of a quantity over runs of a point.
 
     Attributes:
-        samples: all of them where they are too few for an interval, else empty.
+        samples: all of them if they are too few for an interval, otherwise empty.
     """
 
     runs: int
@@ -52,23 +81,85 @@ class Distribution(Struct, frozen=True):
     samples: tuple[float, ...] = ()
 
 
+def distribution(samples: Samples) -> Distribution | None:
+    """Return the distribution of the finite samples among (n,); None without any."""
+    known = finite(samples)
+    if not len(known):
+        return None
+    p5, median, p95 = (float(value) for value in np.percentile(known, [5, 50, 95]))
+    std = float(np.std(known, ddof=1)) if len(known) > 1 else float("nan")
+    few = tuple(known.tolist()) if len(known) < RUNS_MIN else ()
+    return Distribution(
+        len(known), mean_interval(known), std, p5, median, p95, float(known.min()), float(known.max()), few
+    )
+
+
+def finite(samples: Samples) -> Samples:
+    """Return the finite samples."""
+    return samples[np.isfinite(samples)]
+
+
+def count_text(count: int, of: int) -> str:
+    """Return the number of runs behind a mean if it is less than all of them, otherwise ""."""
+    return f"n = {count}" if count < of else ""
+
+
+class FormationParameter(Struct, frozen=True):
+    """A variable of a formation.
+
+    Attributes:
+        cluster: the formation's name, None if there is only one.
+    """
+
+    name: str
+    cluster: str | None = None
+
+    @property
+    def unit(self) -> str:
+        """Return the unit, m or rad."""
+        return unit(self.name)
+
+    @property
+    def titled(self) -> str:
+        """Return the name with its unit, and the cluster's if there are several."""
+        return self.labelled(f"{self.name} ({self.unit})")
+
+    def labelled(self, text: str) -> str:
+        """Return a text about the variable, with the cluster's name if there are several."""
+        return f"{self.cluster}: {text}" if self.cluster else text
+
+
+def parameters(columns: Iterable[str], clusters: Sequence[str]) -> dict[str, FormationParameter]:
+    """Return the formation parameters of columns of errors, by the columns' prefix; names may contain points.
+
+    Args:
+        columns: names such as errors.x_c.true_rms, or clusters.NAME.errors.x_c.true_rms of a second cluster.
+        clusters: names of all of them.
+    """
+    prefixes = dict.fromkeys(column.rpartition(".")[0] for column in columns)
+    matches = {each: match for each in prefixes if (match := _COLUMN.fullmatch(each))}
+    others = {match[1] for match in matches.values()}
+    first = "/".join(name for name in clusters if name not in others) if len(clusters) > 1 else None
+    return {each: FormationParameter(match[2], match[1] or first) for each, match in matches.items()}
+
+
 class GridPoint(Struct, frozen=True):
     """One combination of the grid's values.
 
     Attributes:
-        values: by path; empty where only seeds and drawn values vary.
-        names: the values in short, no two of a field alike.
+        values: by path; empty if only seeds and drawn values vary.
+        names: the abbreviated values, unique for each field.
         runs: finished ones.
         ended_well: share of them; None without a run.
-        without_collision: share of those that ended well in which no drone ran into another or an obstacle, or fell.
-        engaged: runs that ended well and had every cluster engaged at some instant of the judged window; None where
-            no run has a cluster.
-        as_planned: share of those that ended well that did what their plan says.
-        excluded: runs that ended well and did not do what their plan says: they are in no spread and no difference.
-        spreads: by column of the table, of those that ended well and did what their plan says.
-        least_separation_m: of all that ended well, None where no run has any.
+        without_collision: share of those that ended well in which no drone collided with anything, or fell.
+        engaged: runs that ended well with every cluster engaged at some instant of the judged window; None if no run
+            has a cluster.
+        as_planned: share of those that ended well that followed their plan.
+        excluded: runs that ended well and did not follow their plan: they are in no spread and no difference.
+        spreads: by column of the table, of those that ended well and followed their plan.
+        least_separation_m: of all that ended well, None if no run has any.
         differences: by column, of its value less that at the first point in the run with the same seed, over the pairs
-            of runs of which both are in the spreads; empty at the first point, and where seeds are not paired.
+            of runs of which both are in the spreads; empty at the first point, and if seeds are not paired.
     """
 
     label: str
@@ -90,7 +181,7 @@ class GridPoint(Struct, frozen=True):
         return round(self.ended_well.value * self.runs) if self.ended_well else 0
 
     def count(self, column: str) -> str:
-        """Return of how many runs a mean is, "" where it is of all that ended well."""
+        """Return the number of runs behind a mean, "" if it is of all that ended well."""
         spread = self.spreads.get(column)
         return count_text(spread.runs, self.well) if spread else ""
 
@@ -99,18 +190,18 @@ class SweepSummary(Struct, frozen=True):
     """summary.json of a sweep.
 
     Attributes:
-        changed: texts `a.b.c=value` by which the scenario was changed against its file; None: not known.
-        dates: when the first and the last run were flown (ISO 8601, UTC); None where no run has a date.
+        changed: texts `a.b.c=value` by which the scenario differs from its file; None: not known.
+        dates: when the first and the last run were flown (ISO 8601, UTC); None if no run has a date.
         not_engaged: runs that ended well, but a cluster was never engaged within the judged window.
-        not_as_planned: by what the first of them did not do, how many runs ended well and did not do what their plan
-            says; texts that differ in figures only are one.
+        not_as_planned: number of runs that ended well and did not follow their plan, by the first deviation; texts
+            that differ in figures only are one.
         judged_unengaged: runs that ended well whose window holds instants at which a cluster was not engaged.
-        window_notes: by why their window is not that of the scenario, how many runs ended well.
-        windows_s: the judged windows, least start and greatest end of all runs; None where no run has one.
+        window_notes: number of runs that ended well, by why their window is not that of the scenario.
+        windows_s: the judged windows, least start and greatest end of all runs; None if no run has one.
         paper_std: Table I by parameter, empty for any flight but Test 1.
-        parameters: of the formations, by the beginning of their columns.
-        metrics: columns of the figures of the user's own.
-        unmeasured: by the reason, how many runs have none of those.
+        parameters: of the formations, by the prefix of their columns.
+        metrics: columns of the user's metrics.
+        unmeasured: number of runs that have none of those, by the reason.
     """
 
     scenario: str
@@ -138,20 +229,261 @@ class SweepSummary(Struct, frozen=True):
     window_notes: dict[str, int] = {}
 
     def json(self) -> bytes:
-        """Return the text of summary.json; what is not known is null."""
+        """Return the text of summary.json; unknown values are null."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
     @property
     def flown(self) -> list[GridPoint]:
-        """Return the points that a run has finished."""
+        """Return the points with finished runs."""
         return [point for point in self.points if point.runs]
 
     @property
     def known(self) -> set[str]:
-        """Return the columns that some run at some point has a number of."""
+        """Return the columns of which some run at some point has a number."""
         return {column for point in self.points for column in point.spreads}
 
 
-def count_text(count: int, of: int) -> str:
-    """Return the number of runs behind a mean where it is less than the whole, else ""."""
-    return f"n = {count}" if count < of else ""
+class SweepResults:
+    """The rows of the finished runs of a sweep, in columns."""
+
+    def __init__(self, design: SweepDesign, rows: Sequence[Row]) -> None:
+        self.design = design
+        self.rows = rows
+        self.points = np.array([row["point"] for row in rows], np.int64)
+        self.well = np.array([row["failure"] is None for row in rows], bool)
+        columns = dict.fromkeys(name for row in rows for name in row if name not in FIXED)
+        self.errors = [
+            name
+            for name in columns
+            if name.startswith(("errors.", "clusters.")) and name.endswith(tuple(STATISTICS.values()))
+        ]
+        prefix, suffix = engaged_column(" ").split(" ")
+        engaged = [name for name in columns if name.startswith(prefix) and name.endswith(suffix)]
+        self.parameters = parameters(self.errors, [name[len(prefix) : -len(suffix)] for name in engaged])
+        self.metrics = [name for name in columns if name.startswith(METRIC)]
+        report = design.plan.document.get("report")
+        self.metrics_function = str(report.get("metrics") or "") if isinstance(report, Mapping) else ""
+        self.has_seeds = design.seeds is not None
+        self.drawn = [axis.path for axis in design.axes if isinstance(axis, Draw)]
+        self.paper_std = {} if self.drawn else _paper_std(design)
+
+    def values(self, column: str, point: int | None = None) -> Samples:
+        """Return a column for the runs that ended well, at one point or all; NaN where unknown."""
+        chosen = self.well if point is None else self.well & (self.points == point)
+        cells = [row.get(column) for row, is_chosen in zip(self.rows, chosen, strict=True) if is_chosen]
+        return np.array([np.nan if cell is None else cell for cell in cells], np.float64)
+
+    def flown(self, column: str, point: int | None = None) -> Samples:
+        """Return `values`, NaN for runs that did not follow their plan, by which statistics would look better."""
+        return np.where(self.values("as_planned", point) == 0, np.nan, self.values(column, point))
+
+    def differences(self, column: str, point: int) -> Samples:
+        """Return value − value at the first point of each pair of runs with one seed that are both of `flown`.
+
+        Empty at the first point, and if seeds are not paired.
+        """
+        if not self.design.paired or point == 0:
+            return np.zeros(0)
+        first, own = (dict(zip(self.values("run", at), self.flown(column, at), strict=True)) for at in (0, point))
+        return finite(np.array([value - first.get(run - point, np.nan) for run, value in own.items()], np.float64))
+
+    def ended_well(self, point: int) -> tuple[int, int]:
+        """Return how many of a point's finished runs ended well, and their number."""
+        at_point = self.points == point
+        return int((at_point & self.well).sum()), int(at_point.sum())
+
+    def without_collision(self, point: int) -> tuple[int, int]:
+        """Return in how many of a point's runs that ended well no drone collided or fell, and their number."""
+        collisions, crashed = self.values("collisions", point), self.values("crashed", point)
+        return int(((collisions == 0) & (crashed != 1)).sum()), len(collisions)
+
+    def engaged(self, point: int | None = None) -> tuple[int, int]:
+        """Return how many runs that ended well had every cluster engaged, and how many have a cluster."""
+        engaged = self.values("engaged", point)
+        return int((engaged == 1).sum()), int(np.isfinite(engaged).sum())
+
+    def as_planned(self, point: int) -> tuple[int, int]:
+        """Return how many of a point's runs that ended well followed their plan, and how many are judged."""
+        planned = self.values("as_planned", point)
+        return int((planned == 1).sum()), int(np.isfinite(planned).sum())
+
+    def never_as_planned(self) -> list[int]:
+        """Return the points with finished runs of which none ended well and followed its plan."""
+        points = []
+        for point in range(self.design.points):
+            (well, runs), (planned, of) = self.ended_well(point), self.as_planned(point)
+            if runs and not planned and (of or not well):  # without a cluster no run that ended well is judged
+                points.append(point)
+        return points
+
+    def windows_s(self) -> tuple[float, float] | None:
+        """Return the least start and the greatest end [s] of the judged windows, None if no run has one."""
+        start, end = (self.values(f"window_{side}_s") for side in ("from", "to"))
+        known = np.isfinite(start) & np.isfinite(end)
+        return (float(start[known].min()), float(end[known].max())) if known.any() else None
+
+    def summary(self) -> SweepSummary:
+        """Return the content of summary.json."""
+        plan, rows = self.design.plan, self.rows
+        well = [row for row, is_well in zip(rows, self.well, strict=True) if is_well]
+        engaged, of = self.engaged()
+        dates = sorted(row["date"] for row in rows if row.get("date"))
+        return SweepSummary(
+            scenario=str(plan.document["name"]),
+            seed=self.design.seed,
+            vary=plan.vary,
+            changed=plan.changed,
+            dates=(dates[0], dates[-1]) if dates else None,
+            runs=plan.runs,
+            finished=len(rows),
+            failed=dict(Counter(_texts(rows, "failure")).most_common()),
+            not_engaged=of - engaged,
+            not_as_planned=_counted(_texts(well, "shortfall")),
+            judged_unengaged=sum(row.get("engaged_throughout") is False for row in well),
+            window_notes=_counted(_texts(well, "window_note")),
+            windows_s=self.windows_s(),
+            paper_std=dict(self.paper_std),
+            level=LEVEL,
+            flown_wall_s=sum(row["wall_s"] or 0.0 for row in rows),
+            hosts=dict(Counter(_texts(rows, "host"))),
+            fingerprints=dict(Counter(_texts(rows, "fingerprint"))),
+            version=plan.version,
+            parameters=self.parameters,
+            metrics=tuple(self.metrics),
+            unmeasured=dict(Counter(_texts(rows, "metrics_failure")).most_common()),
+            points=[self._point(point) for point in range(self.design.points)],
+        )
+
+    def _point(self, point: int) -> GridPoint:
+        well, runs = self.ended_well(point)
+        engaged, of = self.engaged(point)
+        planned, judged = self.as_planned(point)
+        columns = (SEPARATION, *self.errors, *self.metrics)
+        compared = (*self.metrics, SEPARATION, *(each for each in self.errors if each.endswith(".true_rms")))
+        names = self.design.names(point)
+        return GridPoint(
+            label=" · ".join(names.values()) or "all runs",
+            values=self.design.at(point),
+            names=names,
+            runs=runs,
+            ended_well=share_interval(well, runs) if runs else None,
+            without_collision=share_interval(*self.without_collision(point)) if well else None,
+            engaged=engaged if of else None,
+            as_planned=share_interval(planned, judged) if judged else None,
+            excluded=judged - planned,
+            spreads={column: each for column in columns if (each := distribution(self.flown(column, point)))},
+            least_separation_m=min(finite(self.values(SEPARATION, point)).tolist(), default=None),
+            differences={
+                column: each for column in compared if (each := distribution(self.differences(column, point)))
+            },
+        )
+
+
+def _texts(rows: Iterable[Row], column: str) -> list[str]:
+    """Return the texts of a column, empty ones left out."""
+    return [row[column] for row in rows if row.get(column)]
+
+
+def _counted(texts: Iterable[str]) -> dict[str, int]:
+    """Return how often each text occurs, most often first; those that differ in figures only count as the first one."""
+    first: dict[str, str] = {}
+    counts = Counter(first.setdefault(_FIGURE.sub("#", text), text) for text in texts)
+    return dict(counts.most_common())
+
+
+def _paper_std(design: SweepDesign) -> Mapping[str, float]:
+    """Return Table I if every point flies Test 1 with one cluster, otherwise nothing."""
+    scenarios = (design.scenario(point) for point in range(design.points))
+    try:
+        flown = all(len(each.clusters) == 1 and paper_table(each, each.clusters[0].name) for each in scenarios)
+    except ScenarioError:
+        return {}
+    return PAPER_TABLE_1 if flown else {}
+
+
+# Names of fields
+
+UNITS = {  # by the end of a name, longer ones first
+    "_kg_m2": "kg m²",
+    "_kg_m3": "kg/m³",
+    "_nm_s2": "N m s²",
+    "_rad_s": "rad/s",
+    "_deg_s": "deg/s",
+    "_n_s_m": "N s/m",
+    "_n_s2": "N s²",
+    "_1_s2": "1/s²",
+    "_m_s2": "m/s²",
+    "_percent": "%",
+    "_1_s": "1/s",
+    "_m_s": "m/s",
+    "_px2": "px²",
+    "_deg": "deg",
+    "_rad": "rad",
+    "_mah": "mAh",
+    "_px": "px",
+    "_kg": "kg",
+    "_hz": "Hz",
+    "_ms": "ms",
+    "_ut": "µT",
+    "_m": "m",
+    "_s": "s",
+}
+OF_CHANNEL = {  # units relative to that of the channel: zsim.sensors
+    "noise": "",
+    "density": "/√Hz",
+    "bias": "",
+    "bias_walk": "/√s",
+    "bias_instability": "",
+    "quantum": "",
+}
+SECTIONS = ("environment", "sensors", "drones", "clusters", "metrics")  # left out before the names of their fields
+WORDS = {
+    "gps": "GPS",
+    "imu": "IMU",
+    "mag": "magnetometer",
+    "baro": "barometer",
+    "accel": "accelerometer",
+    "gyro": "gyroscope",
+    "takeoff": "take-off",
+}
+OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
+_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
+
+
+class FieldName(Struct, frozen=True):
+    """Words and unit of a field; the unit is empty if it has none."""
+
+    words: str
+    unit: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.words} ({self.unit})" if self.unit else self.words
+
+    def at(self, value: str) -> str:
+        """Return the field with an abbreviated value, e.g. "wind gust 1.5 m/s"."""
+        return f"{self.words} {value}{f' {self.unit}' if self.unit else ''}"
+
+
+def field_name(path: str) -> FieldName:
+    """Return the name of a field of a scenario, or of a column `metrics.NAME`, by its path from the top.
+
+    For example, sensors.gps.position_m.noise is the "GPS position noise" in m.
+    """
+    steps = [word or bracket for word, bracket in _STEP.findall(path)] or [path]
+    kept = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
+    kept = [f"{steps[0].removesuffix('s')} {kept[0]}", *kept[1:]] if kept[0].isdigit() else kept
+    parted = [_parted(step) for step in kept]
+    if steps[0] == "clusters" and "plan" in steps[2:-2] and steps[-2] in OF_VARIABLES:
+        name = steps[-1]  # of a variable: angles are in rad, in deg if the name ends so
+        parted[-1] = (name[:-4], "deg") if name.endswith("_deg") else (name, unit(name))
+    measure = parted[-1][1]
+    if kept[-1] in OF_CHANNEL and len(kept) > 1 and parted[-2][1]:
+        measure = parted[-2][1] + OF_CHANNEL[kept[-1]]
+    return FieldName(" ".join(words for words, _ in parted), measure)
+
+
+def _parted(step: str) -> tuple[str, str]:
+    """Return the words and the unit of one step."""
+    end = next((end for end in UNITS if step.endswith(end) and step != end), "")
+    words = step.removesuffix(end).split("_")
+    return " ".join(WORDS.get(word, word) for word in words), UNITS.get(end, "")

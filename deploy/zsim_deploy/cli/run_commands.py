@@ -134,7 +134,7 @@ def _judged_at_the_end(out: Path, report: bool, failed: bool) -> str:
     try:
         if report:
             return _report(out)
-        from zsim_analysis.reading.verdict import marks_of, verdict
+        from zsim_analysis.reading.shortfall import marks_of, verdict
 
         judged = verdict(out / "run.mcap")
         for mark, _ in marks_of(judged.shortfalls):
@@ -232,11 +232,11 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
     from zsim_analysis.sweep.design import is_sweep
 
     if is_sweep(folder):
-        from zsim_analysis.sweep.report.make_sweep_report import make_sweep_report as make
-        from zsim_analysis.sweep.report.terminal_tables import terminal_text
+        from zsim_analysis.sweep.sweep_report import make_sweep_report as make
+        from zsim_analysis.sweep.sweep_report import terminal_text
     else:
         from zsim_analysis.report.make_report import make_report as make
-        from zsim_analysis.report.tables import terminal_text
+        from zsim_analysis.report.summary import terminal_text
     with Console(stderr=True).status("reading …") as status:
         summary: Any = make(folder, lambda text: status.update(cell(text)), formats)
     PipedConsole().print(terminal_text(summary))
@@ -250,7 +250,7 @@ def _compare(directories: list[Path], out: Path | None, formats: Sequence[str]) 
 
     from zsim.record.record_reader import record_in
     from zsim.runtime.progress import cell
-    from zsim_analysis.report.make_report import compare, comparison_path
+    from zsim_analysis.report.comparison import compare, comparison_path
     from zsim_analysis.sweep.design import is_sweep
 
     for directory in directories:
@@ -377,8 +377,8 @@ def export(
 
     opt.check_range(from_, to)
     record_at(run)
+    from zsim_analysis.export.columns import MessageSelection
     from zsim_analysis.export.make_export import export as write
-    from zsim_analysis.export.selection import MessageSelection
 
     selection = MessageSelection(tuple(keys or ()), from_, to)
     console = Console(stderr=True)

@@ -27,7 +27,7 @@ from zsim_deploy.hosts.host_link import EventLoopThread, HostLink, HostLinks, fe
 from zsim_deploy.hosts.host_plan import RECORD, HostPlan, leftovers, port_faults
 from zsim_deploy.hosts.remote_process import ProcessLog, RemoteProcess
 from zsim_deploy.hosts.status_table import StatusTable
-from zsim_deploy.inventory import MODULES, InventoryFile, extras
+from zsim_deploy.inventory import MODULE, MODULES, InventoryFile, extras
 from zsim_deploy.launch.run_folder import Launch
 from zsim_deploy.launch.supervisor import EndSignals, Outcome, Supervisor
 
@@ -163,9 +163,9 @@ class HostRun:
         host = plan.host(name)
         log = ProcessLog(self._out / "logs" / f"{name}.log", self._status.say)
         on_line = self._supervisor.handle_line if name == WORLD else None
-        link = self._links.by_name[host]
-        more = (on_line, plan.folder(host), plan.identity(name))
-        return RemoteProcess(name, plan.arguments(name), link, plan.python(host), self._loop, log, *more)
+        command = [plan.python(host), *MODULE, *plan.arguments(name)]
+        files = (plan.folder(host), plan.identity(name))
+        return RemoteProcess(name, command, self._links.by_name[host], self._loop, log, on_line, files)
 
     # The end
 

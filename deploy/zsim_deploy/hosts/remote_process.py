@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import signal
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ import asyncssh
 
 from zsim.errors import HostsError
 from zsim_deploy.hosts.host_link import EventLoopThread, HostLink, shell_line
-from zsim_deploy.inventory import MODULE
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
 from zsim_deploy.launch.supervisor import end_text
 
@@ -33,37 +32,33 @@ class RemoteProcess:
     """A role on another host.
 
     Args:
-        arguments: of the `zsim` command there.
+        command: words of its command line there.
         log: of its output.
         on_line: takes every line of its standard output; None sends that to the log too.
-        files: what it needs below that folder and takes away when it ends; brought again whenever it is started again.
+        files: what it needs below a folder and takes away when it ends; brought again whenever it is started again.
     """
 
     def __init__(
         self,
         name: str,
-        arguments: list[str],
+        command: Sequence[str],
         link: HostLink,
-        python: str,
         loop: EventLoopThread,
         log: "ProcessLog",
         on_line: Callable[[str], None] | None = None,
-        folder: str = "",
-        files: Mapping[str, bytes] | None = None,
+        files: tuple[str, Mapping[str, bytes]] = ("", {}),
     ) -> None:
         self.name = name
         self.role = name.split(".", 1)[0]
         self.host = link.name
         self.restarts = 0
         self.pid = 0
-        self._arguments = arguments
+        self._command = command
         self._link = link
-        self._python = python
         self._loop = loop
         self._log = log
         self._on_line = on_line
-        self._folder = folder
-        self._files = files or {}
+        self._folder, self._files = files
         self._starts = 0
         self._process: asyncssh.SSHClientProcess[str] | None = None
         self._life: Future[None] | None = None
@@ -115,7 +110,7 @@ class RemoteProcess:
         if self._starts > 1 and self._files:
             await self._link.put_files(self._folder, self._files, LEND_S, retry=True)
         settings = " ".join(f"{name}={value}" for name, value in SINGLE_THREADED.items())
-        command = f"echo {PID}$$; exec env {settings} {shell_line([self._python, *MODULE, *self._arguments])}"
+        command = f"echo {PID}$$; exec env {settings} {shell_line(self._command)}"
         async with (
             self._link.channel(retry=True) as connection,
             connection.create_process(command, encoding="utf-8", errors="replace") as process,

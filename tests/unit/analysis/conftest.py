@@ -2,7 +2,7 @@
 
 import pytest
 
-from zsim_analysis.report.pages import ReportFigure
+from zsim_analysis.report.figure_style import ReportFigure
 
 PNG = b"\x89PNG"
 

@@ -13,10 +13,9 @@ from zsim.drone_colours import drone_colours, rgb
 HOME = Path(__file__).parents[3]
 DRAWN_IN = (
     "agents/zsim_bridges/console/scene.py",
-    "deploy/zsim_analysis/export/foxglove_scene.py",
-    "deploy/zsim_analysis/report/figures/plan_view.py",
-    "deploy/zsim_analysis/report/figures/drone_panels.py",
-    "deploy/zsim_analysis/report/figures/comparison_drones.py",
+    "deploy/zsim_analysis/export/foxglove_messages.py",
+    "deploy/zsim_analysis/report/drone_figures.py",
+    "deploy/zsim_analysis/report/comparison_figures.py",
 )
 # Linear RGB as dichromats see it [Viénot, Brettel, Mollon 1999]: without L cones, and without M cones.
 DICHROMATS = (

@@ -17,23 +17,22 @@ import pytest
 import recorded_run
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
+from recorded_run import messages_on
 from refused import has_terms
 from synthetic_pictures import AHEAD, FRONT_P_BK, NO_JPEG, image, info, jpeg
 
-from zsim.contract import keys, messages
+from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Truth
-from zsim.drone_colours import colours_of
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
-from zsim.record import RecordReader, RecordWriter
+from zsim.record import RecordWriter
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
-from zsim_analysis.export import Format, rerun_blueprint
-from zsim_analysis.export.foxglove_messages import NumericMessageType
-from zsim_analysis.export.foxglove_scene import Instant, RotorDisc
-from zsim_analysis.export.foxglove_topics import FoxgloveFile
+from zsim_analysis.export import Format, viewers
+from zsim_analysis.export.columns import MessageSelection
+from zsim_analysis.export.foxglove_file import ConvertedRun, FoxgloveFile, Instant
+from zsim_analysis.export.foxglove_messages import NumericMessageType, RotorDisc
 from zsim_analysis.export.make_export import export
-from zsim_analysis.export.rerun_blueprint import TIMELINE, drone_mesh, panels
-from zsim_analysis.export.selection import MessageSelection
+from zsim_analysis.export.viewers import TIMELINE, drone_mesh, plots
 
 DRONES = ("drone1", "a-b.c", "end")
 GATES = 301  # of six seconds
@@ -79,11 +78,6 @@ def protobuf_type(data: bytes, name: str) -> Any:
     while waiting:
         add(waiting.pop(next(iter(waiting))))
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
-
-
-def messages_on(run: Path, key: str) -> list[Any]:
-    with RecordReader(run / "run.mcap") as reader:
-        return [messages.decode(key, message.payload) for message in reader.messages({key})]
 
 
 def xyz(v: Any) -> tuple[float, float, float]:
@@ -332,9 +326,8 @@ def test_the_layout_shows_the_cameras(filmed: Path) -> None:
 @cache
 def isolated() -> tuple[str, ...]:
     """Return what runs a command without a network, nothing where this machine does not allow it."""
-    allowed = (
-        shutil.which("unshare") and subprocess.run([*WITHOUT_NETWORK, "true"], capture_output=True).returncode == 0
-    )
+    tried = [*WITHOUT_NETWORK, "true"]
+    allowed = shutil.which("unshare") and subprocess.run(tried, capture_output=True).returncode == 0
     return WITHOUT_NETWORK if allowed else ()
 
 
@@ -348,6 +341,16 @@ def rerun(home: Path, *arguments: str) -> str:
     done = subprocess.run([*isolated(), RERUN, *arguments], env=own, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
+
+
+def rows_of(home: Path, path: Path) -> Counter[tuple[str, str]]:
+    """Return the number of rows of each entity and column of a file of Rerun's."""
+    rows: Counter[tuple[str, str]] = Counter()
+    chunk = r"^Chunk\(\w+\) with (\d+) rows .* - (/\S*) - data columns: \[(.*)\]"
+    for count, entity, columns in re.findall(chunk, rerun(home, "rrd", "print", "-v", str(path)), re.M):
+        for column in {column.split("@", 1)[1] for column in columns.split()}:
+            rows[entity.replace("\\", ""), column] += int(count)
+    return rows
 
 
 @pytest.fixture(scope="module")
@@ -370,14 +373,7 @@ def test_rerun_reads_it_without_a_fault(run: Path, converted: Path) -> None:
 
 
 def test_rerun_has_what_is_drawn_and_plotted_at_every_instant(run: Path, converted: Path) -> None:
-    rows: Counter[tuple[str, str]] = Counter()
-    for count, entity, columns in re.findall(
-        r"^Chunk\(\w+\) with (\d+) rows .* - (/\S*) - data columns: \[(.*)\]",
-        rerun(run / "home", "rrd", "print", "-v", str(converted)),
-        re.M,
-    ):
-        for column in {column.split("@", 1)[1] for column in columns.split()}:
-            rows[entity.replace("\\", ""), column] += int(count)
+    rows = rows_of(run / "home", converted)
     topics = shown(run / "foxglove.mcap")
     transforms = sum(len(message.transforms) for _, message in topics["/tf"])
     assert rows["/tf", "Transform3D:translation"] == transforms == GATES * 8 + 2  # and two cameras
@@ -400,13 +396,7 @@ def test_rerun_plays_pictures_with_their_camera_in_the_drone_s_tree(filmed: Path
     path = filmed / "foxglove.rrd"
     rerun(filmed / "home", "mcap", "convert", str(filmed / "foxglove.mcap"), "-o", str(path))
     assert has_terms(rerun(filmed / "home", "rrd", "verify", str(path)), "verified", "without error")
-    printed = rerun(filmed / "home", "rrd", "print", "-v", str(path))
-    rows: Counter[tuple[str, str]] = Counter()
-    for count, entity, columns in re.findall(
-        r"^Chunk\(\w+\) with (\d+) rows .* - (/\S*) - data columns: \[(.*)\]", printed, re.M
-    ):
-        for column in {column.split("@", 1)[1] for column in columns.split()}:
-            rows[entity.replace("\\", ""), column] += int(count)
+    rows = rows_of(filmed / "home", path)
     assert rows["/drone/drone1/front_camera/image", "EncodedImage:blob"] == FILMED
     assert rows["/drone/drone1/front_camera/calibration", "Pinhole:image_from_camera"] == 1
     assert rows["/tf", "Transform3D:translation"] == FILMED + 1
@@ -415,10 +405,11 @@ def test_rerun_plays_pictures_with_their_camera_in_the_drone_s_tree(filmed: Path
 def test_the_blueprint_names_what_rerun_reads_of_the_file(run: Path, converted: Path) -> None:
     topics = shown(run / "foxglove.mcap")
     variables = {"main": tuple(topics["/cluster/main/variables"][0][1].DESCRIPTOR.fields_by_name)}
-    curves = [curve for _, curves in panels(topics, variables, colours_of(DRONES)) for curve in curves]
-    assert {curve.entity for curve in curves} == {"/cluster/main/variables", *(f"/drone/{d}/numbers" for d in DRONES)}
+    content = ConvertedRun(dict.fromkeys(topics, 1), variables, {drone: [] for drone in DRONES}, 0)
+    curves = [curve for _, curves in plots(content) for curve in curves]
+    assert {curve.topic for curve in curves} == {"/cluster/main/variables", *(f"/drone/{d}/numbers" for d in DRONES)}
     for curve in curves:
-        described = topics[curve.entity][0][1].DESCRIPTOR
+        described = topics[curve.topic][0][1].DESCRIPTOR
         assert curve.field in described.fields_by_name
         assert curve.component == f"{described.full_name}:message"
     assert {f"desired_{name}" for name in ("x_c", "beta")} <= {curve.field for curve in curves}
@@ -460,5 +451,5 @@ def test_a_drone_s_mesh_reaches_to_the_rims_of_its_rotors() -> None:
 
 def test_without_rerun_s_library_there_is_no_blueprint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded_run.write(tmp_path / "run.mcap")
-    monkeypatch.setattr(rerun_blueprint, "is_available", lambda: False)
+    monkeypatch.setattr(viewers, "has_rerun", lambda: False)
     assert [path.name for path in export(tmp_path, Format.FOXGLOVE).paths] == ["foxglove.mcap", "foxglove-layout.json"]

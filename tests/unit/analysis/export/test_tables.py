@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 import pytest
 import recorded_run
 import scipy.io
+from recorded_run import messages_on
 from refused import has_terms, refused
 from synthetic_pictures import image, info, sightings
 from typer.testing import CliRunner
@@ -31,15 +32,15 @@ from zsim.contract.camera_messages import CameraImage, Sightings
 from zsim.errors import ReportError, RunError
 from zsim.record import RecordReader, RecordWriter
 from zsim.sensors.sensor import message_type
-from zsim_analysis.export import Format, matlab
+from zsim_analysis.export import Format, table_files
+from zsim_analysis.export.columns import MessageSelection, Sighting, table_columns, table_name
 from zsim_analysis.export.make_export import export, placed
-from zsim_analysis.export.matlab import matlab_names
-from zsim_analysis.export.message_columns import fields, table_name
-from zsim_analysis.export.selection import MessageSelection, Sighting
+from zsim_analysis.export.table_files import matlab_names
 from zsim_deploy import arguments
 from zsim_deploy.cli.cli import app
 
 GATES = 301  # of six seconds
+ROTORS = ("front_left", "front_right", "rear_right", "rear_left")
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +51,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for each in (Format.CSV, Format.PARQUET, Format.MAT):
         export(folder, each)
     return folder
-
-
-def messages_on(run: Path, key: str) -> list[Any]:
-    """Return the messages of a key on record."""
-    with RecordReader(run / "run.mcap") as reader:
-        return [messages.decode(key, message.payload) for message in reader.messages({key})]
 
 
 def counts(run: Path) -> dict[str, int]:
@@ -72,27 +67,25 @@ def counts(run: Path) -> dict[str, int]:
     return found
 
 
+READ: dict[str, Any] = {"csv": pd.read_csv, "parquet": pd.read_parquet}
+
+
 def csv(run: Path, name: str) -> Any:
     """Return a table as pandas reads it."""
     return pd.read_csv(run / "csv" / f"{name}.csv")
 
 
-def parquet(path: Path) -> Any:
-    """Return a table as pandas reads it."""
-    return pd.read_parquet(path)
-
-
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize("suffix", READ)
 def test_every_message_is_a_row_of_its_table(run: Path, suffix: str) -> None:
-    reads = {"csv": lambda path: len(pd.read_csv(path)), "parquet": lambda path: len(parquet(path))}
-    found = {path.stem: reads[suffix](path) for path in (run / suffix).glob(f"*.{suffix}")}
+    found = {path.stem: len(READ[suffix](path)) for path in (run / suffix).glob(f"*.{suffix}")}
     assert found == counts(run)
 
 
 @pytest.mark.parametrize("drone", ["drone1", "a-b.c", "end"])
 def test_truth_is_the_same_to_the_bit(run: Path, drone: str) -> None:
     truths = messages_on(run, keys.truth(drone))
-    for table in (csv(run, "truth"), parquet(run / "parquet" / "truth.parquet")):
+    for suffix, read in READ.items():
+        table = read(run / suffix / f"truth.{suffix}")
         mine = table[table["name"] == drone]
         assert len(mine) == GATES
         assert mine["t_ns"].tolist() == [truth.t_ns for truth in truths]
@@ -100,9 +93,7 @@ def test_truth_is_the_same_to_the_bit(run: Path, drone: str) -> None:
         for field, columns in {
             "position_m": ["position_m_x", "position_m_y", "position_m_z"],
             "orientation_wxyz": ["orientation_w", "orientation_x", "orientation_y", "orientation_z"],
-            "rotor_rad_s": [
-                f"rotor_rad_s_{place}" for place in ("front_left", "front_right", "rear_right", "rear_left")
-            ],
+            "rotor_rad_s": [f"rotor_rad_s_{place}" for place in ROTORS],
         }.items():
             assert mine[columns].to_numpy().tolist() == [list(getattr(truth, field)) for truth in truths]
 
@@ -149,7 +140,7 @@ def test_the_manifest_tells_what_the_tables_are(run: Path) -> None:
 
 def test_no_table_has_a_column_twice() -> None:
     for kind in set(messages.types_by_shape().values()):
-        names = [column for field in fields(kind, {}) for column in field.columns]
+        names = [column for field in table_columns(kind, {}) for column in field.columns]
         assert len(names) == len(set(names)), kind
 
 
@@ -190,18 +181,18 @@ def test_matlab_names_are_valid_and_never_the_same() -> None:
     made = matlab_names(names)
     assert len(set(made.values())) == len(names)
     assert all(made[name].isascii() and made[name].isidentifier() and made[name][0] != "_" for name in names)
-    assert all(len(valid) <= 63 and valid not in matlab.KEYWORDS for valid in made.values())
+    assert all(len(valid) <= 63 and valid not in table_files.KEYWORDS for valid in made.values())
 
 
 def test_a_variable_that_matlab_would_not_load_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matlab, "VARIABLE_MAX", 100_000)
+    monkeypatch.setattr(table_files, "VARIABLE_MAX", 100_000)
     with refused(ReportError, "imu", "GB", "MATLAB", "GB", "--keys"):
         export(run, Format.MAT, run / "large.mat")
     assert not list(run.glob("large*"))
 
 
 def test_times_make_a_variable_small_enough(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matlab, "VARIABLE_MAX", 100_000)
+    monkeypatch.setattr(table_files, "VARIABLE_MAX", 100_000)
     estimates = MessageSelection(("drone/*/estimate",))
     with refused(ReportError, "estimate", "GB", "--keys", "--from", "--to"):
         export(run, Format.MAT, tmp_path / "all.mat", estimates)
@@ -215,8 +206,7 @@ def test_what_a_message_does_not_have_is_empty(tmp_path: Path) -> None:
             names = ("x_c", "y_c", "z_c", "yaw", "pitch", "phi_1", "phi_2", "p")[: 4 * len(drones)]
             values = (1.5,) * len(names)
             state = flight_messages.ClusterState(k, 0, "engaged", drones, names, values, values, values, None, 1.0, "")
-            key = keys.cluster_state(f"of_{len(drones)}")
-            writer.add(key, messages.encode(state), messages.encoding(key), k, k)
+            writer.add_message(keys.cluster_state(f"of_{len(drones)}"), state, k)
     export(tmp_path, Format.CSV)
     export(tmp_path, Format.PARQUET)
     lines = (tmp_path / "csv" / "cluster_state.csv").read_text().splitlines()
@@ -238,7 +228,7 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
     selection = MessageSelection(("drone/*/truth", "cluster/**"), from_s=1.0, to_s=2.0)
     done = export(run, Format.PARQUET, tmp_path / "some", selection)
     assert done.tables == {"cluster_state.parquet": 51, "truth.parquet": 153}
-    times = parquet(tmp_path / "some" / "truth.parquet")["t_ns"]
+    times = pd.read_parquet(tmp_path / "some" / "truth.parquet")["t_ns"]
     assert (times.min(), times.max()) == (1_000_000_000, 2_000_000_000)
     with refused(ReportError, "run.mcap", "drone/nobody/**", "messages"):
         export(run, Format.CSV, tmp_path / "none", MessageSelection(("drone/nobody/**",)))
@@ -252,20 +242,21 @@ def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None
         export(run, Format.CSV, tmp_path / "out", some)
     export(run, Format.CSV, tmp_path / "out", MessageSelection(("world/info",)), force=True)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"info.csv", "export.json"}
+    for _ in range(2):
+        export(run, Format.MAT, tmp_path / "again.mat", some, force=True)
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("precious")
-    with refused(ReportError, str(tmp_path / "home"), "folder", "else"):
-        export(run, Format.CSV, tmp_path / "home", some, force=True)
-    with refused(ReportError, str(run / "run.mcap"), "record", "itself"):
-        export(run, Format.MAT, run / "run.mcap", some, force=True)
-    with refused(ReportError, str(tmp_path / "home" / "thesis.tex"), "file", "else"):
-        export(run, Format.MAT, tmp_path / "home" / "thesis.tex", some, force=True)
+    for form, target, *terms in (
+        (Format.CSV, tmp_path / "home", "folder", "else"),
+        (Format.MAT, run / "run.mcap", "record", "itself"),
+        (Format.MAT, tmp_path / "home" / "thesis.tex", "file", "else"),
+    ):
+        with refused(ReportError, str(target), *terms):
+            export(run, form, target, some, force=True)
     assert (tmp_path / "home" / "thesis.tex").read_text() == "precious"
     (tmp_path / "home" / "export.json").write_text("[]")
     with pytest.raises(ReportError, match=r"export\.json"):
         export(run, Format.CSV, tmp_path / "home", some, force=True)
-    for _ in range(2):
-        export(run, Format.MAT, tmp_path / "again.mat", some, force=True)
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "plots"])
@@ -328,8 +319,8 @@ def test_an_interrupt_while_it_is_put_in_place_changes_nothing(
 
 def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> None:
     with RecordReader(run / "run.mcap") as reader, RecordWriter(tmp_path / "run.mcap") as writer:
-        for message in reader.messages(by_time=False):
-            writer.add(message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns)
+        for each in reader.messages(by_time=False):
+            writer.add(each.key, each.payload, messages.encoding(each.key), each.t_ns, each.wall_ns)
         for payload in (b"", b"\xff", msgspec.msgpack.encode({"t_ns": "soon"})):
             writer.add(keys.truth("drone1"), payload, "", 5, 5)
         huge = {**msgspec.to_builtins(messages_on(run, "process/controller.main/join")[0]), "incarnation": 2**63}
@@ -338,7 +329,8 @@ def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> No
     (note, _) = done.notes  # the other one is that of the pictures
     assert has_terms(note, "3", "messages", "left out")
     assert done.tables["truth.parquet"] == counts(run)["truth"]
-    assert parquet(tmp_path / "parquet" / "join.parquet")["incarnation"].isna().sum() == 1
+    joins: Any = pd.read_parquet(tmp_path / "parquet" / "join.parquet")
+    assert joins["incarnation"].isna().sum() == 1
 
 
 def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
@@ -391,14 +383,10 @@ def long_record(path: Path, gates: int) -> None:
     with RecordWriter(path) as writer:
         for k in range(gates):
             t_ns = 20_000_000 * k
+            v, level, counts = (0.1 * k, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0), {"gps": (k, 0), "imu": (k, k)}
+            estimate = flight_messages.Estimate(t_ns, k, v, v, level, 0.1, covariance, 0.1, v, counts)
             for name in ("a", "b", "c", "d"):
-                v = (0.1 * k, 0.2, 0.3)
-                counts = {"gps": (k, 0), "imu": (k, k)}
-                estimate = flight_messages.Estimate(
-                    t_ns, k, v, v, (1.0, 0.0, 0.0, 0.0), 0.1, covariance, 0.1, v, counts
-                )
-                key = keys.estimate(name)
-                writer.add(key, messages.encode(estimate), messages.encoding(key), t_ns, t_ns)
+                writer.add_message(keys.estimate(name), estimate, t_ns)
 
 
 @pytest.mark.parametrize("suffix", [pytest.param("csv", marks=pytest.mark.soak), "parquet"])
@@ -479,8 +467,7 @@ def seen(tmp_path: Path) -> Path:
 def test_every_hat_that_was_seen_is_a_row_and_so_is_a_picture_without_one(seen: Path, form: Format) -> None:
     done = export(seen, form)
     assert done.tables == {f"camera_info.{form.value}": 1, f"sighting.{form.value}": 7}
-    read = pd.read_csv if form is Format.CSV else pd.read_parquet
-    table = read(seen / form.value / f"sighting.{form.value}")
+    table = READ[form.value](seen / form.value / f"sighting.{form.value}")
     assert table["hats"].tolist() == [2, 2, 0, 1, 3, 3, 3]
     np.testing.assert_array_equal(table["hat"], [0, 1, np.nan, 0, 0, 1, 2])
     np.testing.assert_array_equal(table["range_m"], [4.0, 5.0, np.nan, 4.0, 4.0, 5.0, 6.0])

@@ -11,17 +11,13 @@ import pytest
 import synthetic_record
 from synthetic_record import Flown
 
-from zsim.contract import keys, messages
+from zsim.contract import keys
 from zsim.contract.flight_messages import Estimate, Status, Truth, Velocity
-from zsim.record import RecordWriter
 from zsim.schema.message import Vector3
 from zsim_analysis.reading import drone_errors
-from zsim_analysis.reading.distances import distances, separations
-from zsim_analysis.reading.drone_errors import YAW, estimate_errors, nees, velocity_responses
-from zsim_analysis.reading.flight import FlightReader, read_flight
-from zsim_analysis.reading.formation import formations_of
-from zsim_analysis.reading.goal import goal_errors
-from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.drone_errors import YAW, distances, estimate_errors, nees, separations, velocity_responses
+from zsim_analysis.reading.formation import formations_of, goal_errors
+from zsim_analysis.reading.recorded_flight import RecordedFlight, read_flight
 
 OFFSET_M, VELOCITY_M_S, YAW_RAD = (0.1, -0.25, 0.05), (0.02, 0.0, -0.01), 0.03
 SIGMA_M, SIGMA_M_S, SIGMA_RAD = 0.1, 0.02, 0.01
@@ -58,10 +54,7 @@ def moved(vector: Vector3, by: Vector3) -> Vector3:
 
 @pytest.fixture(scope="module")
 def flight() -> RecordedFlight:
-    reader = FlightReader(answers=True)
-    for key, message, wall_ns in traffic(Flown(duration_s=3.0)):
-        reader.add_message(key, message, wall_ns)
-    return reader.flight()
+    return synthetic_record.flight(traffic(Flown(duration_s=3.0)), answers=True)
 
 
 def test_errors_of_estimates_and_what_is_stated_of_them(flight: RecordedFlight) -> None:
@@ -111,18 +104,13 @@ def test_velocities_are_those_of_the_commander_by_the_heading(flight: RecordedFl
 
 
 def test_nothing_is_collected_that_nobody_asked_for() -> None:
-    reader = FlightReader()
-    for key, message, wall_ns in traffic(Flown(duration_s=0.1)):
-        reader.add_message(key, message, wall_ns)
-    plain = reader.flight()
+    plain = synthetic_record.flight(traffic(Flown(duration_s=0.1)))
     assert plain.estimates == plain.commands == {}
     assert estimate_errors(plain) == velocity_responses(plain) == {}
 
 
 def test_what_is_read_of_a_record_is_what_was_flown(flight: RecordedFlight, tmp_path: Path) -> None:
-    with RecordWriter(tmp_path / "run.mcap") as writer:
-        for key, message, wall_ns in traffic(Flown(duration_s=3.0)):
-            writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+    synthetic_record.record(tmp_path / "run.mcap", traffic(Flown(duration_s=3.0)))
     read = read_flight(tmp_path / "run.mcap", answers=True)
     assert np.array_equal(read.estimates["drone2"].p_W, flight.estimates["drone2"].p_W)
     assert np.array_equal(read.commands["drone2"].velocity, flight.commands["drone2"].velocity)
@@ -146,10 +134,7 @@ def test_distances_of_the_paper_s_triangle(flight: RecordedFlight) -> None:
 
 
 def test_errors_against_the_goal_have_the_climb() -> None:
-    reader = FlightReader()
-    for key, message, wall_ns in synthetic_record.traffic(Flown(duration_s=6.0, climb_s=4.0)):
-        reader.add_message(key, message, wall_ns)
-    flight = reader.flight()
+    flight = synthetic_record.flight(synthetic_record.traffic(Flown(duration_s=6.0, climb_s=4.0)))
     (formation,) = formations_of(flight)
     goal = goal_errors(formation, flight.scenario)
     assert goal is not None

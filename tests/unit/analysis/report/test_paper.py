@@ -10,12 +10,11 @@ from synthetic_record import SCENARIOS, Flown
 
 from zsim.contract.run_messages import Event
 from zsim.scenario import scenario_file
-from zsim_analysis.reading.flight import FlightReader
 from zsim_analysis.reading.formation import Formation, formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.report.paper import PAPER_TABLE_1, flies_paper_test, paper_table, paper_table_of
 from zsim_analysis.sweep.design import SweepDesign, make_plan, read_document
-from zsim_analysis.sweep.points import SweepResults
+from zsim_analysis.sweep.sweep_summary import SweepResults
 
 WINDOW_S = (120.0, 320.0)
 UNLIKE = (
@@ -55,12 +54,8 @@ def test_it_does_not_stand_beside_test_2() -> None:
 
 
 def flies(*overrides: str, scenario: str) -> bool:
-    reader = FlightReader()
-    for key, message, wall_ns in synthetic_record.traffic(
-        Flown(duration_s=0.1, scenario=scenario, overrides=overrides)
-    ):
-        reader.add_message(key, message, wall_ns)
-    return flies_paper_test(reader.flight(), "main")
+    flown = Flown(duration_s=0.1, scenario=scenario, overrides=overrides)
+    return flies_paper_test(synthetic_record.flight(synthetic_record.traffic(flown)), "main")
 
 
 @pytest.mark.parametrize("scenario", ["step", "trajectory"])
@@ -81,10 +76,7 @@ def test_test_2_is_equation_4_however_it_is_written() -> None:
 @pytest.fixture(scope="module")
 def flown() -> tuple[RecordedFlight, Formation]:
     """Return a flight whose record says that it is Test 1, and a formation that is engaged within its window."""
-    reader = FlightReader()
-    for key, message, wall_ns in synthetic_record.traffic(Flown(duration_s=1.0)):
-        reader.add_message(key, message, wall_ns)
-    flight = reader.flight()
+    flight = synthetic_record.flight(synthetic_record.traffic(Flown(duration_s=1.0)))
     (formation,) = formations_of(flight)
     return flight, replace(formation, t_s=np.linspace(*WINDOW_S, len(formation.t_s)))
 

@@ -12,8 +12,19 @@ from refused import has_terms, refused
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
-from zsim_analysis.sweep.axes import Draw, Grid, Seeds, field_path, is_inside, parse
-from zsim_analysis.sweep.design import SweepDesign, SweepPlan, difference, make_plan, read_document
+from zsim_analysis.sweep.design import (
+    Draw,
+    Grid,
+    Seeds,
+    SweepDesign,
+    SweepPlan,
+    difference,
+    field_path,
+    is_inside,
+    make_plan,
+    parse,
+    read_document,
+)
 
 STEP = Path(__file__).parents[4] / "scenarios/step.yaml"
 GUST = "environment.wind.gust_m_s"

@@ -1,9 +1,10 @@
-"""One run of a sweep, flown in this process: its row is what the report of its record shows."""
+"""One run of a sweep, flown in this process: its row is what the report of its record shows, and the user's metrics."""
 
 import errno
 import itertools
 import os
 import pickle
+import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,16 +12,26 @@ from typing import Any
 
 import numpy as np
 import pytest
+from effort import effort
 from refused import has_terms, refused
+from settling import settled, settling
 from short_flight import ONE, diverge
+from synthetic_record import Flown, traffic
+from synthetic_record import flight as flight_of
 
 from zsim.contract.fingerprint import fingerprint
-from zsim.errors import RecordError
+from zsim.contract.framing import GateMessages
+from zsim.errors import RecordError, ScenarioError
 from zsim.record import record_writer
 from zsim.scenario import scenario_file
+from zsim.schema import plugin
 from zsim_analysis import in_process
-from zsim_analysis.reading.formation import Formation
+from zsim_analysis.in_process import InProcessFlight
+from zsim_analysis.reading.drone_errors import estimate_errors
+from zsim_analysis.reading.formation import Formation, formations_of
+from zsim_analysis.reading.recorded_flight import FlightReader
 from zsim_analysis.report.make_report import judge
+from zsim_analysis.sweep.design import SweepDesign, make_plan, read_document
 from zsim_analysis.sweep.sweep_run import Task, engaged_s, fly
 from zsim_world.fleet.fleet import Fleet
 
@@ -180,3 +191,139 @@ def test_the_record_of_a_run_that_crashes_is_kept(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(Fleet, "advance", crash)
     assert fly(task(record=tmp_path / "000007"))["failure"] == "ZeroDivisionError: a bug"
     assert [path.name for path in tmp_path.iterdir()] == ["000007"]
+
+
+SOURCE = """
+import sys
+
+def highest_m(flight):
+    return flight.tracks[0].p_W[:, 2].max()
+
+def several(flight):
+    return {"drones": len(flight.tracks), "unknown_m": float("nan"), "nothing": None}
+
+def crash(flight):
+    raise ValueError("two\\nlines")
+
+def leave(flight):
+    sys.exit(3)
+
+def words(flight):
+    return {"drones": "one"}
+
+def bad_name(flight):
+    return {"a b": 1}
+
+def many(flight):
+    return dict.fromkeys((f"n{i}" for i in range(101)), 1.0)
+
+number = 3
+"""
+
+
+@pytest.fixture
+def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the user's module and a scenario."""
+    monkeypatch.setenv(plugin.FOLDERS, "")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "sweep_figures_of_mine.py").write_text(SOURCE)
+    (tmp_path / "one.yaml").write_text(ONE)
+    plugin.search(tmp_path)
+    return tmp_path
+
+
+def test_the_example_of_the_documentation() -> None:
+    """The side p is too long by a sine of 1 m that ends at 6 s."""
+    flight = flight_of(traffic(Flown(duration_s=10.0)))
+    formation = formations_of(flight)[0]
+    assert settling(flight) == {"settled_s": 0.0, "overshoot_m": pytest.approx(0.0, abs=1e-6)}
+    wave = np.where(formation.t_s < 6.0, np.sin(2 * np.pi * formation.t_s / 4.0), 0.0)
+    found = settled(formation.t_s, wave, engaged_s=0.0)
+    assert found["overshoot_m"] == pytest.approx(1.0)
+    assert found["settled_s"] == pytest.approx(5.66, abs=0.03)  # the sine falls below 0.5 m at 5 s + 2/3 s
+    assert settled(formation.t_s, np.ones_like(wave), engaged_s=0.0)["settled_s"] is None
+
+
+MEASURED_PAIR = PAIR.replace("duration_s: 6", "duration_s: 8") + "report: {metrics: 'effort:effort'}\n"
+
+
+def test_commands_and_estimates_are_there_for_metrics() -> None:
+    """The example of the documentation: control effort and NEES are those of the messages of the same flight."""
+    found = fly(Task(0, 0, {}, scenario_file.from_text(MEASURED_PAIR)))
+    assert found["metrics_failure"] is None
+    commands: list[tuple[int, float]] = []
+
+    class Commands:
+        def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+            if key.endswith("/cmd/velocity"):
+                commands.append((message.t_ns, float(np.sum(np.square(message.velocity_m_s)))))
+
+        def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+            pass
+
+    reader = FlightReader(answers=True)
+    InProcessFlight(scenario_file.from_text(MEASURED_PAIR)).run([reader, Commands()])
+    flight = reader.flight()
+    engaged_s = formations_of(flight)[0].engaged_s
+    assert engaged_s is not None
+    squares = [square for t_ns, square in commands if t_ns >= engaged_s * 1e9]
+    assert len(squares) > 100
+    assert found["metrics.command_rms_m_s"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-6)
+    errors = estimate_errors(flight)
+    assert list(errors) == ["drone1", "drone2"]
+    nees = np.concatenate([each.nees[each.t_s >= engaged_s] for each in errors.values()])
+    assert found["metrics.nees"] == pytest.approx(np.nanmean(nees), rel=1e-12)
+    assert effort(flight)["nees"] == found["metrics.nees"]
+
+
+def measured(function: str) -> dict[str, object]:
+    text = f"{ONE}\nreport: {{metrics: 'sweep_figures_of_mine:{function}'}}\n"
+    return fly(Task(7, 0, {}, scenario_file.from_text(text)))
+
+
+def test_a_number_is_a_column_of_the_function_s_name_and_a_mapping_one_for_each_name(beside: Path) -> None:
+    found = measured("highest_m")
+    assert found["metrics_failure"] is None
+    assert isinstance(found["metrics.highest_m"], float)
+    found = measured("several")
+    assert found["metrics_failure"] is None
+    metrics = {name: value for name, value in found.items() if name.startswith("metrics.")}
+    assert metrics == {"metrics.drones": 1.0, "metrics.unknown_m": None, "metrics.nothing": None}
+
+
+@pytest.mark.parametrize(
+    ("function", "terms"),
+    [
+        ("crash", ("ValueError", "two", "lines")),
+        ("leave", ("SystemExit", "3")),
+        ("words", ("drones", "number")),
+        ("bad_name", ("'a b'", "63")),
+        ("many", ("101", "100")),
+        ("nowhere", ("function",)),
+        ("number", ("function",)),
+    ],
+)
+def test_what_goes_wrong_in_it_is_one_line_and_the_run_is_kept(
+    beside: Path, function: str, terms: tuple[str, ...]
+) -> None:
+    found = measured(function)
+    assert found["failure"] is None
+    assert isinstance(found["sim_s"], float)
+    failure = found["metrics_failure"]
+    assert isinstance(failure, str)
+    assert "\n" not in failure
+    assert has_terms(failure.replace(f"sweep_figures_of_mine:{function}", "NAME"), "report.metrics", *terms)
+    assert not [name for name in found if name.startswith("metrics.")]
+
+
+@pytest.mark.parametrize("function", ["sweep_figures_of_mine:nowhere", "no_such_module:f", "sweep_figures_of_mine"])
+def test_a_function_that_is_not_there_is_refused_before_anything_flies(beside: Path, function: str) -> None:
+    document, _ = read_document(beside / "one.yaml", [f"report.metrics={function}"])
+    with refused(ScenarioError, "report.metrics", f"'{function}'"):
+        make_plan("one.yaml", document, ["seed"], 2)
+
+
+def test_a_plan_with_a_function_resolves(beside: Path) -> None:
+    function = "sweep_figures_of_mine:several"
+    document, _ = read_document(beside / "one.yaml", [f"report.metrics={function}"])
+    assert SweepDesign(make_plan("one.yaml", document, ["seed"], 2)).scenario(1).report.metrics == function

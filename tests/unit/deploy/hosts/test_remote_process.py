@@ -96,7 +96,7 @@ def started(tmp_path: Path) -> Iterator[Start]:
 
     def start(link: Any, on_line: Any = None, log: ProcessLog | None = None) -> RemoteProcess:
         log = log or ProcessLog(tmp_path / "estimator.d1.log", lambda text: None)
-        remote = RemoteProcess("estimator.d1", ["estimator"], link, "python3", loop, log, on_line, "/z/runs/1", FILES)
+        remote = RemoteProcess("estimator.d1", ["python3", "estimator"], link, loop, log, on_line, ("/z/runs/1", FILES))
         remote.start()
         return remote
 

@@ -31,8 +31,8 @@ from zsim.record.mcap_layout import (
     places,
 )
 from zsim_analysis.export import Format
+from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
-from zsim_analysis.export.selection import MessageSelection
 from zsim_analysis.report.make_report import judge
 
 CUTS = 50

@@ -1,4 +1,4 @@
-"""What a sweep came to: confidence intervals, distributions, and the parameters in the names of columns."""
+"""What a sweep came to: confidence intervals, distributions, and the names of its columns and fields."""
 
 import math
 
@@ -9,9 +9,16 @@ from sweep_rows import made, plan, well
 
 from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign
-from zsim_analysis.sweep.intervals import RUNS_MIN, mean_interval, share_interval
-from zsim_analysis.sweep.points import SweepResults, distribution, parameters
-from zsim_analysis.sweep.sweep_summary import FormationParameter
+from zsim_analysis.sweep.sweep_summary import (
+    RUNS_MIN,
+    FormationParameter,
+    SweepResults,
+    distribution,
+    field_name,
+    mean_interval,
+    parameters,
+    share_interval,
+)
 
 
 @pytest.mark.parametrize("n", [RUNS_MIN, 10, 200])
@@ -41,16 +48,6 @@ def test_the_interval_of_a_share_is_the_exact_one(count: int, of: int, level: fl
     assert (found.low, found.high) == pytest.approx((wanted.low, wanted.high), rel=1e-9)
     if count == 0:
         assert found.high == pytest.approx(1 - ((1 - level) / 2) ** (1 / of), rel=1e-12)
-
-
-def test_intervals_cover_what_they_promise() -> None:
-    """Of 2000 repetitions, as many intervals hold the true value as their level says, within four deviations."""
-    rng = stream(1, "coverage")
-    held = sum(found.low <= 0.5 <= found.high for found in (mean_interval(rng.normal(0.5, 1, 8)) for _ in range(2000)))
-    assert held / 2000 == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / 2000))
-    counts = rng.binomial(20, 0.3, 2000)
-    exact = [share_interval(int(count), 20) for count in counts]
-    assert sum(found.low <= 0.3 <= found.high for found in exact) / 2000 >= 0.95
 
 
 def test_a_spread() -> None:
@@ -120,3 +117,39 @@ def test_differences_are_of_runs_with_the_same_seed() -> None:
         .points[2]
         .differences
     )
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("sensors.gps.position_m.noise", "GPS position noise (m)"),
+        ("environment.wind.gust_m_s", "wind gust (m/s)"),
+        ("sensors.imu.accel_m_s2.density", "IMU accelerometer density (m/s²/√Hz)"),
+        ("sensors.imu.gyro_deg_s.bias_walk", "IMU gyroscope bias walk (deg/s/√s)"),
+        ("sensors.gps.dropout", "GPS dropout"),
+        ("drones.drone2.mass_kg", "drone2 mass (kg)"),
+        ("drones[1].mass_kg", "drone 1 mass (kg)"),
+        ("clusters.main.gains.proportional_1_s", "main gains proportional (1/s)"),
+        ("clusters.main.plan.takeoff_s", "main plan take-off (s)"),
+        ("clusters.main.plan.target.p", "main plan target p (m)"),
+        ("clusters.main.plan.target.x_c", "main plan target x_c (m)"),
+        ("clusters[0].plan.target.beta", "cluster 0 plan target beta (rad)"),
+        ("clusters.main.plan.target.yaw_deg", "main plan target yaw (deg)"),
+        ("clusters.main.plan.target[left.phi_2]", "main plan target left.phi_2 (rad)"),
+        ("clusters.main.plan.trajectory.waypoints[0].values.w_1", "main plan trajectory waypoints 0 values w_1 (m)"),
+        ("clusters.main.plan.trajectory.expressions.z_c", "main plan trajectory expressions z_c (m)"),
+        ("clusters.main.plan.trajectory.constants.r", "main plan trajectory constants r"),
+        ("clusters.plan.gains.proportional_1_s", "plan gains proportional (1/s)"),
+        ("sensors.preset", "sensors preset"),
+        ("duration_s", "duration (s)"),
+        ("seed", "seed"),
+        ("metrics.overshoot_m", "overshoot (m)"),
+    ],
+)
+def test_a_path_has_words_and_a_unit(path: str, name: str) -> None:
+    assert str(field_name(path)) == name
+
+
+def test_a_value_stands_with_its_unit() -> None:
+    assert field_name("environment.wind.gust_m_s").at("1.5") == "wind gust 1.5 m/s"
+    assert field_name("estimation.flow").at("true") == "estimation flow true"

@@ -1,4 +1,4 @@
-"""A record as inputs: which agents are run again, and what reached the world before each gate."""
+"""A record as inputs: the agents that are run again, what reached the world before each gate, and links to aircraft."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -6,17 +6,29 @@ from typing import Any
 
 import msgspec
 import pytest
+import synthetic_record
 from refused import has_terms
 from synthetic_pictures import image, info, sightings
+from synthetic_record import Flown
 
 from zsim import __version__
 from zsim.contract import keys, messages
-from zsim.contract.flight_messages import Estimate, Mode, Truth
+from zsim.contract.flight_messages import Estimate, LinkState, Mode, Truth
 from zsim.contract.run_messages import Bye, Clock, ClusterRequest, Event, Health, Join
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
-from zsim_analysis.reading.recorded_run import AgentProcess, RecordedAgents, gates, recorded_agents
+from zsim_analysis.reading.recorded_run import (
+    AgentProcess,
+    DriverLink,
+    RecordedAgents,
+    driver_links,
+    gates,
+    recorded_agents,
+)
+from zsim_analysis.report.comparison import ABSENT, fact_rows
+from zsim_analysis.report.comparison_figures import ComparedRun
+from zsim_analysis.report.make_report import facts, judge
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
@@ -191,3 +203,61 @@ def test_pictures_are_no_inputs_and_what_detectors_saw_is(write: Any) -> None:
     )
     assert found == same
     assert [[key for key, _ in inputs] for _, inputs, _ in found] == [[], [keys.detections("d1")], []]
+
+
+SECOND_NS = 1_000_000_000
+PEER = "192.168.1.20:14580"
+OVERRIDES = ("drones.drone3.body=external",)
+REPORTS = [  # state, age, loss, round trip, refused, of two drivers one after the other
+    [("waiting", None, None, None, 0), ("armed", 20.0, 1.0, 4.0, 3), ("lost", 1200.0, 1.0, 6.0, 3)],
+    [("connected", 30.0, 4.0, 20.0, 2), ("armed", 10.0, None, None, 2)],
+]
+
+
+def record(path: Path, reports: list[list[tuple]] = REPORTS) -> Path:
+    """Write a flight of 5 s of whose drones one is external, with a report of its link each second."""
+    flown = Flown(duration_s=5.0, overrides=OVERRIDES)
+    links = [(seq, *report) for driver in reports for seq, report in enumerate(driver)]
+    with RecordWriter(path) as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown):
+            writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+        for t_s, (seq, state, age, loss, trip, refused) in enumerate(links):
+            link = LinkState(t_s * SECOND_NS, seq, "driver.drone3", PEER, state, age, loss, trip, None, refused)
+            key = keys.link("drone3")
+            writer.add(key, messages.encode(link), messages.encoding(key), link.t_ns, link.t_ns)
+    return path
+
+
+def test_a_link_is_judged_over_all_drivers_of_its_drone(tmp_path: Path):
+    (link,) = driver_links(record(tmp_path / "run.mcap")).values()
+    assert link == DriverLink(PEER, 1200.0, 2.0, 4.0, 6.0, lost=1, lost_s=1.0, refused=5)
+
+
+def test_what_is_not_known_is_left_out(tmp_path: Path):
+    path = record(tmp_path / "run.mcap", [[("waiting", None, None, None, 0)]])
+    assert driver_links(path) == {"drone3": DriverLink(PEER, None, None, None, None, 0, 0.0, 0)}
+    assert str(driver_links(path)["drone3"]).split(", ")[0] == PEER
+
+
+def test_a_report_has_the_link_of_an_external_drone_and_no_other(tmp_path: Path):
+    summary = judge(record(tmp_path / "run.mcap"))[-1]
+    assert list(summary.links) == ["drone3"]
+    assert [label for label, _ in facts(summary) if "drone" in label] == ["Link of drone3"]
+
+
+def test_a_run_without_external_drones_has_no_links(tmp_path: Path):
+    synthetic_record.write(tmp_path / "run.mcap", Flown(duration_s=1.0))
+    assert judge(tmp_path / "run.mcap")[-1].links == {}
+    assert driver_links(tmp_path / "run.mcap") == {}
+
+
+def test_a_run_with_a_link_is_compared_with_one_without(tmp_path: Path):
+    directories = [tmp_path / name for name in ("simulated", "mixed")]
+    for directory in directories:
+        directory.mkdir()
+    synthetic_record.write(directories[0] / "run.mcap", Flown(duration_s=1.0))
+    record(directories[1] / "run.mcap")
+    rows = fact_rows([ComparedRun(d.name, d, *judge(d / "run.mcap")) for d in directories])
+    (link,) = (row.cells for row in rows if row.name == "Link of drone3")
+    assert link[0] == ABSENT
+    assert PEER in link[1]

@@ -1,0 +1,419 @@
+"""Selected messages of a record as tables: which keys and times, which columns, and rows in batches.
+
+The columns of any message of the contract follow from its type: vectors become a column per component, variables and
+sensors one per name, and what has no fixed shape becomes JSON text. All formats of tables are written from them.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, Struct, inspect
+from numpy.typing import NDArray
+
+from zsim.contract import keys, messages
+from zsim.contract.camera_messages import CameraImage, Sightings
+from zsim.contract.messages import REFUSALS
+from zsim.record import Recorded, RecordReader
+from zsim.scenario.fault_kinds import ROTORS
+from zsim.sensors.sensor import sensor_of
+from zsim_analysis.reading.recorded_run import decode_or_none
+
+CELLS = 100_000  # of a batch: some 5 MB as Python objects
+PROGRESS_EVERY = 10_000  # messages
+WHOLE_MAX = 2**63 - 1
+QUATERNION = "_wxyz"
+COUNTS = ("used", "refused")  # an estimate's counts of a sensor's samples
+_NUMERIC = inspect.IntType | inspect.FloatType
+
+Kind = Literal["whole", "number", "flag", "text"]
+Values = NDArray[Any] | list[Any]
+
+
+class MessageSelection(NamedTuple):
+    """Keys and times to be exported.
+
+    Attributes:
+        expressions: key expressions as Zenoh's; none: every key.
+        from_s: simulated time of the first message [s], None: the start.
+        to_s: of the last one.
+    """
+
+    expressions: tuple[str, ...] = ()
+    from_s: float | None = None
+    to_s: float | None = None
+
+    def keys(self, reader: RecordReader) -> list[str]:
+        """Return the selected keys on record."""
+        every = not self.expressions
+        return [key for key in reader.topics() if every or any(keys.matches(each, key) for each in self.expressions)]
+
+    def messages(self, reader: RecordReader, wanted: list[str]) -> Iterator[Recorded]:
+        """Yield the messages of some keys that are within the times, in order of simulated time."""
+        first = 0 if self.from_s is None else round(self.from_s * 1e9)
+        last = 2**64 if self.to_s is None else round(self.to_s * 1e9)
+        return (message for message in reader.messages(frozenset(wanted)) if first <= message.t_ns <= last)
+
+
+def subject(key: str) -> str:
+    """Return the drone, cluster or process of a key; `world` if it concerns all."""
+    kind, whose, what = keys.parts(key)
+    if kind == "view":
+        return what or "world"
+    return whose if what else "world"
+
+
+class RowBatch(NamedTuple):
+    """Rows of one table, in order of time.
+
+    Attributes:
+        kind: of the messages.
+        only: the subject of all rows, if each subject has a table of its own.
+        names: subject of each.
+        messages: decoded.
+        wall_ns: when each reached the recorder.
+    """
+
+    kind: type[Struct]
+    only: str
+    names: list[str]
+    messages: list[Any]
+    wall_ns: list[int]
+
+
+class Columns(NamedTuple):
+    """The columns that one field of a message becomes.
+
+    Attributes:
+        name: unique in the table.
+        kind: of all its columns.
+        columns: their names.
+        values: returns a value per row, or a table (rows, columns); None or NaN where there is none.
+        names: of the variables, one column each; empty for other fields.
+        keys: the columns of each key of a map; empty for other fields.
+    """
+
+    name: str
+    kind: Kind
+    columns: tuple[str, ...]
+    values: Callable[[RowBatch], Values]
+    names: tuple[str, ...] = ()
+    keys: Mapping[str, slice] = {}
+
+
+def table_columns(kind: type[Struct], names: Mapping[str, Sequence[str]]) -> tuple[Columns, ...]:
+    """Return the columns of a message's table.
+
+    Args:
+        kind: of the message.
+        names: the names, or keys, that occur in each open field, in their order.
+    """
+    opens = open_fields(kind)
+    hidden = {"t_ns", "seq", *(["names"] if "named" in opens.values() else [])}  # `names` are in the others' columns
+    own = [field for field in _fields(kind) if field.name not in hidden]
+    return (
+        Columns("name", "text", ("name",), lambda batch: batch.names),
+        Columns("t_s", "number", ("t_s",), lambda batch: [message.t_ns / 1e9 for message in batch.messages]),
+        Columns("t_ns", "whole", ("t_ns",), lambda batch: [message.t_ns for message in batch.messages]),
+        *([_plain("seq", "whole")] if "seq" in kind.__struct_fields__ else []),
+        *(each for field in own for each in _columns(field, opens.get(field.name), names.get(field.name, ()))),
+        Columns("wall_ns", "whole", ("wall_ns",), lambda batch: np.array(batch.wall_ns, np.uint64).astype(np.int64)),
+    )
+
+
+def open_fields(kind: type[Struct]) -> dict[str, Literal["named", "numbers", "pairs"]]:
+    """Return the fields of a message whose columns depend on its content: named variables, maps of numbers or pairs."""
+    opens: dict[str, Literal["named", "numbers", "pairs"]] = {}
+    for field in _fields(kind):
+        match field.type:
+            case inspect.VarTupleType(item_type=item, min_length=least) if isinstance(item, _NUMERIC) and not least:
+                if "names" in kind.__struct_fields__:
+                    opens[field.name] = "named"
+            case inspect.DictType(value_type=value) if isinstance(value, _NUMERIC):
+                opens[field.name] = "numbers"
+            case inspect.DictType(value_type=inspect.TupleType(item_types=items)) if len(items) == len(COUNTS):
+                opens[field.name] = "pairs"
+    return opens
+
+
+def table_name(kind: type[Struct]) -> str:
+    """Return the name of a message's table: cluster_state for ClusterState, sensor_NAME for a user's sensor."""
+    if sensor := sensor_of(kind):
+        return f"sensor_{sensor}"
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower()
+
+
+def _fields(kind: type[Struct]) -> Iterable[inspect.Field]:
+    info = inspect.type_info(kind)
+    assert isinstance(info, inspect.StructType)
+    return info.fields
+
+
+def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) -> list[Columns]:
+    name, info = field.name, field.type
+    if open_kind and not names:
+        return []
+    if open_kind:
+        return [_named(name, names) if open_kind == "named" else _keyed(name, names, open_kind == "pairs")]
+    if isinstance(info, inspect.UnionType):
+        others = [each for each in info.types if not isinstance(each, inspect.NoneType)]
+        info = others[0] if len(others) == 1 else info
+    match info:
+        case inspect.IntType():
+            return [Columns(name, "whole", (name,), lambda batch: [_whole(getattr(m, name)) for m in batch.messages])]
+        case inspect.FloatType():
+            return [_plain(name, "number")]
+        case inspect.BoolType():
+            return [_plain(name, "flag")]
+        case inspect.StrType() | inspect.LiteralType():
+            return [_plain(name, "text")]
+    if components := _components(name, info):
+        return [Columns(name, "number", tuple(components), lambda batch: _vectors(batch, name, len(components)))]
+    if isinstance(info, inspect.StructType) and all(isinstance(part.type, _NUMERIC) for part in info.fields):
+        return [_part(name, part.name) for part in info.fields]
+    return [Columns(name, "text", (name,), lambda batch: [json_text(getattr(m, name)) for m in batch.messages])]
+
+
+def _plain(name: str, kind: Kind) -> Columns:
+    def values(batch: RowBatch) -> Values:
+        return [None if (value := getattr(m, name)) is UNSET else value for m in batch.messages]
+
+    return Columns(name, kind, (name,), values)
+
+
+def _part(name: str, part: str) -> Columns:
+    """Return the column of a number inside a field that is a struct."""
+    column = f"{name}_{part}"
+    return Columns(column, "number", (column,), lambda batch: [getattr(getattr(m, name), part) for m in batch.messages])
+
+
+def _named(name: str, names: Sequence[str]) -> Columns:
+    """Return a column for each of the messages' `names`, which may differ from message to message."""
+
+    def values(batch: RowBatch) -> Values:
+        table = np.full((len(batch.messages), len(names)), np.nan)
+        indices: dict[tuple[str, ...], list[int]] = {}
+        for row, message in zip(table, batch.messages, strict=True):
+            if message.names not in indices:
+                indices[message.names] = [names.index(each) for each in message.names]
+            row[indices[message.names]] = getattr(message, name)
+        return table
+
+    return Columns(name, "number", tuple(f"{name}_{_tidy(each)}" for each in names), values, tuple(names))
+
+
+def _keyed(name: str, names: Sequence[str], pairs: bool) -> Columns:
+    """Return a column for each key of a map, or two for a map of pairs: FIELD_KEY_used and FIELD_KEY_refused."""
+    ends = [f"_{end}" for end in COUNTS] if pairs else [""]
+    columns = tuple(f"{name}_{_tidy(key)}{end}" for key in names for end in ends)
+    places = {key: slice(i * len(ends), (i + 1) * len(ends)) for i, key in enumerate(names)}
+
+    def values(batch: RowBatch) -> Values:
+        table = np.full((len(batch.messages), len(columns)), np.nan)
+        for row, message in zip(table, batch.messages, strict=True):
+            for key, value in getattr(message, name).items():
+                row[places[key]] = value
+        return table
+
+    return Columns(name, "number", columns, values, keys=places)
+
+
+def _vectors(batch: RowBatch, name: str, count: int) -> Values:
+    return np.array([getattr(m, name)[:count] for m in batch.messages], np.float64).reshape(-1, count)
+
+
+def _components(name: str, info: inspect.Type) -> list[str]:
+    """Return the columns of a field with a fixed number of numbers, none for any other field."""
+    if isinstance(info, inspect.VarTupleType) and info.min_length == info.max_length == 36:
+        return [f"{name}_{i}{j}" for i in range(6) for j in range(6)]
+    if isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # of more rotors, the first four
+        return [f"{name}_{part}" for part in ROTORS]
+    if not isinstance(info, inspect.TupleType) or not all(isinstance(each, _NUMERIC) for each in info.item_types):
+        return []
+    count = len(info.item_types)
+    if name.endswith(QUATERNION):
+        return [f"{name.removesuffix(QUATERNION)}_{part}" for part in "wxyz"]
+    return [f"{name}_{part}" for part in ("xyz" if count == 3 else range(count))]
+
+
+def _whole(value: int | None) -> int | None:
+    """Return an integer, None if it does not fit 64 bits."""
+    return value if value is not None and -WHOLE_MAX <= value <= WHOLE_MAX else None
+
+
+def _tidy(name: str) -> str:
+    """Return a name with letters, digits and underscores only."""
+    return re.sub(r"\W", "_", name)
+
+
+def json_text(value: Any) -> str:
+    """Return a value as JSON, in which types unknown to JSON are written as their repr."""
+    try:
+        return msgspec.json.encode(value, enc_hook=repr).decode()
+    except REFUSALS:  # keys that are not text, for instance
+        return msgspec.json.encode(repr(value)).decode()
+
+
+class Foreign(Struct, frozen=True):
+    """A message on a key unknown to the contract; `content` is its payload as JSON."""
+
+    t_ns: int
+    key: str
+    content: str
+
+
+class Sighting(Struct, frozen=True):
+    """A row of a hat that was seen in a picture, or of a picture without any, whose numbers are NaN.
+
+    `hats` is the number of hats in the picture, `hat` the index of this one, from 0.
+    """
+
+    t_ns: int
+    seq: int
+    t_sample_ns: int
+    source: str
+    camera: str
+    hats: int
+    hat: int | None = None
+    direction_B: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    range_m: float = math.nan
+    sigma_direction_rad: float = math.nan
+    sigma_range_m: float = math.nan
+
+
+class TableSurvey:
+    """The tables of a selection, by a first pass over the record.
+
+    Attributes:
+        wanted: the keys.
+        pictures: number of selected messages that go into no table.
+        kinds: the message type of each key of the contract.
+        rows: messages by type, including those outside the times or unreadable; None: of foreign keys.
+    """
+
+    def __init__(self, reader: RecordReader, selection: MessageSelection) -> None:
+        self._reader = reader
+        self._selection = selection
+        counts = reader.topics()
+        chosen = selection.keys(reader)
+        self.pictures = sum(counts[key] for key in chosen if messages.type_of(key) is CameraImage)
+        if not selection.expressions:
+            chosen = [key for key in chosen if not keys.is_accepted(key)]  # repeats of commands that are rows already
+        self.wanted = [key for key in chosen if messages.type_of(key) is not CameraImage]
+        if (info := reader.last(keys.INFO)) is not None:
+            decode_or_none(info)  # registers the messages of users' sensors
+        self.kinds = {key: kind for key in self.wanted if (kind := messages.type_of(key))}
+        self.rows: Counter[type[Struct] | None] = Counter()
+        for key in self.wanted:
+            self.rows[self.kinds.get(key)] += counts[key]
+        self._names = self._open_names()
+        self._tables: dict[type[Struct], tuple[Columns, ...]] = {}
+
+    def table(self, kind: type[Struct]) -> tuple[Columns, ...]:
+        """Return the columns of a type's table."""
+        if kind not in self._tables:
+            names = {field: list(each) for field, each in self._names.get(kind, {}).items()}
+            self._tables[kind] = table_columns(kind, names)
+        return self._tables[kind]
+
+    def width(self, kind: type[Struct]) -> int:
+        """Return the number of columns of a type's table."""
+        return sum(len(each.columns) for each in self.table(kind))
+
+    def rows_within(self, kind: type[Struct]) -> int:
+        """Return the number of messages of a type within the times; this reads all of them."""
+        wanted = [key for key, of in self.kinds.items() if of is kind]
+        return sum(1 for _ in self._selection.messages(self._reader, wanted))
+
+    def decode(self, recorded: Recorded) -> Any:
+        """Return a message, None if it is not of the type of its key; foreign ones as Foreign."""
+        if recorded.key in self.kinds:
+            return decode_or_none(recorded)
+        try:
+            content = json_text(msgspec.msgpack.decode(recorded.payload))
+        except REFUSALS:
+            content = json_text({"hexadecimal": recorded.payload.hex()})
+        return Foreign(recorded.t_ns, recorded.key, content)
+
+    def _open_names(self) -> dict[type[Struct], dict[str, dict[str, None]]]:
+        """Return the names, or keys, that occur in the open fields of all messages."""
+        opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
+        found: dict[type[Struct], dict[str, dict[str, None]]] = {
+            kind: {field: {} for field in opens} for kind, opens in opened.items()
+        }
+        wanted = [key for key, kind in self.kinds.items() if opened[kind]]
+        for recorded in self._selection.messages(self._reader, wanted) if wanted else ():
+            if (message := decode_or_none(recorded)) is None:
+                continue
+            for field, open_kind in opened[type(message)].items():
+                names = message.names if open_kind == "named" else getattr(message, field)
+                found[type(message)][field].update(dict.fromkeys(names))
+        return found
+
+
+class DecodedMessages:
+    """Selected messages of a record with their decoded content; those for which `decode` returns None are left out.
+
+    Attributes:
+        refused: messages left out so far.
+    """
+
+    def __init__(
+        self, messages: Iterable[Recorded], decode: Callable[[Recorded], Any], progress: Callable[[int], None]
+    ) -> None:
+        self._messages = messages
+        self._decode = decode
+        self._progress = progress
+        self.refused = 0
+
+    def __iter__(self) -> Iterator[tuple[Recorded, Any]]:
+        for count, recorded in enumerate(self._messages):
+            if count % PROGRESS_EVERY == 0:
+                self._progress(count)
+            message = self._decode(recorded)
+            if message is None:
+                self.refused += 1
+            else:
+                yield recorded, message
+
+
+def batches(
+    decoded: Iterable[tuple[Recorded, Any]], width: Callable[[type[Struct]], int], by_name: bool = False
+) -> Iterator[RowBatch]:
+    """Yield all rows; a table's batches come in order of time.
+
+    Args:
+        decoded: messages in order of time.
+        width: number of columns of a table, by which its batches have fewer rows.
+        by_name: whether each drone, cluster and process has tables of its own.
+    """
+    incomplete: dict[tuple[type[Struct], str], RowBatch] = {}
+    for recorded, message in _rows(decoded):
+        kind, name = type(message), subject(recorded.key)
+        only = name if by_name and kind is not Foreign else ""  # foreign names may be invalid as names of files
+        batch = incomplete.setdefault((kind, only), RowBatch(kind, only, [], [], []))
+        batch.names.append(name)
+        batch.messages.append(message)
+        batch.wall_ns.append(recorded.wall_ns)
+        if len(batch.names) * width(kind) >= CELLS:
+            yield incomplete.pop((kind, only))
+    yield from incomplete.values()
+
+
+def _rows(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[tuple[Recorded, Any]]:
+    """Yield messages, and a Sighting for each hat of Sightings."""
+    for recorded, message in decoded:
+        if not isinstance(message, Sightings):
+            yield recorded, message
+            continue
+        source = message.source or ("world" if keys.is_sensor(recorded.key) else "")
+        head = (message.t_ns, message.seq, message.t_sample_ns, source, message.camera, len(message.seen))
+        for hat, seen in enumerate(message.seen):
+            numbers = (seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
+            yield recorded, Sighting(*head, hat, *numbers)
+        if not message.seen:
+            yield recorded, Sighting(*head)

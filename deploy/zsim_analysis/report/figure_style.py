@@ -1,0 +1,386 @@
+"""What all figures share: colours, axes, lines, legends, spreads of many lines, and marks of time on their axes."""
+
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from msgspec import Struct
+
+from zsim.contract.run_messages import Event
+from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.formation import Formation
+from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
+from zsim_analysis.reading.shortfall import CONTROLLER
+
+COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's conference papers
+DPI = 200  # of PNG files
+PAPER_PT = 8.0  # text size: that of a paper's captions
+LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of an entry of a legend without its name, in text sizes
+LETTER_PAD_PT = 3.0  # between the letter of a panel and its axes
+MARK_EMS, LINE_EMS = 0.75, 1.25  # width of a bold letter and height of a line, in text sizes
+MARK_LINES, MARK_PAD_IN = 4, 0.05  # greatest number of lines of a mark's reason, and room above a mark
+FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE takes no Type 3
+POINTS = 2000  # per line: more than a page has pixels
+# Okabe and Ito's colours, distinct with every kind of colour vision.
+BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
+BLUE, VERMILION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
+GREY, DARK, GRID = "#8c959f", "#444c56", "#c9d1d9"
+AMBER = "#9a6a00"  # an orange that is legible as small print on white
+DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.0, "ls": (0, (5, 3)), "zorder": 4}
+MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 1.1, "zorder": 2}  # seen on both sides of truth where they agree
+TRUE: dict[str, Any] = {"color": BLUE, "lw": 0.6, "zorder": 3}
+SPREAD = (5.0, 50.0, 95.0)  # percentiles
+SPREAD_INSTANTS = 1000  # at which percentiles are computed
+SYMBOLS = {"x_c": "$x_c$", "y_c": "$y_c$", "z_c": "$z_c$", "p": "$p$", "q": "$q$", "beta": "$\\beta$"}
+GREEK = {"phi": "\\phi", "rho": "\\rho"}
+
+
+class ReportFigure(Struct, frozen=True):
+    """A figure with its file name, and its title and caption on the page."""
+
+    name: str
+    title: str
+    caption: str
+    drawing: Figure
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Return width and height of its PNG file, by which a browser lays out the page before it has loaded it."""
+        width, height = self.drawing.get_size_inches() * self.drawing.dpi
+        return round(width), round(height)
+
+    @property
+    def is_column(self) -> bool:
+        """Return whether it is as wide as a column, two of which fit a page."""
+        return self.drawing.get_size_inches()[0] <= COLUMN_IN
+
+    def png(self) -> bytes:
+        """Return the figure as a PNG file; this lays it out for all its files."""
+        file = io.BytesIO()
+        self.drawing.savefig(file, format="png")
+        self.drawing.set_layout_engine("none")
+        return file.getvalue()
+
+    def vector(self, form: str) -> bytes:
+        """Return the figure as a file of one of `zsim_analysis.report.FORMATS`, the same bytes each time."""
+        file = io.BytesIO()
+        stamp = "CreationDate" if form == "pdf" else "Date"
+        with rc_context(FONTS):
+            self.drawing.savefig(file, format=form, metadata={stamp: None})
+        return file.getvalue()
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure with automatic layout; matplotlib's global state is not used."""
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+
+
+def dress(axes: Axes, label: str = "") -> None:
+    """Set the grid, spines and text size of axes, and the label of their y axis."""
+    axes.grid(True, color=GRID, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(which="both", labelsize=PAPER_PT - 1)
+    axes.margins(x=0.01)
+    if label:
+        axes.set_ylabel(label, fontsize=PAPER_PT)
+
+
+def label_time(axes: Iterable[Axes]) -> None:
+    """Label the time axes of panels."""
+    for each in axes:
+        each.set_xlabel("simulated time (s)", fontsize=PAPER_PT)
+
+
+def label(name: str) -> str:
+    """Return the label of a parameter with its unit."""
+    stem, _, number = name.partition("_")
+    greek = f"${GREEK[stem]}_{{{number}}}$" if stem in GREEK else name
+    return f"{SYMBOLS.get(name, greek)} ({unit(name)})"
+
+
+def scale(axes: Axes, *values: Array, pad: float = 0.06) -> None:
+    """Set the range of a y axis to that of some values, not of all that is drawn, if they have any width."""
+    if limits := padded_range(np.concatenate(values), pad):
+        axes.set_ylim(limits)
+
+
+def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
+    """Return the range of the finite samples, padded at each end by a share of it; None if it has no width."""
+    known = samples[np.isfinite(samples)]
+    if not len(known) or known.max() <= known.min():
+        return None
+    room = share * (known.max() - known.min())
+    return float(known.min() - room), float(known.max() + room)
+
+
+def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
+    """Draw a line with no more points than are visible."""
+    axes.plot(*thinned(x, y), **style)
+
+
+def thinned(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
+    """Return a line of at most `points` points: minimum and maximum of each bin, so that no extreme is lost."""
+    if len(x) <= points:
+        return x, y
+    size = -(-len(x) // (points // 2))
+    starts = np.arange(0, len(x), size)
+    bins = np.full((len(starts), size), np.nan)
+    bins.flat[: len(x)] = y
+    unknown = np.isnan(bins)  # chosen only in bins without a known value
+    least, greatest = (np.where(unknown, worst, bins) for worst in (np.inf, -np.inf))
+    kept = np.unique((starts + least.argmin(axis=1), starts + greatest.argmax(axis=1)))
+    return x[kept], y[kept]
+
+
+def draw_spread(axes: Axes, t_s: Array, values: Array, colour: str) -> None:
+    """Draw many lines as their median, the band that holds nine of ten, and their extremes, none of which is lost.
+
+    Args:
+        axes: to draw into.
+        t_s: (K,) simulated time.
+        values: (K, N), NaN where unknown.
+        colour: of the spread.
+    """
+    known = np.isfinite(values).any(axis=1)
+    t_s, values = t_s[known], values[known]
+    if not len(t_s):
+        return
+    step = -(-len(t_s) // SPREAD_INSTANTS)
+    at, starts = t_s[::step], np.arange(0, len(values), step)
+    low, middle, high = np.nanpercentile(values[::step], SPREAD, axis=1)
+    least = np.minimum.reduceat(np.nanmin(values, axis=1), starts)
+    greatest = np.maximum.reduceat(np.nanmax(values, axis=1), starts)
+    axes.fill_between(at, low, high, color=colour, alpha=0.25, lw=0, zorder=2, label="5 to 95 %")
+    axes.plot(at, middle, color=colour, lw=1.0, zorder=3, label="median")
+    axes.plot(at, least, color=colour, lw=0.4, alpha=0.7, zorder=2, label="least and greatest")
+    axes.plot(at, greatest, color=colour, lw=0.4, alpha=0.7, zorder=2)
+
+
+def letter_panels(panels: Iterable[Axes]) -> None:
+    """Letter panels with their titles, in reading order, (a), (b) and so on; a single one gets no letter."""
+    panels = list(panels)
+    for number, axes in enumerate(panels if len(panels) > 1 else ()):
+        letters = chr(ord("a") + number % 26) * (1 + number // 26)
+        place = "center" if axes.get_title() else "left"
+        title = axes.get_title(loc=place)
+        look: Any = {"fontsize": PAPER_PT, "pad": LETTER_PAD_PT}
+        if title:
+            axes.set_title(f"({letters}) {title}", loc=place, **look)
+        else:
+            axes.set_title(f"({letters})", loc=place, ha="right", **look)  # beside all that stands above axes
+
+
+def finish(figure: Figure, lettered: Iterable[Axes], grid: Any, legend_columns: int) -> None:
+    """Letter some panels of a grid over time, label its time axes, align its labels, and put the legend above it."""
+    letter_panels(lettered)
+    label_time(grid[-1])
+    figure.align_ylabels(grid[:, 0])
+    legend_above(figure, grid[0, 0], legend_columns)
+
+
+def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
+    """Put the legend of all axes above a figure, where it covers no data: each name once, those of `axes` first."""
+    named: dict[str, Any] = {}
+    for each in (axes, *figure.axes):
+        for handle, name in zip(*each.get_legend_handles_labels(), strict=True):
+            named.setdefault(name, handle)
+    handles, labels = list(named.values()), list(named)
+    if handles:
+        longest = (ENTRY_EMS + LETTER_EMS * max(map(len, labels))) * PAPER_PT / 72  # inches
+        columns = min(columns, max(1, int(figure.get_size_inches()[0] / longest)))
+        figure.legend(
+            handles,
+            labels,
+            loc="outside upper center",
+            ncols=min(columns, len(handles)),
+            frameon=False,
+            fontsize=PAPER_PT,
+            columnspacing=1.2,
+            handlelength=1.6,
+        )
+
+
+def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
+    """Write a warning about its flight above a figure, in space of its own.
+
+    Args:
+        figure: complete, with its legend; it grows by the height of the mark.
+        head: the first line.
+        reason: wrapped below it, cut after MARK_LINES lines.
+        colour: of the text.
+    """
+    width_in, height_in = figure.get_size_inches()
+    letters = int(72 * width_in / (MARK_EMS * PAPER_PT))
+    lines = [head, *wrap(reason, letters, max_lines=MARK_LINES, placeholder=" …")]
+    whole_in = height_in + len(lines) * LINE_EMS * PAPER_PT / 72 + MARK_PAD_IN
+    mark = figure.suptitle("\n".join(lines), va="top", color=colour, fontsize=PAPER_PT, fontweight="bold")
+    mark.set_y(1 - MARK_PAD_IN / whole_in)
+    mark.set_in_layout(False)  # matplotlib would lay it over a legend that stands above the axes
+    figure.set_size_inches(width_in, whole_in)
+    top, room_px = height_in / whole_in, 0.0  # below it axes and the legends above them are laid out
+    for legend, box in [(legend, legend.get_window_extent()) for legend in figure.legends]:
+        if box.y0 > figure.bbox.height / 2:  # not one below the axes
+            room_px = max(room_px, box.height + figure.dpi * PAPER_PT / 72)
+            legend.set_bbox_to_anchor((0.0, 0.0, 1.0, top), figure.transFigure)
+    if isinstance(engine := figure.get_layout_engine(), ConstrainedLayoutEngine):  # which ignores an anchored legend
+        engine.set(rect=(0.0, 0.0, 1.0, top - room_px / figure.bbox.height))
+
+
+# Marks of time
+
+FAULT, TAKE_OVER = "fault", "taken over"
+COLOURS = {"assembly": SKY, "held": ORANGE, "landing": GREEN, FAULT: VERMILION, TAKE_OVER: PURPLE}
+ALPHA = 0.22
+SHORT, HAIRLINE_PT = 0.005, 0.8  # bands shorter than this share of their axis are drawn as a line of this width
+WINDOW = "window of the statistics"
+WINDOW_GREY = "#e7ebf0"  # between white and the grid lines upon it
+ASSEMBLY = {"taking_off": "assembly", "assembling": "assembly"}
+RETURNS = ("restart", "superseded", "join")  # events of a process that takes part again
+
+
+class Band(Struct, frozen=True):
+    """Something that lasted, from and to simulated time."""
+
+    kind: str
+    from_s: float
+    to_s: float
+
+
+class TimeMarks(Struct, frozen=True):
+    """Marks on the time axes of a flight; times [s], None where it never happened.
+
+    Attributes:
+        takeoff_s: of the first drone.
+        engaged_s: of the formation.
+        bands: phases, faults and take-overs.
+        span_s: the run, which every time axis shows whole; None: only what is drawn.
+    """
+
+    takeoff_s: float | None = None
+    engaged_s: float | None = None
+    bands: tuple[Band, ...] = ()
+    span_s: tuple[float, float] | None = None
+
+    def has(self, kind: str) -> bool:
+        """Return whether there is a band of a kind."""
+        return any(band.kind == kind for band in self.bands)
+
+
+def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> TimeMarks:
+    """Return the marks of a flight, with the phases and the engagement of a formation."""
+    bands = united([*_faults(flight), *_take_overs(flight), *(_phases(formation) if formation else ())])
+    takeoffs_s = [
+        track.status_t_ns[track.states.index("taking_off")] / 1e9
+        for track in flight.tracks
+        if "taking_off" in track.states
+    ]
+    start_s = flight.first_ns / 1e9 if flight.replay_of else 0.0  # a replay may begin anywhere
+    engaged_s = formation.engaged_s if formation else None
+    return TimeMarks(min(takeoffs_s, default=None), engaged_s, tuple(bands), (start_s, flight.last_ns / 1e9))
+
+
+def united(bands: Iterable[Band]) -> list[Band]:
+    """Return bands with those of a kind that overlap or touch united, so that those of several drones are one."""
+    by_kind: dict[str, list[Band]] = {}
+    for band in bands:
+        by_kind.setdefault(band.kind, []).append(band)
+    one: list[Band] = []
+    for kind, own in by_kind.items():
+        for band in sorted(own, key=lambda band: band.from_s):
+            if one and one[-1].kind == kind and band.from_s <= one[-1].to_s:
+                one[-1] = Band(kind, one[-1].from_s, max(one[-1].to_s, band.to_s))
+            else:
+                one.append(band)
+    return one
+
+
+def _phases(formation: Formation) -> Iterator[Band]:
+    """Yield the phases of a formation other than idle and engaged."""
+    phases = np.array(formation.phases)
+    if not len(phases):
+        return
+    starts = np.flatnonzero(np.r_[True, phases[1:] != phases[:-1]])
+    ends = np.r_[formation.t_s[starts[1:]], formation.t_s[-1]]
+    for start, end_s in zip(starts, ends, strict=True):
+        kind = ASSEMBLY.get(str(phases[start]), str(phases[start]))
+        if kind in COLOURS:
+            yield Band(kind, float(formation.t_s[start]), float(end_s))
+
+
+def _faults(flight: RecordedFlight) -> Iterator[Band]:
+    """Yield the injected faults, up to the end of the flight unless something ends them."""
+    ends = {event.data.get("id"): event.t_ns for event in flight.events if event.kind in ("fault_end", "fault_clear")}
+    for place, event in enumerate(flight.events):
+        if event.kind == "fault":
+            end_ns = ends.get(event.data.get("id"))
+            if end_ns is None and event.data.get("kind") == PROCESS_KILL:
+                end_ns = _return_ns(event, flight.events[place + 1 :])
+            yield Band(FAULT, event.t_ns / 1e9, (flight.last_ns if end_ns is None else end_ns) / 1e9)
+
+
+def _return_ns(kill: Event, later: Sequence[Event]) -> int | None:
+    """Return the simulated instant from which a killed process takes part again, None if it never does."""
+    for event in later:
+        if event.kind in RETURNS and event.subject == kill.subject:
+            done_ns = event.data.get("done_ns", event.t_ns)  # the last gate of its predecessor, where it continues
+            return max(kill.t_ns, min(event.t_ns, done_ns)) if isinstance(done_ns, int) else event.t_ns
+    return None
+
+
+def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
+    """Yield the times in which others than a controller flew a drone: from acquisition or first command to release."""
+    since_ns: dict[str, int] = {}
+    for event in flight.events:
+        if (change := _commander(event)) is None:
+            continue
+        drone, commander = change
+        if commander and not commander.startswith(CONTROLLER):
+            since_ns.setdefault(drone, event.t_ns)
+        elif (begun_ns := since_ns.pop(drone, None)) is not None:
+            yield Band(TAKE_OVER, begun_ns / 1e9, event.t_ns / 1e9)
+    for begun_ns in since_ns.values():
+        yield Band(TAKE_OVER, begun_ns / 1e9, flight.last_ns / 1e9)
+
+
+def _commander(event: Event) -> tuple[str, str] | None:
+    """Return a drone and its new commander, "" for nobody, by an event; None if the event changes no commander."""
+    if event.kind in ("commander", "release"):
+        return event.subject, event.source if event.kind == "commander" else ""
+    args = event.data.get("args")
+    if event.kind != "control" or event.data.get("ok") is not True or not isinstance(args, dict):
+        return None
+    drone = args.get("drone")
+    if not isinstance(drone, str) or event.subject not in ("acquire", "release"):
+        return None
+    return drone, event.source if event.subject == "acquire" else ""
+
+
+def draw_marks(axes: Iterable[Axes], marks: TimeMarks, whole: bool = True) -> None:
+    """Draw marks into axes of time that already hold their lines; `whole` extends them to the whole run."""
+    for each in axes:
+        if whole and marks.span_s:
+            each.update_datalim([(t_s, 0.0) for t_s in marks.span_s], updatey=False)
+            each.autoscale_view(scaley=False)
+        low, high = each.dataLim.intervalx
+        for band in marks.bands:
+            start, end, colour = max(band.from_s, low), min(band.to_s, high), COLOURS[band.kind]
+            if start < end:
+                each.axvspan(start, end, color=colour, alpha=ALPHA, lw=0, zorder=0.5, label=band.kind)
+                if end - start < SHORT * (high - low):
+                    each.axvline((start + end) / 2, color=colour, lw=HAIRLINE_PT, zorder=0.6)
+        for name, t_s, dashes in (("take-off", marks.takeoff_s, ":"), ("engagement", marks.engaged_s, "-.")):
+            if t_s is not None and low <= t_s <= high:
+                each.axvline(t_s, color=DARK, lw=1.0, ls=dashes, zorder=1.5, label=name)
+
+
+def shade_window(axes: Axes, window_s: tuple[float, float]) -> None:
+    """Shade the window of the statistics on a time axis."""
+    axes.axvspan(*window_s, color=WINDOW_GREY, lw=0, zorder=0, label=WINDOW)

@@ -1,0 +1,431 @@
+"""Makes the report of a sweep: table in; summary.json, figures/*.png and report.html out; and tables for the terminal.
+
+A table has a row for each point of the grid: on the page with intervals, in tables that fit it; on a terminal briefly,
+in as few tables as its width allows, every name whole.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from textwrap import wrap
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import Struct
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from zsim.errors import ReportError, printable
+from zsim.runtime.progress import cell
+from zsim_analysis.reading.shortfall import span_text
+from zsim_analysis.report.make_report import Picture, changed_text, date_text, sources, template, write_report
+from zsim_analysis.report.paper import PAPER_NOTE
+from zsim_analysis.report.summary import PAPER_COLUMN, STATISTICS
+from zsim_analysis.sweep.sweep import load
+from zsim_analysis.sweep.sweep_figures import figures
+from zsim_analysis.sweep.sweep_summary import (
+    RUNS_MIN,
+    SEPARATION,
+    ConfidenceInterval,
+    Distribution,
+    FieldName,
+    FormationParameter,
+    GridPoint,
+    SweepResults,
+    SweepSummary,
+    field_name,
+)
+
+POINTS_MAX = 200  # in a table of the page; sweep.parquet has all
+DETAILED_MAX = 24  # points with a table of their own
+OVERVIEW = ("runs", "ended well", "as planned", "engaged", "no collision", "separation (m)", "least (m)")
+OWN = "figures of your own"
+BLOCK_COLUMNS = 6  # of a table that fits the page, including those of the grid's fields
+QUANTILES = "true RMS, 5 to 95 %"
+
+
+def make_sweep_report(
+    directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
+) -> SweepSummary:
+    """Read the finished runs, write DIR/summary.json, DIR/figures/*.png and DIR/report.html.
+
+    The sweep may still be running.
+
+    Args:
+        directory: of the sweep.
+        progress: called with a text at each step.
+        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written too.
+
+    Raises:
+        RunError: it holds no sweep.
+        ReportError: no run is finished yet, or the directory cannot be written.
+    """
+    sweep = load(directory)
+    rows = sweep.rows()
+    if not rows:
+        raise ReportError(f"{directory}: no run of this sweep is finished yet; there is nothing to report")
+    results = SweepResults(sweep.design, rows)
+    summary = results.summary()
+    write_report(directory, summary.json(), figures(results), partial(page, summary), progress, formats)
+    return summary
+
+
+class PointTable(NamedTuple):
+    """Heads, and a row of cells for each point, without the fields of the grid."""
+
+    heads: list[str]
+    rows: list[list[str]]
+    title: str = ""
+    caption: str = ""
+
+
+def _table(
+    points: Sequence[GridPoint],
+    titles: Mapping[str, str],
+    text: Callable[[GridPoint, str], str],
+    title: str = "",
+    caption: str = "",
+) -> PointTable:
+    """Return the table of some columns, given their titles and the text of a column at a point."""
+    return PointTable(list(titles.values()), [[text(p, column) for column in titles] for p in points], title, caption)
+
+
+def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
+    """Return report.html."""
+    points, axes = summary.flown[:POINTS_MAX], axes_of(summary)
+    names = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in summary.known}
+    errors = {f"{prefix}.true_rms": each.titled for prefix, each in names.items()}
+    own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
+    differing_points = [each for each in points if each.differences]
+    columns = ["parameter", *([PAPER_COLUMN] if summary.paper_std else []), *STATISTICS, QUANTILES]
+    return template("sweep.html.j2", "zsim_analysis.sweep").render(
+        summary=summary,
+        facts=facts(summary),
+        notes=notes(summary),
+        runs_min=RUNS_MIN,
+        overview=[*map(str, axes), *OVERVIEW],
+        points=[(*values_of(point), *overview(point)) for point in points],
+        parameters=list(names),
+        errors=_blocks(points, axes, _table(points, errors, _mean)),
+        metrics=_blocks(points, axes, _table(points, own, _mean)),
+        differences=_blocks(differing_points, axes, _table(differing_points, differing(summary), _difference)),
+        reference=heading_of(summary.points[0]),
+        without_data=without_data(summary),
+        left_out=len(summary.flown) - len(points),
+        window=windows_of(summary),
+        paper_column=PAPER_COLUMN,
+        details=columns,
+        tables=[(heading_of(point), details(point, names, summary.paper_std)) for point in points[:DETAILED_MAX]],
+        paper_note=PAPER_NOTE if summary.paper_std else "",
+        figures=sources(pictures),
+    )
+
+
+def axes_of(summary: SweepSummary) -> list[FieldName]:
+    """Return the full names of the fields of the grid; without any, that of a column which holds all runs."""
+    return [field_name(path) for path in summary.points[0].values] or [FieldName("point")]
+
+
+def values_of(point: GridPoint) -> list[str]:
+    """Return the values of a point, as many as `axes_of` has names."""
+    return list(point.names.values()) or [point.label]
+
+
+def heading_of(point: GridPoint) -> str:
+    """Return the fields of a point with their values, in words."""
+    return ", ".join(field_name(path).at(value) for path, value in point.names.items()) or point.label
+
+
+def differing(summary: SweepSummary) -> dict[str, str]:
+    """Return the titles of the columns that have paired differences, the user's own first."""
+    errors = {f"{prefix}.true_rms": f"RMS of {each.titled}" for prefix, each in summary.parameters.items()}
+    own = {column: str(field_name(column)) for column in summary.metrics}
+    titles = {**own, **errors, SEPARATION: "separation (m)"}
+    known = {column for point in summary.points for column in point.differences}
+    return {column: title for column, title in titles.items() if column in known}
+
+
+def _blocks(
+    points: Sequence[GridPoint], axes: Sequence[FieldName], table: PointTable
+) -> list[tuple[list[str], list[list[str]]]]:
+    """Return heads and rows of tables that fit the page, each with the fields of the grid."""
+    across = max(2, BLOCK_COLUMNS - len(axes))
+    blocks = []
+    for part in np.array_split(np.arange(len(table.heads)), max(1, -(-len(table.heads) // across))):
+        heads = [*map(str, axes), *(table.heads[i] for i in part)]
+        rows = [[*values_of(point), *(row[i] for i in part)] for point, row in zip(points, table.rows, strict=True)]
+        blocks.append((heads, rows))
+    return blocks if table.heads else []
+
+
+def facts(summary: SweepSummary) -> list[tuple[str, str]]:
+    """Return the lines at the head of the page: pairs of a label and its value."""
+    well = summary.finished - sum(summary.failed.values())
+    hosts = ", ".join(f"{host} ({count})" for host, count in summary.hosts.items())
+    return [
+        ("Scenario", f"{summary.scenario}, seed {summary.seed}"),
+        ("Changed", changed_text(summary.changed)),
+        ("Varied", " ".join(summary.vary) or "nothing"),
+        ("Runs", f"{summary.finished} of {summary.runs} finished, {well} of them ended well"),
+        ("Date", " to ".join(dict.fromkeys(map(date_text, summary.dates or (None,))))),
+        ("Flown", f"{summary.flown_wall_s:.0f} s of wall time in all, on {hosts or 'no host'}"),
+        ("Window", windows_of(summary)),
+        ("Fingerprint", ", ".join(summary.fingerprints) or "not known"),
+        ("Version", summary.version),
+    ]
+
+
+def windows_of(summary: SweepSummary) -> str:
+    """Return the judged windows of all runs in words."""
+    return span_text(summary.windows_s) if summary.windows_s else "not known"
+
+
+def marks_of(summary: SweepSummary) -> list[str]:
+    """Return the deviations of the runs from their plan, a line each."""
+    runs = f"of {summary.finished} runs"
+    lines = [f"{count} {runs} not as planned: {text}" for text, count in summary.not_as_planned.items()]
+    if summary.judged_unengaged:
+        lines.append(
+            f"{summary.judged_unengaged} {runs} were judged while a cluster was not engaged "
+            f"(window {windows_of(summary)}); give a window after the engagement, report.window_s"
+        )
+    return lines + [f"{count} {runs}: {text}" for text, count in summary.window_notes.items()]
+
+
+def notes(summary: SweepSummary) -> list[str]:
+    """Return what a reader should know about the figures."""
+    lines = []
+    if summary.finished < summary.runs:
+        lines.append(f"{summary.runs - summary.finished} runs are not finished; the same command goes on with them.")
+    lines += [f"{count} of {summary.finished} runs failed: {reason}" for reason, count in summary.failed.items()]
+    lines += marks_of(summary)
+    if summary.not_engaged:
+        lines.append(
+            f"In {summary.not_engaged} runs that ended well a cluster was never engaged within the judged window; "
+            "its errors are left out."
+        )
+    lines += [f"{count} of {summary.finished} runs have no {OWN}: {why}" for why, count in summary.unmeasured.items()]
+    if len(summary.fingerprints) > 1:
+        lines.append("The hosts compute with different numeric fingerprints; the same bits are not promised.")
+    return lines
+
+
+def without_data(summary: SweepSummary) -> str:
+    """Describe quantities missing from every run, "" if there are none."""
+    errors = {each.titled: prefix for prefix, each in summary.parameters.items()}
+    own = {str(field_name(column)): column for column in summary.metrics}
+    known = summary.known | {column.rpartition(".")[0] for column in summary.known}
+    parts = []
+    for what, columns in (("formation errors", errors), (OWN, own)):
+        names = [name for name, column in columns.items() if column not in known]
+        if names:
+            parts.append(what if len(names) == len(columns) else f"{what} of {', '.join(names)}")
+    return f"No run has {', nor '.join(parts)}; they are in no table and no figure." if parts else ""
+
+
+def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: dict[str, float]) -> list[list[str]]:
+    """Return the table of one point, a row per formation parameter; no row if no run there has errors."""
+    rows: list[list[str]] = []
+    if not any(f"{prefix}.true_rms" in point.spreads for prefix in names):
+        return rows
+    for prefix, parameter in names.items():
+        printed = paper_std.get(parameter.name)
+        paper = ["" if printed is None else f"{printed:g}"] if paper_std else []
+        rms = point.spreads.get(f"{prefix}.true_rms")
+        span = "–" if rms is None or rms.samples else f"{rms.p5:.4f} to {rms.p95:.4f}"
+        means = [_mean(point, f"{prefix}.{statistic}") for statistic in STATISTICS.values()]
+        rows.append([parameter.titled, *paper, *means, span])
+    return rows
+
+
+def overview(point: GridPoint, brief: bool = False) -> list[str]:
+    """Return the cells of OVERVIEW at a point: how its runs ended."""
+    well, planned, apart = (
+        _share(share, brief) for share in (point.ended_well, point.as_planned, point.without_collision)
+    )
+    return [
+        str(point.runs),
+        well,
+        _noted(planned, f"{point.excluded} excluded" if point.excluded else ""),
+        "–" if point.engaged is None else str(point.engaged),
+        apart,
+        _mean(point, SEPARATION, ".2f", brief),
+        "–" if point.least_separation_m is None else f"{point.least_separation_m:.2f}",
+    ]
+
+
+def _share(share: ConfidenceInterval | None, brief: bool) -> str:
+    """Return a share in percent, with its interval unless brief."""
+    if share is None:
+        return "–"
+    interval = "" if brief else f" [{100 * share.low:.3g}, {100 * share.high:.3g}]"
+    return f"{100 * share.value:.3g} %{interval}"
+
+
+def _mean(point: GridPoint, column: str, form: str = ".4f", brief: bool = False) -> str:
+    """Return the mean of a column, with its interval unless brief, and its number of runs if they are not all."""
+    spread = point.spreads.get(column)
+    if spread is None:
+        return "–"
+    if brief:
+        return _noted(f"{spread.mean.value:{form}}", point.count(column).replace(" ", ""))
+    return _noted(_spread(spread, form), point.count(column))
+
+
+def _difference(point: GridPoint, column: str, brief: bool = False) -> str:
+    """Return the mean of paired differences with its interval, and the number of pairs."""
+    spread = point.differences.get(column)
+    if spread is None:
+        return "–"
+    if not brief:
+        return _noted(_spread(spread, ".4f"), f"n = {spread.runs}")
+    if spread.samples:  # too few for an interval
+        return ", ".join(f"{each:+.3g}" for each in spread.samples)
+    return f"{spread.mean.value:+.3g} ± {spread.mean.high - spread.mean.value:.2g} (n={spread.runs})"
+
+
+def _spread(spread: Distribution, form: str) -> str:
+    """Return a mean with half the width of its interval, or the runs themselves if they are too few for one."""
+    if spread.samples:
+        return ", ".join(f"{each:{form}}" for each in spread.samples)
+    half = spread.mean.high - spread.mean.value
+    return f"{spread.mean.value:{form}}" + (f" ± {half:{form}}" if np.isfinite(half) else "")
+
+
+def _noted(text: str, note: str) -> str:
+    return f"{text} ({note})" if note else text
+
+
+# Terminal
+
+TERMINAL_POINTS_MAX = 40
+BETWEEN = 3  # characters between two columns of a table
+EDGE = 1  # fewer characters after the last column of a table, including its edges
+ERRORS_MAX = 9  # parameters, as many as in the paper's Table I
+HEAD = 8  # characters of a head that stand in one line, at least
+AXES_MAX = 3  # fields of the grid with a column each; more of them share one
+
+
+class TerminalColumn(Struct, frozen=True):
+    """A column with its head, which is broken only between words, and a cell for each point."""
+
+    head: str
+    cells: tuple[str, ...]
+
+    @property
+    def lines(self) -> list[str]:
+        """Return the head in lines."""
+        return wrap(self.head, max(map(len, (*self.cells, "x" * HEAD))), break_long_words=False, break_on_hyphens=False)
+
+    @property
+    def width(self) -> int:
+        """Return the required number of characters, with the space to the next column."""
+        return max(map(len, (*self.lines, *self.cells))) + BETWEEN
+
+
+class TerminalText(Struct, frozen=True):
+    """The deviations of the runs from their plan; at each point the user's metrics, how the runs ended, and errors."""
+
+    summary: SweepSummary
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield from (Text(printable(mark), style="bold red") for mark in marks_of(self.summary))
+        for table in terminal_tables(self.summary):
+            if table.heads:
+                yield from _fitted(table, self.summary, options.max_width)
+        if missing := without_data(self.summary):
+            yield cell(missing)
+
+
+def terminal_text(summary: SweepSummary) -> TerminalText:
+    """Return the tables of a sweep, which fit the terminal that shows them."""
+    return TerminalText(summary)
+
+
+def terminal_tables(summary: SweepSummary) -> list[PointTable]:
+    """Return the user's metrics, paired differences, how the runs ended, and errors; tables without heads are empty."""
+    points, level = summary.flown[:TERMINAL_POINTS_MAX], f"{100 * summary.level:g} %"
+    own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
+    errors = _terminal_errors(summary)
+    compared = {  # of the user's metrics, otherwise of the errors
+        column: title
+        for column, title in differing(summary).items()
+        if column in summary.metrics or (not summary.metrics and column in errors)
+    }
+    cluster = next((each.cluster for each in errors.values()), None)
+    of = f" of {cluster}" if cluster else ""
+    title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs as planned"
+    names = {column: each.name for column, each in errors.items()}
+    return [
+        _table(
+            points, own, partial(_mean, form=".4g", brief=True), "Figures of your own, means over the runs as planned"
+        ),
+        _table(
+            points,
+            compared,
+            partial(_difference, brief=True),
+            f"Differences from {heading_of(summary.points[0])} of runs with the same seed",
+            f"means ± half of the {level} interval, of n pairs; of few pairs each one\n",
+        ),
+        PointTable(
+            list(OVERVIEW),
+            [overview(point, brief=True) for point in points],
+            f"{summary.scenario}: {summary.finished} of {summary.runs} runs",
+            "means are of the runs as planned, not of those excluded; least of all; "
+            f"{level} intervals are in the report\n",
+        ),
+        _table(points, names, partial(_mean, form=".3f", brief=True), title, "in m; angles in rad\n"),
+    ]
+
+
+def _terminal_errors(summary: SweepSummary) -> dict[str, FormationParameter]:
+    """Return the parameters, by the column of their true RMS, whose errors stand on a terminal.
+
+    They are the first ones of the first cluster that are no headings, which for Test 1 are the paper's.
+    """
+    columns = {f"{prefix}.true_rms": each for prefix, each in summary.parameters.items()}
+    flown = {column: each for column, each in columns.items() if column in summary.known}
+    first = next((each.cluster for each in flown.values()), None)
+    own = [(column, each) for column, each in flown.items() if each.cluster == first]
+    return dict([(column, each) for column, each in own if not each.name.startswith("phi_")][:ERRORS_MAX])
+
+
+def _fitted(table: PointTable, summary: SweepSummary, width: int) -> Iterator[Text | Table]:
+    """Yield title, tables and caption; tables are at most `width` characters wide if one column fits."""
+    axes = _axis_columns(summary)
+    cells = zip(*table.rows, strict=True) if table.rows else [()] * len(table.heads)
+    columns = [TerminalColumn(head, tuple(each)) for head, each in zip(table.heads, cells, strict=True)]
+    yield cell(table.title)
+    for part in _parted(columns, width + EDGE - sum(column.width for column in axes)):
+        grid = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1))
+        for place, column in enumerate([*axes, *part]):
+            justify = "left" if place < len(axes) else "right"
+            grid.add_column(cell("\n".join(column.lines)), justify=justify, vertical="bottom", no_wrap=True)
+        for row in zip(*(column.cells for column in [*axes, *part]), strict=True):
+            grid.add_row(*map(cell, row))
+        yield grid
+    left_out = len(summary.flown) - TERMINAL_POINTS_MAX
+    more = f"{left_out} more points are in the report. " if left_out > 0 else ""
+    yield cell(f"{more}{table.caption}".strip())
+
+
+def _axis_columns(summary: SweepSummary) -> list[TerminalColumn]:
+    """Return a column for each field of the grid, or one for all of them if they are many."""
+    names = [str(name) for name in axes_of(summary)]
+    rows = [values_of(point) for point in summary.flown[:TERMINAL_POINTS_MAX]]
+    if len(names) > AXES_MAX:
+        return [TerminalColumn(" · ".join(names), tuple(" · ".join(row) for row in rows))]
+    return [TerminalColumn(name, tuple(row[i] for row in rows)) for i, name in enumerate(names)]
+
+
+def _parted(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:
+    """Return columns in as few parts of similar size as fit a width in characters; a wider one stands alone."""
+    for count in range(1, len(columns) + 1):
+        ends = np.linspace(0, len(columns), count + 1).round().astype(int).tolist()
+        parts = [columns[start:end] for start, end in pairwise(ends)]
+        if all(len(part) == 1 or sum(column.width for column in part) <= room for part in parts):
+            return parts
+    return []
