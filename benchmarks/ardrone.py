@@ -23,7 +23,7 @@ import zenoh
 
 from benchmarks.child import Server
 from benchmarks.exchange.lap import free_port
-from zsim_bridges.ardrone.wire import at_commands, navdata
+from zsim_bridges.ardrone import at_commands, navdata
 
 PERIOD_S = 0.03  # of the SDK
 FIRST = "127.9.0.2"

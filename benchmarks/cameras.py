@@ -15,8 +15,7 @@ import numpy as np
 from zsim.math.frames import quaternion_from_rpy
 from zsim.sensors.camera import BottomCamera, Camera, FrontCamera, Hats
 from zsim.sensors.camera_model import camera_pose, lens_of
-from zsim_agents.cameras.detector import HatDetector
-from zsim_agents.cameras.jpeg import decoded
+from zsim_agents.cameras.detector import HatDetector, decoded
 from zsim_agents.cameras.rendering.renderer import Renderer
 from zsim_agents.cameras.rendering.scene import DroneStates, Scene, default_look
 

@@ -17,14 +17,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zenoh
 
 from benchmarks.child import Server
 from benchmarks.exchange.lap import free_port
-from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.frame import Link, Parser
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.frame import Link, Parser
 
 HEIGHT_M = 3.0
 SETPOINTS_HZ = 20.0  # what MAVSDK sends
@@ -88,7 +88,7 @@ class Program:
     def send(self, message: dialect.CommandLong | dialect.SetPositionTargetLocalNed) -> None:
         self.socket.sendto(self._link.pack(message), self._to)
 
-    def until(self, true: Callable[[object], bool]) -> None:
+    def until(self, true: Callable[[Any], bool]) -> None:
         """Read until a message is as wanted."""
         while not any(true(each.message) for each in self._parser.feed(self.socket.recv(65_536))):
             pass

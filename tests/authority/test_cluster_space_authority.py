@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from zsim_agents.formation.control_law import FormationGains, ProportionalLaw
-from zsim_agents.formation.flight_data import ShapeLimits
+from zsim_agents.formation.flight_check import ShapeLimits
 from zsim_agents.formation.guidance import RampPlanner
 from zsim_agents.formation.spaces.cluster_space import Array, closest_pair
 from zsim_agents.formation.spaces.scenario_space import cluster_space

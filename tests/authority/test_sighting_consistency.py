@@ -19,7 +19,7 @@ from zsim.contract.flight_messages import Sightings
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera import SightingModel
-from zsim_agents.estimation.joint.joint_bank import JointBank
+from zsim_agents.estimation.joint_filter import JointBank
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.sensors.sightings import DIAMETER_NOISE
 

@@ -7,7 +7,7 @@ import pytest
 from operated_flight import STEP_LIMIT_S, OperatedFlight
 
 from zsim.scenario import scenario_file
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST
+from zsim_agents.formation.flight_check import HELD_ON_REQUEST
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 SHORT = ("clusters.main.plan.takeoff_s=1", "clusters.main.plan.target.z_c=8")

@@ -36,7 +36,7 @@ from zsim.sensors.sensor import Channel, ErrorModel, RateHz, Sample, Sensor, Sen
 from zsim.schema.message import Number
 from zsim_agents.estimation.paper_estimator import PaperEstimator
 from zsim_agents.formation.control_law import ControlLaw
-from zsim_agents.formation.spaces.pair_cluster import PairCluster
+from zsim_agents.formation.spaces.triad_cluster import PairCluster
 
 
 class Law(ControlLaw):

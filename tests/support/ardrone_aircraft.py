@@ -9,10 +9,10 @@ from zsim.contract import flight_messages, messages
 from zsim.contract.flight_messages import DroneState
 from zsim.scenario import scenario_file
 from zsim.schema.quantities import G_M_S2
-from zsim_bridges.ardrone.aircraft.aircraft import Aircraft, Outlets
-from zsim_bridges.ardrone.wire import at_commands, navdata
-from zsim_bridges.ardrone.wire.at_commands import Command
-from zsim_bridges.ardrone.wire.navdata import Navdata
+from zsim_bridges.ardrone import at_commands, navdata
+from zsim_bridges.ardrone.aircraft import Aircraft, Outlets
+from zsim_bridges.ardrone.at_commands import Command
+from zsim_bridges.ardrone.navdata import Navdata
 
 GATE_NS = 20_000_000
 SOURCE = "ardrone.main"

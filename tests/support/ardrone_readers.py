@@ -19,3 +19,9 @@ def pyardrone_reads(what: str, data: bytes) -> dict[str, Any]:
     done = subprocess.run([sys.executable, str(SCRIPT), what], input=data, capture_output=True, check=False, timeout=60)
     assert done.returncode == 0, done.stderr.decode()
     return json.loads(done.stdout)
+
+
+def configuration_entries(data: bytes) -> dict[str, str]:
+    """Return the entries of a configuration that the control port sent."""
+    lines = (line.partition(" = ") for line in data.removesuffix(b"\0").decode("ascii").splitlines())
+    return {key: value for key, _, value in lines}

@@ -3,8 +3,8 @@
 import math
 from typing import Any
 
-from zsim_bridges.ardrone.wire import at_commands, navdata
-from zsim_bridges.ardrone.wire.navdata_options import GPS_TAG, LAYOUTS, TAG_OF
+from zsim_bridges.ardrone import at_commands, navdata
+from zsim_bridges.ardrone.navdata import GPS_TAG, LAYOUTS, TAG_OF
 
 STEP_NS = 5_000_000
 G = 9.80665

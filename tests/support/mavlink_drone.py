@@ -5,12 +5,12 @@ from typing import Any, TypeVar
 from zsim.contract import flight_messages
 from zsim.contract.messages import Origin
 from zsim.scenario import scenario_file
-from zsim_bridges.mavlink.autopilot.personality import PERSONALITIES
-from zsim_bridges.mavlink.vehicle.mavlink_vehicle import MavlinkVehicle, Options
-from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.frame import Received
-from zsim_bridges.mavlink.wire.wire_message import WireMessage
-from zsim_bridges.vehicle_links.command_sender import CommandSender
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.dialect import WireMessage
+from zsim_bridges.mavlink.frame import Received
+from zsim_bridges.mavlink.mavlink_vehicle import MavlinkVehicle, Options
+from zsim_bridges.mavlink.personality import PERSONALITIES
+from zsim_bridges.vehicle_links.drone_link import CommandSender
 
 GATE_NS = 20_000_000
 ORIGIN = Origin(latitude_deg=47.4, longitude_deg=8.5, height_m=400.0)

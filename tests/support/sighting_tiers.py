@@ -20,8 +20,7 @@ from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.camera_model import camera_pose, lens_of, undistorted
-from zsim_agents.cameras.detector import HatDetector
-from zsim_agents.cameras.jpeg import decoded
+from zsim_agents.cameras.detector import HatDetector, decoded
 from zsim_agents.cameras.rendering.scene import DroneStates
 from zsim_world.sensors.sightings import SightingSampler
 

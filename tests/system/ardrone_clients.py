@@ -17,9 +17,9 @@ import pytest
 from federation import Federation, Role
 from wire import PATIENCE_S
 
-from zsim_bridges.ardrone.wire import at_commands, configuration_text, navdata
-from zsim_bridges.ardrone.wire.at_commands import Command
-from zsim_bridges.ardrone.wire.navdata import Navdata, StateBit
+from zsim_bridges.ardrone import at_commands, configuration, navdata
+from zsim_bridges.ardrone.at_commands import Command
+from zsim_bridges.ardrone.navdata import Navdata, StateBit
 
 SCRIPTS = Path(__file__).parent / "ardrone_clients"
 NODE_PACKAGES = ("ar-drone@0.3.3", "ardrone-autonomy@0.1.2")
@@ -185,7 +185,7 @@ class PlainPilot:
 
     def configuration(self, mode: int = at_commands.SEND_CONFIGURATION) -> bytes:
         """Return what the control port sends for a CTRL."""
-        with socket.create_connection((self.address, configuration_text.PORT), PATIENCE_S) as control:
+        with socket.create_connection((self.address, configuration.PORT), PATIENCE_S) as control:
             data = b""
             while not data.endswith(b"\0"):
                 self.send(at_commands.Control(0, mode))  # it may come before the connection has been accepted

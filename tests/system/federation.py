@@ -35,7 +35,7 @@ from forked_commands import COLUMNS, ROOT, ZSIM
 from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader, repair
-from zsim_agents.cameras import hat_outline
+from zsim_agents.cameras import detector
 
 PORTS = range(20_000, 30_000)  # below the range from which systems take ports for outgoing connections
 WORKERS_MAX = 8  # that start processes side by side
@@ -354,7 +354,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
     with open(Path(tempfile.gettempdir()) / f"zsim-tests-compile-{checkout}.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert forked_commands.run(*flight, hangs_s=COMPILES_S).code == 0
-        hat_outline.rehearse()
+        detector.rehearse()
 
 
 @pytest.fixture

@@ -8,12 +8,13 @@ from collections.abc import Iterator
 
 import pytest
 from ardrone_clients import PlainPilot, addresses, node, node_modules, python, serve
+from ardrone_readers import configuration_entries
 from federation import ONE, Federation, Role
 from picture_pump import pumping
 from wire import PATIENCE_S, Client
 
-from zsim_bridges.ardrone.wire import at_commands, configuration_text
-from zsim_bridges.ardrone.wire.navdata import StateBit
+from zsim_bridges.ardrone import at_commands
+from zsim_bridges.ardrone.navdata import StateBit
 
 __all__ = ["node_modules"]
 
@@ -132,11 +133,10 @@ def test_the_control_port_has_the_configuration(fleet: Fleet) -> None:
         pilot.request()
         pilot.send(at_commands.ResetWatchdog(0))
         pilot.config("CONTROL:euler_angle_max", "0.3")
-        entries = configuration_text.parse_configuration(pilot.configuration())
+        entries = configuration_entries(pilot.configuration())
         assert entries["general:num_version_soft"] == "2.4.8"
         assert float(entries["control:euler_angle_max"]) == pytest.approx(math.radians(5.0), abs=1e-4)  # the drone's
-        kept = configuration_text.parse_custom_list(pilot.configuration(at_commands.SEND_CUSTOM_LIST))
-        assert kept.sessions == {"00000000": "default"}
+        assert b"[sessions]\r00000000,default\r" in pilot.configuration(at_commands.SEND_CUSTOM_LIST)
 
 
 def test_the_version_comes_by_ftp_and_the_question_is_answered(fleet: Fleet) -> None:

@@ -9,7 +9,7 @@ from ardrone_clients import PlainPilot, addresses, serve
 from federation import ONE, Federation
 from wire import PATIENCE_S
 
-from zsim_bridges.ardrone.wire import at_commands, configuration_text, navdata
+from zsim_bridges.ardrone import at_commands, configuration, navdata
 
 pytestmark = pytest.mark.xdist_group("ardrone_fuzz")
 
@@ -86,7 +86,7 @@ def test_nothing_flies_and_all_is_counted(federation: Federation, count: int) ->
 def _fuzz_commands(pilot: PlainPilot, chance: random.Random, count: int) -> int:
     """Send malformed datagrams to the AT port, and strange ones between; return how many the former are."""
     datagrams = malformed(chance)
-    with socket.create_connection((pilot.address, configuration_text.PORT), PATIENCE_S) as control:
+    with socket.create_connection((pilot.address, configuration.PORT), PATIENCE_S) as control:
         pilot.send(at_commands.ResetWatchdog(0))
         for _ in range(count // BURST):
             for _ in range(BURST):
@@ -100,7 +100,7 @@ def _await_configuration(pilot: PlainPilot, control: socket.socket) -> None:
     """Wait until all that was sent to the AT port is dealt with: the answer to a request behind it comes."""
     pilot.send(at_commands.Control(0, at_commands.SEND_CONFIGURATION))
     data = b""
-    while not data.endswith(configuration_text.END):
+    while not data.endswith(configuration.END):
         received = control.recv(65_536)
         assert received, "the control port has been closed"
         data += received
@@ -121,7 +121,7 @@ def _fuzz_requests(pilot: PlainPilot, chance: random.Random, count: int) -> int:
 
 def _fuzz_streams(address: str, chance: random.Random, count: int) -> None:
     """Send bytes to the TCP ports, and leave or stay."""
-    for port in (configuration_text.PORT, FTP_PORT, VIDEO_PORT):
+    for port in (configuration.PORT, FTP_PORT, VIDEO_PORT):
         for _ in range(count):
             with socket.create_connection((address, port), PATIENCE_S) as stream:
                 lines = [chance.randbytes(chance.randrange(700)) for _ in range(chance.randrange(4))]

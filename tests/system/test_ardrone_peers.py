@@ -8,7 +8,7 @@ from federation import ONE, Federation
 from lab import Lab
 from wire import PATIENCE_S
 
-from zsim_bridges.ardrone.wire import at_commands, navdata
+from zsim_bridges.ardrone import at_commands, navdata
 
 pytestmark = pytest.mark.xdist_group("ardrone_peers")
 

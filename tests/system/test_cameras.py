@@ -13,7 +13,7 @@ from zsim.math.frames import rotation_matrix
 from zsim.math.rotation import pose_between
 from zsim.sensors.camera import FrontCamera, Hats
 from zsim.sensors.camera_model import camera_pose
-from zsim_agents.cameras.jpeg import decoded
+from zsim_agents.cameras.detector import decoded
 
 PAIR = """
 name: pair

@@ -15,9 +15,9 @@ from mavlink_programs import free_udp_ports
 from mixed_formation import UNFLOWN
 from wire import PATIENCE_S
 
-from zsim_bridges.ardrone.wire import at_commands, navdata
-from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.frame import Link
+from zsim_bridges.ardrone import at_commands, navdata
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.frame import Link
 
 pytestmark = pytest.mark.soak
 

@@ -12,9 +12,8 @@ from federation import Federation, Role
 from mavlink_programs import Program, free_udp_ports
 from wire import Client
 
-from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.frame import Link, Parser
-from zsim_bridges.mavlink.wire.signing import Signing
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.frame import Link, Parser, Signing
 
 pytestmark = pytest.mark.xdist_group("mavlink")
 

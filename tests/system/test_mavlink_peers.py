@@ -12,8 +12,8 @@ from mavlink_programs import free_udp_ports
 from mixed_formation import UNFLOWN
 from wire import PATIENCE_S
 
-from zsim_bridges.mavlink.wire import dialect
-from zsim_bridges.mavlink.wire.frame import Link, Parser, Received
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.frame import Link, Parser, Received
 
 pytestmark = pytest.mark.xdist_group("mavlink_peers")
 

@@ -1,9 +1,16 @@
-"""Finds magenta hats in a picture, from zsim or from a real camera: bearing and range of each, and how sure. Pure.
+"""Finds magenta hats in a picture, from zsim or from a real camera: bearing and range of each, with sigmas. Pure.
 
-How magenta a pixel is is a number that is linear where a hat mixes with grass, sky or hull, and nothing for orange:
-the share of a pixel that a hat covers is that number over the hat's own. Direction and range follow from the circle of
-its outline, of which rotors may hide a part: a ball of radius r at a distance d has an apparent radius a with
-sin a = r / d, wherever in the picture it is.
+How magenta a pixel is is a number that is linear where a hat mixes with grass, sky or hull, and zero for orange: the
+share of a pixel that a hat covers is that number over the hat's own. Direction and range follow from the circle of the
+hat's outline, of which rotors may hide a part: a ball of radius r at a distance d has an apparent radius a with
+sin a = r / d anywhere in the picture.
+
+The edge is searched from outside inwards, in directions all around a point of the ball. The best circle through half
+of the points in a row decides which others are on the same one. Circles are fitted by least squares to
+x^2 + y^2 = 2 a x + 2 b y + c (I. Kasa, IEEE Trans. Instrum. Meas. 25, 1976) in the plane that touches the unit sphere
+at the ball: there it is a circle wherever in the picture it stands.
+
+Order of this file: JPEG decoding, the detector, the hat in one part of the picture, the compiled fit of its outline.
 """
 
 import math
@@ -14,38 +21,79 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import Seen
-from zsim.sensors.camera_model import CameraPose, Lens
-from zsim_agents.cameras.hat_outline import WHOLE_CENTRE, Outline, outline
-from zsim_agents.cameras.rendering.view import View
+from zsim.math.compiled import Field, columns, portable
+from zsim.math.rotation import Vector, add, cross, dot, norm, scaled
+from zsim.sensors.camera import PictureError, frame_of
+from zsim.sensors.camera_model import CameraPose, Lens, spread
+from zsim_agents.cameras.rendering.scene import View
 
 Picture = NDArray[np.uint8]
-Field = NDArray[np.float32]
-Array = NDArray[np.float64]
+Levels = NDArray[np.float32]
 
+PIXELS_MAX = 1920 * 1080 * 2  # of a picture that is decoded; twice the limit of a scenario's camera
 LEVEL_MIN = 24  # of 255, of R - G: below it is noise
 SHARE_MIN = 0.3  # of R - G over R: less is no magenta
 BLUE_SHARE = 0.2  # of B - G over R - G: less is orange or red; the paper's magenta has 0.59
-BLUE_WEIGHT = 1.5  # of what is missing of it, taken off
+BLUE_WEIGHT = 1.5  # subtracted per unit of missing blue
 AREA_MIN_PX = 2  # at half of the resolution
 BLOBS_MAX = 100  # the largest; more are no hats
-ROOM_PX = 4  # about a blob, for its edge and what is behind it
-CORE = 0.5  # of the most magenta, from which on a pixel is a hat's
-CORE_MIN_PX = 12  # of pixels that a hat covers wholly; with fewer its own colour is taken from how blurred it is
-BLUR_PX2 = 1.1  # px^2, variance of what lens, pixel, JPEG and a mean of nine make of a point; calibrated
+ROOM_PX = 4  # around a blob, for its edge and the background
+CORE = 0.5  # of the most magenta; pixels above belong to a hat
+CORE_MIN_PX = 12  # of wholly covered pixels; with fewer the hat's own colour is computed from its blur
+POINT_BLUR_PX2 = 1.1  # px^2, variance by which lens, pixel, JPEG and a mean of nine blur a point; calibrated
 ROUND_MIN = 0.3  # of the smaller variance over the larger; less is no ball
-PIECE_GAP = 0.3  # of a ball's size, between two pieces of it; a guard before it is 0.2 wide
-SHARE_OF_EDGE_MIN = 0.3  # visible; of less the circle is not known
-DIAMETER_MIN_PX = 4.0  # px; the range of smaller ones errs to one side, by more than its sigma says
-# Standard deviations, calibrated: px per px by which edge points are off, and px^2 over the diameter. Of a centre the
-# second counts as far as a part is hidden, and px^3 over the diameter's square are added; of a diameter, px are.
+PIECE_GAP = 0.3  # of a ball's size, between two pieces of it; a guard in front is 0.2 wide
+SHARE_OF_EDGE_MIN = 0.3  # visible; with less the circle is unknown
+DIAMETER_MIN_PX = 4.0  # px; the range of smaller ones has a bias beyond its sigma
+# Standard deviations, calibrated, of a centre and of a diameter: px per px of roughness of the edge, px^2 over the
+# diameter (of a centre, in proportion to the hidden part), and px^3 over its square (centre) or px (diameter).
 CENTRE = 2.0, 6.5, 8.0
 DIAMETER = 2.0, 4.6, 0.1
+SQUARE_3, SQUARE_5 = (np.ones((side, side), np.uint8) for side in (3, 5))
+
+DIRECTIONS = 32
+STEP_PX = 0.5  # along a direction
+EDGE = 0.5  # of a pixel, covered by the ball
+EDGE_BLUR_PX2 = 1.1  # px^2, variance of what blurs an edge; a curved edge is half covered inside of it; calibrated
+# px, px^2 over the radius, px over the noise of the share: tolerance of an edge point to its circle; calibrated
+NEAR_PX, NEAR_PX2, NEAR_NOISE = 0.2, 1.0, 6.0
+POINTS_MIN = 5  # of a circle
+REFINEMENTS = 3  # of the set of points on it
+OUTSIDE = 3.0  # cost of a point outside of a circle, over that of one inside: a ball may be hidden, but not protrude
+WHOLE_CENTRE = math.sqrt(2.0 / DIRECTIONS)  # Outline.centre of a ball that nothing hides
+SINGULAR = 1e-9  # of a determinant over its value for points all around
+
+EDGE_POINT = columns("EdgePointColumns", (Field("x", "px"), Field("y", "px"), Field("on", "1")))
 
 _x = np.linspace(1e-3, 60, 6000)
 _PEAK = (1 - np.exp(-_x)) / _x  # of a blurred disc's middle over its own colour, times 1 / x, by x = r^2 / 2 s^2
 
 
-class Box(NamedTuple):
+def decoded(data: bytes, width: int, height: int) -> Picture:
+    """Return a JPEG as B, G, R, (height, width, 3).
+
+    Its size is read from the header before anything is decoded, so that a stranger's picture takes bounded memory.
+
+    Raises:
+        PictureError: no JPEG, another size than announced, or too many pixels.
+    """
+    _, found_width, found_height = frame_of(data)
+    if (found_width, found_height) != (width, height):
+        found = f"{found_width} x {found_height}"
+        raise PictureError(f"data is a JPEG of {found}; must be {width} x {height}, as the camera's info")
+    if width * height > PIXELS_MAX:
+        raise PictureError(f"picture has {width * height} pixels; must have at most {PIXELS_MAX}")
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise PictureError(f"data ({len(data)} bytes) is a JPEG that cannot be decoded ({error.code})") from error
+    if picture is None or picture.shape != (height, width, 3):
+        raise PictureError(f"data ({len(data)} bytes) is a JPEG that cannot be decoded; must be whole")
+    return picture  # type: ignore[return-value]
+
+
+class _Box(NamedTuple):
     """A part of a picture: its upper left corner and its size [px]."""
 
     u: int
@@ -53,33 +101,18 @@ class Box(NamedTuple):
     wide: int
     high: int
 
-    def touches(self, other: "Box") -> bool:
-        """Tell whether the other one is a piece of the same ball: nearer than a part of this one's size."""
+    def touches(self, other: "_Box") -> bool:
+        """Tell whether the other one is a piece of the same ball: the gap is small compared to this one's size."""
         gap = 1 + PIECE_GAP * max(self.wide, self.high)
         across = max(self.u, other.u) - min(self.u + self.wide, other.u + other.wide)
         down = max(self.v, other.v) - min(self.v + self.high, other.v + other.high)
         return max(across, down) <= gap
 
-    def with_other(self, other: "Box") -> "Box":
-        """Return the part that holds both."""
+    def united(self, other: "_Box") -> "_Box":
+        """Return the smallest box around both."""
         u, v = min(self.u, other.u), min(self.v, other.v)
         right, low = max(self.u + self.wide, other.u + other.wide), max(self.v + self.high, other.v + other.high)
-        return Box(u, v, right - u, low - v)
-
-
-class Blob(NamedTuple):
-    """A hat in the picture: its circle, its size [px], and pixels per radian there."""
-
-    circle: Outline
-    diameter_px: float
-    scale: float
-
-    def sigmas_px(self) -> tuple[float, float]:
-        """Return the standard deviations of the centre, per axis, and of the diameter."""
-        circle, size, rough = self.circle, self.diameter_px, self.circle.rough_px
-        hidden = max(0.0, circle.centre - WHOLE_CENTRE)
-        centre = math.hypot(CENTRE[0] * circle.centre * rough, CENTRE[1] * hidden / size, CENTRE[2] / size**2)
-        return centre, math.hypot(2 * circle.radius * math.hypot(DIAMETER[0] * rough, DIAMETER[1] / size), DIAMETER[2])
+        return _Box(u, v, right - u, low - v)
 
 
 class HatDetector:
@@ -105,71 +138,93 @@ class HatDetector:
         size = picture.shape[1], picture.shape[0]
         if size != (self._lens.width, self._lens.height):
             raise ValueError(f"picture is {size[0]} x {size[1]}; must be {self._lens.width} x {self._lens.height}")
-        blobs = [self._blob(picture, box) for box in self._boxes(picture)]
-        return tuple(self._sighting(blob) for blob in blobs if blob is not None)
+        found = [self._hat(picture, box) for box in self._boxes(picture)]
+        return tuple(hat for hat in found if hat is not None)
 
-    def _boxes(self, picture: Picture) -> list[Box]:
-        """Return where something is magenta, at half of the resolution."""
+    def _boxes(self, picture: Picture) -> list[_Box]:
+        """Return magenta parts of the picture at half of its resolution, the largest first."""
         blue, green, red = cv2.split(cv2.resize(picture, self._half, interpolation=cv2.INTER_AREA))
         level = cv2.subtract(red, green)
         strong = cv2.addWeighted(level, 1.0, red, -SHARE_MIN, 0.5 - LEVEL_MIN)
         bluish = cv2.subtract(blue, green)
         mask = cv2.min(strong, cv2.addWeighted(bluish, 1.0, level, -BLUE_SHARE, 0.0))
-        outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-        boxes = [Box(*cv2.boundingRect(outline)) for outline in outlines]
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        boxes = [_Box(*cv2.boundingRect(contour)) for contour in contours]
         large = [box for box in boxes if box.wide * box.high >= AREA_MIN_PX]
-        return joined(sorted(large, key=lambda box: (-box.wide * box.high, box))[:BLOBS_MAX])
+        whole: list[_Box] = []  # with the pieces of one ball, which a rotor guard crosses, as one
+        for box in sorted(large, key=lambda box: (-box.wide * box.high, box))[:BLOBS_MAX]:
+            for i, other in enumerate(whole):
+                if other.touches(box):
+                    whole[i] = other.united(box)
+                    break
+            else:
+                whole.append(box)
+        return whole
 
-    def _blob(self, picture: Picture, box: Box) -> Blob | None:
-        """Return the hat in a box of the picture at half of its resolution; None if it is none, or not all of it."""
+    def _hat(self, picture: Picture, box: _Box) -> Seen | None:
+        """Return the hat in a box of the picture at half of its resolution; None if it is none, or cut by the edge."""
         u, v, wide, high = (2 * side for side in box)
         room = ROOM_PX + max(wide, high) // 6
         u0, v0, u1, v1 = u - room, v - room, u + wide + room, v + high + room
         if u <= 2 or v <= 2 or u + wide >= self._lens.width - 2 or v + high >= self._lens.height - 2:
-            return None  # a part of a hat tells neither bearing nor range
+            return None  # a part of a hat gives neither bearing nor range
         part = slice(max(v0, 0), v1), slice(max(u0, 0), u1)
-        level = magenta(picture[part])
+        level = _magenta(picture[part])
         sides = level[0], level[-1], level[1:-1, 0], level[1:-1, -1]
         behind = float(np.median(np.concatenate(sides)))
         noise = min(_deviation(side) for side in sides)  # of those that no hull crosses
         level -= np.float32(behind)
-        return _outlined(level, noise, self._rays[part], self._lens.fx)
-
-    def _sighting(self, blob: Blob) -> Seen:
-        centre_px, diameter_px = blob.sigmas_px()
-        range_m = self._radius_m / math.sin(blob.circle.radius_rad)
-        x, y, z = (self._R_BK @ blob.circle.ray).tolist()
-        return Seen((x, y, z), range_m, centre_px / blob.scale, range_m * diameter_px / blob.diameter_px)
-
-
-def _deviation(values: Field) -> float:
-    """Return the standard deviation of normally distributed values, of which some are not."""
-    return 1.48 * float(np.median(np.abs(values - np.median(values))))
-
-
-def joined(boxes: list[Box]) -> list[Box]:
-    """Return boxes, the largest first, with the pieces of one ball, which a rotor guard crosses, as one."""
-    whole: list[Box] = []
-    for box in boxes:
-        for i, other in enumerate(whole):
-            if other.touches(box):
-                whole[i] = other.with_other(box)
-                break
-        else:
-            whole.append(box)
-    return whole
+        outlined = _outlined(level, noise, self._rays[part], self._lens.fx)
+        if outlined is None:
+            return None
+        circle, scale = outlined
+        diameter_px, rough = 2 * circle.radius_rad * scale, circle.rough_px
+        hidden = max(0.0, circle.centre - WHOLE_CENTRE)
+        centre_px = math.hypot(
+            CENTRE[0] * circle.centre * rough, CENTRE[1] * hidden / diameter_px, CENTRE[2] / diameter_px**2
+        )
+        size_px = math.hypot(
+            2 * circle.radius * math.hypot(DIAMETER[0] * rough, DIAMETER[1] / diameter_px), DIAMETER[2]
+        )
+        range_m = self._radius_m / math.sin(circle.radius_rad)
+        x, y, z = (self._R_BK @ circle.ray).tolist()
+        return Seen((x, y, z), range_m, centre_px / scale, range_m * size_px / diameter_px)
 
 
-def magenta(picture: Picture) -> Field:
-    """Return how magenta each pixel is, (h, w): R - G, less where too little blue is in it."""
+def _magenta(picture: Picture) -> Levels:
+    """Return how magenta each pixel is, (h, w): R - G, less where blue is missing."""
     blue, green, red = (channel.astype(np.float32) for channel in cv2.split(picture))
     level, bluish = red - green, blue - green
     lack = np.maximum(np.float32(BLUE_SHARE) * level - bluish, 0) * np.float32(BLUE_WEIGHT)
     return np.where(level > 0, np.maximum(level - lack, 0), level)
 
 
-def _outlined(level: Field, noise: float, rays: Field, focal_px: float) -> Blob | None:
-    """Return the hat of which each pixel has a level over what is behind it, (h, w)."""
+def _deviation(values: Levels) -> float:
+    """Return the standard deviation of normally distributed values with outliers."""
+    return 1.48 * float(np.median(np.abs(values - np.median(values))))
+
+
+class Outline(NamedTuple):
+    """The circle of a ball on the sphere of directions.
+
+    Attributes:
+        ray: to its centre, a unit vector of K.
+        radius_rad: its apparent radius; NaN where there is no circle.
+        share: visible share of its edge.
+        rough_px: root mean square distance of edge points from it.
+        centre, radius: standard deviations of the centre, per axis, and of the radius over that of an edge point.
+    """
+
+    ray: Vector
+    radius_rad: float
+    share: float
+    rough_px: float
+    centre: float
+    radius: float
+
+
+def _outlined(level: Levels, noise: float, rays: Levels, focal_px: float) -> tuple[Outline, float] | None:
+    """Return the circle of a hat from the levels above the background, (h, w), and pixels per radian there."""
     mean = cv2.blur(level, (3, 3), borderType=cv2.BORDER_REPLICATE)
     v, u = divmod(int(np.argmax(mean)), level.shape[1])
     peak = float(mean[v, u])
@@ -178,26 +233,21 @@ def _outlined(level: Field, noise: float, rays: Field, focal_px: float) -> Blob 
     cosine = float(rays[v, u, 2])
     core = (level > CORE * peak).astype(np.uint8)
     near = cv2.dilate(core, SQUARE_5).astype(np.uint8)
-    covered = _shares(level, core, near, peak)
+    covered = _covered(level, core, near, peak)
     oblique = cosine * cosine  # variance of a round one in the plane of the picture: cos^2 off the axis
     if _roundness(covered) / oblique < ROUND_MIN:
         return None
     scale = focal_px / (cosine * math.sqrt(cosine))  # between those along and across the way to the middle
     circle = outline(covered, noise / peak, rays, scale)
-    if not circle.share >= SHARE_OF_EDGE_MIN:
-        return None
-    diameter_px = 2 * circle.radius_rad * scale
-    return Blob(circle, diameter_px, scale) if diameter_px >= DIAMETER_MIN_PX else None
+    is_known = circle.share >= SHARE_OF_EDGE_MIN and 2 * circle.radius_rad * scale >= DIAMETER_MIN_PX
+    return (circle, scale) if is_known else None
 
 
-SQUARE_3, SQUARE_5 = (np.ones((side, side), np.uint8) for side in (3, 5))
-
-
-def _shares(level: Field, core: Picture, near: Picture, peak: float) -> Field:
-    """Return the share of each pixel that the hat covers: its level over the hat's own there, which shade changes."""
+def _covered(level: Levels, core: Picture, near: Picture, peak: float) -> Levels:
+    """Return the covered share of each pixel: its level over the hat's own there, which varies with the shading."""
     inner = cv2.erode(core, SQUARE_3)
     count = int(inner.sum())
-    own: Field | float
+    own: Levels | float
     if count > CORE_MIN_PX:
         side = 2 * round(math.sqrt(count) / 4) + 5
         total = cv2.blur(level * inner, (side, side), borderType=cv2.BORDER_CONSTANT)
@@ -205,12 +255,12 @@ def _shares(level: Field, core: Picture, near: Picture, peak: float) -> Field:
         mean = np.float32((level * inner).sum() / count)
         own = np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), mean)
     else:
-        blurred = peak / float((level * near).sum()) * 2 * math.pi * BLUR_PX2
+        blurred = peak / float((level * near).sum()) * 2 * math.pi * POINT_BLUR_PX2
         own = peak / (1 - math.exp(-float(np.interp(-blurred, -_PEAK, _x))))
     return np.clip(level / own, 0, 1) * near
 
 
-def _roundness(covered: Field) -> float:
+def _roundness(covered: Levels) -> float:
     """Return the smaller variance of what is covered over the larger; 0 for nothing."""
     moments = cv2.moments(covered)
     area = moments["m00"]
@@ -219,3 +269,181 @@ def _roundness(covered: Field) -> float:
     uu, vv, uv = moments["mu20"] / area, moments["mu02"] / area, moments["mu11"] / area
     middle, half = (uu + vv) / 2, math.hypot((uu - vv) / 2, uv)
     return (middle - half) / max(middle + half, 1e-9)
+
+
+NONE = Outline((0.0, 0.0, 1.0), math.nan, 0.0, 0.0, 0.0, 0.0)
+Circle = tuple[float, float, float]  # middle and radius [px]
+
+
+def rehearse() -> None:
+    """Load or compile the kernels with an empty picture, so that the first hat does not wait for them."""
+    outline(np.zeros((3, 3), np.float32), 0.0, np.ones((3, 3, 3), np.float32), 1.0)
+
+
+@portable
+def outline(covered: NDArray, noise: float, rays: NDArray, scale: float) -> Outline:
+    """Return the circle of a ball, NONE where there is no circle.
+
+    Args:
+        covered: share of each pixel that the ball covers, float32 (h, w).
+        noise: standard deviation of that share.
+        rays: unit vectors of K through the pixels, float32 (h, w, 3).
+        scale: pixels per radian there.
+    """
+    u, v = _middle(covered)
+    ahead = _ray(rays, u, v)
+    right = cross((0.0, 1.0, 0.0), ahead)
+    right = scaled(right, 1.0 / norm(right))
+    down = cross(ahead, right)
+    points = np.empty((DIRECTIONS, EDGE_POINT.size))
+    count = 0
+    for k in range(DIRECTIONS):
+        turn = 2.0 * math.pi * k / DIRECTIONS
+        cosine, sine = math.cos(turn), math.sin(turn)
+        away = _edge(covered, u, v, cosine, sine)
+        if away > 0.0:
+            ray = _ray(rays, u + away * cosine, v + away * sine)
+            ahead_px = dot(ray, ahead) / scale
+            points[count, 0], points[count, 1], points[count, 2] = (
+                dot(ray, right) / ahead_px,
+                dot(ray, down) / ahead_px,
+                1.0,
+            )
+            count += 1
+    points = points[:count]
+    if count < POINTS_MIN or not _choose(points, noise):
+        return NONE
+    x, y, r = _fitted(points, 0, count)
+    centre, radius, rough = _spread(points, x, y, r)
+    ray = add(ahead, add(scaled(right, x / scale), scaled(down, y / scale)))
+    radius_rad = math.atan((r + EDGE_BLUR_PX2 / (2.0 * r)) / scale)
+    return Outline(
+        scaled(ray, 1.0 / norm(ray)), radius_rad, points[:, EDGE_POINT.on].sum() / DIRECTIONS, rough, centre, radius
+    )
+
+
+@portable
+def _middle(covered: NDArray) -> tuple[float, float]:
+    """Return the middle of what is covered [px]."""
+    area, across, along = 1e-9, 0.0, 0.0
+    for v in range(covered.shape[0]):
+        for u in range(covered.shape[1]):
+            share = float(covered[v, u])
+            area, across, along = area + share, across + share * u, along + share * v
+    return across / area, along / area
+
+
+@portable
+def _between(picture: NDArray, u: float, v: float) -> float:
+    """Return the value of a picture (h, w) between its pixels, 0 outside."""
+    if u < 0.0 or v < 0.0 or u >= picture.shape[1] - 1 or v >= picture.shape[0] - 1:
+        return 0.0
+    i, j = int(u), int(v)
+    a, b = u - i, v - j
+    above = (1.0 - a) * picture[j, i] + a * picture[j, i + 1]
+    return (1.0 - b) * above + b * ((1.0 - a) * picture[j + 1, i] + a * picture[j + 1, i + 1])
+
+
+@portable
+def _ray(rays: NDArray, u: float, v: float) -> Vector:
+    """Return the unit vector through a point between pixels, clamped to the picture."""
+    u = min(max(u, 0.0), rays.shape[1] - 1.001)
+    v = min(max(v, 0.0), rays.shape[0] - 1.001)
+    ray = _between(rays[:, :, 0], u, v), _between(rays[:, :, 1], u, v), _between(rays[:, :, 2], u, v)
+    return scaled(ray, 1.0 / norm(ray))
+
+
+@portable
+def _edge(covered: NDArray, u: float, v: float, cosine: float, sine: float) -> float:
+    """Return the distance of the edge from a point, coming from outside [px]; 0 without an edge."""
+    steps = int(math.hypot(float(covered.shape[0]), float(covered.shape[1])) / STEP_PX)
+    outer = 0.0
+    for step in range(steps, -1, -1):
+        away = step * STEP_PX
+        share = _between(covered, u + away * cosine, v + away * sine)
+        if share > EDGE:
+            return away + STEP_PX * (share - EDGE) / (share - outer)
+        outer = share
+    return 0.0
+
+
+@portable
+def _fitted(points: NDArray, first: int, count: int) -> Circle:
+    """Return the circle fitted to those of `count` points in a row, from `first` on, that are marked as on it."""
+    n, mx, my = 0.0, 0.0, 0.0
+    for k in range(count):
+        x, y, on = points[(first + k) % len(points)]
+        n, mx, my = n + on, mx + on * x, my + on * y
+    mx, my = mx / n, my / n
+    xx, xy, yy, xz, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(count):
+        x, y, on = points[(first + k) % len(points)]
+        x, y = x - mx, y - my
+        z = x * x + y * y
+        xx, xy, yy = xx + on * x * x, xy + on * x * y, yy + on * y * y
+        xz, yz, zz = xz + on * x * z, yz + on * y * z, zz + on * z
+    determinant = xx * yy - xy * xy
+    if determinant <= SINGULAR * (xx + yy) * (xx + yy):
+        return mx, my, 0.0  # collinear
+    a, b = (xz * yy - yz * xy) / (2.0 * determinant), (yz * xx - xz * xy) / (2.0 * determinant)
+    return mx + a, my + b, math.sqrt(a * a + b * b + zz / n)
+
+
+@portable
+def _near_px(r: float, noise: float) -> float:
+    """Return the tolerance of an edge point to a circle of radius r."""
+    return NEAR_PX + NEAR_PX2 / r + NEAR_NOISE * noise
+
+
+@portable
+def _cost(points: NDArray, circle: Circle, noise: float) -> float:
+    """Return the cost of explaining all points by a circle."""
+    x, y, r = circle
+    if r <= 0.0:
+        return math.inf
+    near, total = _near_px(r, noise), 0.0
+    for k in range(len(points)):
+        off = math.hypot(points[k, 0] - x, points[k, 1] - y) - r
+        total += OUTSIDE if off > near else min(abs(off) / near, 1.0)
+    return total
+
+
+@portable
+def _choose(points: NDArray, noise: float) -> bool:
+    """Mark the points on the circle that most of them share; False if there are too few."""
+    count = len(points)
+    least, best = math.inf, (0.0, 0.0, 0.0)
+    for first in range(count):
+        circle = _fitted(points, first, count // 2 + 1)
+        cost = _cost(points, circle, noise)
+        if cost < least:
+            least, best = cost, circle
+    near = np.empty(count)
+    for _ in range(REFINEMENTS):
+        x, y, r = best
+        if r <= 0.0:
+            return False
+        for k in range(count):
+            off = abs(math.hypot(points[k, 0] - x, points[k, 1] - y) - r)
+            near[k] = 1.0 if off < _near_px(r, noise) else 0.0
+        for k in range(count):  # next to a hidden point the edge is blurred
+            points[k, EDGE_POINT.on] = near[k] * near[k - 1] * near[(k + 1) % count]
+        if points[:, EDGE_POINT.on].sum() < POINTS_MIN:
+            return False
+        best = _fitted(points, 0, count)
+    return best[2] > 0.0
+
+
+@portable
+def _spread(points: NDArray, x: float, y: float, r: float) -> tuple[float, float, float]:
+    """Return the standard deviations of centre and radius over that of an edge point, and the roughness [px]."""
+    n, sx, sy, sxx, sxy, syy, rough = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(len(points)):
+        if points[k, EDGE_POINT.on] != 0.0:
+            dx, dy = points[k, EDGE_POINT.x] - x, points[k, EDGE_POINT.y] - y
+            rough += (math.hypot(dx, dy) - r) ** 2
+            dx, dy = dx / r, dy / r
+            n, sx, sy = n + 1.0, sx + dx, sy + dy
+            sxx, sxy, syy = sxx + dx * dx, sxy + dx * dy, syy + dy * dy
+    centre, radius = spread(n, sx, sy, sxx, sxy, syy)
+    return centre, radius, math.sqrt(rough / n)

@@ -1,4 +1,8 @@
-"""Strapdown dead reckoning of one drone, and how its small errors grow, in plain floats and compiled loops.
+"""Dead reckoning of one drone: Madgwick's attitude filter, strapdown integration, and the growth of small errors.
+
+In plain floats, compiled. S. O. H. Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor
+arrays", University of Bristol, 2010: quaternion rate (12), objective of gravity (25), its Jacobian (26), fusion (33).
+Quaternions are Hamilton, w first, body to world; the world is z up, so a body at rest feels +g along world z.
 
 Errors are additive for position and velocity; the attitude's is a small rotation in the world frame,
 R_true = (I + [theta_W]x) R_WB, so that a past attitude has the error of the present one.
@@ -18,35 +22,24 @@ from zsim.math.rotation import (
     axpy,
     column,
     cross,
+    dot,
     heading,
     matrix,
     multiply,
+    norm,
     normalised,
     product,
     scaled,
     subtract,
 )
-from zsim_agents.estimation.madgwick import madgwick_step, rotation_vector_quaternion
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12  # first index of each in the error state
-
 HORIZONTAL_MIN = 1e-6  # of a squared unit vector; nearer to the zenith a heading is not defined
+# Mean of a unit vector in the plane along a small offset e under noise s per axis: slope * e/s.
+UNIT_VECTOR_SLOPE = math.sqrt(math.pi / 8)
 
 Reckoning = tuple[Vector, Vector, Quaternion, Vector, Vector, Vector]
 """p_WB [m], v_WB [m/s], q_WB, a_WB [m/s^2; W]; rate [rad/s] and specific force [m/s^2] in B, bias-free."""
-
-
-@inlined
-def vector(row: np.ndarray, at: int) -> Vector:
-    """Return three entries of an array."""
-    return float(row[at]), float(row[at + 1]), float(row[at + 2])
-
-
-@inlined
-def acceleration(q: Quaternion, f_B: Vector, gravity: float) -> Vector:
-    """Return R_WB f_B + g_W [m/s^2; W]."""
-    f_W = product(matrix(q), f_B)
-    return f_W[0], f_W[1], f_W[2] - gravity
 
 
 @inlined
@@ -66,7 +59,7 @@ def reckon(
         state: at the previous sample.
         accel: specific force of the centre of mass as measured [m/s^2; B].
         gyro: body rate as measured [rad/s; B].
-        accel_bias, gyro_bias: to be taken off.
+        accel_bias, gyro_bias: subtracted.
         beta: Madgwick's gain [rad/s].
         gravity: length of g_W [m/s^2], along -z.
         dt: length of the step [s].
@@ -83,15 +76,82 @@ def reckon(
 
 
 @inlined
-def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravity: float) -> Reckoning:
-    """Return the state with an error of the filter put into it, biases into what they were taken off.
+def acceleration(q: Quaternion, f_B: Vector, gravity: float) -> Vector:
+    """Return R_WB f_B + g_W [m/s^2; W]."""
+    f_W = product(matrix(q), f_B)
+    return f_W[0], f_W[1], f_W[2] - gravity
+
+
+@inlined
+def madgwick_step(q: Quaternion, w_WB_B: Vector, f_B: Vector, beta: float, dt: float) -> Quaternion:
+    """Return the attitude after one IMU sample [Madgwick (33), the gyroscope's part integrated exactly].
 
     Args:
-        state: nominal state.
-        error: error state, (n,), as `write_transition` orders it.
-        with_accel_bias: whether it holds an accelerometer bias.
-        gravity: [m/s^2].
+        q: attitude at the previous sample, B to W.
+        w_WB_B: bias-free body rate over the step [rad/s].
+        f_B: specific force at the end of the step [m/s^2]; zero gives a step by the gyroscope alone.
+        beta: gain [rad/s]; turns the attitude towards gravity by at most 2 beta dt.
+        dt: length of the step [s].
     """
+    turned = multiply(q, rotation_vector_quaternion(scaled(w_WB_B, dt)))
+    if beta == 0.0 or f_B == (0.0, 0.0, 0.0):
+        return normalised(turned)
+    g = gravity_gradient(turned, f_B)
+    length = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2] + g[3] * g[3])
+    if length == 0.0:
+        return normalised(turned)
+    scale = beta * dt / length
+    w, x, y, z = turned
+    return normalised((w - scale * g[0], x - scale * g[1], y - scale * g[2], z - scale * g[3]))
+
+
+@inlined
+def gravity_gradient(q: Quaternion, f_B: Vector) -> Quaternion:
+    """Return J^T f, the gradient of |R_BW z_W - f_B/|f_B||^2 / 2 over q [Madgwick (25), (26), (34)]."""
+    w, x, y, z = q
+    scale = 1.0 / norm(f_B)
+    ex = 2.0 * (x * z - w * y) - f_B[0] * scale
+    ey = 2.0 * (w * x + y * z) - f_B[1] * scale
+    ez = 1.0 - 2.0 * (x * x + y * y) - f_B[2] * scale
+    return (
+        -2.0 * y * ex + 2.0 * x * ey,
+        2.0 * z * ex + 2.0 * w * ey - 4.0 * x * ez,
+        -2.0 * w * ex + 2.0 * z * ey - 4.0 * y * ez,
+        2.0 * x * ex + 2.0 * y * ey,
+    )
+
+
+@inlined
+def rotation_vector_quaternion(v: Vector) -> Quaternion:
+    """Return the quaternion of a rotation vector [rad], by series: exact to 1e-9 up to 0.6 rad, without libm.
+
+    Gyroscope steps and filter corrections are far below that; the result is always normalised.
+    """
+    s = dot(v, v)
+    cosine = 1.0 - s / 8.0 + s * s / 384.0 - s * s * s / 46080.0
+    sine = 0.5 - s / 48.0 + s * s / 3840.0 - s * s * s / 645120.0
+    return normalised((cosine, *scaled(v, sine)))
+
+
+def levelling_time_s(beta: float, direction_sigma_rad: float) -> float:
+    """Return the time constant with which the filter pulls its tilt to the measured one [s]; infinite for beta = 0.
+
+    The step has a fixed length 2 beta dt. Under noise of the measured direction, per axis [rad], its mean along a small
+    offset e is 2 beta dt * sqrt(pi/8) * e/sigma, hence a first-order pull.
+    """
+    if beta == 0.0:
+        return math.inf
+    return direction_sigma_rad / (2.0 * UNIT_VECTOR_SLOPE * beta)
+
+
+def beta_for(levelling_s: float, direction_sigma_rad: float) -> float:
+    """Return the gain [rad/s] for a levelling time [s]; inverse of `levelling_time_s`."""
+    return direction_sigma_rad / (2.0 * UNIT_VECTOR_SLOPE * levelling_s)
+
+
+@inlined
+def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravity: float) -> Reckoning:
+    """Return the state corrected by an error of the filter, (n,), ordered as in `write_transition`."""
     p, v, q, _, w, f_B = state
     p, v = add(p, vector(error, POSITION)), add(v, vector(error, VELOCITY))
     q = normalised(multiply(rotation_vector_quaternion(vector(error, ATTITUDE)), q))
@@ -103,28 +163,36 @@ def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravit
 
 @inlined
 def arm_acceleration(w: Vector, w_before: Vector, arm: Vector, dt: float) -> Vector:
-    """Return alpha x r + w x (w x r) [m/s^2; B], which a sensor at p_BS = `arm` feels beyond the centre."""
+    """Return alpha x r + w x (w x r) [m/s^2; B], the additional acceleration at p_BS = `arm`."""
     alpha = ((w[0] - w_before[0]) / dt, (w[1] - w_before[1]) / dt, (w[2] - w_before[2]) / dt)
     return add(cross(alpha, arm), cross(w, cross(w, arm)))
 
 
 @inlined
-def write_minus_cross(M: np.ndarray, row: int, column: int, a: Vector, scale: float) -> None:
-    """Write -scale [a]x into a 3 x 3 block whose diagonal is already zero."""
-    M[row, column + 1] = scale * a[2]
-    M[row, column + 2] = -scale * a[1]
-    M[row + 1, column] = -scale * a[2]
-    M[row + 1, column + 2] = scale * a[0]
-    M[row + 2, column] = scale * a[1]
-    M[row + 2, column + 1] = -scale * a[0]
+def write_prediction(
+    F: np.ndarray,
+    Q: np.ndarray,
+    walk: np.ndarray,
+    state: Reckoning,
+    v_before: Vector,
+    gravity: float,
+    levelling_s: float,
+    with_accel_bias: bool,
+    variances: Vector,
+    dt: float,
+) -> None:
+    """Write transition and process noise of an interval of dead reckoning from `v_before` [m/s] to `state`.
 
-
-@inlined
-def write_minus_rotation(M: np.ndarray, row: int, column: int, R: Matrix, scale: float) -> None:
-    """Write -scale R into a 3 x 3 block."""
-    for i in range(3):
-        for j in range(3):
-            M[row + i, column + j] = -scale * R[i][j]
+    Arguments as of `write_transition` and `write_process_noise`.
+    """
+    v = state[1]
+    f_W = (
+        (v[0] - v_before[0]) / dt,
+        (v[1] - v_before[1]) / dt,
+        (v[2] - v_before[2]) / dt + gravity,
+    )
+    write_transition(F, f_W, matrix(state[2]), levelling_s, with_accel_bias, dt)
+    write_process_noise(Q, walk, variances, dt)
 
 
 @inlined
@@ -154,14 +222,31 @@ def write_transition(
 
 
 @inlined
+def write_minus_cross(M: np.ndarray, row: int, column: int, a: Vector, scale: float) -> None:
+    """Write -scale [a]x into a 3 x 3 block whose diagonal is already zero."""
+    M[row, column + 1] = scale * a[2]
+    M[row, column + 2] = -scale * a[1]
+    M[row + 1, column] = -scale * a[2]
+    M[row + 1, column + 2] = scale * a[0]
+    M[row + 2, column] = scale * a[1]
+    M[row + 2, column + 1] = -scale * a[0]
+
+
+@inlined
+def write_minus_rotation(M: np.ndarray, row: int, column: int, R: Matrix, scale: float) -> None:
+    """Write -scale R into a 3 x 3 block."""
+    for i in range(3):
+        for j in range(3):
+            M[row + i, column + j] = -scale * R[i][j]
+
+
+@inlined
 def write_process_noise(Q: np.ndarray, walk: np.ndarray, variances: Vector, dt: float) -> None:
-    """Write the noise that the interval `dt` adds into Q, which starts as zero.
+    """Write the process noise of an interval `dt` [s] into Q, (n, n), which starts as zero.
 
     Args:
-        Q: (n, n).
         walk: (n,), density of each bias' random walk [unit^2/s], zero elsewhere.
         variances: gained over the interval per axis by velocity [m^2/s^2], tilt and yaw [rad^2].
-        dt: length of the interval [s].
     """
     velocity_variance, tilt_variance, yaw_variance = variances
     for i in range(3):
@@ -175,45 +260,6 @@ def write_process_noise(Q: np.ndarray, walk: np.ndarray, variances: Vector, dt: 
 
 
 @inlined
-def write_prediction(
-    F: np.ndarray,
-    Q: np.ndarray,
-    walk: np.ndarray,
-    state: Reckoning,
-    v_before: Vector,
-    gravity: float,
-    levelling_s: float,
-    with_accel_bias: bool,
-    variances: Vector,
-    dt: float,
-) -> None:
-    """Write transition and process noise of an interval at whose end the nominal state is `state`.
-
-    Args:
-        F, Q, walk, levelling_s, with_accel_bias, dt: as in `write_transition` and `write_process_noise`.
-        v_before: velocity at the start of the interval [m/s].
-        gravity: [m/s^2].
-        variances: gained by velocity [m^2/s^2], tilt and yaw [rad^2].
-    """
-    v = state[1]
-    f_W = (
-        (v[0] - v_before[0]) / dt,
-        (v[1] - v_before[1]) / dt,
-        (v[2] - v_before[2]) / dt + gravity,
-    )
-    write_transition(F, f_W, matrix(state[2]), levelling_s, with_accel_bias, dt)
-    write_process_noise(Q, walk, variances, dt)
-
-
-@inlined
-def heading_gradient(R: Matrix) -> Vector:
-    """Return the derivative of the heading over a small world rotation; (0, 0, 1) when the nose is level."""
-    x = column(R, 0)
-    squared = max(x[0] * x[0] + x[1] * x[1], HORIZONTAL_MIN)
-    return -x[2] * x[0] / squared, -x[2] * x[1] / squared, 1.0
-
-
-@inlined
 def heading_and_sigma(q: Quaternion, P: np.ndarray) -> tuple[float, float]:
     """Return the heading [rad] and its standard deviation [rad] under the covariance P of the error state."""
     gradient = heading_gradient(matrix(q))
@@ -222,3 +268,16 @@ def heading_and_sigma(q: Quaternion, P: np.ndarray) -> tuple[float, float]:
         for j in range(3):
             variance += gradient[i] * P[ATTITUDE + i, ATTITUDE + j] * gradient[j]
     return heading(q), math.sqrt(max(variance, 0.0))
+
+
+@inlined
+def heading_gradient(R: Matrix) -> Vector:
+    """Return the derivative of the heading by a small world rotation; (0, 0, 1) when the nose is level."""
+    x = column(R, 0)
+    squared = max(x[0] * x[0] + x[1] * x[1], HORIZONTAL_MIN)
+    return -x[2] * x[0] / squared, -x[2] * x[1] / squared, 1.0
+
+
+@inlined
+def vector(row: np.ndarray, at: int) -> Vector:
+    return float(row[at]), float(row[at + 1]), float(row[at + 2])

@@ -1,13 +1,13 @@
-"""What an estimator is, whoever wrote it: made for one drone, fed with its sensors, asked for an estimate at a gate.
+"""The interface of estimators: made for one drone, fed with its sensors, asked for an estimate at every gate.
 
-A scenario chooses it by `estimation: {algorithm: …}`: `ekf`, the one of this package that flies by default; `paper`;
-or `package.module:Class`, a class of your own with the methods of `DroneEstimator`. It sees plain objects alone:
-sections of the scenario, messages of the contract, and numbers. Where its module is looked for: `zsim.schema.plugin`.
+A scenario chooses one by `estimation: {algorithm: …}`: `ekf`, the default of this package; `paper`; or
+`package.module:Class`, a class of your own with the methods of `DroneEstimator`. It sees only plain objects: sections
+of the scenario, messages of the contract, and numbers. For the search path of its module see `zsim.schema.plugin`.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, NoReturn, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from zsim.schema.checker import show
 CLASSES = {"paper": "zsim_agents.estimation.paper_estimator:PaperEstimator"}
 SIZES = {"position_m": 3, "velocity_m_s": 3, "orientation_wxyz": 4, "covariance": 36, "gyro_bias_rad_s": 3}
 STATES = 6  # of the covariance
-NORM_TOLERANCE = 1e-3  # chosen: of a quaternion; 0.1 % is a hundred times what single precision loses
+NORM_TOLERANCE = 1e-3  # chosen: of a quaternion; 0.1 % is a hundred times the error of single precision
 Numbers = Sequence[float] | NDArray[np.float64]
 
 
@@ -47,9 +47,9 @@ class StateEstimate(NamedTuple):
 class DroneEstimator(Protocol):
     """Estimates the state of one drone.
 
-    A class may have three methods more, for a process that takes over from one that died. `snapshot(self)` returns all
-    that the estimator has come to know as a map of plain values and arrays (`zsim.contract.snapshot.State`), and
-    `restore(self, state)` takes it over in a new object, which then goes on to the same bits. Without them
+    A class may have three more methods, for a process that takes over from one that died. `snapshot(self)` returns the
+    whole state of the estimator as a map of plain values and arrays (`zsim.contract.snapshot.State`), and
+    `restore(self, state)` sets it in a new object, which then continues with the same bits. Without them
     `warm_start(self, last)` is called, with the last `zsim.contract.flight_messages.Estimate` that was published.
 
     Args:
@@ -64,7 +64,7 @@ class DroneEstimator(Protocol):
     def receive(self, sensor: str, message: Any) -> None:
         """Take a reading.
 
-        Readings of a gate come in the order of their arrival, then of their names; some may be late or missing.
+        Readings of a gate come in the order of arrival, then of their names; some may be late or missing.
 
         Args:
             sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or of your own.
@@ -78,10 +78,10 @@ class DroneEstimator(Protocol):
 
 
 def estimator_class(algorithm: str, where: str = "estimation.algorithm") -> Callable[..., DroneEstimator] | None:
-    """Return the class that an algorithm names; None for the stock one, whose drones share one `EstimatorBank`.
+    """Return the class that an algorithm names; None for `ekf`, whose drones share one `EstimatorBank`.
 
     Raises:
-        DocumentError: no such module or class, or it lacks a method; `where` opens the line.
+        DocumentError: no such module or class, or it lacks a method; the text begins with `where`.
     """
     if algorithm == ESTIMATORS[0]:
         return None
@@ -89,12 +89,7 @@ def estimator_class(algorithm: str, where: str = "estimation.algorithm") -> Call
 
 
 class EstimatorSet:
-    """An estimator of one class for each of several drones, with the methods of an `EstimatorBank`.
-
-    Args:
-        make: the class.
-        drones, environment, estimation, gate_s: as of `DroneEstimator`.
-    """
+    """An estimator of one class for each of several drones, with the methods of an `EstimatorBank`."""
 
     def __init__(
         self,
@@ -108,23 +103,19 @@ class EstimatorSet:
         self._estimators = [make(drone, environment, estimation, gate_s) for drone in drones]
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
-        """Hand a message over to the estimator of drone i."""
         try:
             self._estimators[i].receive(sensor, message)
         except plugin.RAISED as error:
-            if (failure := self._failure(error, i)) is None:
-                raise
-            raise failure from error
+            self._raise(error, i)
 
     def receive_gate(self, gate: Any) -> bool:
-        """Refuse it: its messages are to be handed over one by one."""
-        return False
+        return False  # its messages are to be passed one by one
 
     def estimate(self, t_s: float) -> list[StateEstimate]:
         """Return the estimates for `t_s`, as plain numbers.
 
         Raises:
-            UserCodeError: one of them is not what an estimate consists of.
+            UserCodeError: a class raised, or returned an invalid estimate.
         """
         return [self._estimate(i, t_s) for i in range(len(self._estimators))]
 
@@ -132,36 +123,34 @@ class EstimatorSet:
         try:
             estimate = self._estimators[i].estimate(t_s)
         except plugin.RAISED as error:
-            if (failure := self._failure(error, i)) is None:
-                raise
-            raise failure from error
+            self._raise(error, i)
         return _plain(estimate, self._estimators[i], self._drones[i])
 
-    def _failure(self, error: BaseException, i: int) -> UserCodeError | None:
-        """Return what a user's class raised with its drone; None for any other error."""
+    def _raise(self, error: BaseException, i: int) -> NoReturn:
+        """Raise an error of a user's class with its drone, any other one again."""
         failure = plugin.user_code_error(error, "")
-        return UserCodeError(f"{failure.text}, for {self._drones[i]}") if failure else None
+        if failure is None:
+            raise error
+        raise UserCodeError(f"{failure.text}, for {self._drones[i]}") from error
 
     def snapshot(self) -> State | None:
-        """Return the states of all of them, None if their class has no `snapshot`."""
+        """Return the states of all estimators, None if their class has no `snapshot`."""
         if not all(hasattr(each, "snapshot") for each in self._estimators):
             return None
         return {"estimators": [each.snapshot() for each in cast("list[Any]", self._estimators)]}
 
     def restore(self, state: State) -> None:
-        """Hand each of them the state of the one in its place."""
         for each, own in zip(cast("list[Any]", self._estimators), state["estimators"], strict=True):
             each.restore(own)
 
     def warm_start(self, i: int, last: Any) -> None:
-        """Hand the last published estimate over to an estimator that can use it."""
         warm_start = getattr(self._estimators[i], "warm_start", None)
         if warm_start:
             warm_start(last)
 
 
 def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> StateEstimate:
-    """Return an estimate as a message has it."""
+    """Return a validated estimate in plain numbers."""
     what = f"{plugin.full_name(type(estimator))}.estimate returns for {drone}"
     values = {}
     for field in (*SIZES, "yaw_rad", "yaw_sigma_rad"):
@@ -188,7 +177,7 @@ def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> St
 
 
 def _impossible(field: str, numbers: Sequence[float]) -> str:
-    """Return what no state of a drone can have among the finite numbers of a field, empty where all may be."""
+    """Describe values that no drone's state can have; empty where all are possible."""
     if field == "covariance" and min(numbers[:: STATES + 1]) < 0.0:
         return f"the variance {min(numbers[:: STATES + 1]):g}; must be >= 0"
     if field == "yaw_sigma_rad" and numbers[0] < 0.0:

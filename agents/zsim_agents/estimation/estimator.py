@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 from msgspec import UNSET, Struct
 
@@ -17,17 +17,17 @@ from zsim.runtime.inbox import Input
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import EstimatorSet, estimator_class
 from zsim_agents.estimation.estimator_bank import EstimatorBank
-from zsim_agents.estimation.joint.cluster_banks import ClusterBanks
+from zsim_agents.estimation.joint_filter import ClusterBanks
 
 
 class Estimator(Agent):
     """Feeds the scenario's estimators from `drone/{d}/sensor/*`: an EstimatorBank, or objects of a class.
 
-    It has the name of the first of its drones and stands for the estimators of the others too.
+    It is named after the first of its drones and serves for the estimators of the others too.
 
     Args:
         info: of the run.
-        scenario: the resolved one that the info carries.
+        scenario: the resolved one in the info.
         drones: a name, or several.
 
     Raises:
@@ -38,33 +38,40 @@ class Estimator(Agent):
     def __init__(self, info: messages.Info, scenario: Scenario, drones: str | Sequence[str]) -> None:
         super().__init__()
         names = (drones,) if isinstance(drones, str) else tuple(drones)
-        _check(names, scenario)
+        known = [drone.name for drone in scenario.drones]
+        for name in names or ("",):
+            if name not in known:
+                raise RunError(f"estimator: drone is {name!r}; must be one of {', '.join(known)}")
         self.name, *others = (f"estimator.{drone}" for drone in names)
         self.serves = tuple(others)
         self.period_ns = info.gate_ns
         self.writes = tuple(keys.estimate(drone) for drone in names)
-        specs = [scenario.drone(drone) for drone in names]
-        settings = (specs, scenario.environment, scenario.estimation, info.gate_ns / 1e9)
-        make = estimator_class(scenario.estimation.chosen(), "world/info: estimation.algorithm")
-        sighted = scenario.estimation.use_sightings is True and not make
-        banks = ClusterBanks(scenario, names, info.gate_ns / 1e9) if sighted else None
-        self._estimators = banks or (EstimatorSet(make, *settings) if make else EstimatorBank(*settings))
-        self._fresh: Callable[[], EstimatorBank | ClusterBanks] | None = (
-            None if make else partial(EstimatorBank, *settings)
-        )
-        if sighted:
-            self._fresh = partial(ClusterBanks, scenario, names, info.gate_ns / 1e9)
-        read = tuple(banks.drones) if banks else names
+        gate_s = info.gate_ns / 1e9
+        settings = ([scenario.drone(drone) for drone in names], scenario.environment, scenario.estimation, gate_s)
+        own_class = estimator_class(scenario.estimation.chosen(), "world/info: estimation.algorithm")
+        self._build: Callable[[], Any] = partial(EstimatorBank, *settings)
+        if own_class:
+            self._build = partial(EstimatorSet, own_class, *settings)
+        elif scenario.estimation.use_sightings is True:
+            self._build = partial(ClusterBanks, scenario, names, gate_s)
+        self._estimators = self._build()
+        read = names
+        if isinstance(self._estimators, ClusterBanks):
+            read = tuple(self._estimators.drones)
+            self.uncounted = tuple(keys.detections(drone) for drone in read if not _has_own_sightings(scenario, drone))
         self.gate_keys = tuple(keys.status(drone) for drone in read)
         self.counted = read
-        beside = [*(sensor.name for sensor in info.own_sensors), *([keys.SIGHTINGS] * (info.sightings is True))]
-        self.reads = tuple(keys.sensors(drone) for drone in read) if make else _reads(read, beside)
-        if banks:
-            self.uncounted = tuple(keys.detections(drone) for drone in read if not has_own_sightings(scenario, drone))
-            self.reads += self.uncounted
+        if own_class:
+            self.reads = tuple(keys.sensors(drone) for drone in read)
+        else:
+            # One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once. Users'
+            # sensors are read because status counts them.
+            users = (*(sensor.name for sensor in info.own_sensors), *([keys.SIGHTINGS] * (info.sightings is True)))
+            kinds = (*keys.SENSORS, *users, "status")
+            self.reads = (*(keys.sensor(drone, kind) for drone in read for kind in kinds), *self.uncounted)
         self._last: dict[str, flight_messages.Estimate] = {}
         self._view_key = keys.estimates_view(self.name)
-        self.takes_gates = COMPILES and not make
+        self.takes_gates = COMPILES and not own_class
         self._since_ns = 0
         self._index = {drone: i for i, drone in enumerate(read)}
         self._names = names
@@ -79,7 +86,7 @@ class Estimator(Agent):
         if self._external and isinstance(message, flight_messages.Status):
             self._silent.discard(keys.thing(key))
         if not isinstance(message, flight_messages.Status):
-            # what a slow link brings has not arrived before the last gate, whatever stamp it bears
+            # over a slow link it has not arrived before the last gate, whatever its stamp
             t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
             _, drone, what = keys.parts(key)
             if drone not in self._index:
@@ -91,9 +98,9 @@ class Estimator(Agent):
             super().receive_gate(gate)
 
     def step(self, t_ns: int) -> list[Output]:
-        estimates = cast("list[Any]", self._estimators.estimate(t_ns * 1e-9))
+        estimates = self._estimators.estimate(t_ns * 1e-9)
         named = zip(self._names, self.writes, estimates, strict=True)
-        if self._external:  # nothing is known of one whose driver has been silent since the last gate
+        if self._external:  # no estimate of a drone whose driver has been silent since the last gate
             named = [each for each in named if each[0] not in self._silent]
             self._silent = set(self._external)
         make, source, self._last, outputs = flight_messages.Estimate, self.source, {}, []
@@ -107,9 +114,9 @@ class Estimator(Agent):
         return [Output(self._view_key, ViewEstimates(t_ns, self.next_seq(self._view_key), shown))]
 
     def rehearse(self) -> None:
-        if self._fresh is None:
+        if isinstance(self._estimators, EstimatorSet):
             return
-        bank, drone, t_ns, still = self._fresh(), self._names[0], 1_000_000, (0.0, 0.0, 0.0)
+        bank, drone, t_ns, still = self._build(), self._names[0], 1_000_000, (0.0, 0.0, 0.0)
         readings: dict[str, Struct] = {
             "imu": messages.Imu(t_ns, 0, t_ns, (0.0, 0.0, 9.8), still),
             "gps": messages.Gps(t_ns, 0, t_ns, 0.0, 0.0, 0.0, still, still, 1.0, 3, 9),
@@ -133,22 +140,7 @@ class Estimator(Agent):
         self._estimators.warm_start(self.writes.index(key), message)
 
 
-def has_own_sightings(scenario: Scenario, drone: str) -> bool:
+def _has_own_sightings(scenario: Scenario, drone: str) -> bool:
     """Tell whether the world computes a drone's sightings; else a detector's are used."""
     spec = scenario.drone(drone)
     return spec.sensors.sightings is not UNSET and not spec.is_external
-
-
-def _reads(drones: Sequence[str], own: Sequence[str]) -> tuple[str, ...]:
-    """One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once.
-
-    Users' sensors are read since status counts them.
-    """
-    return tuple(keys.sensor(drone, kind) for drone in drones for kind in (*keys.SENSORS, *own, "status"))
-
-
-def _check(names: Sequence[str], scenario: Scenario) -> None:
-    known = [drone.name for drone in scenario.drones]
-    for name in names or ("",):
-        if name not in known:
-            raise RunError(f"estimator: drone is {name!r}; must be one of {', '.join(known)}")

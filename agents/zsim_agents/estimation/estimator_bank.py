@@ -1,57 +1,73 @@
 """The estimators of many drones as rows of arrays: sensors in, a compiled step for all of them, estimates out.
 
-Readings are only written down when they come. At the end of the gate every drone's IMU moves its nominal state
-(strapdown), its covariance follows, and its other readings are judged and used (measurement_update).
+Readings are only stored when they come. At the end of the gate every drone's IMU moves its nominal state (strapdown),
+its covariance follows, and its other readings are judged and used (measurement_update).
+
+Order of this file: the bank, its step, and reading a gate's messages into rows of readings.
 """
 
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from operator import itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.contract import encoding, keys, messages
+from zsim.contract.encoding import GAP, Layouts, Program
 from zsim.contract.flight_messages import Estimate
 from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
 from zsim.contract.snapshot import State
-from zsim.math.compiled import Held, hold, portable
+from zsim.math.compiled import Held, hold, inlined, portable
 from zsim.math.rotation import axpy, multiply, normalised, scaled
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation import measurement_update, strapdown
-from zsim_agents.estimation.dead_reckoning import acceleration, heading_and_sigma
+from zsim_agents.estimation.dead_reckoning import acceleration, heading_and_sigma, rotation_vector_quaternion
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.filter_setup import initial_rows
 from zsim_agents.estimation.filter_state import (
+    BARO,
     COUNT,
     ESTIMATE,
+    FLOW,
+    GPS,
     IMU,
     LAYOUT,
     NOMINAL,
     READING,
     SETTING,
+    SIZES,
+    SONAR,
     STATES,
+    VALUES_MAX,
     Rows,
     put,
     put_quaternion,
     reckoning,
     vector,
 )
-from zsim_agents.estimation.madgwick import rotation_vector_quaternion
 from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, YAW, set_variance
-from zsim_agents.estimation.sensor_reader import GateReader
 from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2
 
 _READING = struct.Struct(f"{READING.size}d")
-_ROOM = 256  # readings of a gate, at first
+_ROOM = 256  # readings of a gate, initially
 _YAW, _YAW_SIGMA = ESTIMATE.yaw, ESTIMATE.yaw_sigma
-_COVARIANCE = slice(ESTIMATE.covariance, _YAW_SIGMA)  # which is the next field
+_COVARIANCE = slice(ESTIMATE.covariance, _YAW_SIGMA)  # the next field
 _p_WB, _v_WB, _gyro_bias = (
     itemgetter(first, first + 1, first + 2) for first in (ESTIMATE.p_WB, ESTIMATE.v_WB, ESTIMATE.gyro_bias)
 )
 _q_WB = itemgetter(*range(ESTIMATE.q_WB, ESTIMATE.q_WB + 4))
-_REFUSED = len(SENSORS)  # place of the refused of the first sensor behind its used
+_REFUSED = len(SENSORS)  # offset of a sensor's count of refused readings from that of used ones
+
+NOBODY = -1
+NS_S = 1e-9  # s/ns
+BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # positions among the floats of these messages
+GPS_FIX, SONAR_VALID = 3, 3  # positions among the integers
+RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # of keys in the order in which runners deliver
+
+read = inlined(encoding.read)
 
 _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # values and extra of a reading
     "imu": lambda m: (*m.accel_m_s2, *m.gyro_rad_s, 0.0, 0.0),
@@ -64,19 +80,18 @@ _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # values and extra o
 
 
 class EstimatorBank:
-    """Fuse the sensors of several drones; `i` counts them in the order given.
+    """Fuses the sensors of several drones; `i` is the index in the order given.
 
-    Sensors may come in any order between two gates. Duplicates are ignored; readings that are older than the
-    sensor's last one, not finite, or outside of their gate are refused and counted.
+    Sensors may come in any order between two gates. Duplicates are ignored; readings that are older than the sensor's
+    last one, not finite, or outside of their gate are refused and counted.
 
     Args:
         drones: their mounts and error models are what the filter assumes.
         environment: gravity and magnetic field.
-        estimation: settings.
         gate_s: interval of the gates [s].
 
     Attributes:
-        counted: sensors in the order in which they are published, and where their used and refused are counted.
+        counted: sensors in the order of publication, and where their used and refused are counted.
     """
 
     counted = (*((name, k, _REFUSED + k) for k, name in enumerate(SENSORS) if k != IMU), ("imu", IMU, _REFUSED + IMU))
@@ -86,38 +101,50 @@ class EstimatorBank:
     ) -> None:
         self.rows, self._estimates = initial_rows(drones, environment, estimation, gate_s)
         self._held, self._held_rows = hold(self.rows), self.rows
+        self._readings, self._count = np.empty((0, READING.size)), 0
         self._make_room(_ROOM)
-        self._count = 0
         self._reader = GateReader([drone.name for drone in drones])
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
-        """Take a message of a sensor in SENSORS, which came at `t_arrival_s`; others are ignored."""
+        """Take a message that arrived at `t_arrival_s`; sensors other than SENSORS are ignored."""
         if sensor not in _VALUES:
             return
         if self._count == len(self._readings):
-            self._grow()
+            self._make_room(2 * self._count)
         kind, t_sample_s = SENSORS.index(sensor), message.t_sample_ns * 1e-9
         place, values = self._count * _READING.size, _VALUES[sensor](message)
         _READING.pack_into(self._room, place, i, kind, t_sample_s if kind == IMU else t_arrival_s, t_sample_s, *values)
         self._count += 1
 
     def receive_gate(self, gate: GateMessages) -> bool:
-        """Take all sensors of a gate; False, and none, if one of its messages is not as the world writes it."""
+        """Take all sensors of a gate; False, and none, if one of its messages has to be decoded."""
         while self._count + len(gate) > len(self._readings):
-            self._grow()
+            self._make_room(2 * len(self._readings))
         count = self._reader.take(gate, self._readings, self._count)
         if count >= 0:
             self._count = count
         return count >= 0
 
     def estimate(self, t_s: float, wanted: Sequence[int] | None = None) -> list[StateEstimate]:
-        """Use what has come since the last gate and return the estimates for `t_s`, those of some drones, or of all."""
+        """Use the readings since the last gate and return the estimates for `t_s` of some drones, or of all."""
         count, self._count = self._count, 0
         self.use(t_s, self._readings[:count])
         rows, counts = self._estimates.tolist(), self.rows.counts[:, COUNT.used :].tolist()
         if wanted is not None:
             rows, counts = [rows[i] for i in wanted], [counts[i] for i in wanted]
-        return [_estimate(row, of, self.counted) for row, of in zip(rows, counts, strict=True)]
+        return [
+            StateEstimate(
+                _p_WB(row),
+                _v_WB(row),
+                _q_WB(row),
+                row[_YAW],
+                tuple(row[_COVARIANCE]),
+                row[_YAW_SIGMA],
+                _gyro_bias(row),
+                {sensor: (of[used], of[refused]) for sensor, used, refused in self.counted},
+            )
+            for row, of in zip(rows, counts, strict=True)
+        ]
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Use readings (M, READING.size) and return the estimates for `t_s`, (N, ESTIMATE.size)."""
@@ -129,7 +156,7 @@ class EstimatorBank:
     def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
         """Continue from a published estimate; call before the first reading.
 
-        Tilt and biases, of which the estimate has no covariance, start as uncertain as in a cold start.
+        Tilt and biases, of which an estimate has no covariance, start as uncertain as in a cold start.
         """
         w, x, y, z = (float(part) for part in last.orientation_wxyz)
         row, setting, P = self.rows.nominal[i], self.rows.setting[i], self.rows.covariance[i]
@@ -144,7 +171,6 @@ class EstimatorBank:
         self.rows.counts[i, COUNT.heading_known] = last.yaw_sigma_rad < HEADING_SIGMA_RAD
 
     def snapshot(self) -> State:
-        """Return the rows as they are between two gates."""
         return {name: getattr(self.rows, name) for name in STATES}
 
     def restore(self, state: State) -> None:
@@ -159,28 +185,10 @@ class EstimatorBank:
                 raise ValueError(f"{name} is of shape {state[name].shape}; must be {rows.shape}")
             rows[...] = state[name]
 
-    def _grow(self) -> None:
-        former = self._readings
-        self._make_room(2 * len(former))
-        self._readings[: len(former)] = former
-
     def _make_room(self, readings: int) -> None:
-        self._room = bytearray(readings * _READING.size)
+        former, self._room = self._readings, bytearray(readings * _READING.size)
         self._readings = np.frombuffer(self._room).reshape(readings, READING.size)
-
-
-def _estimate(row: list[float], counts: list[int], counted: Iterable[tuple[str, int, int]]) -> StateEstimate:
-    """Return a row of estimates and its drone's counts as what is published."""
-    return StateEstimate(
-        _p_WB(row),
-        _v_WB(row),
-        _q_WB(row),
-        row[_YAW],
-        tuple(row[_COVARIANCE]),
-        row[_YAW_SIGMA],
-        _gyro_bias(row),
-        {sensor: (counts[used], counts[refused]) for sensor, used, refused in counted},
-    )
+        self._readings[: len(former)] = former
 
 
 @portable
@@ -209,8 +217,8 @@ def sort_readings(rows: Rows, readings: np.ndarray, first: np.ndarray, after: np
     Args:
         rows: of N drones; changed.
         readings: (M, READING.size).
-        first: the first of each drone, (N,); -1 for none, as it comes in.
-        after: of each reading, the next one of the same drone, (M,); -1 after the last.
+        first: the first of each drone, (N,); comes in as -1 for none.
+        after: of each reading, the next one of the same drone, (M,); comes in as -1.
     """
     last = np.full(rows.nominal.shape[0], -1)
     for m in range(readings.shape[0]):
@@ -248,7 +256,7 @@ def _step_one(
 def write_estimate(row: np.ndarray, setting: np.ndarray, P: np.ndarray, t_s: float, estimate: np.ndarray) -> None:
     """Write the estimate for an instant that the IMU may not have reached yet, (ESTIMATE.size,).
 
-    Until then it goes on with the acceleration of the IMU's last sample, its noise and what the drone does meanwhile.
+    Until then it is extrapolated with the acceleration of the last sample, its noise, and possible manoeuvres.
     """
     p, v, q, a_W, w, _ = reckoning(row)
     ahead = t_s - row[NOMINAL.t]
@@ -273,3 +281,89 @@ def write_estimate(row: np.ndarray, setting: np.ndarray, P: np.ndarray, t_s: flo
     for i in range(6):
         for j in range(i, 6):
             estimate[ESTIMATE.covariance + 6 * i + j] = estimate[ESTIMATE.covariance + 6 * j + i] = P[i, j]
+
+
+class ReaderTables(NamedTuple):
+    """The layout of the messages of a gate for compiled code, and buffers for one of them."""
+
+    program: Program
+    owner: NDArray[np.int64]  # (keys, 2): drone and sensor of each key of the table, or NOBODY
+    ints: NDArray[np.int64]
+    floats: NDArray[np.float64]
+    bits: NDArray[np.uint64]  # of the floats
+
+
+class GateReader:
+    """Reads the sensors of drones, in the order of the bank, out of gates."""
+
+    def __init__(self, drones: Sequence[str]) -> None:
+        self._whose = {
+            keys.sensor(drone, kind): (i, SENSORS.index(kind)) for i, drone in enumerate(drones) for kind in SENSORS
+        }
+        self._table: Sequence[str] = ()
+        kinds = [messages.type_of(keys.sensor("any", sensor)) for sensor in SENSORS]
+        layouts = Layouts(kind for kind in kinds if kind)
+        floats, owner = np.zeros(layouts.floats), np.empty((0, 2), dtype=np.int64)
+        ints = np.zeros(layouts.ints, dtype=np.int64)
+        self._tables = ReaderTables(layouts.program, owner, ints, floats, floats.view(np.uint64))
+        self._held = hold(self._tables)
+
+    def take(self, gate: GateMessages, readings: NDArray[np.float64], count: int) -> int:
+        """Write readings from row `count` on; return the new count, -1 if a message has to be decoded.
+
+        Args:
+            readings: (M, READING.size), with room for all messages of the gate.
+        """
+        if gate.table is not self._table:
+            self._table = gate.table
+            owner = np.array([self._whose.get(key, (NOBODY, NOBODY)) for key in gate.table], dtype=np.int64)
+            self._held = hold(self._tables._replace(owner=owner))
+        data = np.frombuffer(gate.buffer, dtype=np.uint8)
+        if gate.which.flags.writeable:
+            for array in (gate.which, gate.ends, data):
+                array.setflags(write=False)  # as off the wire: writeable arrays are compiled separately
+        return collect(self._held, gate.which, gate.ends, data, readings, count)
+
+
+@portable
+def collect(held: Held, which: NDArray, ends: NDArray, data: NDArray, readings: NDArray, count: int) -> int:
+    """Write the sensor messages of a gate as readings, of each drone by time and name; see GateReader.take."""
+    program, owner, ints, floats, bits = held.content
+    start, first = 0, count
+    marks = np.empty(which.shape[0], np.int64)
+    for m in range(which.shape[0]):
+        if not (0 <= which[m] < owner.shape[0] and start + GAP <= ends[m] <= data.shape[0]):
+            return -1
+        i, kind = owner[which[m], 0], owner[which[m], 1]
+        if i >= 0:
+            if not read(program, kind, data, start + GAP, ends[m], ints, bits):
+                return -1
+            place = count
+            mark = ints[0] * len(RANK) + RANK[kind]
+            while place > first and readings[place - 1, READING.drone] == i and marks[place - 1 - first] > mark:
+                readings[place], marks[place - first] = readings[place - 1], marks[place - 1 - first]
+                place -= 1
+            fill(readings[place], i, kind, ints, floats)
+            marks[place - first] = mark
+            count += 1
+        start = ends[m]
+    return count
+
+
+@inlined
+def fill(reading: NDArray, i: int, kind: int, ints: NDArray, floats: NDArray) -> None:
+    """Write one message of drone i as a reading."""
+    reading[READING.drone], reading[READING.sensor] = i, kind
+    reading[READING.t_arrival], reading[READING.t_sample] = ints[0] * NS_S, ints[2] * NS_S
+    first = BARO_ALTITUDE if kind == BARO else GPS_POSITION if kind == GPS else 0
+    for k in range(VALUES_MAX):
+        reading[READING.values + k] = floats[first + k] if k < SIZES[kind] else 0.0
+    reading[READING.extra], reading[READING.extra + 1] = 0.0, 0.0
+    if kind == IMU:
+        reading[READING.t_arrival] = reading[READING.t_sample]
+    elif kind == GPS:
+        reading[READING.extra], reading[READING.extra + 1] = floats[GPS_SIGMA], ints[GPS_FIX]
+    elif kind == SONAR:
+        reading[READING.extra] = ints[SONAR_VALID]
+    elif kind == FLOW:
+        reading[READING.extra] = floats[FLOW_QUALITY]

@@ -1,6 +1,6 @@
-"""What the estimators of N drones are: arrays with a row for each drone, and what stands in which column.
+"""The state of the estimators of N drones: arrays with a row for each drone, and the meaning of their columns.
 
-Compiled code reads the columns as constants. A sensor is counted by its place in `zsim.contract.keys.SENSORS`.
+Compiled code reads the columns as constants. A sensor's number is its place in `zsim.contract.keys.SENSORS`.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ _MOMENT_FIELDS = (
     Field("v_corrected", "m/s", 3),
 )
 MOMENT = columns("Moment", _MOMENT_FIELDS)
-NOMINAL = columns(  # begins as a moment does, so one function reads both
+NOMINAL = columns(  # begins like a moment, so that one function reads both
     "Nominal",
     (
         *_MOMENT_FIELDS,
@@ -36,7 +36,7 @@ NOMINAL = columns(  # begins as a moment does, so one function reads both
         Field("f_B", "m/s^2", 3),  # of the last sample of the IMU, without its bias
         Field("gyro_bias", "rad/s", 3),
         Field("accel_bias", "m/s^2", 3),
-        Field("t_start", "s"),  # of the interval since the last gate, and what has happened in it
+        Field("t_start", "s"),  # of the interval since the last gate, as the next four
         Field("v_start", "m/s", 3),
         Field("dt_squared", "s^2"),  # sum of the squared steps of the IMU
         Field("lost_velocity", "m^2/s^2"),  # variance to add for samples that are missing
@@ -153,7 +153,7 @@ Moment = tuple[float, Vector, Vector, Quaternion, Vector, Vector, Vector]
 
 
 class Rows(NamedTuple):
-    """All that the estimators of N drones are; n is the size of the largest error state."""
+    """All data of the estimators of N drones; n is the size of the largest error state."""
 
     nominal: NDArray[np.float64]  # (N, NOMINAL.size)
     counts: NDArray[np.int64]  # (N, COUNT.size)
@@ -170,52 +170,39 @@ class Rows(NamedTuple):
     sighted: NDArray[np.float64]  # (N, N), when a sighting of one drone by another was used last [s]; (0, 0) likewise
 
 
-STATES = (
-    "nominal",
-    "counts",
-    "covariance",
-    "bias",
-    "history",
-    "clones",
-    "joint",
-    "sighted",
-)  # rows that change; others are settings
+STATES = "nominal", "counts", "covariance", "bias", "history", "clones", "joint", "sighted"  # the others are settings
 
 
 @inlined
 def put(row: np.ndarray, at: int, a: Vector) -> None:
-    """Write three columns."""
     row[at], row[at + 1], row[at + 2] = a[0], a[1], a[2]
 
 
 @inlined
 def increase(row: np.ndarray, at: int, more: np.ndarray, first: int) -> None:
-    """Add three places of an array to three columns."""
+    """Add three entries of an array to three columns."""
     for k in range(3):
         row[at + k] += more[first + k]
 
 
 @inlined
 def quaternion(row: np.ndarray, at: int) -> Quaternion:
-    """Return four columns."""
     return float(row[at]), float(row[at + 1]), float(row[at + 2]), float(row[at + 3])
 
 
 @inlined
 def put_quaternion(row: np.ndarray, at: int, q: Quaternion) -> None:
-    """Write four columns."""
     row[at], row[at + 1], row[at + 2], row[at + 3] = q[0], q[1], q[2], q[3]
 
 
 @inlined
 def matrix_at(row: np.ndarray, at: int) -> Matrix:
-    """Return nine columns, row by row."""
+    """Return nine columns as a matrix, row by row."""
     return vector(row, at), vector(row, at + 3), vector(row, at + 6)
 
 
 @inlined
 def reckoning(row: np.ndarray) -> Reckoning:
-    """Return the nominal state."""
     return (
         vector(row, NOMINAL.p_WB), vector(row, NOMINAL.v_WB), quaternion(row, NOMINAL.q_WB),
         vector(row, NOMINAL.a_WB), vector(row, NOMINAL.w_WB_B), vector(row, NOMINAL.f_B),
@@ -224,7 +211,6 @@ def reckoning(row: np.ndarray) -> Reckoning:
 
 @inlined
 def put_reckoning(row: np.ndarray, state: Reckoning) -> None:
-    """Set the nominal state."""
     put(row, NOMINAL.p_WB, state[0])
     put(row, NOMINAL.v_WB, state[1])
     put_quaternion(row, NOMINAL.q_WB, state[2])
@@ -235,7 +221,6 @@ def put_reckoning(row: np.ndarray, state: Reckoning) -> None:
 
 @inlined
 def put_moment(row: np.ndarray, m: Moment) -> None:
-    """Write a moment of the history."""
     row[MOMENT.t] = m[0]
     put(row, MOMENT.p_WB, m[1])
     put(row, MOMENT.v_WB, m[2])
@@ -247,7 +232,7 @@ def put_moment(row: np.ndarray, m: Moment) -> None:
 
 @inlined
 def moment(row: np.ndarray) -> Moment:
-    """Return a moment of the history, or the present one of the nominal state."""
+    """Return a moment of the history, or the present one from a nominal row."""
     return (
         float(row[MOMENT.t]), vector(row, MOMENT.p_WB), vector(row, MOMENT.v_WB), quaternion(row, MOMENT.q_WB),
         vector(row, MOMENT.w_WB_B), vector(row, MOMENT.p_corrected), vector(row, MOMENT.v_corrected),

@@ -1,7 +1,14 @@
 """The aiding readings of a drone's gate: accepted as they come, compared with dead reckoning, used in one update.
 
-A reading is compared with the state of its own instant. Every one is judged by an innovation gate; what passes
-corrects the nominal state, the biases and the covariance.
+A reading is compared with the state at its own instant. Each is judged by an innovation gate; accepted ones correct the
+nominal state, the biases and the covariance.
+
+A measurement model takes the state at the instant of the sample (p, v in the world, R_WB, w_WB_B), writes its rows of
+the Jacobian H, which come in as zero, and returns the predicted reading. `lag` is the age of the sample [s]: to first
+order an error of the past position is the present one less lag times that of the velocity. The body rate's own error
+times a lever arm is left out: below 1 mm/s.
+
+Order of this file: acceptance, the first heading, the update of a gate, its parts, measurement models.
 """
 
 import math
@@ -9,9 +16,16 @@ import math
 import numpy as np
 
 from zsim.math.compiled import inlined, portable
-from zsim.math.rotation import heading, matrix, product
+from zsim.math.rotation import Matrix, Vector, add, column, composed, cross, heading, matrix, product, transposed
 from zsim_agents.estimation import strapdown
-from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
+from zsim_agents.estimation.dead_reckoning import (
+    ATTITUDE,
+    HORIZONTAL_MIN,
+    POSITION,
+    VELOCITY,
+    heading_gradient,
+    write_minus_cross,
+)
 from zsim_agents.estimation.filter_state import (
     BARO,
     BIAS,
@@ -37,32 +51,33 @@ from zsim_agents.estimation.filter_state import (
     quaternion,
     vector,
 )
-from zsim_agents.estimation.joint_covariance import block, put_block, use_own
 from zsim_agents.estimation.kalman_update import (
-    ROWS_MAX,
+    add_innovation_covariance,
+    add_projection,
+    block,
+    put_block,
     stacked_update,
-    write_baro,
-    write_flow,
-    write_gps,
-    write_mag,
-    write_sonar,
+    whiten,
+    within_gates,
 )
 
+ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
 YAW = ATTITUDE + 2  # place in the error state
-VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would drown the rest
+VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and larger squares would cost all others their digits
 SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
-HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which turns the attitude to it
-SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
-MOVES_SIGMAS = 2.0  # of the velocity, chosen: one that stands still moves so fast at 2 % of the samples
+HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which sets the heading
+SET_DOWN_SIGMA_RAD = 0.05  # rad: accuracy of setting a drone down by eye, where there is no magnetometer
+MOVES_SIGMAS = 2.0  # of the velocity, chosen: the estimate of a drone at rest exceeds it in 2 % of the samples
 DENIED_S = 2.0  # s since two drones saw each other, chosen: errors grow little meanwhile
-HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
+HEADING_WAIT_S = 1.0  # s without a reading of the magnetometer, after which the scenario's heading is used
+COSINE_MIN = 0.1  # of the sonar's ray to the vertical; beyond 84 deg it does not hit the ground below
 
 
 @inlined
 def accept(rows: Rows, i: int, reading: np.ndarray) -> bool:
-    """Whether an aiding reading is to be used at the end of the gate.
+    """Tell whether an aiding reading is to be used at the end of the gate.
 
-    One that is out of order, too old or no number is counted as refused; a duplicate is not counted, nor is a sonar
+    One that is out of order, too old or not finite is counted as refused; a duplicate is not counted, nor is a sonar
     without an echo, which has no information.
     """
     row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
@@ -89,18 +104,10 @@ def accept(rows: Rows, i: int, reading: np.ndarray) -> bool:
 
 
 @inlined
-def set_variance(P: np.ndarray, k: int, variance: float) -> None:
-    """Give one state a new variance without any correlation with the others."""
-    for j in range(P.shape[0]):
-        P[k, j] = P[j, k] = 0.0
-    P[k, k] = variance
-
-
-@inlined
 def start_heading(
     rows: Rows, i: int, P: np.ndarray, t_s: float, readings: np.ndarray, first: int, after: np.ndarray
 ) -> None:
-    """Give the attitude its first heading: the magnetometer's, or where it tells none, the one it was set down with."""
+    """Initialise the heading: by the magnetometer, or where that gives none, as the drone was set down."""
     row, counts, setting = rows.nominal[i], rows.counts[i], rows.setting[i]
     if math.isnan(row[NOMINAL.t_first_gate]):
         row[NOMINAL.t_first_gate] = t_s
@@ -111,7 +118,7 @@ def start_heading(
             seen = product(matrix(quaternion(row, NOMINAL.q_WB)), product(R_BS, vector(readings[at], READING.values)))
             field = vector(setting, SETTING.field_W)
             angle = math.atan2(field[1], field[0]) - math.atan2(seen[1], seen[0])
-            _turn_heading(row, counts, setting[SETTING.gravity], angle)  # its certainty comes from the update
+            _turn_heading(row, counts, setting[SETTING.gravity], angle)  # its variance follows from the update
             return
         at = after[at]
     if not rows.layout[i, LAYOUT.compass] or t_s - row[NOMINAL.t_first_gate] > HEADING_WAIT_S:
@@ -123,223 +130,21 @@ def start_heading(
 @inlined
 def _turn_heading(row: np.ndarray, counts: np.ndarray, gravity: float, angle: float) -> None:
     strapdown.turn_heading(row, gravity, angle)
-    counts[COUNT.kept] = 0  # a turn makes the past meaningless
+    counts[COUNT.kept] = 0  # a turn invalidates the history
     counts[COUNT.heading_known] = 1
 
 
 @inlined
-def predict(H: np.ndarray, at: int, kind: int, setting: np.ndarray, past: Moment, lag: float, out: np.ndarray) -> None:
-    """Write what a sensor should read into out[at:], and its rows of H."""
-    aid = SETTING.sensors + kind * SENSOR.size
-    _, p, v, q, w, _, _ = past
-    R, arm = matrix(q), vector(setting, aid + SENSOR.p_BS)
-    if kind == GPS:
-        expected = write_gps(H, at, p, v, R, w, arm, lag)
-        for k in range(6):
-            out[at + k] = expected[k]
-    elif kind == MAG:
-        field = write_mag(H, at, R, matrix_at(setting, aid + SENSOR.R_BS), vector(setting, SETTING.field_W))
-        put(out, at, field)
-    elif kind == BARO:
-        out[at] = write_baro(H, at, p, R, arm, lag)
-    elif kind == SONAR:
-        out[at] = write_sonar(H, at, p, R, arm, vector(setting, aid + SENSOR.down_B), lag)
-    else:
-        put(out, at, write_flow(H, at, v, R, w, arm))
-
-
-@inlined
-def with_biases(rows: Rows, i: int, kind: int, H: np.ndarray, at: int, out: np.ndarray) -> None:
-    """Put the sensor's biases on the prediction, their columns of H written."""
-    for channel in range(CHANNELS):
-        place = LAYOUT.biases + (kind * CHANNELS + channel) * BIAS.size
-        state, row = rows.layout[i, place + BIAS.state], at + rows.layout[i, place + BIAS.row]
-        for k in range(rows.layout[i, place + BIAS.axes] if state >= 0 else 0):
-            H[row + k, state + k] = 1.0
-            out[row + k] += rows.bias[i, state + k]
-
-
-@inlined
-def is_denied(rows: Rows, i: int, kind: int) -> bool:
-    """Tell whether who sees a drone, or is seen by it, trusts its own sensor of a kind, so that this one's is wrong."""
-    for j in range(rows.sighted.shape[0]):
-        last_s = max(rows.sighted[i, j], rows.sighted[j, i])
-        trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0
-        if j != i and trusted and rows.nominal[i, NOMINAL.t] - last_s < DENIED_S:
-            return True
-    return False
-
-
-@inlined
-def widen(P: np.ndarray, k: int, variance: float, layout: np.ndarray) -> None:
-    """Add a variance to a state of the position or velocity, and to its clones: it is one error of all of them."""
-    first = layout[LAYOUT.first_clone] + k
-    end = first + CLONED * layout[LAYOUT.clones]  # beyond, P has room for those of other drones
-    P[k, k] += variance
-    for a in range(first, end, CLONED):
-        P[a, k] += variance
-        P[k, a] += variance
-        for b in range(first, end, CLONED):
-            P[a, b] += variance
-
-
-@portable
-def inflate(rows: Rows, i: int, P: np.ndarray, kind: int, z: np.ndarray, expected: np.ndarray, at: int) -> None:
-    """Make the states that a long refused sensor observes as uncertain as its innovation: it is trusted again."""
-    row, layout = rows.nominal[i], rows.layout[i]
-    squares, total = np.zeros(VALUES_MAX), 0.0
-    for k in range(SIZES[kind]):
-        y = z[at + k] - expected[at + k]
-        squares[k] = min(y * y, SQUARE_MAX)
-        total += squares[k]
-    if kind == GPS:
-        for k in range(6):
-            widen(P, POSITION + k, squares[k], layout)
-    elif kind == FLOW:
-        for k in range(3):
-            widen(P, VELOCITY + k, total, layout)
-    elif kind == BARO:
-        widen(P, POSITION + 2, squares[0], layout)
-    elif kind == MAG:
-        P[YAW, YAW] += HEADING_SIGMA_RAD * HEADING_SIGMA_RAD
-    row[NOMINAL.refused_since + kind] = row[NOMINAL.t]
-
-
-@inlined
-def count_outcome(row: np.ndarray, counts: np.ndarray, kind: int, passed: bool) -> None:
-    """Count a reading that went through its gate, or did not."""
-    if passed:
-        counts[COUNT.used + kind] += 1
-        row[NOMINAL.refused_since + kind] = math.nan
-        return
-    counts[COUNT.refused + kind] += 1
-    if math.isnan(row[NOMINAL.refused_since + kind]):
-        row[NOMINAL.refused_since + kind] = row[NOMINAL.t]
-
-
-@portable
-def keep(rows: Rows, i: int, used: bool, distances: np.ndarray, blocks: np.ndarray, kinds: np.ndarray) -> np.ndarray:
-    """Count the outcome of each block; return the rows (m,) to use: all, or those inside of their own gates."""
-    kept, m = np.zeros(ROWS_MAX, dtype=np.int64), 0
-    for b in range(blocks.shape[0]):
-        first, size = blocks[b, 0], blocks[b, 1]
-        good = used or distances[b] <= rows.limits[size]
-        count_outcome(rows.nominal[i], rows.counts[i], kinds[b], good)
-        for k in range(size if good else 0):
-            kept[m] = first + k
-            m += 1
-    return kept[:m]
-
-
-@portable
-def _correct_jointly(
-    rows: Rows,
-    i: int,
-    P: np.ndarray,
-    H: np.ndarray,
-    y: np.ndarray,
-    variance: np.ndarray,
-    blocks: np.ndarray,
-    kinds: np.ndarray,
-) -> np.ndarray:
-    """Do as `correct` does, with the covariance of all drones, whose states it corrects."""
-    distances = np.zeros(ROWS_MAX)
-    put_block(rows.joint, i, P)  # it may have been inflated
-    used = use_own(rows, i, H, variance, y, blocks, distances)
-    kept = keep(rows, i, used, distances, blocks, kinds)
-    if not used and kept.shape[0]:
-        use_own(rows, i, H[kept], variance[kept], y[kept], blocks[:0], distances)
-    return block(rows.joint, i, P.shape[0])
-
-
-@portable
-def correct(
-    rows: Rows,
-    i: int,
-    P: np.ndarray,
-    H: np.ndarray,
-    z: np.ndarray,
-    expected: np.ndarray,
-    variance: np.ndarray,
-    blocks: np.ndarray,
-    kinds: np.ndarray,
-) -> np.ndarray:
-    """Use a stack of measurements, (m,) each, of which the blocks stand in `blocks` (b, 2); return the covariance.
-
-    All are tried together; those whose own innovation lies outside of its gate are then left out.
-    """
-    y, distances = z - expected, np.zeros(ROWS_MAX)
-    if rows.joint.shape[0]:
-        return _correct_jointly(rows, i, P, H, y, variance, blocks, kinds)
-    used, x, P, _ = stacked_update(P, H, variance, y, blocks, rows.limits, distances)
-    kept = keep(rows, i, used, distances, blocks, kinds)
-    if not used and kept.shape[0]:
-        _, x, P, _ = stacked_update(P, H[kept], variance[kept], y[kept], blocks[:0], rows.limits, distances)
-    if kept.shape[0]:
-        strapdown.correct(rows.nominal[i], rows.layout[i], rows.setting[i, SETTING.gravity], x)
-        if rows.layout[i, LAYOUT.aiding_biases]:
-            for k in range(P.shape[0]):
-                rows.bias[i, k] += x[k]
-    return P
-
-
-@inlined
-def stack(
-    rows: Rows,
-    i: int,
-    reading: np.ndarray,
-    H: np.ndarray,
-    z: np.ndarray,
-    expected: np.ndarray,
-    at: int,
-    known: tuple[Moment, float, int],
-) -> None:
-    """Put a reading on a stack of measurements from row `at` on, compared with the state of its own instant.
-
-    Args:
-        known: that state, as `strapdown.recall_known` returns it.
-    """
-    kind, setting = int(reading[READING.sensor]), rows.setting[i]
-    past, lag, state = known
-    predict(H, at, kind, setting, past, lag, expected)
-    strapdown.move_columns(H, at, SIZES[kind], state)
-    with_biases(rows, i, kind, H, at, expected)
-    for k in range(SIZES[kind]):
-        z[at + k] = reading[READING.values + k]
-
-
-@inlined
-def distrust_turn(P: np.ndarray, H: np.ndarray, expected: np.ndarray, at: int) -> None:
-    """Let the flow tell a heading, in rows from `at` on, only as far as the drone surely moves.
-
-    A heading's error turns the velocity. Turned by the error of an estimate that should be zero, it would tell a
-    heading that nothing measures (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for
-    designing consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010).
-    """
-    squared = expected[at] * expected[at] + expected[at + 1] * expected[at + 1]
-    noise = MOVES_SIGMAS * MOVES_SIGMAS * (P[VELOCITY, VELOCITY] + P[VELOCITY + 1, VELOCITY + 1])
-    share = 1.0 - noise / squared if squared > noise else 0.0
-    for r in range(at, at + 2):
-        for k in range(3):
-            H[r, ATTITUDE + k] *= share
-
-
-@inlined
-def write_variance(reading: np.ndarray, setting: np.ndarray, variance: np.ndarray, at: int) -> None:
-    """Write the variances of a reading's rows; a GPS receiver's own figure counts where it is worse."""
-    kind = int(reading[READING.sensor])
-    known = SETTING.sensors + kind * SENSOR.size
-    for k in range(SIZES[kind]):
-        variance[at + k] = setting[known + SENSOR.variance + k]
-    if kind == GPS:
-        claimed = reading[READING.extra] * reading[READING.extra] - setting[known + SENSOR.correlated]
-        for k in range(3):
-            variance[at + k] = max(claimed, setting[known + SENSOR.variance])
+def set_variance(P: np.ndarray, k: int, variance: float) -> None:
+    """Give one state a new variance and no correlation with the others."""
+    for j in range(P.shape[0]):
+        P[k, j] = P[j, k] = 0.0
+    P[k, k] = variance
 
 
 @portable
 def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, after: np.ndarray) -> np.ndarray:
-    """Judge and use a gate's readings, in one stacked update unless they are very many; return the covariance.
+    """Judge and use a gate's readings, in one stacked update unless there are very many; return the covariance.
 
     Args:
         rows: of all drones.
@@ -347,7 +152,7 @@ def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, af
         P: its covariance, (n, n).
         readings: of the gate, (M, READING.size).
         first: the drone's first among them; -1 for none.
-        after: of each reading, the next one of the same drone, (M,); -1 after the last.
+        after: for each reading, the next one of the same drone, (M,); -1 after the last.
     """
     row, counts, setting, n = rows.nominal[i], rows.counts[i], rows.setting[i], P.shape[0]
     H, z, expected, variance = np.zeros((ROWS_MAX, n)), np.zeros(ROWS_MAX), np.zeros(ROWS_MAX), np.zeros(ROWS_MAX)
@@ -385,3 +190,342 @@ def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, af
         P = correct(rows, i, P, H[:m], z[:m], expected[:m], variance[:m], blocks[:b], kinds)
     strapdown.remember(counts, rows.history[i], rows.layout[i, LAYOUT.history], moment(row))
     return P
+
+
+@inlined
+def stack(
+    rows: Rows,
+    i: int,
+    reading: np.ndarray,
+    H: np.ndarray,
+    z: np.ndarray,
+    expected: np.ndarray,
+    at: int,
+    known: tuple[Moment, float, int],
+) -> None:
+    """Add a reading to a stack of measurements from row `at` on, compared with the state of its own instant.
+
+    That state is `known`, as returned by `strapdown.recall_known`.
+    """
+    kind, setting = int(reading[READING.sensor]), rows.setting[i]
+    past, lag, state = known
+    predict(H, at, kind, setting, past, lag, expected)
+    strapdown.move_columns(H, at, SIZES[kind], state)
+    with_biases(rows, i, kind, H, at, expected)
+    for k in range(SIZES[kind]):
+        z[at + k] = reading[READING.values + k]
+
+
+@inlined
+def predict(H: np.ndarray, at: int, kind: int, setting: np.ndarray, past: Moment, lag: float, out: np.ndarray) -> None:
+    """Write the expected reading of a sensor into out[at:], and its rows of H."""
+    aid = SETTING.sensors + kind * SENSOR.size
+    _, p, v, q, w, _, _ = past
+    R, arm = matrix(q), vector(setting, aid + SENSOR.p_BS)
+    if kind == GPS:
+        expected = write_gps(H, at, p, v, R, w, arm, lag)
+        for k in range(6):
+            out[at + k] = expected[k]
+    elif kind == MAG:
+        field = write_mag(H, at, R, matrix_at(setting, aid + SENSOR.R_BS), vector(setting, SETTING.field_W))
+        put(out, at, field)
+    elif kind == BARO:
+        out[at] = write_baro(H, at, p, R, arm, lag)
+    elif kind == SONAR:
+        out[at] = write_sonar(H, at, p, R, arm, vector(setting, aid + SENSOR.down_B), lag)
+    else:
+        put(out, at, write_flow(H, at, v, R, w, arm))
+
+
+@inlined
+def with_biases(rows: Rows, i: int, kind: int, H: np.ndarray, at: int, out: np.ndarray) -> None:
+    """Add the sensor's biases to the prediction, and write their columns of H."""
+    for channel in range(CHANNELS):
+        place = LAYOUT.biases + (kind * CHANNELS + channel) * BIAS.size
+        state, row = rows.layout[i, place + BIAS.state], at + rows.layout[i, place + BIAS.row]
+        for k in range(rows.layout[i, place + BIAS.axes] if state >= 0 else 0):
+            H[row + k, state + k] = 1.0
+            out[row + k] += rows.bias[i, state + k]
+
+
+@inlined
+def distrust_turn(P: np.ndarray, H: np.ndarray, expected: np.ndarray, at: int) -> None:
+    """Let the flow determine the heading, in rows from `at` on, only as far as the drone surely moves.
+
+    A heading's error turns the velocity. The velocity's error of a drone at rest would thereby give a heading that
+    nothing measures (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for designing
+    consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010).
+    """
+    squared = expected[at] * expected[at] + expected[at + 1] * expected[at + 1]
+    noise = MOVES_SIGMAS * MOVES_SIGMAS * (P[VELOCITY, VELOCITY] + P[VELOCITY + 1, VELOCITY + 1])
+    share = 1.0 - noise / squared if squared > noise else 0.0
+    for r in range(at, at + 2):
+        for k in range(3):
+            H[r, ATTITUDE + k] *= share
+
+
+@inlined
+def write_variance(reading: np.ndarray, setting: np.ndarray, variance: np.ndarray, at: int) -> None:
+    """Write the variances of a reading's rows; a GPS receiver's own figure counts where it is worse."""
+    kind = int(reading[READING.sensor])
+    known = SETTING.sensors + kind * SENSOR.size
+    for k in range(SIZES[kind]):
+        variance[at + k] = setting[known + SENSOR.variance + k]
+    if kind == GPS:
+        claimed = reading[READING.extra] * reading[READING.extra] - setting[known + SENSOR.correlated]
+        for k in range(3):
+            variance[at + k] = max(claimed, setting[known + SENSOR.variance])
+
+
+@inlined
+def is_denied(rows: Rows, i: int, kind: int) -> bool:
+    """Tell whether a drone that sees or is seen by this one trusts its own sensor of a kind: then this one is wrong."""
+    for j in range(rows.sighted.shape[0]):
+        last_s = max(rows.sighted[i, j], rows.sighted[j, i])
+        trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0
+        if j != i and trusted and rows.nominal[i, NOMINAL.t] - last_s < DENIED_S:
+            return True
+    return False
+
+
+@portable
+def inflate(rows: Rows, i: int, P: np.ndarray, kind: int, z: np.ndarray, expected: np.ndarray, at: int) -> None:
+    """Make the states observed by a long refused sensor as uncertain as its innovation: it is trusted again."""
+    row, layout = rows.nominal[i], rows.layout[i]
+    squares, total = np.zeros(VALUES_MAX), 0.0
+    for k in range(SIZES[kind]):
+        y = z[at + k] - expected[at + k]
+        squares[k] = min(y * y, SQUARE_MAX)
+        total += squares[k]
+    if kind == GPS:
+        for k in range(6):
+            widen(P, POSITION + k, squares[k], layout)
+    elif kind == FLOW:
+        for k in range(3):
+            widen(P, VELOCITY + k, total, layout)
+    elif kind == BARO:
+        widen(P, POSITION + 2, squares[0], layout)
+    elif kind == MAG:
+        P[YAW, YAW] += HEADING_SIGMA_RAD * HEADING_SIGMA_RAD
+    row[NOMINAL.refused_since + kind] = row[NOMINAL.t]
+
+
+@inlined
+def widen(P: np.ndarray, k: int, variance: float, layout: np.ndarray) -> None:
+    """Add a variance to a state of position or velocity, and to its clones: all have the same error."""
+    first = layout[LAYOUT.first_clone] + k
+    end = first + CLONED * layout[LAYOUT.clones]  # beyond are the places of larger error states
+    P[k, k] += variance
+    for a in range(first, end, CLONED):
+        P[a, k] += variance
+        P[k, a] += variance
+        for b in range(first, end, CLONED):
+            P[a, b] += variance
+
+
+@portable
+def correct(
+    rows: Rows,
+    i: int,
+    P: np.ndarray,
+    H: np.ndarray,
+    z: np.ndarray,
+    expected: np.ndarray,
+    variance: np.ndarray,
+    blocks: np.ndarray,
+    kinds: np.ndarray,
+) -> np.ndarray:
+    """Use a stack of measurements, (m,) each, whose blocks are in `blocks` (b, 2); return the covariance.
+
+    All are tried together; if that fails, those outside of their own gates are left out.
+    """
+    y, distances = z - expected, np.zeros(ROWS_MAX)
+    if rows.joint.shape[0]:
+        return _correct_jointly(rows, i, P, H, y, variance, blocks, kinds)
+    used, x, P, _ = stacked_update(P, H, variance, y, blocks, rows.limits, distances)
+    kept = keep(rows, i, used, distances, blocks, kinds)
+    if not used and kept.shape[0]:
+        _, x, P, _ = stacked_update(P, H[kept], variance[kept], y[kept], blocks[:0], rows.limits, distances)
+    if kept.shape[0]:
+        strapdown.correct(rows.nominal[i], rows.layout[i], rows.setting[i, SETTING.gravity], x)
+        if rows.layout[i, LAYOUT.aiding_biases]:
+            for k in range(P.shape[0]):
+                rows.bias[i, k] += x[k]
+    return P
+
+
+@portable
+def _correct_jointly(
+    rows: Rows,
+    i: int,
+    P: np.ndarray,
+    H: np.ndarray,
+    y: np.ndarray,
+    variance: np.ndarray,
+    blocks: np.ndarray,
+    kinds: np.ndarray,
+) -> np.ndarray:
+    """Like `correct`, with the joint covariance of all drones, whose states are corrected."""
+    distances = np.zeros(ROWS_MAX)
+    put_block(rows.joint, i, P)  # it may have been inflated
+    used = use_own(rows, i, H, variance, y, blocks, distances)
+    kept = keep(rows, i, used, distances, blocks, kinds)
+    if not used and kept.shape[0]:
+        use_own(rows, i, H[kept], variance[kept], y[kept], blocks[:0], distances)
+    return block(rows.joint, i, P.shape[0])
+
+
+@portable
+def use_own(
+    rows: Rows, i: int, H: np.ndarray, variance: np.ndarray, y: np.ndarray, blocks: np.ndarray, distances: np.ndarray
+) -> bool:
+    """Judge measurements of a drone's own sensors together and, if all are within their gates, use them.
+
+    Args:
+        rows: of all drones; `rows.joint` is changed.
+        i: the drone.
+        H: Jacobian by its own errors, (m, n).
+        variance: of the rows' white noise, (m,).
+        y: innovations, (m,).
+        blocks, distances: see `kalman_update.within_gates`.
+    """
+    first, HJ = i * H.shape[1], np.zeros((H.shape[0], rows.joint.shape[0]))
+    add_projection(rows.joint, H, first, HJ)
+    S = np.diag(variance)
+    add_innovation_covariance(HJ, H, first, S)
+    if not within_gates(S, y, blocks, rows.limits, distances):
+        return False
+    correct_all(rows, HJ, S, y.copy())
+    return True
+
+
+@portable
+def correct_all(rows: Rows, HJ: np.ndarray, S: np.ndarray, y: np.ndarray) -> None:
+    """Correct all drones and the joint covariance by innovations y (m,) of covariance S; HJ = H J, overwritten as y."""
+    whiten(S, HJ, y)
+    J, x = rows.joint, np.zeros(HJ.shape[1])
+    for k in range(y.shape[0]):
+        for d in range(x.shape[0]):
+            x[d] += y[k] * HJ[k, d]
+    for r in range(x.shape[0]):
+        for k in range(y.shape[0]):
+            weight = HJ[k, r]
+            if weight != 0.0:
+                for c in range(x.shape[0]):
+                    J[r, c] -= weight * HJ[k, c]
+    n = rows.covariance.shape[1]
+    for i in range(rows.nominal.shape[0]):
+        error = x[i * n : i * n + n]
+        strapdown.correct(rows.nominal[i], rows.layout[i], rows.setting[i, SETTING.gravity], error)
+        if rows.layout[i, LAYOUT.aiding_biases]:
+            for k in range(n):
+                rows.bias[i, k] += error[k]
+
+
+@portable
+def keep(rows: Rows, i: int, used: bool, distances: np.ndarray, blocks: np.ndarray, kinds: np.ndarray) -> np.ndarray:
+    """Count the outcome of each block; return the rows (m,) to use: all, or those inside of their own gates."""
+    kept, m = np.zeros(ROWS_MAX, dtype=np.int64), 0
+    for b in range(blocks.shape[0]):
+        first, size = blocks[b, 0], blocks[b, 1]
+        good = used or distances[b] <= rows.limits[size]
+        count_outcome(rows.nominal[i], rows.counts[i], kinds[b], good)
+        for k in range(size if good else 0):
+            kept[m] = first + k
+            m += 1
+    return kept[:m]
+
+
+@inlined
+def count_outcome(row: np.ndarray, counts: np.ndarray, kind: int, passed: bool) -> None:
+    """Count a reading as used or refused, and note since when its sensor is refused."""
+    if passed:
+        counts[COUNT.used + kind] += 1
+        row[NOMINAL.refused_since + kind] = math.nan
+        return
+    counts[COUNT.refused + kind] += 1
+    if math.isnan(row[NOMINAL.refused_since + kind]):
+        row[NOMINAL.refused_since + kind] = row[NOMINAL.t]
+
+
+SIX = tuple[float, float, float, float, float, float]
+
+
+@inlined
+def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Matrix, w: Vector, arm: Vector, lag: float) -> SIX:
+    """Antenna at p_BS = `arm`: position p + R r [m], velocity v + R (w x r) [m/s]; six rows from `i`."""
+    offset = product(R, arm)
+    swing = product(R, cross(w, arm))
+    for k in range(3):
+        H[i + k, POSITION + k] = 1.0
+        H[i + k, VELOCITY + k] = -lag
+        H[i + 3 + k, VELOCITY + k] = 1.0
+    write_minus_cross(H, i, ATTITUDE, offset, 1.0)
+    write_minus_cross(H, i + 3, ATTITUDE, swing, 1.0)
+    return *add(p, offset), *add(v, swing)
+
+
+@inlined
+def write_mag(H: np.ndarray, i: int, R: Matrix, R_BS: Matrix, field_W: Vector) -> Vector:
+    """Magnetometer turned by R_BS in a known field: (R R_BS)^T m [uT]; three rows from `i`."""
+    R_WS = composed(R, R_BS)
+    for k in range(3):
+        row = cross(column(R_WS, k), field_W)
+        H[i + k, ATTITUDE] = row[0]
+        H[i + k, ATTITUDE + 1] = row[1]
+        H[i + k, ATTITUDE + 2] = row[2]
+    return product(transposed(R_WS), field_W)
+
+
+@inlined
+def write_baro(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, lag: float) -> float:
+    """Barometer at p_BS = `arm`: its height [m]; one row."""
+    offset = product(R, arm)
+    H[i, POSITION + 2] = 1.0
+    H[i, VELOCITY + 2] = -lag
+    H[i, ATTITUDE] = offset[1]
+    H[i, ATTITUDE + 1] = -offset[0]
+    return p[2] + offset[2]
+
+
+@inlined
+def write_sonar(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vector, lag: float) -> float:
+    """Sonar at p_BS = `arm` that looks along `down_B` at the ground z_W = 0: height / cosine [m]; one row.
+
+    Returns 0 with an empty row if the sonar does not look down.
+    """
+    offset = product(R, arm)
+    ray = product(R, down_B)
+    cosine = -ray[2]
+    if cosine < COSINE_MIN:
+        return 0.0
+    height = p[2] + offset[2]
+    per_cosine = height / (cosine * cosine)
+    H[i, POSITION + 2] = 1.0 / cosine
+    H[i, VELOCITY + 2] = -lag / cosine
+    H[i, ATTITUDE] = offset[1] / cosine + per_cosine * ray[1]
+    H[i, ATTITUDE + 1] = -offset[0] / cosine - per_cosine * ray[0]
+    return height / cosine
+
+
+@inlined
+def write_flow(H: np.ndarray, i: int, v: Vector, R: Matrix, w: Vector, arm: Vector) -> Vector:
+    """Velocity of the camera at p_BS = `arm` in the heading frame, Rz(yaw)^T (v + R (w x r)); three rows."""
+    swing = product(R, cross(w, arm))
+    x, y, _ = column(R, 0)
+    length = math.sqrt(max(x * x + y * y, HORIZONTAL_MIN))
+    c, s = x / length, y / length
+    u_W = add(v, swing)
+    u = (c * u_W[0] + s * u_W[1], c * u_W[1] - s * u_W[0], u_W[2])
+    H[i, VELOCITY] = c
+    H[i, VELOCITY + 1] = s
+    H[i + 1, VELOCITY] = -s
+    H[i + 1, VELOCITY + 1] = c
+    H[i + 2, VELOCITY + 2] = 1.0
+    by_heading = heading_gradient(R)
+    for k in range(3):
+        turned = cross((1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0), swing)
+        H[i, ATTITUDE + k] = by_heading[k] * u[1] + c * turned[0] + s * turned[1]
+        H[i + 1, ATTITUDE + k] = -by_heading[k] * u[0] + c * turned[1] - s * turned[0]
+        H[i + 2, ATTITUDE + k] = turned[2]
+    return u

@@ -2,10 +2,10 @@
 
 I. Mas, S. Curi, R. Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Environment", section III: gyroscopes and
 accelerometers give the attitude by Madgwick's filter; the position is that of dead reckoning and a GPS receiver, fused
-by an extended Kalman filter "due to the non-linear dynamics". Nothing measures the heading: it begins with the one that
+by an extended Kalman filter "due to the non-linear dynamics". Nothing measures the heading: it starts with the one that
 the drone was set down with, and only the fixes of a moving drone correct it.
 
-Dead reckoning goes along the velocity u that the aircraft itself gives in its heading frame:
+Dead reckoning integrates the velocity u that the aircraft itself gives in its heading frame:
 
     x = (p_WB, yaw)      p' = Rz(yaw) u      yaw' = rate of Madgwick's heading      z = p_WB
 """
@@ -17,19 +17,19 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
-from zsim.contract.messages import Flow, Gps, Imu
+from zsim.contract.messages import Gps, Imu
 from zsim.contract.snapshot import State
 from zsim.math import frames
 from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim.sensors.sensor import ErrorModel, noise_sigma
+from zsim_agents.estimation.dead_reckoning import madgwick_step
 from zsim_agents.estimation.drone_estimator import StateEstimate
-from zsim_agents.estimation.madgwick import madgwick_step
 
 YAW = 3  # place in the state
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
-YAW_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye
-DRIFT_S = 1.0  # s, for which the gyroscope's bias is taken as the same; it is not estimated
+YAW_SIGMA_RAD = 0.05  # rad: accuracy of setting a drone down by eye
+DRIFT_S = 1.0  # s during which the gyroscope's bias is assumed constant; it is not estimated
 SPEED_SIGMA_M_S = 1.0  # m/s, of a drone whose own velocity is not known
 IMU_GAP_MAX_S = 0.1  # s; over a longer one no rate is integrated
 
@@ -57,13 +57,13 @@ class PaperEstimator:
         self._filter = DeadReckoningFilter(yaw)
 
     def receive(self, sensor: str, message: Any) -> None:
-        """Take a reading of the IMU, the GPS receiver or the aircraft's own velocity; leave out the others."""
+        """Take a reading of the IMU, the GPS receiver or the aircraft's own velocity; ignore the others."""
         if sensor in self._used:
             self._used[sensor] += 1
         if sensor == "imu":
             self._turn(message)
         elif sensor == "flow":
-            self._take_velocity(message)
+            self._velocity = message.velocity_m_s if message.quality > 0.0 else None
         elif sensor == "gps" and message.fix:
             self._fix = message
 
@@ -80,12 +80,14 @@ class PaperEstimator:
         self._q = _quaternion(frames.quaternion_multiply(turn, self._q))
         yaw = float(self._filter.x[YAW])
         velocity = rotation_z(yaw) @ (self._velocity or (0.0, 0.0, 0.0))
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3], covariance[3:, 3:] = self._filter.P[:3, :3], self._velocity_variance() * np.eye(3)
         return StateEstimate(
             position_m=self._filter.x[:3],
             velocity_m_s=velocity,
             orientation_wxyz=self._q,
             yaw_rad=float(frames.heading(self._q)),
-            covariance=self._covariance(),
+            covariance=covariance,
             yaw_sigma_rad=math.sqrt(self._filter.P[YAW, YAW]),
             sensors={name: (count, 0) for name, count in self._used.items()},
         )
@@ -97,14 +99,12 @@ class PaperEstimator:
         return {**filter_, **times, "q": self._q, "velocity": self._velocity, "used": self._used}
 
     def restore(self, state: State) -> None:
-        """Take over the state of another estimator of this drone."""
         self._filter.x, self._filter.P = state["x"], state["P"]
         self._t_imu_s, self._t_s = state["t_imu_s"], state["t_s"]
         self._q, self._velocity = tuple(state["q"]), state["velocity"] and tuple(state["velocity"])
         self._used = state["used"]
 
     def _turn(self, sample: Imu) -> None:
-        """Turn the attitude to the instant of a sample."""
         t_s = sample.t_sample_ns * 1e-9
         dt = t_s - self._t_imu_s
         if dt <= 0.0:
@@ -120,32 +120,19 @@ class PaperEstimator:
         x, y, z = frames.rotate(self._q_BS, v_S).tolist()
         return x, y, z
 
-    def _take_velocity(self, flow: Flow) -> None:
-        self._velocity = flow.velocity_m_s if flow.quality > 0.0 else None
-
     def _velocity_variance(self) -> float:
-        """Return the variance per axis of the velocity that dead reckoning uses [m^2/s^2]."""
+        """Return the variance per axis of the velocity used by dead reckoning [m^2/s^2]."""
         return (self._speed_sigma if self._velocity else SPEED_SIGMA_M_S) ** 2
 
     def _process_noise(self, dt: float) -> NDArray[np.float64]:
-        """Return what an interval adds, (4, 4): each velocity errs by itself, and is held for its period."""
+        """Return the process noise of an interval, (4, 4): velocities err independently, each held for its period."""
         position = self._velocity_variance() * self._flow_period_s * dt
         yaw = (self._gyro_sigma**2 * self._imu_period_s + self._gyro_bias**2 * DRIFT_S) * dt
         return np.diag([position, position, position, yaw])
 
-    def _covariance(self) -> NDArray[np.float64]:
-        """Return the covariance of position and velocity, (6, 6)."""
-        P = np.zeros((6, 6))
-        P[:3, :3], P[3:, 3:] = self._filter.P[:3, :3], self._velocity_variance() * np.eye(3)
-        return P
-
 
 class DeadReckoningFilter(ExtendedKalmanFilter):
-    """Position and heading, (p_WB, yaw), by dead reckoning and fixes.
-
-    Args:
-        yaw: at the start [rad].
-    """
+    """Position and heading, (p_WB, yaw), by dead reckoning and fixes."""
 
     def __init__(self, yaw: float) -> None:
         super().__init__(dim_x=4, dim_z=3)
@@ -154,7 +141,7 @@ class DeadReckoningFilter(ExtendedKalmanFilter):
         self._next = self.x
 
     def reckon(self, u: Vector, yaw: float, Q: NDArray[np.float64], dt: float) -> None:
-        """Go on for `dt` [s] with the velocity u [m/s; heading frame], to a heading [rad] known by its rate."""
+        """Move for `dt` [s] with the velocity u [m/s; heading frame], to a heading [rad] known from its rate."""
         step = rotation_z(yaw) @ u * dt
         self._next = np.append(self.x[:3] + step, yaw)
         self.F = np.eye(4)
@@ -175,9 +162,9 @@ class DeadReckoningFilter(ExtendedKalmanFilter):
 def correlation_factor(error: ErrorModel, rate_hz: float) -> float:
     """Return by how much correlation raises the variance of a mean of samples: (1 + a)/(1 - a), a of neighbours.
 
-    The variance of a mean of n samples of a Gauss-Markov process is so many times sigma^2/n (G. V. Bayley,
-    J. M. Hammersley, "The 'effective' number of independent observations in an autocorrelated time series",
-    Supplement to the Journal of the Royal Statistical Society 8, 1946).
+    The variance of a mean of n samples of a Gauss-Markov process is this factor times sigma^2/n (G. V. Bayley, J. M.
+    Hammersley, "The 'effective' number of independent observations in an autocorrelated time series", Supplement to the
+    Journal of the Royal Statistical Society 8, 1946).
     """
     if not error.correlated_sigma:
         return 1.0

@@ -1,7 +1,7 @@
-"""The nominal state of a drone, a row: moved by every sample of its IMU, put right by the filter, and remembered.
+"""The nominal state of a drone, a row: moved by every sample of its IMU, corrected by the filter, and remembered.
 
-A reading that comes late measures a state that the process noise since then is no part of. Where that matters, clones
-of position and velocity stand in the error state: it is compared with the clone nearest to its instant, and the
+A late reading measures a state that does not contain the process noise since then. Where that matters, clones of
+position and velocity stand in the error state: the reading is compared with the clone nearest to its instant, and the
 correlations do the rest. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized framework for processing
 relative state measurements", IEEE International Conference on Robotics and Automation, 2002.
 """
@@ -12,7 +12,14 @@ import numpy as np
 
 from zsim.math.compiled import inlined, portable
 from zsim.math.rotation import Vector, about_z, add, axpy, multiply, normalised, product, scaled, subtract
-from zsim_agents.estimation.dead_reckoning import acceleration, arm_acceleration, corrected, reckon, write_prediction
+from zsim_agents.estimation.dead_reckoning import (
+    acceleration,
+    arm_acceleration,
+    corrected,
+    reckon,
+    rotation_vector_quaternion,
+    write_prediction,
+)
 from zsim_agents.estimation.filter_state import (
     CLONE,
     CLONED,
@@ -36,50 +43,22 @@ from zsim_agents.estimation.filter_state import (
     vector,
 )
 from zsim_agents.estimation.kalman_update import predict_jointly, predicted_covariance
-from zsim_agents.estimation.madgwick import rotation_vector_quaternion
 
 ZERO: Vector = (0.0, 0.0, 0.0)
 ACCEL_MAX_M_S2 = 500.0  # m/s^2, 50 g: no MEMS accelerometer of a drone reads more
 GYRO_MAX_RAD_S = 100.0  # rad/s, 5700 deg/s: likewise
 MANOEUVRE_M_S2 = 0.3  # m/s^2, standard deviation of the acceleration in gusts of 0.5 m/s (0.16) and in transit
 MANOEUVRE_S = 0.5  # s, its correlation time
-LOST_TURN_RAD_S = 0.5  # rad/s, standard deviation of the rate that a missing gyroscope sample hides
+LOST_TURN_RAD_S = 0.5  # rad/s, standard deviation of the rate during a missing gyroscope sample
 COAST_TURN_DENSITY = LOST_TURN_RAD_S**2 * 2.0 * MANOEUVRE_S  # rad^2/s
 COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 
 
 @inlined
-def possible(accel: Vector, gyro: Vector) -> bool:
-    """Whether an IMU can read that; NaN fails each comparison."""
-    good = True
-    for k in range(3):
-        good = good and abs(accel[k]) < ACCEL_MAX_M_S2 and abs(gyro[k]) < GYRO_MAX_RAD_S
-    return good
-
-
-@inlined
-def begin_interval(row: np.ndarray, t_s: float) -> None:
-    """Let the interval between two gates begin."""
-    row[NOMINAL.t_start] = t_s
-    put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
-    row[NOMINAL.dt_squared] = row[NOMINAL.lost_velocity] = row[NOMINAL.lost_turn] = 0.0
-
-
-@inlined
-def begin(row: np.ndarray, counts: np.ndarray, t_s: float) -> None:
-    """Begin at an instant."""
-    row[NOMINAL.t] = t_s
-    counts[COUNT.running] = 1
-    begin_interval(row, t_s)
-
-
-@inlined
 def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
-    """Move to an IMU sample's instant; ignore a duplicate, refuse and count a late or impossible sample.
+    """Move to the instant of an IMU sample; ignore a duplicate, refuse and count a late or impossible sample.
 
     Args:
-        rows: of all drones.
-        i: the drone.
         t_s: instant of the sample [s].
         accel: specific force [m/s^2; S].
         gyro: body rate [rad/s; S].
@@ -106,11 +85,20 @@ def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
     before, after = state[5], moved[5]
     jolt = abs(after[0] - before[0]) + abs(after[1] - before[1]) + abs(after[2] - before[2])
     if jolt > setting[SETTING.jolt]:
-        hidden = 0.5 * jolt * dt  # what a step anywhere between two samples hides
+        hidden = 0.5 * jolt * dt  # error of a step anywhere between two samples
         row[NOMINAL.lost_velocity] += hidden * hidden
     row[NOMINAL.t] = t_s
     row[NOMINAL.dt_squared] += dt * dt
     counts[COUNT.used + IMU] += 1
+
+
+@inlined
+def possible(accel: Vector, gyro: Vector) -> bool:
+    """Tell whether an IMU can read such values; NaN fails each comparison."""
+    good = True
+    for k in range(3):
+        good = good and abs(accel[k]) < ACCEL_MAX_M_S2 and abs(gyro[k]) < GYRO_MAX_RAD_S
+    return good
 
 
 @inlined
@@ -122,7 +110,7 @@ def _lose(row: np.ndarray, missing_s: float) -> None:
 
 @inlined
 def _of_body(row: np.ndarray, setting: np.ndarray, accel: Vector, gyro: Vector, dt: float) -> tuple[Vector, Vector]:
-    """Return a sample of a turned or displaced IMU as one of the centre of mass, in body axes."""
+    """Convert a sample of a turned or displaced IMU into one at the centre of mass, in body axes."""
     imu = SETTING.sensors + IMU * SENSOR.size
     R_BS = matrix_at(setting, imu + SENSOR.R_BS)
     accel, gyro = product(R_BS, accel), product(R_BS, gyro)
@@ -132,8 +120,23 @@ def _of_body(row: np.ndarray, setting: np.ndarray, accel: Vector, gyro: Vector, 
 
 
 @inlined
+def begin(row: np.ndarray, counts: np.ndarray, t_s: float) -> None:
+    row[NOMINAL.t] = t_s
+    counts[COUNT.running] = 1
+    begin_interval(row, t_s)
+
+
+@inlined
+def begin_interval(row: np.ndarray, t_s: float) -> None:
+    """Begin the interval between two gates."""
+    row[NOMINAL.t_start] = t_s
+    put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
+    row[NOMINAL.dt_squared] = row[NOMINAL.lost_velocity] = row[NOMINAL.lost_turn] = 0.0
+
+
+@inlined
 def coast(row: np.ndarray, setting: np.ndarray, t_s: float) -> None:
-    """Go on without an IMU if none came for long: velocity and attitude held, their certainty fading."""
+    """Go on without an IMU after a long gap: velocity and attitude are held and become less certain."""
     dt = t_s - row[NOMINAL.t]
     if dt <= setting[SETTING.coast_after]:
         return
@@ -152,7 +155,7 @@ def grow(rows: Rows, i: int, P: np.ndarray) -> np.ndarray:
         F, Q = np.eye(n), np.zeros((n, n))
         write_growth(rows, i, F, Q)
         if n < P.shape[0]:
-            predict_jointly(P, 0, F, Q)  # the clones, which stay as they are, are the others
+            predict_jointly(P, 0, F, Q)  # the clones, which do not change, are the other errors
         else:
             P = predicted_covariance(P, F, Q)
     begin_interval(row, row[NOMINAL.t])
@@ -161,7 +164,7 @@ def grow(rows: Rows, i: int, P: np.ndarray) -> np.ndarray:
 
 @inlined
 def write_growth(rows: Rows, i: int, F: np.ndarray, Q: np.ndarray) -> None:
-    """Write how the errors grow over the interval that ends now: transition into F, the identity, and noise into Q.
+    """Write the growth of the errors over the interval that ends now: transition into F, which is I, and noise into Q.
 
     Biases that are Gauss-Markov processes decay.
     """
@@ -192,7 +195,7 @@ def write_growth(rows: Rows, i: int, F: np.ndarray, Q: np.ndarray) -> None:
 
 @portable
 def correct(row: np.ndarray, layout: np.ndarray, gravity: float, error: np.ndarray) -> None:
-    """Put an error of the filter into the state and the biases."""
+    """Correct the state and the biases by an error of the filter."""
     with_accel_bias = layout[LAYOUT.accel_bias] != 0
     put_reckoning(row, corrected(reckoning(row), error, with_accel_bias, gravity))
     put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
@@ -212,26 +215,11 @@ def turn_heading(row: np.ndarray, gravity: float, angle: float) -> None:
     put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
 
 
-@inlined
-def remember(counts: np.ndarray, history: np.ndarray, longest: int, now: Moment) -> None:
-    """Keep one more instant, not before any other."""
-    newest = counts[COUNT.newest] + 1 if counts[COUNT.kept] else 0
-    if newest == longest:
-        newest = 0
-    put_moment(history[newest], now)
-    counts[COUNT.newest] = newest
-    counts[COUNT.kept] = min(counts[COUNT.kept] + 1, longest)
-
-
 @portable
 def clone(rows: Rows, i: int, J: np.ndarray, first: int) -> None:
-    """Clone the present position and velocity in the place of the oldest clone, if it is time for one.
+    """Replace the oldest clone by the present position and velocity, if it is time for one.
 
-    Args:
-        rows: of all drones.
-        i: the drone.
-        J: covariance of its errors, or of all drones' together; changed.
-        first: its first state in J.
+    J is the covariance of the drone's errors, or of all drones' together, in which `first` is its first state.
     """
     row, layout = rows.nominal[i], rows.layout[i]
     if not layout[LAYOUT.clones] or not rows.counts[i, COUNT.heading_known]:
@@ -252,12 +240,23 @@ def clone(rows: Rows, i: int, J: np.ndarray, first: int) -> None:
 
 
 @inlined
+def remember(counts: np.ndarray, history: np.ndarray, longest: int, now: Moment) -> None:
+    """Add the present instant, the newest, to the history."""
+    newest = counts[COUNT.newest] + 1 if counts[COUNT.kept] else 0
+    if newest == longest:
+        newest = 0
+    put_moment(history[newest], now)
+    counts[COUNT.newest] = newest
+    counts[COUNT.kept] = min(counts[COUNT.kept] + 1, longest)
+
+
+@inlined
 def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, float, int]:
     """Return the state at `t_s` as it is known now, with the errors that it has.
 
     Returns:
-        the state; how much earlier it is than the position and velocity whose errors it has [s]; the place of these
-        in the error state: 0 for the present ones, else those of a clone.
+        the state; how much earlier it is than the position and velocity whose errors it has [s]; the place of these in
+        the error state: 0 for the present ones, else those of a clone.
     """
     past = recall(rows.counts[i], rows.history[i], rows.layout[i, LAYOUT.history], t_s, now)
     nearest, slot = abs(now[0] - t_s), -1
@@ -276,27 +275,11 @@ def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, f
 
 
 @inlined
-def move_columns(H: np.ndarray, at: int, size: int, state: int) -> None:
-    """Make rows of a Jacobian by the present position and velocity rows by those of a clone, whose place is `state`."""
-    for r in range(at, at + size if state > 0 else at):
-        for k in range(CLONED):
-            H[r, state + k] = H[r, k]
-            H[r, k] = 0.0
-
-
-@inlined
 def recall(counts: np.ndarray, history: np.ndarray, longest: int, t_s: float, now: Moment) -> Moment:
     """Return the state at `t_s` as `now` sees it, later corrections included.
 
-    Between the history's entries and `now` it is interpolated, before all of them it is the oldest, and after `now` it
-    is reached with constant velocity and rate.
-
-    Args:
-        counts: of the drone.
-        history: its ring, (entries, MOMENT.size).
-        longest: entries that the drone uses of it.
-        t_s: instant [s].
-        now: the present state.
+    It is interpolated between the history's entries and `now`, the oldest one before them, and extrapolated with
+    constant velocity and rate after `now`. `history` is the drone's ring, of which it uses `longest` entries.
     """
     if t_s == now[0]:
         return now
@@ -344,3 +327,12 @@ def _between(a: Moment, b: Moment, t_s: float) -> Moment:
 @inlined
 def _mix(a: Vector, b: Vector, part: float) -> Vector:
     return axpy(a, part, subtract(b, a))
+
+
+@inlined
+def move_columns(H: np.ndarray, at: int, size: int, state: int) -> None:
+    """Convert rows of a Jacobian by the present position and velocity into rows by those of a clone at `state`."""
+    for r in range(at, at + size if state > 0 else at):
+        for k in range(CLONED):
+            H[r, state + k] = H[r, k]
+            H[r, k] = 0.0

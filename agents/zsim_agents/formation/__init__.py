@@ -1,4 +1,1 @@
-"""The cluster controller as an agent: phases, requests and plan, references, control law, limits of the robots.
-
-Imports its spaces, and zsim.
-"""
+"""The cluster controller as an agent: phases, requests and plan, references, control law, limits of the robots."""

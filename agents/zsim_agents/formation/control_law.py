@@ -1,29 +1,39 @@
 """Control laws of a formation, from the estimated robots and a reference to velocity commands.
 
-Order of this file: gains and command, what all laws share (`law:` of a cluster may name a subclass of one's own), the
-stock law.
+Order of this file: gains and command, what all laws share (`law:` of a cluster may name a subclass of your own), the
+stock law, and compiled: the saturation of the robots' velocities, and the guard of the distances between them.
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from zsim.contract.snapshot import State
 from zsim.errors import UserCodeError
 from zsim.math.compiled import portable
+from zsim.math.rotation import Vector, dot, norm, subtract
 from zsim.schema import plugin
 from zsim.schema.checker import show
-from zsim_agents.formation.robot_limits import Pairs, RobotLimits, limited, pairs_of
-from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace
+from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace, row
+
+Pairs = tuple[tuple[int, int], ...]
+Order = NDArray[np.int64]
+PairTable = NDArray[np.int64]
 
 RATES = ("vx", "vy", "vz", "yaw rate")  # of a robot, in the order of r_dot
+NEAR_M = 1e-6  # robots that are nearer have no direction from one to the other
+SETTLED_M_S = 1e-9  # a smaller deficit of the rate is ignored
+LOAD_MIN = 1e-9  # against division by zero
+GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three robots in a corner need a few
 
 
 @dataclass(frozen=True)
@@ -32,7 +42,7 @@ class FormationGains:
 
     Attributes:
         k_1_s: proportional gain [1/s]; 0.5 to 0.8 is good, unstable from about 2 on a drone's velocity loop.
-        integral_1_s2: integral gain [1/s^2]; takes out the offset that wind leaves, 0 switches it off.
+        integral_1_s2: integral gain [1/s^2]; removes the offset that wind causes, 0 switches it off.
         integral_max_m_s, integral_max_rad_s: clamp of the integral term for lengths and for angles.
         separation_min_m: least distance between two robots of a reference, and where the guard acts.
         all others: see `RobotLimits`.
@@ -52,12 +62,11 @@ class FormationGains:
 
     @cached_property
     def limits(self) -> RobotLimits:
-        """Return what the saturation and the guard keep."""
         return RobotLimits(*(float(getattr(self, name)) for name in RobotLimits._fields))
 
 
 class FormationCommand(Struct, eq=False):
-    """What the law asks of the robots.
+    """The commands of the law to the robots.
 
     Attributes:
         v_W: velocities (n, 3) [m/s, W]; yaw_rate: (n,) [rad/s].
@@ -74,17 +83,17 @@ class FormationCommand(Struct, eq=False):
 
 
 class ControlLaw(ABC):
-    """A law: what it asks of the robots is saturated and guarded here, for all laws alike.
+    """A control law, whose demands are saturated and guarded here, for all laws alike.
 
-    One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A law of one's
-    own has `rates`, and where it has a state `reset`, `followed`, `snapshot` and `restore`.
+    One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A law of your own
+    has `rates`, and where it has a state `reset`, `followed`, `snapshot` and `restore`.
 
     Args:
         space: cluster space of n robots.
-        gains: of the scenario; a law takes those that it knows.
+        gains: of the scenario; a law uses those that it needs.
 
     Attributes:
-        robots: what they are called in messages, in their order.
+        robots: their names in messages, in order.
     """
 
     def __init__(self, space: ClusterSpace, gains: FormationGains | None = None) -> None:
@@ -96,7 +105,7 @@ class ControlLaw(ABC):
 
     @abstractmethod
     def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
-        """Return r_dot (4n,) that the robots shall have: (vx, vy, vz [m/s], yaw rate [rad/s]) robot by robot, W.
+        """Return the desired r_dot (4n,): (vx, vy, vz [m/s], yaw rate [rad/s]) robot by robot, W.
 
         Args:
             c: (4n,) cluster of the estimates; p_W, v_W: the estimates, (n, 3) [m, m/s; W].
@@ -107,17 +116,17 @@ class ControlLaw(ABC):
         """Forget all state: the formation is engaged, or goes on after it was held."""
 
     def followed(self, dt_s: float) -> None:  # noqa: B027
-        """Go on by dt_s [s]: the robots get what `rates` returned, neither saturated nor held apart.
+        """Advance by dt_s [s]: the robots get what `rates` returned, neither saturated nor held apart.
 
-        It is not called otherwise, so that an integral that grows here does not wind up.
+        Otherwise it is not called, so that an integral that grows here does not wind up.
         """
 
     def snapshot(self) -> State | None:
-        """Return all state as plain values and arrays, {} where there is none; None: it cannot be handed over."""
+        """Return all state as plain values and arrays, {} where there is none, None where it cannot be transferred."""
         return {} if type(self).reset is ControlLaw.reset and type(self).followed is ControlLaw.followed else None
 
     def restore(self, state: State) -> None:  # noqa: B027
-        """Take over what the law of another process returned by `snapshot`, to go on to the same bits."""
+        """Take over the `snapshot` of the law of another process, to continue with the same bits."""
 
     def command(
         self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array, dt_s: float
@@ -139,7 +148,7 @@ class ControlLaw(ABC):
         return FormationCommand(v_cmd_W, yaw_rate, factor, guarded, alarmed)
 
     def _checked(self, r_dot: Any) -> Array:
-        """Return what `rates` of a user's law returned as an array (4n,) of finite numbers."""
+        """Return the result of a user's `rates` as an array (4n,) of finite numbers."""
         what = f"{plugin.full_name(type(self))}.rates returns"
         size = self.space.size
         try:
@@ -188,8 +197,7 @@ class ProportionalLaw(ControlLaw):
         grow(self.integral, self._error, self.gains.integral_1_s2 * dt_s, self._clamp)
 
 
-LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}
-"""The stock laws by the names that a scenario gives them."""
+LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}  # stock laws by their names in a scenario
 
 
 @portable
@@ -208,3 +216,182 @@ def grow(integral: Array, error: Array, rate: float, clamp: Array) -> None:
     """Add rate error to the integral, within its clamp."""
     for k in range(integral.size):
         integral[k] = min(max(integral[k] + rate * error[k], -clamp[k]), clamp[k])
+
+
+class RobotLimits(NamedTuple):
+    """Limits of the saturation and of the guard, for compiled code.
+
+    Attributes:
+        speed_max_m_s, climb_max_m_s, yaw_rate_max_rad_s: limits of each robot.
+        separation_min_m: least distance between two robots.
+        separation_alarm_m: below it two robots are reported.
+        guard_horizon_s: how far ahead the guard looks.
+        response_s: lag of a drone's velocity loop, during which the guard expects it to keep its velocity.
+    """
+
+    speed_max_m_s: float
+    climb_max_m_s: float
+    yaw_rate_max_rad_s: float
+    separation_min_m: float
+    separation_alarm_m: float
+    guard_horizon_s: float
+    response_s: float
+
+
+def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[Array, Pairs, Pairs]:
+    """Return the velocities without dangerous approaches, the pairs concerned, and the pairs in alarm.
+
+    Two robots at distance d, d' = rate of the command along their line, are held to d' >= -(d_near - separation_min) /
+    guard_horizon: the distance predicted over the horizon stays above the minimum, and below it the approach is
+    reversed. d_near allows for the present velocities, which last for the response time. Each robot of a pair takes
+    half of the change; a few sweeps settle several pairs.
+    """
+    parted_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
+    guards, alarms = hold_apart(p_W, v_W, parted_W, order, *limits)
+    return parted_W, *pairs_of(guards, alarms, order)
+
+
+def pairs_of(guards: int, alarms: int, order: Order) -> tuple[Pairs, Pairs]:
+    """Return the pairs that `hold_apart` has held apart, and those in alarm."""
+    return _numbered(order) if guards else (), _numbered(order.T) if alarms else ()
+
+
+def _numbered(order: Order) -> Pairs:
+    """Return the pairs with a number above the diagonal, in the order of their numbers."""
+    numbers = order.tolist()
+    places = [(numbers[i][j], i, j) for j in range(len(numbers)) for i in range(j) if numbers[i][j]]
+    return tuple((i, j) for _, i, j in sorted(places))
+
+
+@portable
+def limited(
+    r_dot: Array, p_W: Array, v_W: Array, v_cmd_W: Array, yaw_rate: Array, order: Order, *limits_of: float
+) -> tuple[float, int, int]:
+    """Write velocities (n, 3) and yaw rates (n,) of r_dot (4n,), saturated and guarded.
+
+    Returns the factor of the saturation, then the result of `hold_apart`; limits_of are the fields of RobotLimits:
+    passing a tuple to compiled code takes longer than all else here.
+    """
+    limits = RobotLimits(*limits_of)
+    for i in range(yaw_rate.size):
+        v_cmd_W[i, 0], v_cmd_W[i, 1], v_cmd_W[i, 2] = r_dot[4 * i], r_dot[4 * i + 1], r_dot[4 * i + 2]
+        yaw_rate[i] = r_dot[4 * i + 3]
+    factor = min(1.0, 1.0 / max(load(v_cmd_W, yaw_rate, limits), LOAD_MIN))
+    scale(v_cmd_W, yaw_rate, factor)
+    guards, alarms = hold_apart(p_W, v_W, v_cmd_W, order, *limits_of)
+    if guards:
+        scale(v_cmd_W, yaw_rate, 1.0 / max(load(v_cmd_W, yaw_rate, limits), 1.0))
+    return factor, guards, alarms
+
+
+@portable
+def load(v_W: Array, yaw_rate: Array, limits: RobotLimits) -> float:
+    """Return the greatest ratio of a robot's speed, climb or yaw rate to its limit; 1 is at the limit."""
+    most = 0.0
+    for i in range(yaw_rate.size):
+        speed = math.sqrt(v_W[i, 0] * v_W[i, 0] + v_W[i, 1] * v_W[i, 1])
+        most = max(most, speed / limits.speed_max_m_s)
+        most = max(most, abs(v_W[i, 2]) / limits.climb_max_m_s)
+        most = max(most, abs(yaw_rate[i]) / limits.yaw_rate_max_rad_s)
+    return most
+
+
+@portable
+def scale(v_W: Array, yaw_rate: Array, factor: float) -> None:
+    for i in range(yaw_rate.size):
+        for k in range(3):
+            v_W[i, k] *= factor
+        yaw_rate[i] *= factor
+
+
+@portable
+def near_pairs(p_W: Array, within_m: float) -> PairTable:
+    """Return the pairs (m, 2), i < j, by j and then by i, of positions (n, 3) that are nearer than a distance."""
+    n = p_W.shape[0]
+    pairs, count = np.empty((n * (n - 1) // 2, 2), np.int64), 0
+    for j in range(1, n):
+        for i in range(j):
+            x, y, z = p_W[j, 0] - p_W[i, 0], p_W[j, 1] - p_W[i, 1], p_W[j, 2] - p_W[i, 2]
+            if not math.sqrt(x * x + y * y + z * z) >= within_m:  # also true for NaN
+                pairs[count, 0], pairs[count, 1] = i, j
+                count += 1
+    return pairs[:count]
+
+
+@portable
+def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of: float) -> tuple[int, int]:
+    """Change commands in place until every pair separates at its least rate (see `guard`).
+
+    Returns how many pairs were changed and how many are nearer than the alarm threshold; writes into order (n, n) the
+    numbers of the former, from 1 on, above the diagonal and of the latter below it, all else zero.
+    """
+    limits = RobotLimits(*limits_of)
+    order[:] = 0
+    near = near_pairs(p_W, max(reach(limits), limits.separation_alarm_m))
+    alarms = note_alarms(p_W, near, limits.separation_alarm_m, order)
+    guards = 0
+    for _ in range(GUARD_SWEEPS):
+        settled = True
+        for k in range(near.shape[0]):
+            i, j = near[k, 0], near[k, 1]
+            if part(p_W, v_W, v_cmd_W, i, j, limits):
+                settled = False
+                if order[i, j] == 0:
+                    guards += 1
+                    order[i, j] = guards
+        if settled:
+            break
+    return guards, alarms
+
+
+@portable
+def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: Order) -> int:
+    """Number the near pairs below the alarm threshold, below the diagonal; return how many there are."""
+    alarms = 0
+    for k in range(near.shape[0]):
+        i, j = near[k, 0], near[k, 1]
+        if norm(subtract(row(p_W, j), row(p_W, i))) < separation_alarm_m:
+            alarms += 1
+            order[j, i] = alarms
+    return alarms
+
+
+@portable
+def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLimits) -> bool:
+    """Let robots i and j separate at their least rate, half of the change each; return whether they did not."""
+    line_W = subtract(row(p_W, j), row(p_W, i))
+    distance = norm(line_W)
+    if distance >= reach(limits):
+        return False
+    u_W = direction(line_W, distance)
+    near = distance + min(along(u_W, v_W, i, j), 0.0) * limits.response_s
+    least = (limits.separation_min_m - near) / limits.guard_horizon_s
+    lacking = least - along(u_W, v_cmd_W, i, j)
+    if lacking <= SETTLED_M_S:
+        return False
+    for k in range(3):
+        v_cmd_W[i, k] -= u_W[k] * lacking / 2
+        v_cmd_W[j, k] += u_W[k] * lacking / 2
+    return True
+
+
+@portable
+def reach(limits: RobotLimits) -> float:
+    """Return the distance beyond which no two robots come too near within the horizon."""
+    climb, speed = limits.climb_max_m_s, limits.speed_max_m_s
+    fastest = 2.0 * math.sqrt(speed * speed + climb * climb)
+    return limits.separation_min_m + fastest * (limits.guard_horizon_s + limits.response_s)
+
+
+@portable
+def along(u_W: Vector, v_W: Array, i: int, j: int) -> float:
+    """Return the rate at which j leaves i along their line [m/s]."""
+    return dot(u_W, subtract(row(v_W, j), row(v_W, i)))
+
+
+@portable
+def direction(line_W: Vector, distance: float) -> Vector:
+    """Return the unit vector of a line; east where robots coincide, so that they part at all."""
+    if distance < NEAR_M:
+        return 1.0, 0.0, 0.0
+    return line_W[0] / distance, line_W[1] / distance, line_W[2] / distance

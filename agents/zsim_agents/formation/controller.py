@@ -1,7 +1,4 @@
-"""The cluster controller as an agent: estimates and states in, velocity commands and cluster state out.
-
-Order of this file: the agent, `receive`, `step`, requests, warm start, pure parts.
-"""
+"""The cluster controller as an agent: estimates and states in, velocity commands and cluster state out."""
 
 import math
 from collections.abc import Sequence
@@ -20,27 +17,12 @@ from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.engagement_setup import engagement_of
-from zsim_agents.formation.flight_data import GateInput, GateOutput
+from zsim_agents.formation.flight_check import GateInput
 from zsim_agents.formation.flight_plan import RequestError, read_request
 
 REQUESTS_MAX = 1000  # between two gates, as in a run that is paused; the next gate publishes them
 
-variances_of = itemgetter(0, 7, 14)  # of the position, in the 6 x 6 covariance, row-major
-
-
-class GateTable:
-    """The numbers of a GateInput of n drones; they hold until the next gate fills them anew.
-
-    Attributes:
-        p_W, v_W, sigma_m: (n, 3); yaw, yaw_sigma, age_s: (n,).
-        fill: takes all numbers of p_W, then of v_W, sigma_m, yaw, yaw_sigma and age_s, drone by drone.
-    """
-
-    def __init__(self, n: int) -> None:
-        table = np.empty((12, n))
-        self.p_W, self.v_W, self.sigma_m = table[:9].reshape(3, n, 3)
-        self.yaw, self.yaw_sigma, self.age_s = table[9:]
-        self.fill = partial(Packing(f"={table.size}d").pack_into, table.data, 0)  # numpy takes three times as long
+_variances_of = itemgetter(0, 7, 14)  # of the position, in the 6 x 6 covariance, row-major
 
 
 class Controller(Agent):
@@ -48,7 +30,7 @@ class Controller(Agent):
 
     Args:
         info: of the run.
-        scenario: the resolved one that the info carries.
+        scenario: the resolved one in the info.
         cluster: name.
 
     Raises:
@@ -75,7 +57,10 @@ class Controller(Agent):
         self._place = {key: i for of_drones in (states, estimates) for i, key in enumerate(of_drones)}
         self._velocity_keys = [keys.command(drone, "velocity") for drone in spec.drones]
         self._estimates = [_UNKNOWN] * len(spec.drones)
-        self._table = GateTable(len(spec.drones))
+        table = np.empty((12, len(spec.drones)))  # the numbers of a GateInput, valid until the next gate
+        self._p_W, self._v_W, self._sigma_m = table[:9].reshape(3, len(spec.drones), 3)
+        self._yaw, self._yaw_sigma, self._age_s = table[9:]
+        self._fill = partial(Packing(f"={table.size}d").pack_into, table.data, 0)  # numpy takes three times as long
         self._states: list[str] = ["landed"] * len(spec.drones)
         self._status_ns = [0] * len(spec.drones)
         self._engagement = engagement_of(scenario, spec)
@@ -91,89 +76,65 @@ class Controller(Agent):
             former = self._estimates[place]
             if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime an older one may come later
                 self._estimates[place] = message
-        elif message.t_ns >= self._status_ns[place]:  # over a link that jitters, too
+        elif message.t_ns >= self._status_ns[place]:  # likewise
             self._states[place], self._status_ns[place] = message.state, message.t_ns
 
     def step(self, t_ns: int) -> list[Output]:
         self._stepped_ns = t_ns
         output = self._engagement.step(self._gate(t_ns))
-        commands = [*self._modes(t_ns, output), *self._velocities(t_ns, output)]
-        return [*self._requests(t_ns), *commands, *self._state(t_ns, output)]
-
-    def _requests(self, t_ns: int) -> list[Output]:
-        """Return the requests since the last gate; a re-run of the record makes them before this one."""
+        source, outputs = self.source, []
         answered, self._answered = self._answered, []
-        key, by = self._request_key, self.source
-        return [
-            Output(
-                key,
-                run_messages.ClusterRequest(
-                    t_ns, self.next_seq(key), request.op, request.args, request.source, answer.ok, answer.error, by
-                ),
+        for request, answer in answered:  # since the last gate; a re-run of the record makes them before this one
+            key = self._request_key
+            message = run_messages.ClusterRequest(
+                t_ns, self.next_seq(key), request.op, request.args, request.source, answer.ok, answer.error, source
             )
-            for request, answer in answered
-        ]
+            outputs.append(Output(key, message))
+        for drone, mode in output.modes:
+            key = keys.command(drone, "mode")
+            outputs.append(Output(key, flight_messages.Mode(t_ns, self.next_seq(key), source, mode)))  # type: ignore[arg-type]
+        for key, setpoint, estimate in zip(self._velocity_keys, output.setpoints, self._estimates, strict=True):
+            if setpoint is not None and estimate is not _UNKNOWN:
+                velocity = in_heading(setpoint.v_W, estimate.yaw_rad)
+                message = flight_messages.Velocity(t_ns, self.next_seq(key), source, velocity, setpoint.yaw_rate)
+                outputs.append(Output(key, message))
+        self._last_state = state = flight_messages.ClusterState(
+            t_ns=t_ns,
+            seq=self.next_seq(self._state_key),
+            phase=output.phase,  # type: ignore[arg-type]
+            drones=self.drones,
+            names=self._engagement.space.names,
+            value=_finite(output.value),
+            desired=_finite(output.desired),
+            desired_rate=_finite(output.desired_rate),
+            trajectory_t_s=output.trajectory_t_s,
+            margin=output.margin if math.isfinite(output.margin) else 0.0,
+            reason=output.reason,
+            source=source,
+            plan_step=output.plan_step,
+        )
+        outputs.append(Output(self._state_key, state))
+        return outputs
 
     def _gate(self, t_ns: int) -> GateInput:
         positions, velocities, variances, yaws, yaw_sigmas, ages_s = [], [], [], [], [], []
         for e in self._estimates:
             positions += e.position_m
             velocities += e.velocity_m_s
-            variances += variances_of(e.covariance)
+            variances += _variances_of(e.covariance)
             yaws.append(e.yaw_rad)
             yaw_sigmas.append(e.yaw_sigma_rad)
             ages_s.append((t_ns - e.t_ns) * 1e-9 if e is not _UNKNOWN else math.inf)
-        table = self._table
-        table.fill(*positions, *velocities, *variances, *yaws, *yaw_sigmas, *ages_s)
-        np.sqrt(table.sigma_m, table.sigma_m)
-        p_W = ahead(table.p_W, table.v_W, table.age_s) if any(ages_s) else table.p_W
-        sigmas = table.sigma_m, table.yaw_sigma
-        return GateInput(t_ns * 1e-9, p_W, table.yaw, table.v_W, *sigmas, table.age_s, tuple(self._states))
-
-    def _modes(self, t_ns: int, output: GateOutput) -> list[Output]:
-        outputs = []
-        for drone, mode in output.modes:
-            key = keys.command(drone, "mode")
-            outputs.append(Output(key, flight_messages.Mode(t_ns, self.next_seq(key), self.source, mode)))  # type: ignore[arg-type]
-        return outputs
-
-    def _velocities(self, t_ns: int, output: GateOutput) -> list[Output]:
-        outputs, source = [], self.source
-        for key, setpoint, estimate in zip(self._velocity_keys, output.setpoints, self._estimates, strict=True):
-            if setpoint is None or estimate is _UNKNOWN:
-                continue
-            velocity = in_heading(setpoint.v_W, estimate.yaw_rad)
-            message = flight_messages.Velocity(t_ns, self.next_seq(key), source, velocity, setpoint.yaw_rate)
-            outputs.append(Output(key, message))
-        return outputs
-
-    def _state(self, t_ns: int, output: GateOutput) -> list[Output]:
-        names = self._engagement.space.names
-        value, desired = _finite(output.value), _finite(output.desired)
-        state = flight_messages.ClusterState(
-            t_ns=t_ns,
-            seq=self.next_seq(self._state_key),
-            phase=output.phase,  # type: ignore[arg-type]
-            drones=self.drones,
-            names=names,
-            value=value,
-            desired=desired,
-            desired_rate=_finite(output.desired_rate),
-            trajectory_t_s=output.trajectory_t_s,
-            margin=output.margin if math.isfinite(output.margin) else 0.0,
-            reason=output.reason,
-            source=self.source,
-            plan_step=output.plan_step,
-        )
-        self._last_state = state
-        return [Output(self._state_key, state)]
+        self._fill(*positions, *velocities, *variances, *yaws, *yaw_sigmas, *ages_s)
+        np.sqrt(self._sigma_m, self._sigma_m)
+        p_W = ahead(self._p_W, self._v_W, self._age_s) if any(ages_s) else self._p_W
+        sigmas = self._sigma_m, self._yaw_sigma
+        return GateInput(t_ns * 1e-9, p_W, self._yaw, self._v_W, *sigmas, self._age_s, tuple(self._states))
 
     def views(self, t_ns: int) -> list[Output]:
-        state = self._last_state
-        if state is None:
+        if self._last_state is None:
             return []
-        seq = self.next_seq(self._view_key)
-        return [Output(self._view_key, cluster_view(state, t_ns, seq))]
+        return [Output(self._view_key, cluster_view(self._last_state, t_ns, self.next_seq(self._view_key)))]
 
     def control_keys(self) -> tuple[str, ...]:
         return (self._control_key,)
@@ -240,18 +201,16 @@ def in_heading(v_W: Sequence[float], yaw: float) -> tuple[float, float, float]:
 
 
 def _finite(values: np.ndarray) -> tuple[float, ...]:
-    """Return values for the wire, where nothing unknown may travel: zeros in its place."""
+    """Return values for the wire, with zeros in place of those that are not finite."""
     numbers = values.tolist()
-    if not math.isfinite(sum(numbers)):  # one of them is not, or they are too large for a sum
+    if not math.isfinite(sum(numbers)):  # one of them is not, or the sum overflows
         numbers = [number if math.isfinite(number) else 0.0 for number in numbers]
     return tuple(numbers)
 
 
 def ahead(p_W: np.ndarray, v_W: np.ndarray, age_s: np.ndarray) -> np.ndarray:
-    """Return where drones are by now whose estimates are old, as behind a slow link: at constant velocity.
+    """Return the present positions (n, 3) of drones with old estimates, at constant velocity.
 
-    Args:
-        p_W, v_W: (n, 3) of the estimates.
-        age_s: (n,); infinite where there is none.
+    The ages (n,) are infinite where there is no estimate.
     """
     return p_W + v_W * np.where(np.isfinite(age_s), age_s, 0.0)[:, None]

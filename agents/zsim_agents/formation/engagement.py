@@ -1,7 +1,7 @@
 """The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
 
 A plain object: estimates in, commands out, once per gate; requests in between. Nothing is engaged, resumed or
-followed that was not checked, every refusal has a reason, and every reference starts where the formation is.
+followed unchecked, every refusal has a reason, and every reference starts where the formation is.
 """
 
 from __future__ import annotations
@@ -12,9 +12,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from zsim.contract.snapshot import State
-from zsim_agents.formation.control_law import ControlLaw, FormationCommand, FormationGains, ProportionalLaw
-from zsim_agents.formation.flight_check import FlightCheck, place_fault, shape_fault
-from zsim_agents.formation.flight_data import (
+from zsim_agents.formation.control_law import (
+    ControlLaw,
+    FormationCommand,
+    FormationGains,
+    Pairs,
+    ProportionalLaw,
+    RobotLimits,
+    guard,
+)
+from zsim_agents.formation.flight_check import (
     AIRBORNE,
     DOWN,
     GUARD_PARTS,
@@ -23,10 +30,12 @@ from zsim_agents.formation.flight_data import (
     REJOINING,
     TOO_NEAR,
     EngagementLimits,
+    FlightCheck,
     GateInput,
     GateOutput,
     ModeCommand,
-    ModeSender,
+    formation_fault,
+    place_fault,
     setpoints,
 )
 from zsim_agents.formation.flight_plan import (
@@ -42,10 +51,8 @@ from zsim_agents.formation.flight_plan import (
     Rejoin,
     Scheduled,
     TakeOff,
-    refuse,
 )
 from zsim_agents.formation.guidance import IN_PLACE_M, Guidance, Places
-from zsim_agents.formation.robot_limits import Pairs, RobotLimits, guard
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
 DT_MAX_S = 0.1  # longest step of the integral, after a gap
@@ -59,7 +66,7 @@ class Engagement:
     Args:
         space: cluster space of n robots.
         drones: their names in the order of the robots, for commands and reasons.
-        plan: what the scenario asks for by itself; a Land by request drops the rest of it.
+        plan: requests that the scenario makes by itself; a Land by request drops the rest of them.
         law: class of the control law.
 
     Raises:
@@ -85,22 +92,22 @@ class Engagement:
         self.law.robots = self.drones
         self.guidance = Guidance(space, self.gains, self.limits.shape)
         self.plan = FlightPlan(space, plan)
-        self._held_limits = self.gains.limits._replace(separation_min_m=self.gains.separation_min_m + HOLD_APART_M)
         self.check = FlightCheck(space, self.drones, self.gains, self.limits)
+        self._held_limits = self.gains.limits._replace(separation_min_m=self.gains.separation_min_m + HOLD_APART_M)
         self._phase = "idle"
         self._gate: GateInput | None = None
         self._dt_s = 0.0
-        self._modes = ModeSender(self.drones, self.limits.resend_s)
+        self._modes: dict[str, float] = {}  # when a mode was commanded last, by drone
         self._landing_s = -math.inf
         self._fault = ""  # why an engaged formation does not close its loop
         self._well_since_s = math.inf
         self._places: Places | None = None  # while the drones of a held formation are led back to them
         self._checked = np.empty(0)  # the last reference without a fault; one at rest stays the same array
-        self._wrapped = self._checked, self._checked  # the last reference and the same with wrapped angles
+        self._wrapped = self._checked, self._checked  # the last reference, and the same with wrapped angles
 
     @property
     def phase(self) -> str:
-        """Return idle, taking_off, assembling, engaged, landing or held."""
+        """One of idle, taking_off, assembling, engaged, landing and held."""
         return "held" if self._phase == "engaged" and (self._fault or self.guidance.paused) else self._phase
 
     def step(self, gate: GateInput) -> GateOutput:
@@ -112,7 +119,17 @@ class Engagement:
         self.plan.run(gate.t_s, self._try)
         if self._phase in ("assembling", "engaged") and gate.down:
             self._phase, self._places = "idle", None
-        return _PHASES[self._phase](self, gate)
+        if self._phase == "engaged":
+            self._judge(gate)
+            return self._hold(gate) if self._fault else self._fly(gate)
+        if self._phase == "taking_off":
+            waiting = self.check.state_fault(gate, AIRBORNE)
+            if waiting:
+                return self._climb(gate, waiting, self._mode_commands(gate, "takeoff", frozenset({"landed"})))
+            self._phase = "assembling"
+        if self._phase == "assembling":
+            return self._climb(gate, self.check.engagement_fault(gate) or READY_TO_ENGAGE)
+        return self._land(gate) if self._phase == "landing" else self._output(gate, "")
 
     def request(self, request: FlightRequest) -> str | None:
         """Grant a request and return None, or return why it is refused; then nothing has changed."""
@@ -124,10 +141,10 @@ class Engagement:
         return refusal
 
     def warm_start(self, phase: str, desired: Array, plan_step: int = 0) -> None:
-        """Go on where a former process of this formation was: in its phase, at its reference (4n,).
+        """Continue in the phase and at the reference (4n,) of a former process of this formation.
 
-        Its plan goes on after the steps that the former one was through with, as in its `GateOutput.plan_step`; what it
-        flew by the plan (a target, a trajectory) is asked for again, from that reference.
+        Its plan continues after the completed steps, as in the former `GateOutput.plan_step`; what it flew by the plan
+        (a target, a trajectory) is requested again, from that reference.
         """
         self._phase = "engaged" if phase == "held" else phase
         if self._phase == "engaged":
@@ -135,7 +152,7 @@ class Engagement:
         self.plan.start_at(plan_step)
 
     def snapshot(self) -> State | None:
-        """Return all that it has come to know, but for the last gate, as plain values; None if the law has none."""
+        """Return the whole state, without the last gate, as plain values; None if the law has none."""
         law = self.law.snapshot()
         if law is None:
             return None
@@ -144,7 +161,7 @@ class Engagement:
             "landing_s": self._landing_s,
             "fault": self._fault,
             "well_since_s": self._well_since_s,
-            "modes": self._modes.sent_s,
+            "modes": self._modes,
             "value": self.check.value,
             "checked": self._checked,
             "places": None if self._places is None else self._places.p_W,
@@ -157,9 +174,8 @@ class Engagement:
         """Take over the snapshot of another process, and the gate that it stepped last."""
         self._phase, self._landing_s = state["phase"], state["landing_s"]
         self._fault, self._well_since_s = state["fault"], state["well_since_s"]
-        self._modes.sent_s = state["modes"]
+        self._modes, self._checked = state["modes"], state["checked"]
         self.check.value = state["value"]
-        self._checked = state["checked"]
         self._places = None if state["places"] is None else self._places_at(state["places"])
         self.guidance.restore(state["guidance"])
         self.plan.restore(state["plan"])
@@ -183,7 +199,10 @@ class Engagement:
         elif isinstance(request, Engage):
             self._grant_engage(gate)
         elif isinstance(request, Land):
-            self._grant_land(gate)
+            if self._phase == "idle" and gate.down:
+                raise RefusalError("all drones are on the ground")
+            self._phase, self._landing_s, self._places = "landing", gate.t_s, None
+            self._modes.clear()
         elif isinstance(request, Rejoin):
             self._grant_rejoin(gate)
         elif isinstance(request, Pause) and self._places is not None:
@@ -202,9 +221,10 @@ class Engagement:
     def _grant_take_off(self, gate: GateInput) -> None:
         if self._phase != "idle":
             raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
-        refuse(self.check.take_off_fault(gate))
+        if fault := self.check.take_off_fault(gate):
+            raise RefusalError(fault)
         self._phase = "taking_off"
-        self._modes.restart()
+        self._modes.clear()
 
     def _grant_engage(self, gate: GateInput) -> None:
         if self._phase == "engaged" and self.guidance.paused and not self._fault:
@@ -212,7 +232,8 @@ class Engagement:
             return
         if self._phase != "assembling":
             raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
-        refuse(self.check.engagement_fault(gate))
+        if fault := self.check.engagement_fault(gate):
+            raise RefusalError(fault)
         self.guidance.engage(self.check.value)
         self.plan.overrule()
         self.law.reset()
@@ -222,10 +243,11 @@ class Engagement:
     def _grant_rejoin(self, gate: GateInput) -> None:
         if self._phase != "engaged" or not self._fault:
             raise RefusalError(f"phase is {self.phase}; possible when held by a fault")
-        refuse(self._unflyable(gate))
+        if fault := self._unflyable(gate):
+            raise RefusalError(fault)
         c = self._checked if self._checked.size else self.guidance.value(gate.t_s)[0]
-        shape = self.limits.shape_in_flight
-        refuse(shape_fault(self.space, c, shape) or place_fault(self.space, c, self.gains, shape))
+        if fault := formation_fault(self.space, c, self.gains, self.limits.shape_in_flight):
+            raise RefusalError(fault)
         self._places = self._places_at(self.space.inverse(c)[0])
 
     def _places_at(self, p_W: Array) -> Places:
@@ -235,21 +257,14 @@ class Engagement:
         """Return why the drones cannot be led one by one."""
         return self.check.state_fault(gate, AIRBORNE) or self.check.estimate_fault(gate)
 
-    def _grant_land(self, gate: GateInput) -> None:
-        if self._phase == "idle" and gate.down:
-            raise RefusalError("all drones are on the ground")
-        self._phase, self._landing_s, self._places = "landing", gate.t_s, None
-        self._modes.restart()
-
-    def _taking_off(self, gate: GateInput) -> GateOutput:
-        waiting = self.check.state_fault(gate, AIRBORNE)
-        if waiting is None:
-            self._phase = "assembling"
-            return self._assembling(gate)
-        return self._climb(gate, waiting, self._modes.commands(gate, "takeoff", frozenset({"landed"})))
-
-    def _assembling(self, gate: GateInput) -> GateOutput:
-        return self._climb(gate, self.check.engagement_fault(gate) or READY_TO_ENGAGE)
+    def _mode_commands(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
+        """Return a mode command for each drone in one of the states, once per resend_s."""
+        due = []
+        for drone, state in zip(self.drones, gate.states, strict=True):
+            if state in states and gate.t_s - self._modes.get(drone, -math.inf) >= self.limits.resend_s:
+                self._modes[drone] = gate.t_s
+                due.append(ModeCommand(drone, mode))
+        return tuple(due)
 
     def _climb(self, gate: GateInput, reason: str, modes: tuple[ModeCommand, ...] = ()) -> GateOutput:
         """Lead the drones that fly straight up to the assembly height, each by its own velocity loop."""
@@ -257,9 +272,42 @@ class Engagement:
         climb_m_s = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), self.limits.assembly_climb_m_s)
         return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
 
-    def _engaged(self, gate: GateInput) -> GateOutput:
-        self._judge(gate)
-        return self._held(gate) if self._fault else self._fly(gate)
+    def _land(self, gate: GateInput) -> GateOutput:
+        # A take-off sent just before may still be on its way: idle only after a while on the ground.
+        if gate.down and gate.t_s - self._landing_s >= self.limits.resend_s:
+            self._phase = "idle"
+        modes = self._mode_commands(gate, "land", AIRBORNE | {"taking_off"})
+        return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
+
+    def _judge(self, gate: GateInput) -> None:
+        """Set the fault of an engaged formation, or clear it when all has been well for a while."""
+        fault = self._way_fault(gate) or self.check.flight_fault(gate)
+        fault = fault or (None if self._fault else self._reference_fault(gate.t_s))
+        if fault:
+            self._fault, self._well_since_s = fault, math.inf
+        elif self._fault:
+            self._well_since_s = min(self._well_since_s, gate.t_s)
+            if gate.t_s - self._well_since_s >= self.limits.heal_s:
+                self._heal(gate)
+
+    def _heal(self, gate: GateInput) -> None:
+        try:
+            self.guidance.rejoin(self.check.value, gate.t_s, self.limits.shape_in_flight)
+        except REFUSALS as refusal:
+            self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
+        else:
+            self._fault, self._places = "", None
+            self.law.reset()
+
+    def _reference_fault(self, t_s: float) -> str | None:
+        """Return why the reference may not be flown now: the checks before the flight cover a limited time."""
+        try:
+            c_des = self.guidance.value(t_s)[0]
+            fault = None if c_des is self._checked else place_fault(self.space, c_des, self.gains, self.limits.shape)
+            self._checked = self._checked if fault else c_des
+        except REFUSALS as error:
+            fault = str(error)
+        return f"reference: {fault}" if fault else None
 
     def _fly(self, gate: GateInput) -> GateOutput:
         c_des, c_dot_des = self.guidance.value(gate.t_s)
@@ -271,15 +319,14 @@ class Engagement:
             self._wrapped = c_des, self.space.wrapped(c_des)
         return self._output(gate, reason, command=command, reference=(self._wrapped[1], c_dot_des))
 
-    def _held(self, gate: GateInput) -> GateOutput:
-        command = self._upright(gate, 0.0, self._held_limits) if self._places is None else self._way_back(gate)
+    def _hold(self, gate: GateInput) -> GateOutput:
+        """Keep the drones of a held formation in place, or lead them to their places, without turning."""
+        if self._places is None:
+            command = self._upright(gate, 0.0, self._held_limits)
+        else:
+            v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, self._places.velocities(gate.p_W), self._held_limits)
+            command = FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
         return self._output(gate, self._fault, command=command)
-
-    def _way_back(self, gate: GateInput) -> FormationCommand:
-        """Return the guarded velocities of drones that fly to their places, without turning."""
-        assert self._places is not None
-        v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, self._places.velocities(gate.p_W), self._held_limits)
-        return FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
 
     def _way_fault(self, gate: GateInput) -> str | None:
         """Return which drone is not in its place yet, while they are led; a drone that cannot be flown ends that."""
@@ -301,43 +348,6 @@ class Engagement:
             v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, limits)
         return FormationCommand(v_W, np.zeros(self.space.n), 1.0, (), alarmed)
 
-    def _landing(self, gate: GateInput) -> GateOutput:
-        # A take-off sent just before may still be on its way: idle only after a while on the ground.
-        if gate.down and gate.t_s - self._landing_s >= self.limits.resend_s:
-            self._phase = "idle"
-        modes = self._modes.commands(gate, "land", AIRBORNE | {"taking_off"})
-        return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
-
-    def _judge(self, gate: GateInput) -> None:
-        """Set the fault of an engaged formation, or heal it when all has been well for a while."""
-        fault = self._way_fault(gate) or self.check.flight_fault(gate)
-        fault = fault or (None if self._fault else self._reference_fault(gate.t_s))
-        if fault:
-            self._fault, self._well_since_s = fault, math.inf
-        elif self._fault:
-            self._well_since_s = min(self._well_since_s, gate.t_s)
-            if gate.t_s - self._well_since_s >= self.limits.heal_s:
-                self._heal(gate)
-
-    def _heal(self, gate: GateInput) -> None:
-        try:
-            self.guidance.rejoin(self.check.value, gate.t_s, self.limits.shape_in_flight)
-        except REFUSALS as refusal:
-            self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
-        else:
-            self._fault, self._places = "", None
-            self.law.reset()
-
-    def _reference_fault(self, t_s: float) -> str | None:
-        """Return why the reference may not be flown now: checks before the flight end after a while."""
-        try:
-            c_des = self.guidance.value(t_s)[0]
-            fault = None if c_des is self._checked else place_fault(self.space, c_des, self.gains, self.limits.shape)
-            self._checked = self._checked if fault else c_des
-        except REFUSALS as error:
-            fault = str(error)
-        return f"reference: {fault}" if fault else None
-
     def _output(
         self,
         gate: GateInput,
@@ -347,7 +357,7 @@ class Engagement:
         command: FormationCommand | None = None,
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
-        """Return the output of a gate; without a reference its own value is the desired one."""
+        """Return the output of a gate; without a reference the present value is the desired one."""
         alarmed = command.alarmed if command else ()
         if alarmed:
             reason = f"{TOO_NEAR}, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
@@ -371,12 +381,3 @@ class Engagement:
 
     def _pairs(self, pairs: Pairs) -> str:
         return ", ".join(f"{self.drones[i]} and {self.drones[j]}" for i, j in pairs)
-
-
-_PHASES = {
-    "idle": lambda engagement, gate: engagement._output(gate, ""),
-    "taking_off": Engagement._taking_off,
-    "assembling": Engagement._assembling,
-    "engaged": Engagement._engaged,
-    "landing": Engagement._landing,
-}

@@ -1,4 +1,13 @@
-"""The engagement that a scenario's cluster asks for: its space, gains, law and plan, rehearsed before the flight."""
+"""The engagement that a scenario's cluster asks for: its space, gains, law and plan, rehearsed before the flight.
+
+A plan is judged before the flight from where the drones stand. In flight the guidance refuses what is beyond the
+limits, twice a second anew, and the formation hovers meanwhile. A plan that is certain to be refused to its end, or is
+over before any formation could begin it, is refused here, with the factor by which its time has to be stretched. Limits
+are a little wider than in flight, as the formation is never exactly where it was set down: cases between the two are
+left to the flight.
+"""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
@@ -11,18 +20,40 @@ from msgspec import UNSET
 from zsim.errors import DocumentError, NotTrustedError, RunError
 from zsim.scenario.scenario import Cluster, Gains, Scenario
 from zsim.schema import plugin
-from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, ProportionalLaw
+from zsim_agents.formation.control_law import (
+    LAWS,
+    ControlLaw,
+    FormationGains,
+    RobotLimits,
+    guard,
+    load,
+)
 from zsim_agents.formation.engagement import Engagement
-from zsim_agents.formation.flight_check import all_near
-from zsim_agents.formation.flight_data import EngagementLimits, GateInput
-from zsim_agents.formation.flight_plan import FlightPlan, PlanError, plan_of
-from zsim_agents.formation.plan_check import check_flyable
-from zsim_agents.formation.robot_limits import guard, load
-from zsim_agents.formation.spaces.cluster_space import ClusterSpace, closest_pair, robot_rates
+from zsim_agents.formation.flight_check import (
+    EngagementLimits,
+    GateInput,
+    all_near,
+    formation_fault,
+    shape_fault,
+)
+from zsim_agents.formation.flight_plan import REFUSALS, FlightPlan, Follow, MoveTo, PlanError, plan_of
+from zsim_agents.formation.guidance import HORIZON_S, LOAD_TOLERANCE, RampPlanner
+from zsim_agents.formation.spaces.cluster_space import (
+    Array,
+    ClusterSpace,
+    SingularClusterError,
+    closest_pair,
+    robot_rates,
+)
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_agents.formation.trajectory import Hold, ramp_onto
+from zsim_agents.formation.trajectory import Hold, Reference, Shifted, ramp_onto
 
 APART_M = 2.0  # of robots in a rehearsal, any distance well above zero
+READY_S = 3.0  # least from the order to take off to the engagement: a take-off to the hover; AR.Drones take 4 to 12 s
+ROOM = 1.05  # chosen: of the limits of speed, as a drone's place in the formation differs by some centimetres
+WAY_ROOM = 1.25  # chosen: of a way from the start, whose length differs by what the drones drift in their climb
+NEAR_ROOM = 0.9  # chosen: of the least separation and height
+STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # of a reference that is sampled
 
 
 def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
@@ -32,10 +63,17 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         RunError: the plan can never be flown, with the reason.
     """
     with _refusals_of(scenario, cluster):
-        space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
-        rehearse(space, gains, law)
-        engagement = Engagement(space, cluster.drones, gains, limits_of(cluster.gains), plan_of(cluster), law)
-        check_flyable(scenario, cluster, space, gains)
+        space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
+        name = cluster.law or "proportional"
+        law = LAWS.get(name) or plugin.load(name, "law", ControlLaw, is_constructed=True)
+        _rehearse(space, gains, law)
+        limits = EngagementLimits()
+        if cluster.gains.sigma_max_m is not UNSET:
+            limits = replace(limits, sigma_max_m=cluster.gains.sigma_max_m)
+        if cluster.gains.heading_sigma_max_deg is not UNSET:
+            limits = replace(limits, yaw_sigma_max_rad=math.radians(cluster.gains.heading_sigma_max_deg))
+        engagement = Engagement(space, cluster.drones, gains, limits, plan_of(cluster), law)
+        _check_flyable(scenario, cluster, space, gains)
         return engagement
 
 
@@ -48,12 +86,12 @@ def check_plan(scenario: Scenario, cluster: Cluster) -> None:
     with _refusals_of(scenario, cluster):
         space = scenario_space(scenario, cluster)
         FlightPlan(space, plan_of(cluster))
-        check_flyable(scenario, cluster, space, gains_of(cluster.gains))
+        _check_flyable(scenario, cluster, space, gains_of(cluster.gains))
 
 
 @contextmanager
 def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
-    """Raise what is wrong with a cluster as a RunError that names it, in its plan with the path in the scenario."""
+    """Raise every fault of a cluster as a RunError that names it, a fault of its plan with the path in the scenario."""
     try:
         yield
     except PlanError as error:
@@ -71,22 +109,10 @@ def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
         raise
 
 
-def law_of(cluster: Cluster) -> Callable[[ClusterSpace, FormationGains], ControlLaw]:
-    """Return the class of the control law that a cluster names.
-
-    Raises:
-        DocumentError: a class of the user's own that cannot be loaded.
-    """
-    name = cluster.law or "proportional"
-    return LAWS.get(name) or plugin.load(name, "law", ControlLaw, is_constructed=True)
-
-
-def rehearse(
-    space: ClusterSpace,
-    gains: FormationGains,
-    law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
+def _rehearse(
+    space: ClusterSpace, gains: FormationGains, law: Callable[[ClusterSpace, FormationGains], ControlLaw]
 ) -> None:
-    """Fly a gate of a formation of its own: code is compiled, or loaded, here and not in flight."""
+    """Fly a gate of another formation: code is compiled, or loaded, here and not in flight."""
     c = space.specimen(max(gains.separation_min_m, APART_M))
     p_W, yaw = space.inverse(c)
     c = space.forward(p_W, yaw)
@@ -102,16 +128,6 @@ def rehearse(
     load(*robot_rates(space, c, c), gains.limits)
 
 
-def limits_of(gains: Gains) -> EngagementLimits:
-    """Return the limits of the phase machine, those of certainty as the scenario has them."""
-    limits = EngagementLimits()
-    if gains.sigma_max_m is not UNSET:
-        limits = replace(limits, sigma_max_m=gains.sigma_max_m)
-    if gains.heading_sigma_max_deg is not UNSET:
-        limits = replace(limits, yaw_sigma_max_rad=math.radians(gains.heading_sigma_max_deg))
-    return limits
-
-
 def gains_of(gains: Gains) -> FormationGains:
     """Return the control law's gains in SI units."""
     return FormationGains(
@@ -123,3 +139,142 @@ def gains_of(gains: Gains) -> FormationGains:
         separation_min_m=gains.separation_min_m,
         separation_alarm_m=gains.separation_alarm_m,
     )
+
+
+def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
+    """Refuse a plan that these drones cannot fly; without a valid formation at the start it is not judged.
+
+    Raises:
+        PlanError: names the step, its demand, and what is possible.
+    """
+    plan = cluster.plan
+    if plan.takeoff_s is None or not (plan.target or plan.trajectory):
+        return
+    ready_s = plan.takeoff_s + READY_S
+    begins_s = max(ready_s, plan.trajectory.start_s) if plan.trajectory else ready_s
+    if plan.land_s is not None and plan.land_s < begins_s:
+        what = "trajectory" if plan.trajectory else "target"
+        reason = f"the {what} of the plan begins at {begins_s:g} s at the earliest"
+        raise PlanError(f"plan.land_s is {plan.land_s:g}; must be later: {reason}")
+    start = _formation_at_start(scenario, cluster, space)
+    if start is None:
+        return
+    rehearsal = _Rehearsal(scenario, cluster, space, gains)
+    goal = start.copy()
+    goal[space.neutral] = 0.0
+    for step in plan_of(cluster):
+        request = step.request
+        try:
+            if isinstance(request, MoveTo):
+                goal = request.goal(space, goal)
+                rehearsal.check_target(start, goal, None if plan.trajectory else request.over_s)
+            elif isinstance(request, Follow):
+                begin_s = request.start_s or 0.0
+                rehearsal.check_trajectory(start, request.trajectory(space, goal), begin_s, ready_s)
+        except REFUSALS as error:
+            raise PlanError(f"{step.path}: {error}") from None
+
+
+def _formation_at_start(scenario: Scenario, cluster: Cluster, space: ClusterSpace) -> Array | None:
+    """Return the variables (4n,) of the drones above their starting places; None where they form none."""
+    drones = [scenario.drone(name) for name in cluster.drones]
+    p_W = np.array([drone.position_m for drone in drones], float)
+    p_W[:, 2] += EngagementLimits().assembly_height_m
+    try:
+        c = space.forward(p_W, np.radians([drone.yaw_deg for drone in drones]))
+        return None if shape_fault(space, c, EngagementLimits().shape) else c
+    except SingularClusterError:
+        return None
+
+
+class _Rehearsal:
+    """Checks the ways of a plan against the limits of formation, controller and drones."""
+
+    def __init__(self, scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
+        limits = EngagementLimits()
+        self._space = space
+        self._share = limits.shape.share
+        self._drones = [(name, scenario.drone(name).limits) for name in cluster.drones]
+        own = [each for _, each in self._drones]
+        asked = gains.limits
+        self._limits: RobotLimits = asked._replace(
+            speed_max_m_s=min(asked.speed_max_m_s, *(each.horizontal_speed_m_s for each in own)),
+            climb_max_m_s=min(asked.climb_max_m_s, *(each.vertical_speed_m_s for each in own)),
+            yaw_rate_max_rad_s=min(asked.yaw_rate_max_rad_s, *(math.radians(each.yaw_rate_deg_s) for each in own)),
+        )
+        in_flight = limits.shape_in_flight
+        wide = replace(gains, separation_min_m=NEAR_ROOM * gains.separation_min_m)
+        self._wide = wide, replace(in_flight, height_min_m=NEAR_ROOM * in_flight.height_min_m)
+        self._exact = gains, limits.shape
+        self._planner = RampPlanner(space, gains, limits.shape)
+
+    def check_target(self, start: Array, goal: Array, over_s: float | None) -> None:
+        """Refuse a target that is not allowed, or too far for its time.
+
+        Raises:
+            PlanError: with the factor; TrajectoryError: it is out of reach.
+        """
+        if fault := self._fault_at(goal):
+            raise PlanError(f"plan.target: {fault}")
+        home, rest = Hold(goal), np.zeros_like(start)
+        if over_s is None:
+            self._planner.fastest((start, rest), home, 0.0)
+            return
+        peak, _ = self._peak(ramp_onto(self._space, start, rest, home, 0.0, over_s), 0.0, over_s)
+        if peak > WAY_ROOM * LOAD_TOLERANCE * self._share:
+            factor = peak / self._share
+            raise PlanError(
+                f"plan.target_over_s is {over_s:g}; must be {factor:.2g} times as long, {factor * over_s:.1f} s or "
+                f"more, for a robot to need at most {self._share:g} times its speed limits"
+            )
+
+    def check_trajectory(self, start: Array, trajectory: Reference, start_s: float, ready_s: float) -> None:
+        """Refuse a trajectory that is too fast, leads through a place that is not allowed, or is over too soon.
+
+        Raises:
+            PlanError: with the factor, or the earliest time; TrajectoryError: it is out of reach.
+        """
+        length_s = trajectory.duration_s
+        end_s = start_s + (math.inf if length_s is None else length_s)
+        if end_s <= ready_s:
+            reason = f"a formation is engaged at {ready_s:g} s at the earliest, {READY_S:g} s after its take-off"
+            raise PlanError(f"plan.trajectory is over at {end_s:g} s; must start later: {reason}")
+        from_s = max(0.0, ready_s - start_s)
+        to_s = min(from_s + HORIZON_S, math.inf if length_s is None else length_s)
+        peak, peak_s = self._peak(trajectory, from_s, to_s)
+        if peak > ROOM * LOAD_TOLERANCE * self._share:
+            factor = peak / self._share
+            raise PlanError(
+                f"plan.trajectory needs {peak:.2f} times the speed limits of a robot {peak_s:.1f} s after its start; "
+                f"must be at most {self._share:g} times: stretch its times by {factor:.2f}"
+            )
+        for t_s in _instants(from_s, to_s):
+            if fault := self._fault_at(trajectory.value(t_s)[0]):
+                raise PlanError(f"plan.trajectory: {t_s:.1f} s after its start {fault}")
+        ramp = self._planner.fastest((start, np.zeros_like(start)), Shifted(trajectory, start_s), ready_s)
+        there_s = ready_s + ramp.over_s
+        if end_s < math.inf and there_s > ready_s + WAY_ROOM * (end_s - ready_s):
+            reason = f"the way to it takes the formation until {there_s:.0f} s"
+            raise PlanError(f"plan.trajectory is over at {end_s:g} s; must start later: {reason}")
+
+    def _peak(self, reference: Reference, from_s: float, to_s: float) -> tuple[float, float]:
+        """Return the greatest share of its limits at which a robot moves along a reference, and when [s]."""
+        return max(
+            (load(*robot_rates(self._space, *reference.value(t_s)), self._limits), t_s)
+            for t_s in _instants(from_s, to_s)
+        )
+
+    def _fault_at(self, c: Array) -> str | None:
+        space = self._space
+        if formation_fault(space, c, *self._wide):
+            return formation_fault(space, c, *self._exact)
+        heights_m = space.inverse(c)[0][:, 2].tolist()
+        for (name, limits), height_m in zip(self._drones, heights_m, strict=True):
+            if height_m > limits.altitude_m:
+                return f"{name} is at z = {height_m:.1f} m; allowed: {limits.altitude_m:g} m, its limits.altitude_m"
+        return None
+
+
+def _instants(from_s: float, to_s: float) -> list[float]:
+    count = min(max(math.ceil((to_s - from_s) / STEP_S) + 1, STEPS_MIN), STEPS_MAX)
+    return np.linspace(from_s, to_s, count).tolist()

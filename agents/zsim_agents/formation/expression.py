@@ -1,7 +1,7 @@
 """An expression of t as text, with its exact derivative.
 
-The text is parsed by Python's own grammar, only whitelisted nodes are taken over into a tree of closures,
-and the tree is evaluated on dual numbers (value, rate): nothing of the text is ever executed.
+The text is parsed by Python's own grammar, only whitelisted nodes are converted into a tree of closures, and the tree
+is evaluated on dual numbers (value, rate): nothing of the text is ever executed.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import ast
 import math
 import operator
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 from zsim.scenario.scenario import CONSTANTS_MAX
 
 Dual = tuple[float, float]
+Node = tuple[Callable[[float], Dual], bool]  # a function of t, and whether it is constant
 
 TEXT_MAX = 1000  # characters
 DEPTH_MAX = 100  # nested operations
@@ -26,19 +26,14 @@ class ExpressionError(ValueError):
     """An expression is not allowed or has no finite value; the message names variable, finding and remedy.
 
     Attributes:
-        name: of the variable, empty where the fault is not one expression's.
-        finding: what is wrong, without the name.
+        name: of the variable, empty where the fault is not in one expression.
+        finding: the fault without the name.
     """
 
     def __init__(self, finding: str, name: str = "") -> None:
         super().__init__(f"{name}: {finding}" if name else finding)
         self.name = name
         self.finding = finding
-
-
-class _Node(NamedTuple):
-    evaluate: Callable[[float], Dual]
-    constant: bool
 
 
 class Expression:
@@ -57,8 +52,7 @@ class Expression:
         self.name = name
         self.text = text
         self._constants = {**CONSTANTS, **checked_constants(constants or {})}
-        node = self._build(self._parse(), 0)
-        self._evaluate, self.constant = node
+        self._evaluate, self.constant = self._build(self._parse(), 0)
 
     def __call__(self, t_s: float) -> Dual:
         """Return value and rate per second at t_s.
@@ -85,58 +79,49 @@ class Expression:
             reason = error.msg if isinstance(error, SyntaxError) else error
             raise self._error(f"cannot be read ({reason})") from None
 
-    def _build(self, tree: ast.expr, depth: int) -> _Node:
+    def _build(self, tree: ast.expr, depth: int) -> Node:
         if depth > DEPTH_MAX:
             raise self._error(f"is nested deeper than {DEPTH_MAX}; allowed: {DEPTH_MAX}")
         if isinstance(tree, ast.Constant):
-            return _constant(self._finite(tree.value))
+            number = finite_number(tree.value)
+            if number is None:
+                raise self._error(f"contains {str(tree.value)[:40]!r}; allowed: {self._allowed()}")
+            return _constant(number)
         if isinstance(tree, ast.Name):
-            return self._named(tree.id)
+            if tree.id == "t":
+                return lambda t: (t, 1.0), False
+            if tree.id not in self._constants:
+                raise self._error(f"uses {tree.id[:40]!r}; allowed: {self._allowed()}")
+            return _constant(self._constants[tree.id])
         if isinstance(tree, ast.BinOp) and type(tree.op) in _BINARY:
             return self._apply(_BINARY[type(tree.op)], [tree.left, tree.right], depth)
         if isinstance(tree, ast.UnaryOp) and type(tree.op) in _UNARY:
             return self._apply(_UNARY[type(tree.op)], [tree.operand], depth)
         if isinstance(tree, ast.Call):
-            return self._call(tree, depth)
+            name = self._source(tree.func)
+            if name not in _FUNCTIONS or tree.keywords:
+                raise self._error(f"calls {name!r}; allowed: {self._allowed()}")
+            function, least, most = _FUNCTIONS[name]
+            if not least <= len(tree.args) <= most:
+                count = f"{least}" if least == most else f"{least} to {most}"
+                raise self._error(f"calls {name} with {len(tree.args)} arguments; allowed: {count}")
+            return self._apply(function, tree.args, depth)
         raise self._error(f"contains {self._source(tree)!r}; allowed: {self._allowed()}")
 
-    def _named(self, name: str) -> _Node:
-        if name == "t":
-            return _Node(lambda t: (t, 1.0), False)
-        if name not in self._constants:
-            raise self._error(f"uses {name[:40]!r}; allowed: {self._allowed()}")
-        return _constant(self._constants[name])
-
-    def _finite(self, value: object) -> float:
-        number = finite_number(value)
-        if number is None:
-            raise self._error(f"contains {str(value)[:40]!r}; allowed: {self._allowed()}")
-        return number
-
-    def _call(self, tree: ast.Call, depth: int) -> _Node:
-        name = self._source(tree.func)
-        if name not in _FUNCTIONS or tree.keywords:
-            raise self._error(f"calls {name!r}; allowed: {self._allowed()}")
-        function, least, most = _FUNCTIONS[name]
-        if not least <= len(tree.args) <= most:
-            count = f"{least}" if least == most else f"{least} to {most}"
-            raise self._error(f"calls {name} with {len(tree.args)} arguments; allowed: {count}")
-        return self._apply(function, tree.args, depth)
-
-    def _apply(self, function: Callable[..., Dual], trees: list[ast.expr], depth: int) -> _Node:
+    def _apply(self, function: Callable[..., Dual], trees: list[ast.expr], depth: int) -> Node:
         nodes = [self._build(tree, depth + 1) for tree in trees]
-        parts = [node.evaluate for node in nodes]
-        if all(node.constant for node in nodes):
+        parts = [evaluate for evaluate, _ in nodes]
+        if all(constant for _, constant in nodes):
             return self._folded(function, [part(0.0) for part in parts])
         if len(parts) == 1:
             (only,) = parts
-            return _Node(lambda t: function(only(t)), False)
+            return lambda t: function(only(t)), False
         if len(parts) == 2:
             left, right = parts
-            return _Node(lambda t: function(left(t), right(t)), False)
-        return _Node(lambda t: function(*[part(t) for part in parts]), False)
+            return lambda t: function(left(t), right(t)), False
+        return lambda t: function(*[part(t) for part in parts]), False
 
-    def _folded(self, function: Callable[..., Dual], arguments: list[Dual]) -> _Node:
+    def _folded(self, function: Callable[..., Dual], arguments: list[Dual]) -> Node:
         try:
             value, _ = function(*arguments)
         except (ArithmeticError, ValueError) as error:
@@ -163,11 +148,11 @@ def checked_constants(constants: Mapping[str, float]) -> dict[str, float]:
     """
     if len(constants) > CONSTANTS_MAX:
         raise ExpressionError(f"constants: found {len(constants)}; allowed: at most {CONSTANTS_MAX}")
+    taken = ["t", *CONSTANTS, *_FUNCTIONS]
     for name, value in constants.items():
         is_name = isinstance(name, str) and len(name) <= NAME_MAX and name.isidentifier()
-        if not is_name or name in {"t", *CONSTANTS, *_FUNCTIONS}:
-            taken = ", ".join(["t", *CONSTANTS, *_FUNCTIONS])
-            allowed = f"an identifier of at most {NAME_MAX} characters except {taken}"
+        if not is_name or name in taken:
+            allowed = f"an identifier of at most {NAME_MAX} characters except {', '.join(taken)}"
             raise ExpressionError(f"constant {str(name)[:40]!r}: not a free name; allowed: {allowed}")
         if finite_number(value) is None:
             raise ExpressionError(f"constant {name}: found {str(value)[:40]!r}; allowed: a finite number")
@@ -175,7 +160,7 @@ def checked_constants(constants: Mapping[str, float]) -> dict[str, float]:
 
 
 def finite_number(value: object) -> float | None:
-    """Return the value as a float, or None where it is no finite number (bool is none)."""
+    """Return the value as a float, or None where it is no finite number (a bool is none)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -184,20 +169,8 @@ def finite_number(value: object) -> float | None:
         return None
 
 
-def _constant(value: float) -> _Node:
-    return _Node(lambda t: (value, 0.0), True)
-
-
-def _add(a: Dual, b: Dual) -> Dual:
-    return a[0] + b[0], a[1] + b[1]
-
-
-def _subtract(a: Dual, b: Dual) -> Dual:
-    return a[0] - b[0], a[1] - b[1]
-
-
-def _multiply(a: Dual, b: Dual) -> Dual:
-    return a[0] * b[0], a[1] * b[0] + a[0] * b[1]
+def _constant(value: float) -> Node:
+    return lambda t: (value, 0.0), True
 
 
 def _divide(a: Dual, b: Dual) -> Dual:
@@ -215,7 +188,7 @@ def _power(a: Dual, b: Dual) -> Dual:
 def _unary(
     function: Callable[[float], float], rate_of: Callable[[float, float, float], float]
 ) -> Callable[[Dual], Dual]:
-    """Return a function of a dual number; `rate_of` takes argument, value and the argument's rate, where it has one."""
+    """Return a function of a dual number; `rate_of` takes argument, value and a rate of the argument that is not 0."""
 
     def apply(a: Dual) -> Dual:
         value = function(a[0])
@@ -224,22 +197,10 @@ def _unary(
     return apply
 
 
-def _min(*parts: Dual) -> Dual:
-    return min(parts, key=_value)
-
-
-def _max(*parts: Dual) -> Dual:
-    return max(parts, key=_value)
-
-
-def _value(a: Dual) -> float:
-    return a[0]
-
-
 _BINARY: dict[type[ast.operator], Callable[[Dual, Dual], Dual]] = {
-    ast.Add: _add,
-    ast.Sub: _subtract,
-    ast.Mult: _multiply,
+    ast.Add: lambda a, b: (a[0] + b[0], a[1] + b[1]),
+    ast.Sub: lambda a, b: (a[0] - b[0], a[1] - b[1]),
+    ast.Mult: lambda a, b: (a[0] * b[0], a[1] * b[0] + a[0] * b[1]),
     ast.Div: _divide,
     ast.Pow: _power,
 }
@@ -247,7 +208,7 @@ _UNARY: dict[type[ast.unaryop], Callable[[Dual], Dual]] = {
     ast.USub: _unary(operator.neg, lambda x, y, rate: -rate),
     ast.UAdd: _unary(operator.pos, lambda x, y, rate: rate),
 }
-_FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {
+_FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {  # with the least and greatest number of arguments
     "sin": (_unary(math.sin, lambda x, y, rate: math.cos(x) * rate), 1, 1),
     "cos": (_unary(math.cos, lambda x, y, rate: -math.sin(x) * rate), 1, 1),
     "tan": (_unary(math.tan, lambda x, y, rate: (1 + y * y) * rate), 1, 1),
@@ -258,6 +219,6 @@ _FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {
     "exp": (_unary(math.exp, lambda x, y, rate: y * rate), 1, 1),
     "log": (_unary(math.log, lambda x, y, rate: rate / x), 1, 1),
     "abs": (_unary(abs, lambda x, y, rate: math.copysign(1.0, x) * rate if x else 0.0), 1, 1),
-    "min": (_min, 2, 16),
-    "max": (_max, 2, 16),
+    "min": (lambda *parts: min(parts, key=lambda part: part[0]), 2, 16),
+    "max": (lambda *parts: max(parts, key=lambda part: part[0]), 2, 16),
 }

@@ -1,23 +1,170 @@
-"""Whether a formation may take off, be engaged, and be flown on, and where it may be: every fault in words."""
+"""Whether a formation may take off, be engaged, flown on, and where it may be led: every fault in words.
+
+Order of this file: limits, input and output of the phase machine at a gate, checks of a gate, checks of a reference.
+The data of a gate are Structs, which take a fifth of the time of a named tuple or dataclass.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
+from msgspec import Struct
 
 from zsim.math.compiled import portable
 from zsim_agents.formation.control_law import FormationGains
-from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateInput, ShapeLimits
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
 
-FAR = 1e6  # m or rad: beyond it a value is a slip
-ROUNDING_M = 1e-9  # of a place that is computed from variables: 1e-14 at 50 m; a limit itself is allowed
+FAR = 1e6  # m or rad: beyond it a value is a mistake
+ROUNDING_M = 1e-9  # of a place computed from variables (1e-14 at 50 m): the limit itself is allowed
 VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # state of an estimate
+AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
+DOWN = frozenset({"landed", "emergency"})  # states of a drone on the ground, or falling
+HELD_ON_REQUEST = "held on request"  # reasons of a formation, from which a display derives the possible requests
+READY_TO_ENGAGE = "ready to engage"
+GUARD_PARTS = "the guard parts"
+TOO_NEAR = "ALARM"
+REJOINING = "rejoining"
+
+
+@dataclass(frozen=True)
+class ShapeLimits:
+    """Where a formation may be engaged, and where a reference may lead it.
+
+    Attributes:
+        spread_min_m: least height of the shape.
+        tilt_max_rad: greatest roll and pitch of the formation.
+        condition_max: greatest condition number of J^-1.
+        height_min_m: least height of a robot's reference over the ground, z_W = 0.
+        share: share of the robots' speed limits that a reference may use; the law keeps the rest.
+    """
+
+    spread_min_m: float = 1.0  # chosen: five sigma of a side's estimate keep robots out of one line
+    tilt_max_rad: float = math.radians(30.0)  # chosen: far from the 90 deg where Euler angles fail
+    condition_max: float = 20.0  # chosen: beyond it a small motion in cluster space is a large one of a robot
+    height_min_m: float = 0.5  # chosen: five rotor radii, above most of the ground effect
+    share: float = 0.8  # chosen
+
+
+@dataclass(frozen=True)
+class EngagementLimits:
+    """Limits and heights of the phase machine; all chosen, `shape` so that no formation comes near a singularity.
+
+    Attributes:
+        shape: where a formation may be engaged and led.
+        flight_slack: in flight the spread may fall to its limit over this, the tilt grow to its limit times this.
+        assembly_height_m: height to which drones climb straight up before engagement, within assembly_within_m.
+        assembly_climb_m_s: greatest speed of that climb.
+        age_max_s: oldest estimate that is flown on.
+        sigma_max_m, yaw_sigma_max_rad: greatest sigma of position and heading for take-off and engagement.
+        in_flight_factor: by which both may be greater in flight.
+        heal_s: time without fault after which a held formation goes on.
+        resend_s: time after which a mode command without effect is sent again.
+    """
+
+    shape: ShapeLimits = field(default_factory=ShapeLimits)
+    flight_slack: float = 1.5  # so that noise at the limit does not hold the formation
+    assembly_height_m: float = 1.5  # many rotor radii over the ground, and a fall that the hull withstands
+    assembly_within_m: float = 0.3  # three sigma of the barometer
+    assembly_climb_m_s: float = 0.5  # half of what the firmware allows: all drones climb equally
+    age_max_s: float = 0.5  # as long as the firmware tolerates silence: 25 gates
+    sigma_max_m: float = 1.0  # half of the least separation of 2 m
+    yaw_sigma_max_rad: float = math.radians(15.0)  # half of the 30 deg at which three sigma turn a velocity by 90 deg
+    in_flight_factor: float = 2.0  # of a position: 2 m, as of a single GPS fix
+    heal_s: float = 0.5  # 25 gates without a fault are no coincidence
+    resend_s: float = 1.0  # ten times the delay of commands in the paper's scenario, 100 ms
+
+    @property
+    def shape_in_flight(self) -> ShapeLimits:
+        """Wider limits beyond which a formation in flight is held."""
+        return dataclasses.replace(
+            self.shape,
+            spread_min_m=self.shape.spread_min_m / self.flight_slack,
+            tilt_max_rad=self.shape.tilt_max_rad * self.flight_slack,
+            condition_max=math.inf,
+        )
+
+
+class GateInput(Struct, eq=False):
+    """The newest estimates of n drones at a gate; its arrays may be overwritten for the next.
+
+    Attributes:
+        t_s: simulated time.
+        p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where nothing is known.
+        sigma_m: (n, 3) standard deviations of position; yaw_sigma: (n,) of the heading [rad].
+        age_s: (n,) ages of the estimates; infinite where there is none.
+        states: (n,) `state` of each drone's sensor/status.
+    """
+
+    t_s: float
+    p_W: Array
+    yaw: Array
+    v_W: Array
+    sigma_m: Array
+    yaw_sigma: Array
+    age_s: Array
+    states: tuple[str, ...]
+
+    @property
+    def down(self) -> bool:
+        """Whether no drone is in the air."""
+        return DOWN.issuperset(self.states)
+
+
+class ModeCommand(NamedTuple):
+    """A mode command for one drone: takeoff or land."""
+
+    drone: str
+    mode: str
+
+
+class Setpoint(Struct, eq=False):
+    """A velocity command for one drone [m/s, W; rad/s]."""
+
+    v_W: Sequence[float]
+    yaw_rate: float
+
+
+def setpoints(gate: GateInput, v_W: Array, yaw_rate: Array) -> tuple[Setpoint | None, ...]:
+    """Return the setpoints of velocities (n, 3) and yaw rates (n,), None for a drone that does not follow one."""
+    every = map(Setpoint, v_W.tolist(), yaw_rate.tolist())
+    if AIRBORNE.issuperset(gate.states):
+        return tuple(every)
+    return tuple(setpoint if state in AIRBORNE else None for setpoint, state in zip(every, gate.states, strict=True))
+
+
+class GateOutput(Struct, eq=False):
+    """Commands of a gate, and the fields of the cluster's state message.
+
+    Attributes:
+        modes: mode commands to send.
+        setpoints: (n,) velocity commands, None for no command.
+        phase, value, desired, desired_rate, trajectory_t_s, margin, reason, plan_step: as in the message; value and
+            desired with wrapped angles.
+        factor: common factor of the saturation, 1 where nothing is saturated.
+        alarmed: pairs of drone indices that are nearer than the alarm threshold.
+    """
+
+    modes: tuple[ModeCommand, ...]
+    setpoints: tuple[Setpoint | None, ...]
+    phase: str
+    value: Array
+    desired: Array
+    desired_rate: Array
+    trajectory_t_s: float | None
+    margin: float
+    reason: str
+    factor: float
+    alarmed: tuple[tuple[int, int], ...]
+    plan_step: int
 
 
 class FlightCheck:
-    """Checks the estimates and states of a gate; each check returns the fault, or None where all is well.
+    """Checks the estimates and states of a gate; each check returns the fault, or None.
 
     Attributes:
         value: (4n,) cluster of the newest estimates that had a frame, zero before any.
@@ -25,16 +172,9 @@ class FlightCheck:
     """
 
     def __init__(
-        self,
-        space: ClusterSpace,
-        drones: tuple[str, ...],
-        gains: FormationGains,
-        limits: EngagementLimits,
+        self, space: ClusterSpace, drones: tuple[str, ...], gains: FormationGains, limits: EngagementLimits
     ) -> None:
-        self.space = space
-        self.drones = drones
-        self.gains = gains
-        self.limits = limits
+        self.space, self.drones, self.gains, self.limits = space, drones, gains, limits
         self._shape_in_flight = limits.shape_in_flight
         self._bounds_in_flight = bounds_of(space, self._shape_in_flight)
         self.value: Array = np.zeros(space.size)
@@ -47,7 +187,6 @@ class FlightCheck:
         self._in_flight = (limits.age_max_s, *(limits.in_flight_factor * sigma for sigma in sigmas))
 
     def observe(self, gate: GateInput) -> None:
-        """Take over the estimates of a gate."""
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
         self._flaw = _first_flaw(gate, *self._in_flight)
         if self._flaw[0] != VALID and not all_near(gate.p_W, gate.yaw):
@@ -65,7 +204,6 @@ class FlightCheck:
         return fault or (self.formation_fault(gate) if "landed" in gate.states else None)
 
     def engagement_fault(self, gate: GateInput) -> str | None:
-        """Return why the formation cannot be engaged."""
         fault = self.state_fault(gate, AIRBORNE) or self._start_fault(gate)
         if fault:
             return fault
@@ -84,7 +222,7 @@ class FlightCheck:
         return shape_fault(self.space, self.value, shape, self._spread)
 
     def formation_fault(self, gate: GateInput) -> str | None:
-        """Return why the robots, where they are, make no formation to start from."""
+        """Return why the robots, where they are, are no formation to start from."""
         fault = self._no_frame or shape_fault(self.space, self.value, self.limits.shape, self._spread)
         if fault:
             return fault
@@ -95,7 +233,7 @@ class FlightCheck:
         return f"{pair} are {distance:.2f} m apart; allowed: {self.gains.separation_min_m:g} m or more"
 
     def estimate_fault(self, gate: GateInput) -> str | None:
-        """Return why the estimates of drones in flight cannot be flown on, those of the gate that was observed."""
+        """Return why the estimates of drones in flight, at the observed gate, cannot be flown on."""
         return self._flaw_text(gate, self._flaw, self.limits.in_flight_factor)
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
@@ -156,9 +294,9 @@ def estimate_flaw(
     sigma_max_m: float,
     yaw_sigma_max: float,
 ) -> tuple[int, int]:
-    """Return what the first estimate that is not well is (STALE, NOT_FINITE, UNCERTAIN, TURNED), and whose; else VALID.
+    """Return the flaw of the first unusable estimate (STALE, NOT_FINITE, UNCERTAIN, TURNED), and its drone; else VALID.
 
-    UNCERTAIN: where the drone is; TURNED: its heading.
+    UNCERTAIN: of the position; TURNED: of the heading.
     """
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:
@@ -174,14 +312,16 @@ def estimate_flaw(
 
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
-    """Return why c is no formation to engage or to lead to, or None; names quantity, value and limit.
+    """Return why c is no shape to engage in or to lead to, or None; names quantity, value and limit.
 
-    Args:
-        spread: of c, where it is known.
+    `spread` of c is passed where it is known.
     """
     outside = first_outside(c, space.bounds)
     if outside >= 0:
-        return _value_fault(space, c, outside)
+        name, value, (low, high) = space.names[outside], float(c[outside]), space.bounds[outside].tolist()
+        if not abs(value) < FAR:
+            return f"{name} is {value:g}; allowed: up to {FAR:g}"
+        return f"{name} is {value:.3g}; allowed: between {low:.3g} and {high:.3g}"
     spread = space.spread(c) if spread is None else spread
     if spread <= limits.spread_min_m:
         return f"{space.spread_text} is {spread:.2f} m; allowed: above {limits.spread_min_m:g} m"
@@ -198,7 +338,7 @@ def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: floa
 
 
 def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
-    """Return the open bounds (4n, 2) of variables of which `shape_fault` finds none at fault, but for the condition."""
+    """Return the open bounds (4n, 2) within which `shape_fault` finds no fault, apart from the condition."""
     bounds = space.bounds.copy()
     for k in space.tilts:
         bounds[k, 0] = max(bounds[k, 0], -limits.tilt_max_rad)
@@ -215,15 +355,13 @@ def first_outside(c: Array, bounds: Array) -> int:
     return -1
 
 
-def _value_fault(space: ClusterSpace, c: Array, k: int) -> str:
-    name, value, (low, high) = space.names[k], float(c[k]), space.bounds[k].tolist()
-    if not abs(value) < FAR:
-        return f"{name} is {value:g}; allowed: up to {FAR:g}"
-    return f"{name} is {value:.3g}; allowed: between {low:.3g} and {high:.3g}"
+def formation_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
+    """Return why the formation may not be led to c, by its shape or the places of its robots, or None."""
+    return shape_fault(space, c, limits) or place_fault(space, c, gains, limits)
 
 
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the robots may not stand where c puts them (too near to each other, too low), or None."""
+    """Return why the robots may not be where c puts them (too near to each other, too low), or None."""
     p_W, _ = space.inverse(c)
     if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
         return None

@@ -1,4 +1,4 @@
-"""What a user or a scenario may ask of a formation, and the plan of a scenario: requests and when they are due.
+"""Requests to a formation by a user or a scenario, and the plan of a scenario: requests and when they are due.
 
 Order of this file: requests, the plan, how requests are read from the wire.
 """
@@ -19,20 +19,21 @@ from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, Sing
 from zsim_agents.formation.trajectory import (
     ExpressionTrajectory,
     Reference,
+    TrajectoryError,
     WaypointTrajectory,
+    named_values,
 )
-from zsim_agents.formation.variable_values import TrajectoryError, named_values
 
 RETRY_S = 0.5  # between two tries of a request that was refused
 WAITS = " of the plan waits: "  # in the note of a plan, between the step and the reason
 
 
 class RefusalError(ValueError):
-    """A request cannot be granted as things stand; the message is the reason."""
+    """A request cannot be granted in the present state; the message is the reason."""
 
 
 class PlanError(ValueError):
-    """A plan can never be flown; the message begins with the path of what is wrong, from `plan`."""
+    """A plan can never be flown; the message begins with the path of the wrong value, from `plan`."""
 
 
 class RequestError(ValueError):
@@ -56,7 +57,7 @@ class Pause:
 
 @dataclass(frozen=True)
 class Rejoin:
-    """Lead the drones of a formation that a fault holds back to their places, each by itself; then it goes on."""
+    """Lead the drones of a formation held by a fault back to their places, each by itself; then it goes on."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class MoveTo:
     over_s: float | None = None
 
     def goal(self, space: ClusterSpace, base: Array) -> Array:
-        """Return the goal (4n,): base with the values put in; raises TrajectoryError."""
+        """Return the goal (4n,): base with the values replaced; raises TrajectoryError."""
         if not self.values:
             raise TrajectoryError(f"target: no values; allowed: numbers by name of {', '.join(space.names)}")
         return named_values(space, self.values, "target", base)
@@ -85,8 +86,8 @@ class Follow:
     Attributes:
         expressions, constants, duration_s: see `ExpressionTrajectory`; or
         waypoints: see `WaypointTrajectory`.
-        start_s: simulated time of the trajectory's t = 0; None: when the formation has got there. A
-            formation that gets there later joins the trajectory in motion.
+        start_s: simulated time of the trajectory's t = 0; None: when the formation has got there. A formation that gets
+            there later joins the trajectory in motion.
     """
 
     expressions: Mapping[str, str | float] = field(default_factory=dict)
@@ -113,20 +114,16 @@ FlightRequest = TakeOff | Engage | Pause | Rejoin | Land | MoveTo | Follow
 REFUSALS = (RefusalError, TrajectoryError, ExpressionError, SingularClusterError)
 
 
-def refuse(fault: str | None) -> None:
-    """Raise a RefusalError if there is a fault."""
-    if fault:
-        raise RefusalError(fault)
-
-
 @dataclass(frozen=True)
 class Scheduled:
-    """A request that is due at at_s of simulated time and repeated until it is granted."""
+    """A request that is due at at_s of simulated time and repeated until it is granted.
+
+    `path` is its place in the cluster's section of the scenario.
+    """
 
     at_s: float
     request: FlightRequest
     path: str = "plan"
-    """Where the request stands in the cluster's section of the scenario."""
 
 
 class FlightPlan:
@@ -144,38 +141,39 @@ class FlightPlan:
     def __init__(self, space: ClusterSpace, steps: Sequence[Scheduled] = ()) -> None:
         _check(space, steps)
         self._steps = tuple(steps)
-        self._next = 0  # first step that is not done
-        self._flown = 0  # first step of those that make the reference flown now, _next where none does
+        self._next = 0  # first step that is not completed
+        self._flown = 0  # first of the steps that make up the reference flown now, _next where none does
         self._try_s = -math.inf
         self.note = ""
 
     def run(self, t_s: float, request: Callable[[FlightRequest], str | None]) -> None:
         """Make the requests that are due at t_s."""
-        self._drop_before_land(t_s)
+        for place in range(len(self._steps) - 1, self._next, -1):
+            step = self._steps[place]
+            if step.at_s <= t_s and isinstance(step.request, Land):
+                self._go_to(place)
+                break
         while self._next < len(self._steps) and t_s >= max(self._steps[self._next].at_s, self._try_s):
-            step = self._steps[self._next].request
-            refusal = request(step)
-            if refusal:
+            due = self._steps[self._next].request
+            if refusal := request(due):
                 self._try_s = t_s + RETRY_S
-                self.note = f"{_OPS[type(step)]}{WAITS}{refusal}"
+                self.note = f"{_OPS[type(due)]}{WAITS}{refusal}"
                 return
-            flown = self._flown if isinstance(step, MoveTo | Follow) else self._next + 1
+            flown = self._flown if isinstance(due, MoveTo | Follow) else self._next + 1
             self._go_to(self._next + 1, flown)
 
     def resume_at(self, engaged: bool) -> int:
-        """Return how many steps a restart leaves out: all that are done, but in flight those flown now."""
+        """Return how many steps a restart skips: all completed ones, but in flight those flown now."""
         return self._flown if engaged else self._next
 
     def start_at(self, step: int) -> None:
-        """Leave out so many steps: they were done before a restart."""
+        """Skip so many steps: they were completed before a restart."""
         self._go_to(min(step, len(self._steps)))
 
     def snapshot(self) -> State:
-        """Return how far it is."""
         return {"next": self._next, "flown": self._flown, "try_s": self._try_s, "note": self.note}
 
     def restore(self, state: State) -> None:
-        """Go on where the same plan of another process is."""
         self._next, self._flown = state["next"], state["flown"]
         self._try_s, self.note = state["try_s"], state["note"]
 
@@ -184,15 +182,8 @@ class FlightPlan:
         self._flown = self._next
 
     def clear(self) -> None:
-        """Drop everything that is not done."""
+        """Drop everything that is not completed."""
         self._go_to(len(self._steps))
-
-    def _drop_before_land(self, t_s: float) -> None:
-        for place in range(len(self._steps) - 1, self._next, -1):
-            step = self._steps[place]
-            if step.at_s <= t_s and isinstance(step.request, Land):
-                self._go_to(place)
-                return
 
     def _go_to(self, step: int, flown: int | None = None) -> None:
         self._next, self._flown = step, step if flown is None else flown
@@ -200,7 +191,7 @@ class FlightPlan:
 
 
 def waiting_step(reason: str) -> tuple[str, str] | None:
-    """Return the step that the plan waits with and why, from the reason of a cluster's state; None if it does not."""
+    """Return the plan's waiting step and its reason from the reason of a cluster's state; None if none waits."""
     before, waits, why = reason.rpartition(WAITS)
     return (before.rpartition("; ")[2], why) if waits else None
 
@@ -244,7 +235,7 @@ def _check(space: ClusterSpace, steps: Sequence[Scheduled]) -> None:
 
 
 def _located(path: str, error: ValueError) -> str:
-    """Return the text of a refusal with the path of the value that is refused."""
+    """Return the text of a refusal with the path of the refused value."""
     if isinstance(error, TrajectoryError):
         return f"{path}{error.at}{' ' if error.finding.startswith('is ') else ': '}{error.finding}"
     if isinstance(error, ExpressionError) and error.name:
@@ -268,37 +259,29 @@ def read_request(op: object, args: object = None) -> FlightRequest:
         if name not in fields:
             allowed = ", ".join(fields) or "none"
             raise RequestError(f"{op}: field {str(name)[:40]!r} is unknown; allowed: {allowed}")
-        kind, fits = fields[name]
-        if not fits(value):
-            raise RequestError(f"{op}: {name} is {str(value)[:40]!r}; allowed: {kind}")
+        if not _fits(value, fields[name]):
+            raise RequestError(f"{op}: {name} is {str(value)[:40]!r}; allowed: {fields[name]}")
     return build(**{name: value for name, value in arguments.items() if value is not None})
 
 
-def _seconds(value: object) -> bool:
+def _fits(value: object, kind: str) -> bool:
+    """Tell whether the value of a field is of a kind, whose text begins with a map, a list or a number."""
+    if kind.startswith("a map"):
+        return isinstance(value, Mapping)
+    if kind.startswith("a list"):
+        return isinstance(value, Sequence) and not isinstance(value, str | bytes)
     return value is None or finite_number(value) is not None
 
 
-def _map(value: object) -> bool:
-    return isinstance(value, Mapping)
-
-
-def _list(value: object) -> bool:
-    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
-
-
-_Fields = dict[str, tuple[str, Callable[[object], bool]]]
-_TARGET: _Fields = {
-    "values": ("a map of numbers by variable", _map),
-    "over_s": ("a number of seconds", _seconds),
+_TARGET = {"values": "a map of numbers by variable", "over_s": "a number of seconds"}
+_TRAJECTORY = {
+    "expressions": "a map of expressions by variable",
+    "constants": "a map of numbers by name",
+    "duration_s": "a number of seconds",
+    "waypoints": "a list of waypoints",
+    "start_s": "a number of seconds",
 }
-_TRAJECTORY: _Fields = {
-    "expressions": ("a map of expressions by variable", _map),
-    "constants": ("a map of numbers by name", _map),
-    "duration_s": ("a number of seconds", _seconds),
-    "waypoints": ("a list of waypoints", _list),
-    "start_s": ("a number of seconds", _seconds),
-}
-_READERS: dict[str, tuple[Callable[..., Any], _Fields]] = {
+_READERS: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
     "takeoff": (TakeOff, {}),
     "engage": (Engage, {}),
     "hold": (Pause, {}),

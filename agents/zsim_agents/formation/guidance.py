@@ -1,7 +1,7 @@
 """Where a formation is to be at every instant: the reference, and the ramps by which requests change it smoothly.
 
-Order of this file: the reference in flight, ramps within the robots' limits and their checks, the places of robots
-that have to come back one by one.
+Order of this file: the reference in flight, ramps within the robots' limits and their checks, the places of robots that
+return one by one.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ import math
 import numpy as np
 
 from zsim.contract.snapshot import State
-from zsim_agents.formation.control_law import FormationGains
-from zsim_agents.formation.flight_check import place_fault, shape_fault
-from zsim_agents.formation.flight_data import ShapeLimits
+from zsim_agents.formation.control_law import FormationGains, RobotLimits, load
+from zsim_agents.formation.flight_check import ShapeLimits, formation_fault
 from zsim_agents.formation.flight_plan import Follow, MoveTo
-from zsim_agents.formation.robot_limits import RobotLimits, load
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, robot_rates
 from zsim_agents.formation.trajectory import (
     Hold,
@@ -30,24 +28,24 @@ from zsim_agents.formation.trajectory import (
 
 SAMPLE_S = 0.5  # at 2 m/s a robot moves 1 m between two samples
 SAMPLES_MIN, SAMPLES_MAX = 41, 301
-HORIZON_S = 600.0  # how far an endless trajectory is checked before; the rest is checked while it is flown
+HORIZON_S = 600.0  # of an endless trajectory that is checked before; the rest is checked while it is flown
 RAMP_MIN_S, RAMP_MAX_S = 2.0, 3600.0
 RAMP_GROWTH = 1.2  # least step of the search for a ramp that is slow enough
 RAMP_SAMPLES = 33  # odd: one falls on the peak rate of a ramp, its middle
 LOAD_TOLERANCE = 1.02  # of the share: ramps are sampled, and one may start at the limit
-BENEATH_M = 1.0  # over the ground; a robot nearer to its place than this climbs or sinks to it; chosen
-IN_PLACE_M = 1.0  # from its place, where the formation takes a robot over; chosen: half of the least separation
+BENEATH_M = 1.0  # horizontally; a robot nearer to its place than this climbs or sinks to it; chosen
+IN_PLACE_M = 1.0  # from its place, where a robot joins the formation; chosen: half of the least separation
 
 
 class Guidance:
     """The reference of an engaged formation, a function of simulated time.
 
-    What the formation is about (a target or a trajectory, its home) is kept apart from what is flown now
-    (a ramp onto it). A variable that a request does not name keeps its goal: the last value that a request
-    gave it; before any, its value at engagement, and zero for the neutral ones (roll, pitch, phi_i, w_k).
+    The purpose of the formation (a target or a trajectory, its home) is kept apart from what is flown now (a ramp onto
+    it). A variable that a request does not name keeps its goal: the last value that a request gave it; before any, its
+    value at engagement, and zero for the neutral ones (roll, pitch, phi_i, w_k).
 
-    Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError where
-    the way is not allowed, and change nothing then.
+    Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError where the way is
+    not allowed, and change nothing then.
 
     Attributes:
         paused: the formation stands still on request.
@@ -61,7 +59,7 @@ class Guidance:
         self._home: Reference = Hold(np.zeros(space.size))
         self._flown: Reference = self._home
         self._goal = np.zeros(space.size)
-        self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last answer of value
+        self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last result of `value`
 
     def value(self, t_s: float) -> tuple[Array, Array]:
         """Return c_des and its rate, each (4n,); computed once a gate."""
@@ -73,7 +71,7 @@ class Guidance:
         """Return the trajectory's own time, or None where none runs."""
         if not isinstance(self._home, Shifted) or self.paused:
             return None
-        own_s, end_s = t_s - self._home.start_s, self._home.reference.duration_s
+        own_s, end_s = t_s - self._home.start_s, self._home.of.duration_s
         return own_s if own_s >= 0.0 and (end_s is None or own_s <= end_s) else None
 
     def engage(self, c: Array) -> None:
@@ -84,14 +82,12 @@ class Guidance:
         self.paused = False
 
     def target(self, request: MoveTo, t_s: float) -> None:
-        """Lead to a target."""
         goal = request.goal(self.space, self._base(t_s))
         home = Hold(goal)
         self._flown = self._planner.ramp(self.value(t_s), home, t_s, request.over_s)
         self._home, self._goal, self.paused = home, goal, False
 
     def follow(self, request: Follow, t_s: float) -> None:
-        """Lead onto a trajectory."""
         trajectory = request.trajectory(self.space, self._base(t_s))
         start_s = request.start_s
         if start_s is None:
@@ -112,7 +108,7 @@ class Guidance:
         self.paused = True
 
     def resume(self, t_s: float) -> None:
-        """Go on after a pause with what the formation was about."""
+        """Go on after a pause to the home."""
         self._flown = self._planner.ramp(self.value(t_s), self._home, t_s)
         self.paused = False
 
@@ -126,12 +122,14 @@ class Guidance:
         self._flown = RampPlanner(self.space, self._gains, shape).ramp(start, home, t_s)
 
     def snapshot(self) -> State:
-        """Return the reference, and what the formation is about, as plain values."""
-        home, flown = state_of(self._home), state_of(self._flown)
-        return {"home": home, "flown": flown, "goal": self._goal, "paused": self.paused}
+        return {
+            "home": state_of(self._home),
+            "flown": state_of(self._flown),
+            "goal": self._goal,
+            "paused": self.paused,
+        }
 
     def restore(self, state: State) -> None:
-        """Take over the reference of another process."""
         self._home, self._flown = reference_of(self.space, state["home"]), reference_of(self.space, state["flown"])
         self._goal, self.paused = state["goal"], state["paused"]
 
@@ -143,9 +141,7 @@ class RampPlanner:
     """Plans the ways of a formation within limits of its shape and of its robots."""
 
     def __init__(self, space: ClusterSpace, gains: FormationGains, limits: ShapeLimits) -> None:
-        self._space = space
-        self._gains = gains
-        self._limits = limits
+        self._space, self._gains, self._limits = space, gains, limits
 
     def ramp(self, start: tuple[Array, Array], onto: Reference, start_s: float, over_s: float | None = None) -> Ramp:
         """Return the ramp from start (c, c_dot) onto a reference; without over_s as fast as the limits let it.
@@ -163,7 +159,12 @@ class RampPlanner:
                 raise TrajectoryError(f"the reference is not allowed: {fault}")
             ramp = self.fastest(start, onto, start_s)
             if over_s is not None:
-                ramp = self._ramp_over(start, onto, start_s, over_s, ramp.over_s)
+                least_s, ramp = ramp.over_s, None
+                if 0.0 < over_s <= RAMP_MAX_S:
+                    ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
+                if ramp is None or self._peak_load(ramp) > self._limits.share * LOAD_TOLERANCE:
+                    allowed = f"allowed at the robots' limits: {least_s:.1f} s to {RAMP_MAX_S:g} s"
+                    raise TrajectoryError(f"over_s is {over_s:g} s; {allowed}")
             fault = self.reference_fault(ramp, start_s, start_s + ramp.over_s)
         except SingularClusterError as error:
             raise TrajectoryError(f"the way is singular: {error}") from None
@@ -187,16 +188,6 @@ class RampPlanner:
         limit = f"not reached within {RAMP_MAX_S:g} s at the robots' limits"
         raise TrajectoryError(f"{limit}: too far, or it moves too fast")
 
-    def _ramp_over(
-        self, start: tuple[Array, Array], onto: Reference, start_s: float, over_s: float, least_s: float
-    ) -> Ramp:
-        if 0.0 < over_s <= RAMP_MAX_S:
-            ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
-            if self._peak_load(ramp) <= self._limits.share * LOAD_TOLERANCE:
-                return ramp
-        allowed = f"allowed at the robots' limits: {least_s:.1f} s to {RAMP_MAX_S:g} s"
-        raise TrajectoryError(f"over_s is {over_s:g} s; {allowed}")
-
     def _peak_load(self, ramp: Ramp) -> float:
         times = np.linspace(ramp.start_s, ramp.start_s + ramp.over_s, RAMP_SAMPLES).tolist()
         return max(self._load(*ramp.value(t_s)) for t_s in times)
@@ -215,21 +206,19 @@ class RampPlanner:
         return None
 
     def _fault_at(self, c: Array, c_dot: Array) -> str | None:
-        space, limits = self._space, self._limits
-        fault = shape_fault(space, c, limits) or place_fault(space, c, self._gains, limits)
-        if fault:
+        if fault := formation_fault(self._space, c, self._gains, self._limits):
             return fault
         share = self._load(c, c_dot)
-        if share > limits.share * LOAD_TOLERANCE:
-            return f"a robot moves at {share:.2f} of its limits; allowed: {limits.share:g}"
+        if share > self._limits.share * LOAD_TOLERANCE:
+            return f"a robot moves at {share:.2f} of its limits; allowed: {self._limits.share:g}"
         return None
 
 
 class Places:
-    """Where the robots of a held formation belong, and how each gets there by itself.
+    """The places of the robots of a held formation, and how each gets there by itself.
 
     A robot that is far out of step (landed, and flown low again) makes a shape in which no formation can be led. It
-    flies over the ground first, at its height and so below or above the others, then straight up or down.
+    first flies horizontally, at its height and so below or above the others, then straight up or down.
 
     Args:
         p_W: (n, 3) m; the places.

@@ -1,7 +1,10 @@
 """References in cluster space: a value and its rate for every instant.
 
-Time is in seconds from the start of the reference; outside [0, duration_s] a reference stands still at the
-nearest end. Angles are continuous in time, not wrapped.
+Time is in seconds from the start of the reference; outside [0, duration_s] a reference stands still at the nearest
+end. Angles are continuous in time, not wrapped. Users give values by the names of variables: in metres and radians, or
+in degrees as NAME_deg.
+
+Order of this file: the interface, references of users, ramps, a reference as plain values, values by name.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ import bisect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -18,24 +21,31 @@ from zsim.contract.snapshot import State
 from zsim.math.compiled import portable
 from zsim.scenario.scenario import WAYPOINTS_MAX
 from zsim_agents.formation.expression import Expression, ExpressionError, finite_number
-from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
-from zsim_agents.formation.variable_values import (
-    TrajectoryError,
-    Variable,
-    named_values,
-    refuse_turns,
-    refuse_twice,
-    variable_of,
-)
+from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace
+
+DEGREES = "_deg"
+ANGLE_MAX_RAD = TAU + 1e-3  # a full turn as typed with four digits; a target beyond it is meant in degrees
+
+
+class TrajectoryError(ValueError):
+    """A trajectory is not possible as written; the message names the place, finding and remedy.
+
+    Attributes:
+        finding: the fault without its place.
+        at: path of the value below the target or the trajectory, empty for the whole.
+    """
+
+    def __init__(self, finding: str, where: str = "", at: str = "") -> None:
+        super().__init__(f"{where} {finding}" if where else finding)
+        self.finding = finding
+        self.at = at
 
 
 class Reference(Protocol):
-    """A motion in cluster space."""
+    """A motion in cluster space; duration_s is the time after which it stands still, None where it never does."""
 
     @property
-    def duration_s(self) -> float | None:
-        """Return the time after which the reference stands still, or None where it never does."""
-        ...
+    def duration_s(self) -> float | None: ...
 
     def value(self, t_s: float) -> tuple[Array, Array]:
         """Return c and c_dot, each (4n,), at t_s; c_dot is the exact derivative of c."""
@@ -57,16 +67,16 @@ class Hold:
 class Shifted:
     """A reference that starts at start_s of the time in which it is evaluated."""
 
-    reference: Reference
+    of: Reference
     start_s: float
 
     @property
     def duration_s(self) -> float | None:
-        own = self.reference.duration_s
+        own = self.of.duration_s
         return None if own is None else max(0.0, self.start_s + own)
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        return self.reference.value(t_s - self.start_s)
+        return self.of.value(t_s - self.start_s)
 
 
 class ExpressionTrajectory:
@@ -78,7 +88,7 @@ class ExpressionTrajectory:
         duration_s: end of the motion, None for none.
 
     Attributes:
-        arguments: of which it is made, by name, as plain values.
+        arguments: of the constructor, by name, as plain values.
 
     Raises:
         ExpressionError, TrajectoryError: an unknown name, an expression or duration not allowed.
@@ -101,11 +111,13 @@ class ExpressionTrajectory:
         for name, text in expressions.items():
             place = f"expressions: {name}", f".expressions.{name}"
             variable = variable_of(space, name, "expressions", ".expressions")
-            refuse_twice(space, variable, given, place)
-            expression = Expression(name, _as_text(name, text), constants)
+            _refuse_twice(space, variable, given, place)
+            if not isinstance(text, str) and finite_number(text) is None:
+                raise ExpressionError(f"{name}: found {str(text)[:40]!r}; allowed: text or a finite number")
+            expression = Expression(name, text if isinstance(text, str) else repr(float(text)), constants)
             if expression.constant:
                 value = expression(0.0)[0]
-                refuse_turns(space, variable, value, place)
+                _refuse_turns(space, variable, value, place)
                 self._base[variable.entry] = value * variable.scale
             else:
                 self._moving.append((variable, expression))
@@ -127,14 +139,14 @@ class ExpressionTrajectory:
 class WaypointTrajectory:
     """Waypoints joined by cubics with the slopes of PCHIP: C1, at rest at both ends, without overshoot.
 
-    A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; what it does not name stays as in the one
-    before (in the first: as in base). Angles that wrap turn the short way.
+    A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; variables that it does not name stay as in the one before
+    (in the first: as in base). Angles that wrap turn by the shorter way.
 
     Attributes:
-        arguments: of which it is made, by name, as plain values.
+        arguments: of the constructor, by name, as plain values.
 
     Raises:
-        TrajectoryError: names the waypoint and what is wrong with it.
+        TrajectoryError: names the waypoint and its fault.
     """
 
     def __init__(self, space: ClusterSpace, waypoints: Sequence[Mapping[str, object]], base: Array) -> None:
@@ -144,8 +156,12 @@ class WaypointTrajectory:
         places: list[Array] = []
         for number, waypoint in enumerate(waypoints, start=1):
             self._times.append(self._time(waypoint, number))
-            named = _waypoint_values(space, waypoint, number, places[-1] if places else base)
-            places.append(places[-1] + space.difference(named, places[-1]) if places else named)
+            unknown = sorted(str(key)[:40] for key in waypoint if key not in ("at_s", "values"))
+            if unknown:
+                raise TrajectoryError(f"waypoint {number}: field {unknown[0]!r} is unknown; allowed: at_s, values")
+            before, at = places[-1] if places else base, f".waypoints[{number - 1}].values"
+            named = named_values(space, waypoint.get("values"), f"waypoint {number}", before, at)
+            places.append(before + space.difference(named, before) if places else named)
         self._places = np.array(places)
         self._slopes = np.zeros_like(self._places)
         if len(places) > 2:
@@ -169,10 +185,10 @@ class WaypointTrajectory:
         return c, c_dot
 
     def _time(self, waypoint: Mapping[str, object], number: int) -> float:
-        at_s = finite_number(waypoint.get("at_s")) if isinstance(waypoint, Mapping) else None
+        value = waypoint.get("at_s") if isinstance(waypoint, Mapping) else waypoint
+        at_s = finite_number(value) if isinstance(waypoint, Mapping) else None
         least = self._times[-1] if self._times else -1e-9
         if at_s is None or not at_s > least:
-            value = waypoint.get("at_s") if isinstance(waypoint, Mapping) else waypoint
             more = f" above {least:g}, that of the waypoint before" if self._times else ", 0 or more"
             finding = f"is {str(value)[:40]}; allowed: a number of seconds{more}"
             raise TrajectoryError(finding, f"waypoint {number}: at_s", f".waypoints[{number - 1}].at_s")
@@ -183,13 +199,13 @@ class WaypointTrajectory:
 class Ramp:
     """A smooth move from a state of motion onto another reference.
 
-    c(t) = onto(t) + the offset of the start, which a quintic takes to zero with its first and second
-    derivative. On a reference at rest, from rest, this is the minimum-jerk move.
+    c(t) = onto(t) + the offset of the start, which a quintic takes to zero with its first and second derivative. On a
+    reference at rest, from rest, this is the minimum-jerk move.
 
     Attributes:
         onto: where the ramp leads; it may move meanwhile.
         start_s, over_s: the ramp runs in [start_s, start_s + over_s] of the time of `onto`.
-        offset, offset_rate: (4n,) c and c_dot at start_s less those of onto; use `ramp_onto`.
+        offset, offset_rate: (4n,) c and c_dot at start_s minus those of onto; use `ramp_onto`.
     """
 
     onto: Reference
@@ -217,7 +233,7 @@ class Ramp:
 def put_ramped(
     c: Array, c_dot: Array, offset: Array, offset_rate: Array, s: float, over_s: float, value: Array, rate: Array
 ) -> None:
-    """Write c and c_dot with what is left of an offset and its rate at share s of a ramp over over_s."""
+    """Write c and c_dot plus the remaining offset and offset rate at share s of a ramp over over_s."""
     left = 1.0 - s * s * s * (10.0 - s * (15.0 - 6.0 * s))
     left_rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / over_s
     swing = s * (1.0 - s * s * (6.0 - s * (8.0 - 3.0 * s))) * over_s
@@ -228,63 +244,110 @@ def put_ramped(
 
 
 def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float) -> Ramp:
-    """Return the ramp from c, moving at c_dot, at start_s onto a reference after over_s; angles short."""
+    """Return the ramp from c, moving at c_dot, at start_s onto a reference after over_s; angles by the shorter way."""
     c_onto, c_dot_onto = onto.value(start_s)
     return Ramp(onto, start_s, over_s, space.difference(c, c_onto), c_dot - c_dot_onto)
 
 
+_KINDS: dict[str, Any] = {
+    "hold": Hold,
+    "shifted": Shifted,
+    "ramp": Ramp,
+    "expressions": ExpressionTrajectory,
+    "waypoints": WaypointTrajectory,
+}
+
+
 def state_of(reference: Reference) -> State:
-    """Return what `reference_of` makes the reference of.
+    """Return a reference of this module as plain values, for `reference_of`.
 
     Raises:
-        TypeError: it is none of this module.
+        TypeError: another reference.
     """
-    if isinstance(reference, Hold):
-        return {"kind": "hold", "c": reference.c, "duration_s": reference.duration_s}
-    if isinstance(reference, Shifted):
-        return {"kind": "shifted", "of": state_of(reference.reference), "start_s": reference.start_s}
-    if isinstance(reference, Ramp):
-        numbers = {name: getattr(reference, name) for name in _RAMP}
-        return {"kind": "ramp", "onto": state_of(reference.onto), **numbers}
-    if isinstance(reference, ExpressionTrajectory | WaypointTrajectory):
-        return {"kind": _KINDS[type(reference)], **reference.arguments}
+    for kind, made in _KINDS.items():
+        if type(reference) is made:
+            arguments = getattr(reference, "arguments", None) or vars(reference)
+            own = {name: state_of(value) if name in ("of", "onto") else value for name, value in arguments.items()}
+            return {"kind": kind, **own}
     raise TypeError(f"reference: {type(reference).__name__} has no state; must be one of this module")
 
 
 def reference_of(space: ClusterSpace, state: State) -> Reference:
-    """Return the reference that a state was returned for.
+    """Return the reference of a state.
 
     Raises:
         KeyError, TypeError, ValueError: the state is not one of `state_of`.
     """
-    arguments: dict[str, Any] = dict(state)
-    kind = arguments.pop("kind")
-    if kind == "hold":
-        return Hold(**arguments)
-    if kind == "shifted":
-        return Shifted(reference_of(space, arguments["of"]), arguments["start_s"])
-    if kind == "ramp":
-        return Ramp(reference_of(space, arguments.pop("onto")), **arguments)
-    return _TRAJECTORIES[kind](space, **arguments)
+    arguments = {
+        name: reference_of(space, value) if name in ("of", "onto") else value
+        for name, value in state.items()
+        if name != "kind"
+    }
+    made = _KINDS[state["kind"]]
+    return made(space, **arguments) if made in (ExpressionTrajectory, WaypointTrajectory) else made(**arguments)
 
 
-_RAMP = ("start_s", "over_s", "offset", "offset_rate")
-_TRAJECTORIES: dict[str, Any] = {"expressions": ExpressionTrajectory, "waypoints": WaypointTrajectory}
-_KINDS = {made: kind for kind, made in _TRAJECTORIES.items()}
+class Variable(NamedTuple):
+    """Place of a variable in c (4n,), and the factor from a user's unit."""
+
+    entry: int
+    scale: float
 
 
-def _waypoint_values(space: ClusterSpace, waypoint: Mapping[str, object], number: int, base: Array) -> Array:
-    unknown = sorted(str(key)[:40] for key in waypoint if key not in ("at_s", "values"))
-    if unknown:
-        raise TrajectoryError(f"waypoint {number}: field {unknown[0]!r} is unknown; allowed: at_s, values")
-    at = f".waypoints[{number - 1}].values"
-    return named_values(space, waypoint.get("values"), f"waypoint {number}", base, at)
+def variable_of(space: ClusterSpace, name: object, where: str, at: str = "") -> Variable:
+    """Return the variable of a name: one of the space's, or an angle's with `_deg`.
+
+    Raises:
+        TrajectoryError: there is none of that name.
+    """
+    text = str(name)
+    angle = text.removesuffix(DEGREES)
+    if text not in space.names and angle in space.names and space.in_radians[space.index(angle)]:
+        return Variable(space.index(angle), math.radians(1.0))
+    try:
+        return Variable(space.index(text), 1.0)
+    except ValueError as error:
+        raise TrajectoryError(str(error), f"{where}:", at) from None
 
 
-def _as_text(name: str, text: object) -> str:
-    if isinstance(text, str):
-        return text
-    number = finite_number(text)
-    if number is None:
-        raise ExpressionError(f"{name}: found {str(text)[:40]!r}; allowed: text or a finite number")
-    return repr(number)
+def named_values(space: ClusterSpace, values: object, where: str, base: Array, at: str = "") -> Array:
+    """Return base (4n,) with values by name: numbers, or expressions without t.
+
+    Raises:
+        TrajectoryError: no mapping, an unknown name or one given twice, no finite number, an angle beyond one turn.
+        ExpressionError: a text that is no expression.
+    """
+    if not isinstance(values, Mapping):
+        raise TrajectoryError(f"found {str(values)[:40]!r}; allowed: numbers by name of variable", f"{where}:", at)
+    c, given = base.copy(), set[int]()
+    for name, value in values.items():
+        variable = variable_of(space, name, where, at)
+        place = f"{where}: {name}", f"{at}.{name}"
+        _refuse_twice(space, variable, given, place)
+        number = finite_number(value)
+        if isinstance(value, str):
+            expression = Expression(str(name), value)
+            number = expression(0.0)[0] if expression.constant else None
+        if number is None:
+            raise TrajectoryError(f"is {str(value)[:40]}; allowed: a finite number, or an expression without t", *place)
+        _refuse_turns(space, variable, number, place)
+        c[variable.entry] = number * variable.scale
+    return c
+
+
+def _refuse_twice(space: ClusterSpace, variable: Variable, given: set[int], place: tuple[str, str]) -> None:
+    """Refuse a variable that is given in two units; note that it is given now."""
+    if variable.entry in given:
+        name = space.names[variable.entry]
+        raise TrajectoryError(f"is given beside the same variable; allowed: {name} or {name}{DEGREES}", *place)
+    given.add(variable.entry)
+
+
+def _refuse_turns(space: ClusterSpace, variable: Variable, value: float, place: tuple[str, str]) -> None:
+    """Refuse a target angle beyond one turn: given in radians, it is meant in degrees."""
+    if not space.in_radians[variable.entry] or abs(value * variable.scale) <= ANGLE_MAX_RAD:
+        return
+    if variable.scale != 1.0:
+        raise TrajectoryError(f"is {value:g} deg; allowed: -360 to 360 deg", *place)
+    remedy = f"allowed: -6.283 to 6.283 rad, or degrees as {space.names[variable.entry]}{DEGREES}"
+    raise TrajectoryError(f"is {value:g} rad; {remedy}", *place)

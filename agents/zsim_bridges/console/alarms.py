@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 from zsim.contract.flight_messages import ViewCluster
 from zsim.contract.run_messages import Event, Fault, Health
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST, TOO_NEAR
+from zsim_agents.formation.flight_check import HELD_ON_REQUEST, TOO_NEAR
 from zsim_agents.formation.spaces.cluster_space import unit
 
 Severity = Literal["amber", "red"]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import viser
 
-from zsim_agents.formation.flight_data import DOWN
+from zsim_agents.formation.flight_check import DOWN
 from zsim_bridges.console.alarms import BATTERY_LOW_PERCENT
 from zsim_bridges.console.command_client import CommandClient
 from zsim_bridges.console.console_tables import DroneRow, drone_table, preflight_lines

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 from zsim.scenario.faults import FaultKind, expected, typed_rest, unstated
 from zsim.scenario.scenario import Cluster, Drone, Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
-from zsim_agents.formation.variable_values import DEGREES
+from zsim_agents.formation.trajectory import DEGREES
 
 SIDEWAYS_M = 50.0  # around the drones' starts; chosen: as far as a page shows a formation well
 HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and within sight
 SIDE_MAX_M = 20.0  # of a formation; chosen
 DISPLACEMENT_M = 5.0  # of a robot from its place in a template; chosen
-TILT_MAX_DEG = 29.0  # of a formation; controllers take less than 30, flight_data.py
+TILT_MAX_DEG = 29.0  # of a formation; controllers take less than 30, flight_check.py
 CORNER_DEG = 10.0  # least angle at a corner; at 0 and 180 degrees the robots are in line
 DIGITS = 6  # of a value as it is shown: 5.1, not 5.1000000000000005
 STEPS = {"m": 0.1, "deg": 1.0}

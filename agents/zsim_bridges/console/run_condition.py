@@ -12,7 +12,7 @@ from zsim.contract.flight_messages import state_refusal
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Clock
 from zsim.scenario.scenario import Scenario
-from zsim_agents.formation.flight_data import (
+from zsim_agents.formation.flight_check import (
     AIRBORNE,
     DOWN,
     GUARD_PARTS,

@@ -16,7 +16,7 @@ from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.schema.quantities import G_M_S2
 from zsim_bridges.ros1.tcpros import message_class
 from zsim_bridges.ros_frames import NAVDATA_STATES, by_axis, xyzw
-from zsim_bridges.vehicle_links.onboard_state import OnboardState
+from zsim_bridges.vehicle_links.drone_link import OnboardState
 
 WORLD = "world"
 MAG_LSB_PER_UT = 1 / 0.3  # AK8975 datasheet, 0.3 uT per LSB: the AR.Drone 2.0's

@@ -16,8 +16,7 @@ from zsim_bridges.ros1.camera_topics import CameraTopics
 from zsim_bridges.ros1.connections import PublishedTopic
 from zsim_bridges.ros1.driver_messages import DriverFrames
 from zsim_bridges.ros1.node import Ros1Node
-from zsim_bridges.vehicle_links.command_sender import CommandSender, ModeName
-from zsim_bridges.vehicle_links.onboard_state import OnboardState
+from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName, OnboardState
 
 NEARLY_ZERO = 1e-6  # of a component of cmd_vel, _EPS of the driver
 REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`

@@ -16,7 +16,7 @@ from zsim_bridges.intake import PictureIntake, TrafficIntake
 from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics, ros1_name
 from zsim_bridges.ros1.node import Ros1Node
-from zsim_bridges.vehicle_links import onboard_state
+from zsim_bridges.vehicle_links import drone_link
 
 POLL_S = 0.1  # how often a stop is looked for
 REPORTED_MAX = 1000  # texts remembered, so that each is printed once
@@ -51,7 +51,7 @@ def serve(
         NodeShutdownError: ROS asked this node to stop.
         RunError: two drones have the same name in ROS.
     """
-    onboard_state.warm_up()
+    drone_link.warm_up()
     node = Ros1Node(f"/{ros1_name(info.federation)}", master_uri, host, say)
     asyncio.run(Ros1Bridge(link, info, observer, node, say).run(stopped))
     if node.shutdown_reason:

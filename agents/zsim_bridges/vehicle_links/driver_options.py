@@ -1,4 +1,4 @@
-"""What a driver is given on the command line, whichever wire its aircraft speaks, and whether a run allows it."""
+"""The options of a driver on the command line, whatever the wire, and the conditions on a run."""
 
 import math
 import re
@@ -10,7 +10,7 @@ from zsim.contract.messages import Info
 from zsim.errors import RunError
 from zsim.math.rotation import Vector
 from zsim.scenario.roles import DRIVER
-from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+from zsim_bridges.vehicle_links.failsafe import FlightLimits
 from zsim_bridges.vehicle_links.vehicle_session import UdpChannel
 
 _POSITION = re.compile(r"\s*,\s*")
@@ -18,14 +18,14 @@ _HOST = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?")  # a name, or a
 
 
 class DriverOptions(NamedTuple):
-    """Of one driver.
+    """Options of one driver.
 
     Attributes:
         drone: which drone of the run the aircraft is.
         limits: that hold whatever is commanded.
         armed: whether it begins armed.
-        origin_m: where the aircraft's own frame begins, or it stands [m; W]; None: as it says, or the scenario has it.
-        yaw_deg: its heading at the start, counter-clockwise from east; None: by its own compass.
+        origin_m: origin of the aircraft's own frame, or where it stands [m; W]; None for what it or the scenario says.
+        yaw_deg: its heading at the start, counter-clockwise from east; None for its own compass.
     """
 
     drone: str
@@ -39,7 +39,7 @@ def udp_channel(address: str, local_port: int = 0) -> UdpChannel:
     """Return the channel of `udp://HOST:PORT`.
 
     Raises:
-        RunError: it is written otherwise.
+        RunError: it has another form.
     """
     try:
         parts = urlsplit(address)
@@ -55,7 +55,7 @@ def position(text: str) -> Vector:
     """Return the position of `X,Y,Z`.
 
     Raises:
-        RunError: it is written otherwise.
+        RunError: it has another form.
     """
     try:
         x, y, z = map(float, _POSITION.split(text.strip()))
@@ -78,10 +78,10 @@ def aircraft_host(text: str) -> str:
 
 
 def check_host(host: str) -> None:
-    """Refuse a host without an address, before the driver takes the place of one that flies.
+    """Refuse an unknown host, before the driver replaces one that flies.
 
     Raises:
-        RunError: that is so.
+        RunError: it is unknown.
     """
     try:
         socket.getaddrinfo(host, None)
@@ -90,13 +90,13 @@ def check_host(host: str) -> None:
 
 
 def check_run(info: Info, process: str, drone: str) -> None:
-    """Refuse a drone that has no driver, one of another name, and a run at another pace than the wall clock's.
+    """Refuse a drone that takes no driver, a process of another name, and a run without the pace of the wall clock.
 
     Args:
         process: name of the driver.
 
     Raises:
-        RunError: with the reason.
+        RunError: one of these.
     """
     bodies = {each.name: each.body for each in info.drones}
     if drone not in bodies:

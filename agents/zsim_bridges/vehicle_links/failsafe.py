@@ -1,51 +1,89 @@
-"""What a driver asks of its aircraft: the accepted commands, while everybody is there; else hold, then land. Pure.
+"""What a driver demands of its aircraft: accepted commands within limits, and a hold or a landing when one is missing.
 
-The rules, for the clock of the run:
+Pure. The rules, by the clock of the run:
 
-- Nothing before an operator has armed the driver on purpose.
-- No setpoint for `silence.hover_s`: it holds. For `silence.land_s` more: it lands.
-- The world silent for as long, whoever flies: it lands.
-- Outside the fence: it lands; from there it does not take off.
-- Killed, by an operator or an accepted emergency, armed or not: its motors stop, and it is disarmed.
-- Landing by itself: it is landed. Down, or in an emergency, without a command: disarmed. A commander that asks for
-  take-off again and again starts no motor then.
-- The aircraft silent: nothing but a landing or a stop is sent. One that was switched off and on again may take the next
-  setpoint, or the repetition of an old take-off, for a new one.
+- Nothing is demanded before an operator has armed the driver.
+- Without a setpoint for `silence.hover_s` it holds; for `silence.land_s` more, it lands.
+- Without the world for as long, whoever flies, it lands.
+- Outside the fence it lands; it does not take off from there.
+- Killed by an operator or an accepted emergency, armed or not, it stops its motors and is disarmed.
+- An aircraft that lands by itself is landed. One that is down, or in an emergency, without a command is disarmed, so
+  that a commander that keeps asking for a take-off starts no motor.
+- While the aircraft is silent, only a landing or a stop is sent: one that was switched off and on again might take the
+  next setpoint, or a repeated take-off, for a new one.
 """
 
+import math
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from zsim.contract import flight_messages
 from zsim.math.frames import heading, turned_about_up
-from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Silence
-from zsim_bridges.vehicle_links.aircraft_state import AIRBORNE, STANDING, STILL, AircraftState
-from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+from zsim_bridges.vehicle_links.vehicle_session import AIRBORNE, STANDING, AircraftState, Demand
 
 TAKEOFF_S = 20.0  # chosen: four times what an AR.Drone takes; then it is given up
 RESET_S = 2.0  # chosen: ten times what an AR.Drone takes to leave its emergency
 LINK_LOST_S = 1.0  # chosen: heartbeats come once a second, telemetry ten times as often
+BRAKING_M_S2 = 1.0  # chosen: half of what an AR.Drone at 12 deg of tilt has; the speed towards a fence follows from it
+RETURN_M_S = 0.5  # chosen: slow, since nobody asked for it
+BREACH_M = 1.0  # chosen: how far outside it lands; the fence itself stops it before
 
 Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resetting"]
-Action = Literal["none", "take_off", "hold", "fly", "land", "kill", "reset"]
 
 
-class Demand(NamedTuple):
-    """What an aircraft is to do now.
+class FlightLimits(NamedTuple):
+    """What a driver never exceeds, whoever commands: limits in W; the fence is a cylinder about the origin.
 
     Attributes:
-        action: `none`: send nothing that starts or steers a motor.
-        velocity_m_s: where it is to fly [W].
-        yaw_rate_rad_s: how it is to turn, counter-clockwise.
+        speed_m_s, climb_m_s, yaw_rate_rad_s: greatest, in any direction, up or down, either way.
+        radius_m, ceiling_m: of the fence; inf for none.
     """
 
-    action: Action
-    velocity_m_s: Vector = STILL
-    yaw_rate_rad_s: float = 0.0
+    speed_m_s: float = 2.0  # chosen: what a person can walk after
+    climb_m_s: float = 1.0  # chosen: control_vz_max of the AR.Drone outdoors
+    yaw_rate_rad_s: float = 1.75  # rad/s, control_yaw of the AR.Drone indoors
+    radius_m: float = math.inf
+    ceiling_m: float = math.inf
+
+    def limited(self, velocity_m_s: Sequence[float], position_m: Sequence[float] | None) -> tuple[float, float, float]:
+        """Return a velocity [m/s; W] within the limits that does not lead through the fence.
+
+        Args:
+            velocity_m_s: that is asked for [W].
+            position_m: of the aircraft [W]; None if it is not known: then no fence acts.
+        """
+        x, y, z = velocity_m_s
+        speed = math.hypot(x, y)
+        share = min(1.0, self.speed_m_s / speed) if speed else 1.0
+        x, y, z = x * share, y * share, max(-self.climb_m_s, min(self.climb_m_s, z))
+        if position_m is None:
+            return x, y, z
+        distance = math.hypot(position_m[0], position_m[1])
+        if distance > 0.0 and not math.isinf(self.radius_m):
+            out_x, out_y = position_m[0] / distance, position_m[1] / distance
+            excess = x * out_x + y * out_y - _approach(self.radius_m - distance)
+            if excess > 0.0:
+                x, y = x - excess * out_x, y - excess * out_y
+        return x, y, min(z, _approach(self.ceiling_m - position_m[2]))
+
+    def yaw_rate(self, yaw_rate_rad_s: float) -> float:
+        """Return a yaw rate [rad/s] within the limit."""
+        return max(-self.yaw_rate_rad_s, min(self.yaw_rate_rad_s, yaw_rate_rad_s))
+
+    def is_breached(self, position_m: Sequence[float]) -> bool:
+        """Return whether an aircraft at a position [m; W] is so far outside that it must land."""
+        distance = math.hypot(position_m[0], position_m[1])
+        return distance > self.radius_m + BREACH_M or position_m[2] > self.ceiling_m + BREACH_M
+
+
+def _approach(distance_m: float) -> float:
+    """Return the greatest speed towards a fence at which the aircraft still stops before it; outside, back to it."""
+    return math.sqrt(2.0 * BRAKING_M_S2 * distance_m) if distance_m > 0.0 else max(-RETURN_M_S, distance_m)
 
 
 class Failsafe:
-    """The phases of a flight, from what is commanded and who is silent.
+    """The phases of a flight, by what is commanded and who is silent.
 
     Args:
         silence: of the scenario.
@@ -56,7 +94,7 @@ class Failsafe:
         armed: whether commands are obeyed.
         phase: of the flight.
         commander: source of the last setpoint.
-        reason: why it left the commander's control last; empty for never.
+        reason: why it last left the commander's control; empty for never.
     """
 
     def __init__(self, silence: Silence, limits: FlightLimits, armed: bool = False) -> None:
@@ -67,7 +105,7 @@ class Failsafe:
         self.phase: Phase = "idle"
         self.commander: str | None = None
         self.reason = ""
-        self._uncommanded = False  # the landing that goes on
+        self._uncommanded = False  # whether the landing under way was not commanded
         self._setpoint: flight_messages.Velocity | None = None
         self._setpoint_ns = self._clock_ns = self._began_ns = 0
 
@@ -96,7 +134,7 @@ class Failsafe:
         self.reason = f"killed by {source}"
 
     def is_stopping(self, vehicle: AircraftState) -> bool:
-        """Tell whether a landing or a stop of the motors goes on."""
+        """Return whether a landing or a stop of the motors is under way."""
         return self.phase == "landing" or (self.phase == "killed" and vehicle.state not in STANDING)
 
     def land(self, reason: str, now_ns: int) -> None:
@@ -105,10 +143,10 @@ class Failsafe:
             self._enter("landing", now_ns)
             self.reason, self._uncommanded = reason, True
 
-    # What comes
+    # The run
 
     def on_clock(self, now_ns: int) -> None:
-        """The world is there."""
+        """Note that the world is there."""
         self._clock_ns = now_ns
 
     def on_command(self, command: flight_messages.Command, now_ns: int, vehicle: AircraftState) -> str | None:
@@ -126,7 +164,7 @@ class Failsafe:
             case flight_messages.Velocity():
                 self._setpoint, self._setpoint_ns, self.commander = command, now_ns, command.source
                 return None
-            case flight_messages.Ardrone(hover=True):  # as the world has it where nobody flies the drone any more
+            case flight_messages.Ardrone(hover=True):  # the world's, when nobody flies the drone any more
                 self._setpoint = self.commander = None
                 return None
             case _:
@@ -152,7 +190,7 @@ class Failsafe:
             self._enter("resetting", now_ns)
         return None
 
-    # What is asked of the aircraft
+    # The aircraft
 
     def demand(self, now_ns: int, vehicle: AircraftState) -> Demand:
         """Return what the aircraft is to do now."""
@@ -174,7 +212,7 @@ class Failsafe:
                 return Demand("none")
 
     def _advance(self, now_ns: int, vehicle: AircraftState) -> None:
-        """Go on to the next phase where the aircraft has reached it, or somebody is silent."""
+        """Enter the next phase once the aircraft has reached it, or somebody is silent."""
         airborne = vehicle.state in AIRBORNE
         if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
             self.reason, self._uncommanded = "the aircraft is in an emergency", True
@@ -195,11 +233,11 @@ class Failsafe:
             self._watch(now_ns, vehicle)
 
     def _settled(self, now_ns: int) -> bool:
-        """Tell whether an aircraft has had the time to show that it obeys."""
+        """Return whether the aircraft has had the time to show that it obeys."""
         return now_ns - self._began_ns > LINK_LOST_S * 1e9
 
     def _settle(self, now_ns: int) -> None:
-        """It is down: after a landing that nobody commanded, only an operator lets it fly again."""
+        """Note that it is down: after a landing that nobody commanded, only an operator lets it fly again."""
         self._enter("idle", now_ns)
         if self._uncommanded:
             self.armed, self._uncommanded = False, False
@@ -216,7 +254,7 @@ class Failsafe:
             self._watch_bounds(now_ns, vehicle)
 
     def _watch_bounds(self, now_ns: int, vehicle: AircraftState) -> None:
-        """Land outside the fence, and without the world, also during a take-off."""
+        """Land outside the fence and without the world, also during a take-off."""
         if self._is_outside(vehicle):
             self.land("it is outside the fence", now_ns)
         elif now_ns - max(self._clock_ns, self._began_ns) > self._land_ns:
@@ -243,5 +281,5 @@ class Failsafe:
 
 
 def _is_lost(vehicle: AircraftState, now_ns: int) -> bool:
-    """Tell whether nothing has come from an aircraft for too long, or ever."""
+    """Return whether nothing has come from an aircraft for too long, or ever."""
     return vehicle.received_ns is None or now_ns - vehicle.received_ns > LINK_LOST_S * 1e9

@@ -12,7 +12,7 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.expression import ExpressionError
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
-from zsim_agents.formation.variable_values import TrajectoryError, named_values
+from zsim_agents.formation.trajectory import TrajectoryError, named_values
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, Times, Track
 
 BLOCK = 512  # instants whose distances are held in memory at once

@@ -19,12 +19,11 @@ from zsim.record import Completeness
 from zsim.record.completeness import SECOND_NS
 from zsim.scenario.roles import WORLD, agent_names, expected_processes, lets_drop
 from zsim.scenario.scenario import Cluster, ClusterPlan, Processes, Scenario
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST
+from zsim_agents.formation.flight_check import HELD_ON_REQUEST
 from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, plan_of, waiting_step
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_agents.formation.trajectory import Hold, Reference
-from zsim_agents.formation.variable_values import variable_of
+from zsim_agents.formation.trajectory import Hold, Reference, variable_of
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, read_flight
 
 NOT_AS_PLANNED = "NOT AS PLANNED"

@@ -14,7 +14,7 @@ from zsim.scenario.scenario import Cluster, ClusterPlan, Drone, Scenario
 from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK
 from zsim_agents.formation.expression import Expression, ExpressionError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
-from zsim_agents.formation.variable_values import TrajectoryError, named_values
+from zsim_agents.formation.trajectory import TrajectoryError, named_values
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 

@@ -10,7 +10,6 @@ import typer
 from typer import Argument, BadParameter, Option
 
 from zsim.errors import RunError, SessionError
-from zsim_bridges.ardrone.server.addresses import FIRST_ADDRESS
 from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
 from zsim_deploy import arguments as opt
 from zsim_deploy.arguments import file_fault, require, say
@@ -22,8 +21,9 @@ if TYPE_CHECKING:
     from zsim.contract.messages import Info
     from zsim.transport.session import Session
     from zsim.transport.tls import Identity
-    from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+    from zsim_bridges.vehicle_links.failsafe import FlightLimits
 
+FIRST_ADDRESS = "127.0.0.2"  # of the first AR.Drone; 127.0.0.1 is where programs on this host send from
 TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everybody on the machine
 DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID that ROS 2 takes
 KEY_BYTES = 32
@@ -252,7 +252,7 @@ def serve_mavlink(
     name: Annotated[str, opt.process_option("mavlink.main")] = "",
 ) -> None:
     """Offer each drone as a vehicle: QGroundControl, MAVSDK, DroneKit, MAVProxy fly it."""
-    from zsim_bridges.mavlink.serve.mavlink_server import MavlinkOptions, serve
+    from zsim_bridges.mavlink.mavlink_server import MavlinkOptions, MavlinkServer
 
     ahead = first_system_id - 1  # as of PX4's simulation, whose ports go by the system id too
     options = MavlinkOptions(
@@ -270,7 +270,7 @@ def serve_mavlink(
     )
     if options.key and options.version == 1:
         raise BadParameter("--signing-key needs MAVLink 2; leave out --protocol 1")
-    serve_as("mavlink", name, partial(serve, options=options), reach)
+    serve_as("mavlink", name, partial(MavlinkServer.serve, options=options), reach)
 
 
 def _endpoint(option: str, text: str, listen: str) -> tuple[str, int]:
@@ -332,11 +332,11 @@ def serve_ardrone(
     name: Annotated[str, opt.process_option("ardrone.main")] = "",
 ) -> None:
     """Offer each drone as an AR.Drone 2.0 on an address of its own."""
-    from zsim_bridges.ardrone.server.addresses import peer_addresses
-    from zsim_bridges.ardrone.server.ardrone_server import ArdroneOptions, serve
+    from zsim_bridges.ardrone.ardrone_server import ArdroneOptions, ArdroneServer
+    from zsim_bridges.ardrone.ports import peer_addresses
 
     options = ArdroneOptions(addresses, peer_addresses(peer or ()), rate)
-    serve_as("ardrone", name, partial(serve, options=options), reach)
+    serve_as("ardrone", name, partial(ArdroneServer.serve, options=options), reach)
 
 
 # Real aircraft
@@ -354,7 +354,7 @@ def _bounds(
     armed: bool, speed: float, climb: float, radius: float | None, ceiling: float | None
 ) -> "tuple[FlightLimits, bool]":
     """Return within what a driver flies, and whether it obeys from the start."""
-    from zsim_bridges.vehicle_links.flight_limits import FlightLimits
+    from zsim_bridges.vehicle_links.failsafe import FlightLimits
 
     radius_m, ceiling_m = (math.inf if limit is None else limit for limit in (radius, ceiling))
     return FlightLimits(speed, climb, radius_m=radius_m, ceiling_m=ceiling_m), armed
@@ -389,15 +389,16 @@ def drive_mavlink(
     ] = None,
 ) -> None:
     """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
-    from zsim_bridges.mavlink.mavlink_driver import drive
+    from zsim_bridges.mavlink.autopilot_session import AutopilotSession
+    from zsim_bridges.vehicle_links.driver import drive
     from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_host, position, udp_channel
 
     options = DriverOptions(drone, *bounds, position(origin) if origin else None, None)
     channel = udp_channel(address, local_port)
     check_host(channel.host)
     key = read_key(signing_key) if signing_key else None
-    serve = partial(drive, options=options, channel=channel, system=system, key=key)
-    serve_as("driver", "", serve, reach, drone)
+    make_session = partial(AutopilotSession.of_run, channel=channel, system=system, key=key)
+    serve_as("driver", "", partial(drive, options=options, make_session=make_session), reach, drone)
 
 
 @ardrone.command("drive")
@@ -420,11 +421,11 @@ def drive_ardrone(
     ] = 8,
 ) -> None:
     """Let an AR.Drone 2.0 fly as a drone of the run."""
-    from zsim_bridges.ardrone.ardrone_driver import drive
-    from zsim_bridges.ardrone.drive.aircraft_session import AircraftSettings
+    from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings
+    from zsim_bridges.vehicle_links.driver import drive
     from zsim_bridges.vehicle_links.driver_options import DriverOptions, aircraft_host, check_host, position
 
     options = DriverOptions(drone, *bounds, position(origin) if origin else None, yaw)
     check_host(aircraft_host(address))
-    settings = AircraftSettings(ultrasound=ultrasound)
-    serve_as("driver", "", partial(drive, options=options, address=address, settings=settings), reach, drone)
+    make_session = partial(AircraftSession.of_run, host=address, settings=AircraftSettings(ultrasound=ultrasound))
+    serve_as("driver", "", partial(drive, options=options, make_session=make_session), reach, drone)

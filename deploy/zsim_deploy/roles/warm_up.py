@@ -42,9 +42,9 @@ def main(extras: Collection[str]) -> None:
         scenario = scenario_file.resolve(formations())
         hosted(_info(scenario), scenario, ["*"]).rehearse()
     if WITH_CAMERAS & {*extras}:
-        from zsim_agents.cameras import hat_outline
+        from zsim_agents.cameras import detector
 
-        hat_outline.rehearse()
+        detector.rehearse()
 
 
 def _info(scenario: Scenario) -> Info:

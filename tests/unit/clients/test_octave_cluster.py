@@ -12,7 +12,7 @@ from zsim.scenario.scenario import Gains
 from zsim_agents.formation.control_law import ProportionalLaw
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.engagement_setup import gains_of
-from zsim_agents.formation.flight_data import GateInput, GateOutput
+from zsim_agents.formation.flight_check import GateInput, GateOutput
 from zsim_agents.formation.flight_plan import Engage, Land, MoveTo, Scheduled, TakeOff
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 

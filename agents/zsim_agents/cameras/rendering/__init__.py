@@ -2,4 +2,4 @@
 
 import cv2
 
-cv2.setNumThreads(1)  # the processors are the world's and the agents'; and one thread gives the same bits everywhere
+cv2.setNumThreads(1)  # other cores belong to the world and the agents; one thread gives the same bits everywhere

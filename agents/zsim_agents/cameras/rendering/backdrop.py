@@ -1,18 +1,20 @@
-"""The ground and the sky as one grey picture, which a map turns into colours: a warp of one channel costs a third.
+"""Ground and sky as one grey picture, which a map turns into colours: warping one channel costs a third of three.
 
 Greys up to LIGHTEST are the ground's, from HAZE on the sky's. The ground is a square tile about W's origin, repeated,
-in levels that each average several pixels of the one before: far away the coarser ones are drawn, lest it glitters.
+in levels of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
 """
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim_agents.cameras.rendering.view import CameraMotion, View
+from zsim_agents.cameras.rendering.scene import CameraMotion, View
+from zsim_agents.cameras.rendering.shapes import SHIFT
 
 Grey = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -39,14 +41,8 @@ COLOURS = {  # B, G, R by grey; chosen: dry grass, white lines, a hazy blue sky
 
 
 class Level(NamedTuple):
-    """A level of the ground.
-
-    Attributes:
-        texels: of its window.
-        texel_m: the size of one [m].
-        reach_m: how far it is drawn at most [m].
-        place: from (x, y, 1) of W [m] to texels, whose whole numbers are their middles, (3, 3).
-    """
+    """A level of the ground, with its texel size, the distance up to which it may be drawn [m], and the homography
+    from (x, y, 1) of W [m] to texels, whose centres are at whole numbers, (3, 3)."""
 
     texels: Grey
     texel_m: float
@@ -55,7 +51,7 @@ class Level(NamedTuple):
 
 
 class Ground:
-    """A ground.
+    """A ground in levels.
 
     Args:
         tile: greys up to LIGHTEST, a square whose side is a multiple of 100; its middle is W's origin, its top north.
@@ -65,21 +61,21 @@ class Ground:
     def __init__(self, tile: Grey, texel_m: float = TEXEL_M) -> None:
         self.tile_m = texel_m * len(tile)
         self.mean = round(float(tile.mean()))
-        self.levels = [self._level(tile, texel_m, f, window) for f, window in zip(FACTORS, WINDOW, strict=True)]
+        self.levels: list[Level] = []
+        for factor, window in zip(FACTORS, WINDOW, strict=True):
+            side = len(tile) // factor
+            mean = tile.reshape(side, factor, side, factor).mean(axis=(1, 3))
+            repeats = max(3, 2 * (window // side // 2) + 1)  # odd: W's origin stays in the middle
+            texels = np.tile(np.rint(mean).astype(np.uint8), (repeats, repeats))
+            scale, middle = 1 / (texel_m * factor), len(texels) / 2 - 0.5
+            place = np.array([[scale, 0, middle], [0, -scale, middle], [0, 0, 1.0]])
+            self.levels.append(Level(texels, texel_m * factor, self.tile_m * (repeats - 1) / 2, place))
 
-    def _level(self, tile: Grey, texel_m: float, factor: int, window: int) -> Level:
-        side = len(tile) // factor
-        mean = tile.reshape(side, factor, side, factor).mean(axis=(1, 3))
-        repeats = max(3, 2 * (window // side // 2) + 1)  # odd: W's origin stays in the middle
-        texels = np.tile(np.rint(mean).astype(np.uint8), (repeats, repeats))
-        scale, middle = 1 / (texel_m * factor), len(texels) / 2 - 0.5  # W's origin is in the middle of the window
-        place = np.array([[scale, 0, middle], [0, -scale, middle], [0, 0, 1.0]])
-        return Level(texels, texel_m * factor, self.tile_m * (repeats - 1) / 2, place)
 
-
-def field(seed: int = 1) -> Ground:
-    """Return a meadow with a line at every metre, and a wider one at every fifth."""
-    rng = np.random.default_rng(seed)
+@cache
+def meadow() -> Ground:
+    """Return a meadow with a line every metre, a wider one every fifth."""
+    rng = np.random.default_rng(1)
     patches = sum(_patches(rng, cells) * share for cells, share in ((10, 12.0), (50, 10.0), (250, 8.0), (1000, 9.0)))
     tile = np.clip(70.0 + patches, 15, 110)
     step = round(1 / TEXEL_M)
@@ -91,7 +87,7 @@ def field(seed: int = 1) -> Ground:
 
 
 def _patches(rng: np.random.Generator, cells: int) -> Array:
-    """Return smooth noise of unit variance over the tile, which repeats."""
+    """Return smooth periodic noise of unit variance over the tile."""
     coarse = np.pad(rng.standard_normal((cells, cells)), 2, mode="wrap")
     wide = TILE // cells
     fine = coarse if wide == 1 else cv2.resize(coarse, None, fx=wide, fy=wide, interpolation=cv2.INTER_CUBIC)
@@ -107,12 +103,7 @@ def colour_map(brightness: float) -> Grey:
 
 
 class Backdrop:
-    """Draws ground and sky as a pinhole sees them.
-
-    Args:
-        view: of the camera, without distortion.
-        ground: what it sees.
-    """
+    """Draws ground and sky as a pinhole camera sees them; `view` is without distortion."""
 
     def __init__(self, view: View, ground: Ground) -> None:
         lens = view.lens
@@ -132,45 +123,44 @@ class Backdrop:
         """Return the picture, owned by this object."""
         height_m = max(float(motion.p_WK[2]), HEIGHT_MIN_M)
         to_W = motion.R_WK @ self._K_inv  # a pixel (u, v, 1) to its ray in W
-        down = (-to_W[2]).tolist()  # how far it goes down, of a ray with z = 1 in K
+        down = (-to_W[2]).tolist()  # descent of a ray with z = 1 in K
         limits = [math.inf, *(height_m / self._reach(level, height_m) for level in self._ground.levels)]
         least, most = _extremes(self._size, down)
         first = next((i for i, limit in enumerate(limits[1:]) if least >= limit), None)
         if first is None:
-            self._sky(down)
-            self._fill(down, 0.0, self._ground.mean)
+            self._draw_sky(down)
+            ground = half_plane(self._size, down, 0.0)
+            if len(ground) >= 3:
+                cv2.fillConvexPoly(self.grey, _fixed(ground), self._ground.mean, cv2.LINE_AA, SHIFT)
             first = len(self._ground.levels) - 1
-        to_ground = self._to_ground(to_W, motion.p_WK, height_m)
-        for i in range(first, -1, -1):  # limits[i + 1] and limits[i] are of `down`, of a level and the finer one
+        # homography from pixels to (x, y, 1) on the ground [m], in the nearest of the repeated tiles
+        x, y = (p - self._ground.tile_m * round(p / self._ground.tile_m) for p in motion.p_WK[:2].tolist())
+        to_ground = np.array([[height_m, 0, -x], [0, height_m, -y], [0, 0, -1.0]]) @ to_W
+        for i in range(first, -1, -1):  # limits of `down` for a level and for the finer one
             if most > limits[i + 1]:
-                self._lay(self._ground.levels[i], to_ground, down, limits[i + 1], limits[i])
+                self._draw_level(self._ground.levels[i], to_ground, down, limits[i + 1], limits[i])
         return self.grey
 
     def ground_rows(self, motion: CameraMotion, room: int) -> slice:
-        """Return the rows that have ground, and so many on either side of them."""
+        """Return the rows that show ground, with so many more on either side."""
         down = (-motion.R_WK[2] @ self._K_inv).tolist()
         first, end = _rows(half_plane(self._size, down, 0.0), self._size) or (0, 0)
         return slice(max(0, first - room), min(self._size[1], end + room)) if first < end else slice(0, 0)
 
     def _reach(self, level: Level, height_m: float) -> float:
-        """Return how far a level is drawn [m]: a pixel is s^2 / (f h) deep on the ground at a distance s."""
+        """Return how far a level is drawn [m]: a pixel at distance s covers a depth of s^2 / (f h) on the ground."""
         return min(math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m), 0.7 * level.reach_m)
 
-    def _sky(self, down: Sequence[float]) -> None:
-        """Draw the sky, bluer the higher; only the rows that have some."""
+    def _draw_sky(self, down: Sequence[float]) -> None:
+        """Draw the sky, bluer the higher, in the rows that show some."""
         a, b, c = (-SKY_SLOPE * each for each in down)
         rows = _rows(half_plane(self._size, (a, b, c), 0.0), self._size)
         if rows is not None:
             upwards = np.float32(b) * self._row_numbers[slice(*rows)] + np.float32(c + HAZE)
             cv2.convertScaleAbs(upwards + np.float32(a) * self._columns, dst=self.grey[slice(*rows)])
 
-    def _fill(self, down: Sequence[float], least: float, grey: int) -> None:
-        part = half_plane(self._size, down, least)
-        if len(part) >= 3:
-            cv2.fillConvexPoly(self.grey, _fixed(part), grey, cv2.LINE_AA, SHIFT)
-
-    def _lay(self, level: Level, to_ground: Array, down: Sequence[float], least: float, most: float) -> None:
-        """Draw a level in the rows where the ground is near enough for it, and not all near enough for a finer one."""
+    def _draw_level(self, level: Level, to_ground: Array, down: Sequence[float], least: float, most: float) -> None:
+        """Draw a level in the rows that are near enough for it and not all near enough for a finer one."""
         part = half_plane(self._size, down, least)
         rows = _rows(part, self._size)
         coarse = _rows(half_plane(self._size, [-each for each in down], -most), self._size) if most < math.inf else rows
@@ -197,21 +187,13 @@ class Backdrop:
         value = self._ground.mean
         cv2.warpPerspective(level.texels, warp, size, out, flags, cv2.BORDER_CONSTANT, value)
 
-    def _to_ground(self, to_W: Array, p_WK: Array, height_m: float) -> Array:
-        """Return the homography from pixels to (x, y, 1) on the ground [m]; of the repeated tiles the nearest."""
-        x, y = (p - self._ground.tile_m * round(p / self._ground.tile_m) for p in p_WK[:2].tolist())
-        return np.array([[height_m, 0, -x], [0, height_m, -y], [0, 0, -1.0]]) @ to_W
-
-
-SHIFT = 4  # fractional bits of OpenCV's coordinates: sixteenths of a pixel
-
 
 def _fixed(points: Points) -> NDArray[np.int32]:
     return np.rint(np.array(points) * (1 << SHIFT)).astype(np.int32)
 
 
 def _rows(part: Points, size: tuple[int, int]) -> tuple[int, int] | None:
-    """Return the first row that a part of the picture has, and the first that it does not have any more."""
+    """Return the first row of a part of the picture, and the one after its last."""
     if len(part) < 3:
         return None
     heights = [v for _, v in part]
@@ -223,14 +205,14 @@ def _rectangle(width: int, height: int) -> Points:
 
 
 def _extremes(size: tuple[int, int], linear: Sequence[float]) -> tuple[float, float]:
-    """Return the least and the greatest a u + b v + c of a picture."""
+    """Return the least and the greatest a u + b v + c in a picture."""
     a, b, c = linear
     at_corners = [a * u + b * v + c for u, v in _rectangle(*size)]
     return min(at_corners), max(at_corners)
 
 
 def half_plane(size: tuple[int, int], linear: Sequence[float], least: float) -> Points:
-    """Return the part of a picture where a u + b v + c >= least, as a polygon; fewer than three points are none."""
+    """Return the part of a picture where a u + b v + c >= least as a polygon, empty with fewer than three points."""
     a, b, c = linear
     corners = _rectangle(*size)
     over = [a * u + b * v + c - least for u, v in corners]

@@ -1,8 +1,11 @@
 """Cluster space: a formation of n robots described as one articulated body.
 
-Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headings about z of W [rad];
-cluster space c holds as many variables: where the formation is, how it is turned, how each robot is turned
-against it, and its shape. Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
+Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headings about z of W [rad]; cluster space c
+has as many variables: where the formation is, how it is turned, how each robot is turned relative to it, and its
+shape. Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
+
+Order of this file: the base class, checks of a user's own class, distances and names, mathematics of the cluster frame
+C with Z-Y-X Euler angles, in plain floats and compiled, because a gate has microseconds.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from numpy.typing import NDArray
 
 from zsim.errors import UserCodeError
 from zsim.math.compiled import portable
+from zsim.math.rotation import Matrix, Vector
 from zsim.schema import plugin
 from zsim.schema.checker import show
 
@@ -25,40 +29,38 @@ Array = NDArray[np.float64]
 TAU = 2 * math.pi
 CONDITION_LENGTH_M = 4.0  # p and q of the paper's formation, equation (3)
 NAMES_SHOWN = 20  # in a message; the paper's cluster has 12
+LENGTH_MIN_M = 1e-9  # a nanometre: below it a direction is rounding noise
 
 
 class SingularClusterError(ValueError):
-    """The formation is so degenerate that its cluster frame does not exist."""
+    """The formation is so degenerate that it has no cluster frame."""
 
 
 class ClusterSpace(ABC):
     """One convention of cluster variables for n robots; every method is a pure function.
 
-    A space of one's own is a subclass with `forward`, `inverse`, `jacobian`, `inverse_jacobian` and `spread`, of which
-    a scenario names the class; it is made by `for_places`.
+    A space of your own is a subclass with `forward`, `inverse`, `jacobian`, `inverse_jacobian` and `spread`, whose
+    class a scenario names; it is made by `for_places`.
 
     Args:
         n: number of robots.
-        names: of the variables, 4 n, pitch among them. The beginning of a name gives its kind: p, q, rho are
-            lengths, w departures in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles
-            that do not.
-        spread_text: what `spread` measures, in words for messages.
+        names: of the variables, 4 n, pitch among them. The beginning of a name gives its kind: p, q, rho are lengths, w
+            departures in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles that do not.
+        spread_text: the quantity that `spread` measures, in words for messages.
 
     Raises:
         ValueError: other names.
 
     Attributes:
-        n: number of robots.
         size: number of cluster variables, 4 n.
         names: their names in the order of c; lengths in metres, angles in radians.
         angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
         in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
         period: (4n,) of the angles that wrap, 2 pi, and 0 for all else.
         bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is none.
-        neutral: (4n,) bool, true for the variables that are zero in a formation that has no other goal: tilts,
-            headings against the formation, departures from a template.
+        neutral: (4n,) bool, true for the variables that are zero in a formation that has no other goal: tilts, relative
+            headings, departures from a template.
         tilts: places of roll and pitch in c.
-        spread_text: what `spread` measures, in words for messages.
     """
 
     def __init__(self, n: int, names: Sequence[str], spread_text: str) -> None:
@@ -81,7 +83,7 @@ class ClusterSpace(ABC):
 
     @classmethod
     def for_places(cls, places_m: Array) -> ClusterSpace:
-        """Return the space of as many robots as there are places (n, 3) [m]; here cls(n), what a scenario names.
+        """Return the space of as many robots as there are places (n, 3) [m]; by default cls(n).
 
         Args:
             places_m: the cluster's `template_m`, else where its robots start; x ahead, y left of the formation.
@@ -125,11 +127,11 @@ class ClusterSpace(ABC):
         """Return the smallest height of the shape [m] (see `spread_text`); 0 where the shape is singular."""
 
     def motion(self, c: Array, c_dot: Array) -> Array:
-        """Return r_dot (4n,) = J^-1 c_dot; spaces whose J^-1 is large have a shorter way than through the matrix."""
-        return self.inverse_jacobian(c).dot(c_dot)  # the same bits as @, in half of its time at so small a size
+        """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 have a shorter way than through the matrix."""
+        return self.inverse_jacobian(c).dot(c_dot)  # the same bits as @, in half the time at this size
 
     def specimen(self, apart_m: float) -> Array:
-        """Return c (4n,) of some formation with robots at least so far apart, level, to try code on."""
+        """Return c (4n,) of some level formation with robots at least so far apart, for rehearsals."""
         radius_m = self.n * apart_m
         turns = np.arange(self.n) * (TAU / self.n)
         p_W = radius_m * np.column_stack((np.cos(turns), np.sin(turns), np.ones(self.n)))
@@ -138,22 +140,21 @@ class ClusterSpace(ABC):
     def margin(self, c: Array) -> float:
         """Return the distance to singularity [m]: spread(c) cos(pitch).
 
-        It is zero exactly where J^-1 is singular (robots 1, 2, 3 in line or two of them in one place, a
-        further robot on the z axis through robot 1, or pitch at 90 degrees), and a length: how far one
-        robot may move before a level formation becomes singular.
+        It is zero exactly where J^-1 is singular (robots 1, 2, 3 in line or two of them in one place, a further robot
+        on the z axis through robot 1, or pitch at 90 degrees), and a length: how far one robot may move before a level
+        formation becomes singular.
         """
         return self.measures(c)[1]
 
     def measures(self, c: Array) -> tuple[float, float]:
-        """Return spread and margin [m]."""
         spread = self.spread(c)
         return spread, spread * math.cos(c[self._pitch])
 
     def condition(self, c: Array) -> float:
         """Return the condition number of J^-1 (2-norm, metres and radians as they are).
 
-        It grows with the unit of length, so a formation larger than 4 m is judged scaled down to 4 m: a
-        large formation is not nearer to singularity than a small one of the same shape.
+        It grows with the unit of length, so a formation larger than 4 m is judged scaled down to 4 m: a large formation
+        is not nearer to singularity than a small one of the same shape.
         """
         lengths = np.abs(c[self._lengths])
         scaled = c.copy()
@@ -161,7 +162,7 @@ class ClusterSpace(ABC):
         return float(np.linalg.cond(self.inverse_jacobian(scaled)))
 
     def difference(self, c_to: Array, c_from: Array) -> Array:
-        """Return c_to - c_from (4n,), angles that wrap the short way."""
+        """Return c_to - c_from (4n,), angles that wrap by the shorter way."""
         return self.wrapped(c_to - c_from)
 
     def wrapped(self, c: Array) -> Array:
@@ -184,9 +185,9 @@ class ClusterSpace(ABC):
 
 
 def checked(space: ClusterSpace) -> ClusterSpace:
-    """Let a space of a user's own refuse, in every method, what is no finite number of the right shape.
+    """Make every method of a user's space refuse results that are not finite numbers of the right shape.
 
-    Its methods then raise UserCodeError, which names class, method and value.
+    The methods then raise UserCodeError, which names class, method and value.
     """
     n, size = space.n, space.size
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -198,35 +199,30 @@ def checked(space: ClusterSpace) -> ClusterSpace:
         "motion": ((size,),),
     }
     for method, wanted in shapes.items():
-        setattr(space, method, _Checked(getattr(space, method), f"{plugin.full_name(type(space))}.{method}", wanted))
+        setattr(space, method, _checked(getattr(space, method), f"{plugin.full_name(type(space))}.{method}", wanted))
     return space
 
 
-class _Checked:
-    """A method of a user's space, with the shapes of what it returns."""
-
-    def __init__(self, method: Callable[..., Any], name: str, shapes: tuple[tuple[int, ...], ...]) -> None:
-        self._method = method
-        self._name = name
-        self._shapes = shapes
-
-    def __call__(self, *arguments: Any) -> Any:
-        returned = self._method(*arguments)
+def _checked(method: Callable[..., Any], name: str, shapes: tuple[tuple[int, ...], ...]) -> Callable[..., Any]:
+    def call(*arguments: Any) -> Any:
+        returned = method(*arguments)
         try:
-            parts = tuple(returned) if len(self._shapes) > 1 else (returned,)
+            parts = tuple(returned) if len(shapes) > 1 else (returned,)
             arrays = [plugin.numbers(part) for part in parts]
         except (TypeError, ValueError):
             arrays = []
-        if [array.shape for array in arrays] != list(self._shapes):
+        if [array.shape for array in arrays] != list(shapes):
             found = " and ".join(f"shape {array.shape}" for array in arrays) or show(returned)
-            allowed = " and ".join(map(str, self._shapes)) if self._shapes != ((),) else "a number"
-            raise UserCodeError(f"{self._name} returns {found}; must be {allowed}")
+            allowed = " and ".join(map(str, shapes)) if shapes != ((),) else "a number"
+            raise UserCodeError(f"{name} returns {found}; must be {allowed}")
         for array in arrays:
             if not np.isfinite(array).all() and all(np.isfinite(argument).all() for argument in arguments):
                 place = np.argwhere(~np.isfinite(array))[0].tolist()
                 at = f" at {place}" if place else ""
-                raise UserCodeError(f"{self._name} returns {array[tuple(place)]}{at}; must be finite")
+                raise UserCodeError(f"{name} returns {array[tuple(place)]}{at}; must be finite")
         return tuple(arrays) if len(arrays) > 1 else arrays[0] if arrays[0].ndim else float(arrays[0])
+
+    return call
 
 
 def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Array]:
@@ -237,7 +233,7 @@ def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Arr
 
 @portable
 def put_wrapped(c: Array, period: Array, near: Array) -> None:
-    """Write c with each variable taken to half a period about zero; period is 2 pi or, for none, 0."""
+    """Write c with each variable wrapped to half a period about zero; period is 2 pi or, for none, 0."""
     for k in range(c.size):
         near[k] = c[k] - period[k] * np.rint(c[k] / TAU)
 
@@ -256,7 +252,6 @@ def closest_pair(p_W: Array) -> tuple[float, int, int]:
 
 
 def numbered(stem: str, robots: Iterable[int]) -> list[str]:
-    """Return the names of a variable that every robot has, robots counted from 1."""
     return [f"{stem}_{k}" for k in robots]
 
 
@@ -283,7 +278,63 @@ def _stem(name: str) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names for a line of text, of many the first and the last."""
+    """Return names for a line of text, abbreviated where there are many."""
     if len(names) <= NAMES_SHOWN:
         return ", ".join(names)
     return ", ".join((*names[: NAMES_SHOWN - 1], f"… {names[-1]}")) + f" ({len(names)})"
+
+
+@portable
+def wrap_angle(angle: float) -> float:
+    """Return the angle wrapped to [-pi, pi]."""
+    return angle - TAU * np.rint(angle / TAU)
+
+
+@portable
+def row(table: Array, i: int) -> Vector:
+    return float(table[i, 0]), float(table[i, 1]), float(table[i, 2])
+
+
+@portable
+def put(J: Array, first: int, column: int, v: Vector) -> None:
+    """Write v into a column of J, from row first on."""
+    J[first, column], J[first + 1, column], J[first + 2, column] = v
+
+
+@portable
+def centroid(p_W: Array) -> Vector:
+    """Return the mean of positions (n, 3)."""
+    n = p_W.shape[0]
+    x, y, z = row(p_W, 0)
+    for i in range(1, n):
+        a = row(p_W, i)
+        x, y, z = x + a[0], y + a[1], z + a[2]
+    return x / n, y / n, z / n
+
+
+@portable
+def pitch_yaw(x_W: Vector) -> tuple[float, float]:
+    """Return pitch and yaw of a frame from its x axis in W."""
+    flat = math.sqrt(x_W[0] * x_W[0] + x_W[1] * x_W[1])
+    return math.atan2(-x_W[2], flat), math.atan2(x_W[1], x_W[0])
+
+
+@portable
+def euler_axes_C(roll: float, pitch: float) -> Matrix:
+    """Return w_WC_C of a unit rate of roll, of pitch and of yaw."""
+    sr, cr = math.sin(roll), math.cos(roll)
+    sp, cp = math.sin(pitch), math.cos(pitch)
+    return (1.0, 0.0, 0.0), (0.0, cr, -sr), (-sp, sr * cp, cr * cp)
+
+
+def euler_rates(roll: float, pitch: float) -> Array:
+    """Return T (3, 3) with (roll', pitch', yaw') = T w_WC_C.
+
+    Raises:
+        SingularClusterError: pitch is at 90 degrees.
+    """
+    sr, cr = math.sin(roll), math.cos(roll)
+    sp, cp = math.sin(pitch), math.cos(pitch)
+    if cp < LENGTH_MIN_M:
+        raise SingularClusterError("pitch is 90 deg: roll and yaw of the formation are one rotation there")
+    return np.array([(1.0, sr * sp / cp, cr * sp / cp), (0.0, cr, -sr), (0.0, sr / cp, cr / cp)])

@@ -1,30 +1,37 @@
-"""The cluster space that a scenario asks for: the stock ones by their names, clusters of clusters by their groups."""
+"""The cluster space that a scenario asks for: a stock one or a user's class, or a cluster of clusters by its groups.
+
+A group k has the cluster c_k of its own robots. Its (x_c, y_c, z_c, yaw) are the place and heading of robot k of the
+parent; the rest of c_k, its tilts, headings and shape, is added to the parent's variables. 4m variables of the parent
+and 4n_k - 4 of each group make 4n. The groups may be clusters of clusters themselves.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zsim.errors import UserCodeError
 from zsim.scenario.scenario import ROBOTS_MAX, Cluster, ClusterGroup, Scenario, space_name
 from zsim.schema import plugin
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, checked
-from zsim_agents.formation.spaces.nested_cluster import NestedCluster
-from zsim_agents.formation.spaces.pair_cluster import PairCluster
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
-from zsim_agents.formation.spaces.triad_cluster import TriadCluster
+from zsim_agents.formation.spaces.triad_cluster import PairCluster, TriadCluster
+
+Places = NDArray[np.intp]
+BODY = ("x_c", "y_c", "z_c", "yaw")  # of a group: variables of a robot of the parent
 
 
 def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     """Return the cluster space of one of a scenario's clusters.
 
     Raises:
-        ValueError: there is none: a template in one line.
-        DocumentError: it is a class of the user's own that cannot be loaded; the line names its module.
-        UserCodeError: it is a class of the user's own that cannot be made.
+        ValueError: the template is in one line.
+        DocumentError: a user's class cannot be loaded; the line names its module.
+        UserCodeError: a user's class cannot be made.
     """
     starts = _starts(scenario, cluster.drones)
     if not cluster.groups:
@@ -38,8 +45,29 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     return NestedCluster(_space(cluster, np.array(centres)), groups)
 
 
+def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
+    places_m = np.array(spec.template_m or starts, dtype=float)
+    name = space_name(spec.space, len(places_m), bool(spec.template_m))
+    if name in STOCK:
+        return STOCK[name](places_m)
+    own: Any = plugin.load(name, "space", ClusterSpace)
+    try:
+        return checked(own.for_places(places_m))
+    except TypeError as error:  # also of a call with wrong arguments, which has no frame of the user's
+        failure = plugin.user_code_error(error, "")
+        raise failure or UserCodeError(f"{name}.for_places raised TypeError: {error}") from error
+
+
+def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
+    """Return where drones start (n, 3) [m]: x ahead and y left of the first of them, z up."""
+    by_name = {drone.name: drone for drone in scenario.drones}
+    yaw = math.radians(by_name[drones[0]].yaw_deg)
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([by_name[name].position_m for name in drones]) @ np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)])
+
+
 def cluster_space(n: int) -> ClusterSpace:
-    """Return the space of n robots called triad: the paper's at n = 3, its generalisation elsewhere.
+    """Return the space of n robots called triad: the paper's at n = 3, its generalisation otherwise.
 
     Raises:
         ValueError: n is not from 2 to 64.
@@ -55,23 +83,139 @@ STOCK: dict[str, Callable[[Array], ClusterSpace]] = {
 }
 
 
-def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
-    """Return the space of as many robots as there are starting places (n, 3)."""
-    places_m = np.array(spec.template_m or starts, dtype=float)
-    name = space_name(spec.space, len(places_m), bool(spec.template_m))
-    if name in STOCK:
-        return STOCK[name](places_m)
-    own: Any = plugin.load(name, "space", ClusterSpace)
-    try:
-        return checked(own.for_places(places_m))
-    except TypeError as error:  # also of a constructor that cannot be called like this, in which no frame is the user's
-        failure = plugin.user_code_error(error, "")
-        raise failure or UserCodeError(f"{name}.for_places raised TypeError: {error}") from error
+class _Group(NamedTuple):
+    """Where a group stands in the whole.
+
+    Attributes:
+        robots: its robots among all.
+        rows: their 4n_k entries in r, four each.
+        body, rest: places of BODY and of all else in its own c.
+        own: places of the rest in the c of the whole.
+        at: places of its body in the r of the parent, four each.
+    """
+
+    space: ClusterSpace
+    robots: slice
+    rows: slice
+    body: Places
+    rest: Places
+    own: slice
+    at: slice
 
 
-def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
-    """Return where drones start (n, 3) [m]: x ahead and y left of the first of them, z up."""
-    by_name = {drone.name: drone for drone in scenario.drones}
-    yaw = math.radians(by_name[drones[0]].yaw_deg)
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([by_name[name].position_m for name in drones]) @ np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)])
+class NestedCluster(ClusterSpace):
+    """c = (variables of the parent, then of each group all but x_c, y_c, z_c, yaw, as NAME.roll, NAME.pitch, ...).
+
+    phi_k of the parent is the yaw of group k relative to that of the parent, NAME.phi_i the heading of a robot relative
+    to the yaw of its group. The origin is the mean of the groups' centroids. The chain rule gives both Jacobians.
+
+    Args:
+        parent: cluster space of m robots.
+        groups: m pairs of name and cluster space, in the order of the robots.
+
+    Raises:
+        ValueError: the number of groups is not m.
+    """
+
+    def __init__(self, parent: ClusterSpace, groups: Sequence[tuple[str, ClusterSpace]]) -> None:
+        if len(groups) != parent.n:
+            raise ValueError(f"groups: {len(groups)}; allowed: {parent.n}, as their parent has robots")
+        self.parent = parent
+        self._groups: list[_Group] = []
+        names, robots = list(parent.names), 0
+        for k, (name, space) in enumerate(groups):
+            body = np.array([space.index(variable) for variable in BODY])
+            rest = np.setdiff1d(np.arange(space.size), body)
+            own = slice(len(names), len(names) + len(rest))
+            after = robots + space.n
+            rows, at = slice(4 * robots, 4 * after), slice(4 * k, 4 * k + 4)
+            self._groups.append(_Group(space, slice(robots, after), rows, body, rest, own, at))
+            names += [f"{name}.{space.names[i]}" for i in rest]
+            robots = after
+        super().__init__(robots, names, "least measure of the parent and its groups")
+
+    def forward(self, p_W: Array, yaw: Array) -> Array:
+        c, bodies = np.empty(self.size), np.empty((self.parent.n, 4))
+        for k, group in enumerate(self._groups):
+            own = group.space.forward(p_W[group.robots], yaw[group.robots])
+            bodies[k], c[group.own] = own[group.body], own[group.rest]
+        c[: self.parent.size] = self.parent.forward(np.ascontiguousarray(bodies[:, :3]), bodies[:, 3].copy())
+        return c
+
+    def inverse(self, c: Array) -> tuple[Array, Array]:
+        p_W, yaw = np.empty((self.n, 3)), np.empty(self.n)
+        for group, own in zip(self._groups, self.parts(c)[1:], strict=True):
+            p_W[group.robots], yaw[group.robots] = group.space.inverse(own)
+        return p_W, yaw
+
+    def jacobian(self, p_W: Array, yaw: Array) -> Array:
+        """Return J: rows of the groups, and rows of the parent times those of the groups' bodies."""
+        J, body = np.zeros((self.size, self.size)), np.zeros((self.parent.size, self.size))
+        bodies = np.empty((self.parent.n, 4))
+        for k, group in enumerate(self._groups):
+            own = group.space.jacobian(p_W[group.robots], yaw[group.robots])
+            bodies[k] = group.space.forward(p_W[group.robots], yaw[group.robots])[group.body]
+            J[group.own, group.rows], body[group.at, group.rows] = own[group.rest], own[group.body]
+        J[: self.parent.size] = self.parent.jacobian(bodies[:, :3].copy(), bodies[:, 3].copy()) @ body
+        return J
+
+    def inverse_jacobian(self, c: Array) -> Array:
+        J_inv = np.zeros((self.size, self.size))
+        parent, *parts = self.parts(c)
+        moved = self.parent.inverse_jacobian(parent)
+        for group, own in zip(self._groups, parts, strict=True):
+            of_own = group.space.inverse_jacobian(own)
+            J_inv[group.rows, : self.parent.size] = of_own[:, group.body] @ moved[group.at]
+            J_inv[group.rows, group.own] = of_own[:, group.rest]
+        return J_inv
+
+    def motion(self, c: Array, c_dot: Array) -> Array:
+        r_dot = np.empty(self.size)
+        parent, *parts = self.parts(c)
+        moved = self.parent.motion(parent, c_dot[: self.parent.size])
+        for group, own in zip(self._groups, parts, strict=True):
+            own_dot = np.empty(group.space.size)
+            own_dot[group.body], own_dot[group.rest] = moved[group.at], c_dot[group.own]
+            r_dot[group.rows] = group.space.motion(own, own_dot)
+        return r_dot
+
+    def specimen(self, apart_m: float) -> Array:
+        """Return specimens of the groups, far from each other."""
+        c = np.zeros(self.size)
+        widest_m = apart_m
+        for group in self._groups:
+            own = group.space.specimen(apart_m)
+            c[group.own] = own[group.rest]
+            widest_m = max(widest_m, 2.0 * float(np.ptp(group.space.inverse(own)[0], axis=0).max()))
+        c[: self.parent.size] = self.parent.specimen(widest_m)
+        return c
+
+    def parts(self, c: Array) -> list[Array]:
+        """Return the cluster of the parent (4m,), then the whole cluster of each group (4n_k,)."""
+        parent = c[: self.parent.size]
+        bodies = np.empty((self.parent.n, 4))
+        bodies[:, :3], bodies[:, 3] = self.parent.inverse(parent)
+        parts = [parent]
+        for k, group in enumerate(self._groups):
+            own = np.empty(group.space.size)
+            own[group.body], own[group.rest] = bodies[k], c[group.own]
+            parts.append(own)
+        return parts
+
+    def spread(self, c: Array) -> float:
+        return min(space.spread(part) for space, part in self._pairs(c))
+
+    def measures(self, c: Array) -> tuple[float, float]:
+        """Return the least spread and margin of parent and groups: the whole is singular where one of them is."""
+        spreads, margins = zip(*(space.measures(part) for space, part in self._pairs(c)), strict=True)
+        return min(spreads), min(margins)
+
+    def condition(self, c: Array) -> float:
+        """Return the greatest condition number of the parent and of the groups, each in its own measure.
+
+        J^-1 of the whole is a product of theirs: where none is large, neither is the whole.
+        """
+        return max(space.condition(part) for space, part in self._pairs(c))
+
+    def _pairs(self, c: Array) -> list[tuple[ClusterSpace, Array]]:
+        return list(zip([self.parent, *(group.space for group in self._groups)], self.parts(c), strict=True))

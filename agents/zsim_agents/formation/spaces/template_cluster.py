@@ -3,14 +3,14 @@
     P_i = C + R (t_i + (N w)_i)
 
 C is the centroid, t_i the template's places, N a basis of the displacements that neither move nor turn it, and R the
-rotation that brings the template nearest to the robots. No robot is privileged, and what one robot does changes the
+rotation that brings the template nearest to the robots. No robot is privileged, and the motion of one robot changes the
 frame by its n-th part only.
 
 Attitudes by best fit: Horn, Closed-form solution of absolute orientation using unit quaternions, J. Opt. Soc. Am. A 4
 (1987), section 4; the same rotation as Kabsch's (1976), and never a reflection. As a formation's frame: Belta, Kumar,
 Abstraction and control for groups of robots, IEEE Trans. Robotics 20 (2004).
 
-Order of this file: the space, the rotation that fits points best, modes of shape.
+Order of this file: the space, the rotation that fits points best, modes of shape, small matrices.
 """
 
 from __future__ import annotations
@@ -21,25 +21,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from zsim.math.compiled import portable
-from zsim.math.rotation import matrix
-from zsim_agents.formation.spaces.cluster_frame import (
-    LENGTH_MIN_M,
-    array_of,
-    euler_angles,
-    euler_axes_of,
-    euler_rates,
-    inertia,
-    rotation_of,
-    row,
-    skew,
-)
+from zsim.math.rotation import Matrix, matrix, matrix_from_rpy
 from zsim_agents.formation.spaces.cluster_space import (
     CONDITION_LENGTH_M,
+    LENGTH_MIN_M,
     TAU,
     Array,
     ClusterSpace,
     SingularClusterError,
+    euler_axes_C,
+    euler_rates,
     numbered,
+    pitch_yaw,
+    row,
 )
 
 INDEPENDENT_MIN = 1e-6  # share of a direction that must be new; rounding leaves 1e-15
@@ -51,18 +45,18 @@ HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # places in the small matrix 
 class TemplateCluster(ClusterSpace):
     """c = (x_c, y_c, z_c, roll, pitch, yaw, phi_1..phi_n, w_1..w_{3n-6}); w in metres rms over the robots.
 
-    w_1 is growth: robots go outwards, by w_1 in the root mean square. Then come the stretches and shears that the
+    w_1 is growth: robots move outwards, by w_1 in the root mean square. Then come the stretches and shears that the
     template has room for (`shape_modes`).
+
+    Args:
+        places_m: (n, 3) the template, n >= 3; its origin does not matter.
+
+    Raises:
+        ValueError: fewer than three places, or all in one line.
 
     Attributes:
         t_C: (n, 3) places of the template about their centroid, in C [m].
         modes_C: (n, 3, 3n - 6), N.
-
-    Args:
-        places_m: (n, 3) the template, n from 3 on; its origin does not matter.
-
-    Raises:
-        ValueError: fewer than three places, or all in one line.
     """
 
     def __init__(self, places_m: ArrayLike) -> None:
@@ -109,7 +103,7 @@ class TemplateCluster(ClusterSpace):
         turn = np.linalg.solve(inertia(b_C.T @ self.t_C), arms.reshape(3, 3 * n)).reshape(3, n, 3)
         roll, pitch, _ = euler_angles(R_WC)
         moved_C = np.einsum("iab,bjk->iajk", np.array([skew(b) for b in b_C]), turn)  # b_i' = R^T v_i - w_WC_C x b_i
-        moved_C[range(n), :, range(n)] += R_WC.T  # less that of the centroid, of which N^T knows nothing
+        moved_C[range(n), :, range(n)] += R_WC.T  # less that of the centroid, which N^T ignores
 
         J = np.zeros((self.size, n, 4))
         J[:3, :, :3] = np.eye(3)[:, None] / n
@@ -157,12 +151,11 @@ class TemplateCluster(ClusterSpace):
         return float(np.linalg.eigvalsh(inertia((S + S.T) / 2))[0]) / self._reach_m
 
     def condition(self, c: Array) -> float:
-        """Return the condition number of J^-1 where what each robot has (velocity, heading, phi) counts by its
-        root mean square over the robots, so that it does not grow with their number; of a formation with robots
-        farther than 4 m from the centroid, of one scaled down to that.
+        """Return the condition number of J^-1, the robots' velocities, headings and phi weighted by their rms.
 
-        w_k and the centroid are orthonormal in this measure; what is left is a matrix of 7 x 7: turns, the three
-        directions of w that they mix with, and the mean of phi.
+        So it does not grow with the number of robots; a formation with robots farther than 4 m from the centroid is
+        scaled down to that. w_k and the centroid are orthonormal in this measure; what is left is a matrix of 7 x 7:
+        turns, the three directions of w that they mix with, and the mean of phi.
         """
         place_C = self._places_C(c)
         scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(place_C, axis=1).max()), LENGTH_MIN_M))
@@ -237,7 +230,6 @@ def rotation_of_quaternion(q: Array) -> Array:
 
 
 def centred(places: ArrayLike) -> Array:
-    """Return places (n, 3) about their mean."""
     p = np.array(places, dtype=float).reshape(-1, 3)
     return p - p.mean(axis=0)
 
@@ -263,28 +255,69 @@ def shape_modes(t: Array) -> Array:
         raise ValueError("template: all places are in one line; allowed: places that span a plane or space")
     single = np.eye(3 * n).reshape(3 * n, n, 3)
     stretches = [t * axis for axis in np.eye(3)]
-    basis = _orthonormal([t, *stretches, *_shears(t), *single], rigid)
+    shears = [np.zeros_like(t) for _ in PLANES]
+    for d, (a, b) in zip(shears, PLANES, strict=True):
+        d[:, a], d[:, b] = t[:, b], t[:, a]
+    basis = _orthonormal([t, *stretches, *shears, *single], rigid)
     return np.sqrt(n) * np.array(basis).T.reshape(n, 3, 3 * n - 6)
 
 
-def _shears(t: Array) -> list[Array]:
-    shears = []
-    for a, b in PLANES:
-        d = np.zeros_like(t)
-        d[:, a], d[:, b] = t[:, b], t[:, a]
-        shears.append(d)
-    return shears
-
-
 def _orthonormal(directions: list[Array], done: list[Array]) -> list[Array]:
-    """Return unit vectors (3n,) along what is new in each direction (n, 3), in their order, beside those done."""
+    """Return unit vectors (3n,) along the new part of each direction (n, 3), in order, orthogonal to those done."""
     basis: list[Array] = []
     for direction in directions:
         v = direction.ravel()
         size = np.linalg.norm(v)
-        for _ in range(2):  # the second pass takes out what rounding left of the first
+        for _ in range(2):  # the second pass removes what rounding left of the first
             earlier = np.array([*done, *basis])
             v = v - earlier.T @ (earlier @ v) if len(earlier) else v
         if size > 0.0 and np.linalg.norm(v) > INDEPENDENT_MIN * size:
             basis.append(v / np.linalg.norm(v))
     return basis
+
+
+@portable
+def inertia(S: Array) -> Array:
+    """Return tr(S) I - S (3, 3)."""
+    M = np.empty((3, 3))
+    trace = S[0, 0] + S[1, 1] + S[2, 2]
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = (trace if i == j else 0.0) - S[i, j]
+    return M
+
+
+@portable
+def skew(a: Array) -> Array:
+    """Return the matrix (3, 3) of a x ."""
+    A = np.zeros((3, 3))
+    A[0, 1], A[0, 2] = -a[2], a[1]
+    A[1, 0], A[1, 2] = a[2], -a[0]
+    A[2, 0], A[2, 1] = -a[1], a[0]
+    return A
+
+
+def euler_angles(R_WC: Array) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of R_WC = Rz(yaw) Ry(pitch) Rx(roll)."""
+    pitch, yaw = pitch_yaw((R_WC[0, 0], R_WC[1, 0], R_WC[2, 0]))
+    return math.atan2(R_WC[2, 1], R_WC[2, 2]), pitch, yaw
+
+
+@portable
+def array_of(R: Matrix) -> Array:
+    rows = np.empty((3, 3))
+    for i in range(3):
+        rows[i, 0], rows[i, 1], rows[i, 2] = R[i]
+    return rows
+
+
+@portable
+def rotation_of(c: Array) -> Array:
+    """Return R_WC (3, 3) of a cluster (4n,) with roll, pitch and yaw at 3, 4 and 5."""
+    return array_of(matrix_from_rpy(c[3], c[4], c[5]))
+
+
+@portable
+def euler_axes_of(c: Array) -> Array:
+    """Return w_WC_C of a unit rate of roll, of pitch and of yaw, row by row (3, 3)."""
+    return array_of(euler_axes_C(c[3], c[4]))

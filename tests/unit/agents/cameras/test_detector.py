@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from pictures import BOTTOM, FRONT, HATS, bodies, hat_K, looks, renderer, scene
+from refused import has_terms
 
-from zsim.sensors.camera import Camera, FrontCamera
-from zsim.sensors.camera_model import camera_pose, lens_of, pixel
-from zsim_agents.cameras.detector import HatDetector
-from zsim_agents.cameras.jpeg import decoded
-from zsim_agents.cameras.rendering.balls import AMBIENT, Ball, draw_ball
-from zsim_agents.cameras.rendering.view import View
+from zsim.sensors.camera import Camera, FrontCamera, PictureError, frame_of
+from zsim.sensors.camera_model import camera_pose, lens_of
+from zsim_agents.cameras.detector import HatDetector, decoded
+from zsim_agents.cameras.rendering.scene import View
+from zsim_agents.cameras.rendering.shapes import AMBIENT, ball_images
 
 ASSOCIATED_RAD = 0.03  # rad, within which a sighting is that of the hat
 
@@ -78,10 +78,9 @@ def test_a_ball_anywhere_in_the_picture_has_its_range_and_direction(place: Any) 
     lens, distance = lens_of(FRONT), 2.0
     direction_K = np.array([*place, 1.0]) / np.linalg.norm([*place, 1.0])
     picture = np.full((lens.height, lens.width, 3), 90, np.uint8)
-    centre = direction_K * distance
-    at = np.array(pixel(lens, *centre.tolist()))
     colour = np.array([134.0, 0.0, 226.0]) / AMBIENT  # in the shade everywhere, so that nothing but geometry counts
-    draw_ball(picture, View(lens), Ball(centre, np.zeros(3), at, 0.0, HATS.diameter_m / 2, colour), direction_K)
+    centres, radius_m = (direction_K * distance)[None], HATS.diameter_m / 2
+    ball_images(View(lens), centres, np.zeros((1, 3)), radius_m, colour, direction_K)[0].draw(picture)
     (seen,) = detector().seen(picture)
     off = np.array(seen.direction_B) - camera_pose(FRONT).R_BK @ direction_K
     assert np.linalg.norm(off) < 5e-4  # 0.2 px
@@ -121,10 +120,8 @@ def test_a_hat_that_the_edge_of_the_picture_cuts_is_left_out() -> None:
 
 def test_a_hat_too_small_for_an_honest_range_is_left_out() -> None:
     drawn = renderer(replace(FRONT, noise=0.0))
-    assert [len(detector().seen(drawn.picture(0, 1.0, bodies([(0, 0, 5), (away, 0, 4.5)])))) for away in (8, 18)] == [
-        1,
-        0,
-    ]
+    seen = [detector().seen(drawn.picture(0, 1.0, bodies([(0, 0, 5), (away, 0, 4.5)]))) for away in (8, 18)]
+    assert [*map(len, seen)] == [1, 0]
 
 
 @pytest.mark.parametrize("kind", ["noise", "magenta", "black", "stripes"])
@@ -151,3 +148,71 @@ def test_orange_red_and_purple_balls_are_no_hats() -> None:
     for i, colour in enumerate([(24, 108, 240), (20, 20, 220), (30, 200, 220), (220, 60, 40), (60, 180, 60)]):
         cv2.circle(picture, (80 + 100 * i, 180), 12, colour, cv2.FILLED, cv2.LINE_AA)
     assert detector().seen(picture) == ()
+
+
+# JPEG of strangers
+
+PICTURE = np.random.default_rng(1).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+
+
+def jpeg(*options: int) -> bytes:
+    return cv2.imencode(".jpg", PICTURE, [*options])[1].tobytes()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [(), (cv2.IMWRITE_JPEG_PROGRESSIVE, 1), (cv2.IMWRITE_JPEG_RST_INTERVAL, 2), (cv2.IMWRITE_JPEG_QUALITY, 5)],
+)
+def test_the_size_of_any_jpeg_is_read(options: tuple[int, ...]) -> None:
+    assert frame_of(jpeg(*options))[1:] == (64, 48)
+    assert decoded(jpeg(*options), 64, 48).shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff\xd8",
+        b"\xff\xd8\xff\xd9",
+        b"\xff\xd8\xff\xc0\x00",
+        b"\xff\xd8\xff\xe0\x00\x00" * 9,
+        b"\xff\xd8" + b"\xff" * 500,
+        b"\x89PNG\r\n\x1a\n" + bytes(100),
+        bytes(range(256)) * 4,
+        cv2.imencode(".png", PICTURE)[1].tobytes(),
+        jpeg()[:20],
+    ],
+)
+def test_what_is_no_jpeg_is_refused(data: bytes) -> None:
+    with pytest.raises(PictureError):
+        decoded(data, 64, 48)
+
+
+def test_every_cut_and_any_noise_is_taken_or_refused_in_a_line() -> None:
+    data, rng = jpeg(), np.random.default_rng(2)
+    pictures = [data[:end] for end in range(0, len(data), 37)]
+    for _ in range(100):
+        noisy = bytearray(data)
+        for at in rng.integers(2, len(data), 5):
+            noisy[at] = rng.integers(256)
+        pictures.append(bytes(noisy))
+    refusals = []
+    for picture in pictures:
+        try:
+            assert decoded(picture, 64, 48).shape == (48, 64, 3)
+        except PictureError as error:
+            refusals.append(str(error))
+    assert not [refusal for refusal in refusals if "\n" in refusal]
+
+
+def test_a_header_of_an_absurd_size_is_refused_before_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("was decoded"))
+    data = bytearray(jpeg())
+    at = data.index(b"\xff\xc0") + 5
+    data[at : at + 4] = b"\xff\xff\xff\xff"
+    with pytest.raises(PictureError) as caught:
+        decoded(bytes(data), 64, 48)
+    assert has_terms(str(caught.value), "65535", "64", "48")
+    with pytest.raises(PictureError) as caught:
+        decoded(bytes(data), 65535, 65535)
+    assert has_terms(str(caught.value), str(65535**2))

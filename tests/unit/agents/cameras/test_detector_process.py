@@ -15,8 +15,8 @@ from zsim.contract.flight_messages import Sightings
 from zsim.contract.messages import Info, Origin
 from zsim.runtime.participant import Participant
 from zsim_agents.cameras import detector_process
+from zsim_agents.cameras.detector import PIXELS_MAX
 from zsim_agents.cameras.detector_process import REPORTS_MAX, DetectorProcess
-from zsim_agents.cameras.jpeg import PIXELS_MAX
 
 INFO = Info(0, 0, 1, "r", "zsim", "lockstep", 0.0, 1, 1, 1, 1, Origin(0.0, 0.0, 0.0), (), (), "", "", "", "")
 FRONT, FRONT_INFO = keys.camera("d1", "front"), keys.camera_info("d1", "front")

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from synthetic_flight import GATE_S, Flight, OneDrone, Reading, estimator, fly, readings, scenario
+from synthetic_flight import GATE_S, Flight, Reading, estimator, fly, readings, scenario
 
+from zsim_agents.estimation.dead_reckoning import levelling_time_s
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.filter_setup import LEVELLING_S, madgwick_beta
 from zsim_agents.estimation.filter_state import Rows
-from zsim_agents.estimation.madgwick import levelling_time_s
 
 NAN, INF = math.nan, math.inf
 AIDING = ("gps", "mag", "baro", "sonar", "flow")
@@ -25,24 +25,19 @@ def flown(seed: int = 1, end_s: float = 20.0, **sections):
     return of, flight, coming, fly(estimator(of), coming, end_s)
 
 
-def position_errors(flight: Flight, estimates, after_s: float = 0.0) -> np.ndarray:
+def errors(flight: Flight, estimates, after_s: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the errors of position [m], velocity [m/s] and heading [rad] at each gate."""
     t = np.array([t for t, _ in estimates if t > after_s])
-    return np.array([e.position_m for t, e in estimates if t > after_s]) - flight.position(t)
+    found = [e for t, e in estimates if t > after_s]
+    heading = np.array([e.yaw_rad for e in found]) - flight.heading(t)
+    position = np.array([e.position_m for e in found]) - flight.position(t)
+    return position, np.array([e.velocity_m_s for e in found]) - flight.velocity(t), np.angle(np.exp(1j * heading))
 
 
-def velocity_errors(flight: Flight, estimates, after_s: float = 0.0) -> np.ndarray:
-    t = np.array([t for t, _ in estimates if t > after_s])
-    return np.array([e.velocity_m_s for t, e in estimates if t > after_s]) - flight.velocity(t)
-
-
-def heading_errors(flight: Flight, estimates, after_s: float = 0.0) -> np.ndarray:
-    t = np.array([t for t, _ in estimates if t > after_s])
-    error = np.array([e.yaw_rad for t, e in estimates if t > after_s]) - flight.heading(t)
-    return np.angle(np.exp(1j * error))
-
-
-def rms(error: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.mean(error**2, axis=0))
+def rms(flight: Flight, estimates, after_s: float = 0.0) -> tuple[np.ndarray, float, float]:
+    """Return the root mean square error of the position by axis, and the worst of velocity and heading."""
+    position, velocity, heading = (np.sqrt(np.mean(e**2, axis=0)) for e in errors(flight, estimates, after_s))
+    return position, float(velocity.max()), float(heading)
 
 
 def covariance(estimate: StateEstimate) -> np.ndarray:
@@ -51,19 +46,18 @@ def covariance(estimate: StateEstimate) -> np.ndarray:
 
 def nees(flight: Flight, estimates, after_s: float) -> float:
     """Mean over time of e^T P^-1 e of position and velocity."""
-    error = np.hstack([position_errors(flight, estimates, after_s), velocity_errors(flight, estimates, after_s)])
+    error = np.hstack(errors(flight, estimates, after_s)[:2])
     P = np.array([covariance(e) for t, e in estimates if t > after_s])
     return float(np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[:, :, None])[:, :, 0])))
 
 
 def test_a_flight_is_followed_to_the_sensors_limits():
     _, flight, _, estimates = flown(end_s=40.0)
-    after = 20.0
-    east, north, up = rms(position_errors(flight, estimates, after))
+    (east, north, up), velocity, heading = rms(flight, estimates, 20.0)
     assert max(east, north) < 0.45  # m; sigma is 0.2 m and wanders slowly
     assert up < 0.03
-    assert max(rms(velocity_errors(flight, estimates, after))) < 0.04  # m/s
-    assert rms(heading_errors(flight, estimates, after)) < 0.01  # rad
+    assert velocity < 0.04  # m/s
+    assert heading < 0.01  # rad
 
 
 @pytest.mark.parametrize(
@@ -161,6 +155,7 @@ def test_what_is_no_number_is_refused_counted_and_harmless(bad: float):
 
 def test_duplicates_change_nothing_and_old_readings_are_refused():
     of, _, coming, clean = flown(seed=5, end_s=8.0)
+    assert fly(estimator(of), coming, 8.0) == clean  # the same readings give the same bits
     twice = [r for reading in coming for r in (reading, reading)]
     assert fly(estimator(of), twice, 8.0)[-1][1] == clean[-1][1]
     old = [next(r for r in coming if r.sensor == name)._replace(t_s=5.001) for name in ("gps", "imu")]
@@ -205,10 +200,9 @@ def test_the_heading_converges_from_anywhere(yaw_deg: float):
     flight = Flight(8, start_s=100.0)
     flight.yaw_start = math.radians(yaw_deg)
     estimates = fly(estimator(of), readings(flight, of, 8, 3.0), 3.0)
-    errors = heading_errors(flight, estimates)
-    assert abs(errors[int(0.1 / GATE_S)]) < 0.25  # rad, from the first reading or two of 0.05 rad
-    assert abs(errors[-1]) < 0.03
-    assert abs(errors[-1]) < 4.0 * estimates[-1][1].yaw_sigma_rad
+    off = np.abs(errors(flight, estimates)[2])
+    assert off[int(0.1 / GATE_S)] < 0.25  # rad, from the first reading or two of 0.05 rad
+    assert off[-1] < min(0.03, 4.0 * estimates[-1][1].yaw_sigma_rad)
 
 
 def test_without_a_magnetometer_the_heading_is_the_one_it_was_set_down_with():
@@ -216,7 +210,7 @@ def test_without_a_magnetometer_the_heading_is_the_one_it_was_set_down_with():
     flight.yaw_start = math.radians(-100.0)
     of = scenario(yaw_deg=-100.0, estimation={"magnetometer": False})
     estimates = fly(estimator(of), readings(flight, of, 9, 3.0), 3.0)
-    assert abs(heading_errors(flight, estimates)[-1]) < 0.01
+    assert abs(errors(flight, estimates)[2][-1]) < 0.01
     assert estimates[-1][1].yaw_sigma_rad == pytest.approx(0.05, rel=0.1)
     assert estimates[-1][1].sensors["mag"] == (0, 0)
 
@@ -264,8 +258,9 @@ def test_latencies_of_all_sensors_are_made_good():
         "imu": {"latency_ms": 10.0},
     }
     _, flight, _, estimates = flown(seed=11, end_s=30.0, sensors=late)
-    assert max(rms(velocity_errors(flight, estimates, 15.0))) < 0.045  # m/s
-    assert rms(heading_errors(flight, estimates, 15.0)) < 0.01
+    _, velocity, heading = rms(flight, estimates, 15.0)
+    assert velocity < 0.045  # m/s
+    assert heading < 0.01
     assert nees(flight, estimates, 15.0) < chi2.ppf(0.999, 6)
     assert all(refused <= 2 for _, refused in estimates[-1][1].sensors.values())
 
@@ -282,20 +277,16 @@ MOUNTS = {
 
 def test_mounts_are_taken_off():
     of, flight = scenario(sensors=MOUNTS), Flight(12, yaw_rate=0.8, accel=0.8)
-    estimates = fly(estimator(of), readings(flight, of, 12, 30.0), 30.0)
-    assert max(rms(position_errors(flight, estimates, 15.0))) < 0.05  # m; the antenna alone is 0.9 m off
-    assert max(rms(velocity_errors(flight, estimates, 15.0))) < 0.045
-    assert rms(heading_errors(flight, estimates, 15.0)) < 0.01
+    coming = readings(flight, of, 12, 30.0)
+    estimates = fly(estimator(of), coming, 30.0)
+    position, velocity, heading = rms(flight, estimates, 15.0)
+    assert position.max() < 0.05  # m; the antenna alone is 0.9 m off
+    assert velocity < 0.045
+    assert heading < 0.01
     assert nees(flight, estimates, 15.0) < chi2.ppf(0.999, 6)
-
-
-def test_mounts_matter():
-    """The same readings without the mounts are far off, so the test before this one can fail."""
-    of, flight = scenario(sensors=MOUNTS), Flight(12, yaw_rate=0.8, accel=0.8)
     unmounted = {name: {k: v for k, v in s.items() if k != "mount"} for name, s in MOUNTS.items() if name != "imu"}
     wrong = scenario(sensors=unmounted | {"imu": MOUNTS["imu"], "mag": MOUNTS["mag"]})
-    estimates = fly(estimator(wrong), readings(flight, of, 12, 30.0), 30.0)
-    assert max(rms(position_errors(flight, estimates, 15.0))) > 0.15
+    assert rms(flight, fly(estimator(wrong), coming, 30.0), 15.0)[0].max() > 0.15  # without them it is far off
 
 
 def test_biases_of_aiding_sensors_widen_the_covariance():
@@ -313,33 +304,28 @@ def test_biases_of_aiding_sensors_widen_the_covariance():
     assert low < np.mean(ends) < high
 
 
-def restart(estimate: StateEstimate, of) -> OneDrone:
-    core = estimator(of)
-    core.warm_start(estimate)
-    return core
-
-
 @pytest.mark.parametrize("preset", ["paper", "ardrone2"])
 def test_a_warm_start_goes_on_where_it_was(preset: str):
     of, flight, coming, unbroken = flown(seed=13, end_s=30.0, preset=preset)
     at = round(20.0 / GATE_S) - 1
-    core = restart(unbroken[at][1], of)
+    core = estimator(of)
+    core.warm_start(unbroken[at][1])
     resumed = fly(core, coming, 30.0, from_s=20.0)
     apart = np.array(
         [np.subtract(a.position_m, b.position_m) for (_, a), (_, b) in zip(resumed, unbroken[at + 1 :], strict=True)]
     )
     assert np.linalg.norm(apart, axis=1).max() < 0.15  # m
     assert np.linalg.norm(apart[0]) < 0.02
-    assert max(rms(velocity_errors(flight, resumed))) < 0.06
-    assert np.abs(heading_errors(flight, resumed)).max() < 0.02
+    assert rms(flight, resumed)[1] < 0.06
+    assert np.abs(errors(flight, resumed)[2]).max() < 0.02
     assert nees(flight, resumed, 20.0) < chi2.ppf(0.999, 6)
 
 
 def test_a_cold_start_in_flight_converges():
     of, flight, coming, _ = flown(seed=3, end_s=30.0)
     estimates = fly(estimator(of), coming, 30.0, from_s=20.0)
-    assert max(rms(velocity_errors(flight, estimates, 22.0))) < 0.05  # m/s
-    assert np.abs(heading_errors(flight, estimates, 23.0)).max() < 0.03
+    assert rms(flight, estimates, 22.0)[1] < 0.05  # m/s
+    assert np.abs(errors(flight, estimates, 23.0)[2]).max() < 0.03
     assert nees(flight, estimates, 20.0) < chi2.ppf(0.999, 6)
 
 
@@ -355,13 +341,13 @@ def test_without_an_imu_the_covariance_grows_and_comes_back():
     assert sigma(16.0) > 0.3
     assert sigma(29.0) < 0.05
     assert nees(flight, [(t, e) for t, e in estimates.items() if 15.0 < t < 20.0], 0.0) < 6.0 * 3.0
-    assert max(rms(velocity_errors(flight, list(estimates.items()), 25.0))) < 0.05
+    assert rms(flight, list(estimates.items()), 25.0)[1] < 0.05
 
 
 def test_without_any_imu_the_other_sensors_still_place_the_drone():
     of, flight, coming, _ = flown(seed=15, end_s=20.0)
     estimates = fly(estimator(of), [r for r in coming if r.sensor != "imu"], 20.0)
-    assert max(rms(position_errors(flight, estimates, 10.0))) < 2.0
+    assert rms(flight, estimates, 10.0)[0].max() < 2.0
     assert estimates[-1][1].sensors["imu"] == (0, 0)
 
 
@@ -382,7 +368,7 @@ def test_a_jump_of_gps_is_refused_at_first_and_believed_when_it_stays():
         for r in coming
     ]
     estimates = fly(estimator(of), jumped, 40.0)
-    east = position_errors(flight, estimates)[:, 0]
+    east = errors(flight, estimates)[0][:, 0]
     assert np.abs(east[: round(24.0 / GATE_S)]).max() < 2.5
     assert east[-1] == pytest.approx(30.0, abs=2.0)
 
@@ -398,14 +384,8 @@ def test_the_covariance_stays_positive_and_symmetric():
 def test_the_estimate_is_plain_python():
     _, _, _, estimates = flown(seed=18, end_s=1.0)
     end = estimates[-1][1]
-    numbers = [
-        *end.position_m,
-        *end.velocity_m_s,
-        *end.orientation_wxyz,
-        *end.covariance,
-        *end.gyro_bias_rad_s,
-    ]
-    numbers += [end.yaw_rad, end.yaw_sigma_rad]
+    vectors = (end.position_m, end.velocity_m_s, end.orientation_wxyz, end.covariance, end.gyro_bias_rad_s)
+    numbers = [x for vector in vectors for x in vector] + [end.yaw_rad, end.yaw_sigma_rad]
     assert {type(x) for x in numbers} == {float}
     assert len(end.covariance) == 36
     assert {type(n) for pair in end.sensors.values() for n in pair} == {int}
@@ -422,8 +402,3 @@ def test_the_gain_follows_the_accelerometer():
         assert levelling_time_s(gains[name], sigma) == pytest.approx(LEVELLING_S)
     assert gains["paper"] == pytest.approx(4.7e-4, rel=0.02)
     assert gains["printed"] == pytest.approx(4.7e-4 * 9.80665, rel=0.02)
-
-
-def test_the_same_readings_give_the_same_bits():
-    of, _, coming, first = flown(seed=19, end_s=5.0)
-    assert fly(estimator(of), coming, 5.0) == first

@@ -1,4 +1,4 @@
-"""A bank of drones: each as if it were alone, and sound whatever comes in."""
+"""A bank of drones: each as if it were alone, sound whatever comes in; gates are read as their messages are."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,10 +11,15 @@ import pytest
 from scipy.stats import chi2
 from synthetic_flight import GATE_S, Flight, Reading, feed, readings, seconds
 
+from zsim.contract import keys
+from zsim.contract.framing import GateMessages
+from zsim.math.compiled import COMPILES
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.estimation.estimator_bank import EstimatorBank
+from zsim_world.run.world import World
 
 END_S = 8.0  # s, of a flight that starts at 2 s
 ASIDE = {"mount": {"position_m": [0.1, -0.05, 0.04], "rpy_deg": [10.0, -20.0, 160.0]}}
@@ -95,15 +100,12 @@ def flown(seed: int, preset: str = "paper") -> list[list[Reading]]:
     of = three(preset)
     pairs = zip(of.drones, flights(seed), strict=True)
     alone = [(msgspec.structs.replace(of, drones=[drone]), flight) for drone, flight in pairs]
-    return [
-        [_tupled(reading) for reading in readings(flight, each, seed + i, END_S)]
-        for i, (each, flight) in enumerate(alone)
-    ]
 
+    def tupled(reading: Reading) -> Reading:
+        values = (tuple(value) if isinstance(value, list) else value for value in reading.values)
+        return reading._replace(values=tuple(values))
 
-def _tupled(reading: Reading) -> Reading:
-    values = (tuple(value) if isinstance(value, list) else value for value in reading.values)
-    return reading._replace(values=tuple(values))
+    return [[*map(tupled, readings(flight, each, seed + i, END_S))] for i, (each, flight) in enumerate(alone)]
 
 
 @pytest.mark.parametrize("preset", ["paper", "ardrone2"])
@@ -163,12 +165,8 @@ def _moved(reading: Reading, by: float) -> Reading:
 
 def crowded(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
     """A link stood still and gives half a second's readings to one gate: more than one update can hold."""
-    return [reading._replace(t_s=5.5) if 5.4 < reading.t_s <= 5.5 else _closer(reading) for reading in coming]
-
-
-def _closer(reading: Reading) -> Reading:
-    held = reading.sensor != "imu" and 5.0 < reading.t_s <= 5.4
-    return reading._replace(t_s=5.5) if held else reading
+    held = [5.4 < r.t_s <= 5.5 or (r.sensor != "imu" and 5.0 < r.t_s <= 5.4) for r in coming]
+    return [r._replace(t_s=5.5) if late else r for r, late in zip(coming, held, strict=True)]
 
 
 @pytest.mark.parametrize("change", [lost, silent_imu, shuffled, impossible, displaced, crowded])
@@ -201,3 +199,86 @@ def test_sensors_that_it_does_not_know_are_left_out():
     bank = bank_of(of)
     bank.receive(0, "airspeed", object(), 0.02)
     assert same(bank.estimate(0.02), bank_of(of).estimate(0.02))
+
+
+# Sensors out of a gate
+
+DRONES = ("d1", "d2", "d3")
+
+
+@pytest.fixture(scope="module")
+def flight() -> tuple[World, list[GateMessages]]:
+    places = [{"name": name, "position_m": [3 * i, 0, 0]} for i, name in enumerate(DRONES)]
+    latency = {"gps": {"latency_ms": 35.0}, "mag": {"latency_ms": 5.0}}
+    of = scenario_file.resolve({"name": "reader", "drones": places, "sensors": latency, "duration_s": 5})
+    world, gates = World(of), []
+    for number in range(120):
+        if number == 20:
+            assert world.fleet.takeoff(0) is None
+        gates.append(world._publication.gate(world.queue.commanders()))
+        world.fleet.advance()
+    return world, gates
+
+
+compiled = pytest.mark.skipif(not COMPILES, reason="numba is not installed: gates are taken apart")
+
+
+def estimates(agent: Estimator, gates: list[GateMessages], whole: bool) -> list[object]:
+    """Return what an estimator says of a flight, handed over as gates or as messages in the order of a runner."""
+    outputs = []
+    for gate in gates:
+        if whole:
+            agent.receive_gate(gate)
+        else:
+            readings = [(key, m) for key, m in gate.decoded() if keys.is_sensor(key)]
+            for key, message in sorted(readings, key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq)):
+                if keys.thing(key) in agent.counted:
+                    agent.receive(key, message)
+        outputs += agent.step(gate.t_ns)
+    return outputs
+
+
+@compiled
+@pytest.mark.parametrize("drones", [DRONES, ("d2",), ("d3", "d1")])
+def test_a_gate_gives_the_estimates_of_its_messages(
+    flight: tuple[World, list[GateMessages]], drones: tuple[str, ...]
+) -> None:
+    world, gates = flight
+    whole, each = (Estimator(world.info(), world.scenario, drones) for _ in range(2))
+    assert whole.takes_gates
+    assert estimates(whole, gates, whole=True) == estimates(each, gates, whole=False)
+
+
+@compiled
+def test_a_message_that_the_world_would_not_write_so_is_decoded_all_the_same(
+    flight: tuple[World, list[GateMessages]],
+) -> None:
+    """One whose floats are whole numbers on the wire: right, but not what the compiled reader knows."""
+    world, gates = flight
+    gate = next(b for b in gates if any(key.endswith("mag") for key, _ in b.pairs))
+    changed = [_with_whole_numbers(gate) if b is gate else b for b in gates]
+    whole, each = (Estimator(world.info(), world.scenario, DRONES) for _ in range(2))
+    assert estimates(whole, changed, whole=True) == estimates(each, changed, whole=False)
+
+
+def test_columns_that_lead_outside_are_not_followed(flight: tuple[World, list[GateMessages]]) -> None:
+    world, gates = flight
+    b, agent = gates[0], Estimator(world.info(), world.scenario, DRONES)
+    for which, ends in (
+        (np.full(len(b), 10**9), b.ends),
+        (np.full(len(b), -5), b.ends),
+        (b.which, b.ends + 10**9),
+        (b.which, b.ends[::-1].copy()),
+        (b.which, -b.ends),
+    ):
+        agent.receive_gate(GateMessages(b.t_ns, b.seq, b.table, which, b.stamps, ends, bytes(b.buffer)))
+    assert len(agent.step(b.t_ns)) == len(DRONES)
+
+
+def _with_whole_numbers(gate: GateMessages) -> GateMessages:
+    outputs = [(key, _rounded(payload) if key.endswith("/mag") else payload) for key, payload in gate.pairs]
+    return GateMessages.of(gate.t_ns, gate.seq, gate.table, outputs)
+
+
+def _rounded(payload: bytes) -> bytes:
+    return msgspec.msgpack.encode({**msgspec.msgpack.decode(payload), "field_ut": [20, 0, -40]})

@@ -10,20 +10,16 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import Seen, Sightings
 from zsim.contract.messages import Baro, Flow, Gps, Imu, Mag
-from zsim.math.rotation import matrix, normalised
+from zsim.math.rotation import matrix, multiply, normalised
 from zsim.scenario import scenario_file
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank
 from zsim_agents.estimation.filter_state import Moment
-from zsim_agents.estimation.joint.cluster_banks import ClusterBanks
-from zsim_agents.estimation.joint.joint_bank import JointBank
-from zsim_agents.estimation.joint.sighting_update import across, expected, write_rows
+from zsim_agents.estimation.joint_filter import ClusterBanks, JointBank, across, expected, write_rows
 
 EYES = scenario_file.load(Path(__file__).parents[4] / "scenarios" / "eyes.yaml")
 GATE_S, GATE_NS = 0.02, 20_000_000
-PLACES = np.array(
-    [(0.0, 4.0, 5.0), (-1.5, 0.0, 5.0), (1.5, 0.0, 5.0)]
-)  # drones 2 and 3 have drone 1 ahead, north of them
+PLACES = np.array([(0.0, 4.0, 5.0), (-1.5, 0.0, 5.0), (1.5, 0.0, 5.0)])  # drone 1 is north of drones 2 and 3
 NORTH = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 CAMERA_B, HAT_B = np.array([0.162, 0.0, 0.012]), np.array([-0.03, 0.0, 0.11])
 FIELD_B = np.array([17.8, 2.8, 14.0])  # of the scenario, seen by who looks north
@@ -43,12 +39,8 @@ def still(
             bank.receive(i, "gps", Gps(t_ns, 0, t_ns, 0, 0, 0, (x, y, z), (0.0, 0.0, 0.0), 2.0, 3, 9), t_ns * 1e-9)
         if gate % 2 == 0:
             bank.receive(i, "mag", Mag(t_ns, 0, t_ns, tuple(FIELD_B.tolist())), t_ns * 1e-9)
-            bank.receive(
-                i,
-                "baro",
-                Baro(t_ns, 0, t_ns, 101_000.0, float(place[2] + baro_off_m[i] + rng.normal(0, 0.1))),
-                t_ns * 1e-9,
-            )
+            height_m = float(place[2] + baro_off_m[i] + rng.normal(0, 0.1))
+            bank.receive(i, "baro", Baro(t_ns, 0, t_ns, 101_000.0, height_m), t_ns * 1e-9)
         if gate % 3 == 0:
             bank.receive(i, "flow", Flow(t_ns, 0, t_ns, tuple(rng.normal(0, 0.1, 3).tolist()), 1.0), t_ns * 1e-9)
 
@@ -62,16 +54,21 @@ def sighted(observer: int, target: NDArray[np.float64], t_ns: int, source: str =
     return Sightings(t_ns=t_ns, seq=0, t_sample_ns=t_ns, source=source, camera="front", seen=(seen,))
 
 
-def settings() -> tuple[object, ...]:
-    return EYES.drones, EYES.environment, EYES.estimation, GATE_S
+def bank_of(kind: type[EstimatorBank] = JointBank) -> EstimatorBank:
+    return kind(EYES.drones, EYES.environment, EYES.estimation, GATE_S)
 
 
-def flown(bank: EstimatorBank, gates: int, seen: dict[int, NDArray[np.float64]] | None = None) -> list[StateEstimate]:
-    """Return the estimates after so many gates; each observer sees a hat there in every third."""
+def flown(
+    bank: EstimatorBank, gates: int, seen: dict[int, NDArray[np.float64]] | None = None, lies_m: float = 0.0
+) -> list[StateEstimate]:
+    """Return the estimates after so many gates; each observer sees a hat there in every third.
+
+    From gate 700 on the barometer of drone 1 is off by `lies_m`.
+    """
     rng = np.random.default_rng(3)
     estimates: list[StateEstimate] = []
     for gate in range(gates):
-        still(bank, gate, rng)
+        still(bank, gate, rng, (lies_m if gate > 700 else 0.0, 0.0, 0.0))
         for observer, target in (seen or {}).items() if gate % 3 == 0 else ():
             bank.receive(observer, "sightings", sighted(observer, target, gate * GATE_NS), gate * GATE_S)
         estimates = bank.estimate(gate * GATE_S)
@@ -79,15 +76,15 @@ def flown(bank: EstimatorBank, gates: int, seen: dict[int, NDArray[np.float64]] 
 
 
 def test_without_sightings_every_drone_is_as_by_itself():
-    alone, together = flown(EstimatorBank(*settings()), 300), flown(JointBank(*settings()), 300)  # type: ignore[arg-type]
+    alone, together = flown(bank_of(EstimatorBank), 300), flown(bank_of(), 300)
     for one, other in zip(alone, together, strict=True):
         assert np.array(other.position_m) == pytest.approx(np.array(one.position_m), abs=1e-9)
         assert np.array(other.covariance) == pytest.approx(np.array(one.covariance), abs=1e-9)
 
 
 def test_with_sightings_the_drones_are_where_they_are_to_each_other():
-    alone = flown(JointBank(*settings()), 1500)  # type: ignore[arg-type]
-    together = flown(JointBank(*settings()), 1500, {1: PLACES[0], 2: PLACES[0]})  # type: ignore[arg-type]
+    alone = flown(bank_of(), 1500)
+    together = flown(bank_of(), 1500, {1: PLACES[0], 2: PLACES[0]})
 
     def miss(estimates: list[StateEstimate], i: int) -> float:
         apart = np.subtract(estimates[0].position_m, estimates[i].position_m)
@@ -103,13 +100,7 @@ def test_a_barometer_that_lies_is_not_trusted_while_others_whom_the_drone_sees_k
     seen: dict[int, NDArray[np.float64]], height_off_m: float
 ):
     """A drone that nobody sees trusts its barometer again, when that has been refused for long."""
-    bank, rng = JointBank(*settings()), np.random.default_rng(3)  # type: ignore[arg-type]
-    estimates: list[StateEstimate] = []
-    for gate in range(1500):
-        still(bank, gate, rng, (5.0 if gate > 700 else 0.0, 0.0, 0.0))
-        for observer, target in seen.items() if gate % 3 == 0 else ():
-            bank.receive(observer, "sightings", sighted(observer, target, gate * GATE_NS), gate * GATE_S)
-        estimates = bank.estimate(gate * GATE_S)
+    estimates = flown(bank_of(), 1500, seen, lies_m=5.0)
     assert estimates[0].position_m[2] == pytest.approx(PLACES[0, 2] + height_off_m, abs=0.3)
     assert (estimates[0].sensors["baro"][1] > 300) == bool(seen)
 
@@ -119,7 +110,7 @@ LATE_GATES = 2  # by which the slower of two detectors is behind
 
 def flown_with_two_detectors(slower_first: bool, late_gates: int) -> list[StateEstimate]:
     """Return the estimates after 30 s in which two detectors look at each picture of drone 2."""
-    bank, rng = JointBank(*settings()), np.random.default_rng(3)  # type: ignore[arg-type]
+    bank, rng = bank_of(), np.random.default_rng(3)
     estimates: list[StateEstimate] = []
     for gate in range(1500):
         still(bank, gate, rng)
@@ -134,12 +125,12 @@ def flown_with_two_detectors(slower_first: bool, late_gates: int) -> list[StateE
 @pytest.mark.parametrize("late_gates", [0, LATE_GATES])
 @pytest.mark.parametrize("slower_first", [False, True])
 def test_what_two_detectors_find_in_one_picture_counts_once(slower_first: bool, late_gates: int):
-    by_one = flown(JointBank(*settings()), 1500, {1: PLACES[0]})  # type: ignore[arg-type]
+    by_one = flown(bank_of(), 1500, {1: PLACES[0]})
     assert flown_with_two_detectors(slower_first, late_gates) == by_one
 
 
 def test_a_camera_that_the_drone_does_not_have_moves_nobody():
-    bank, calm = (JointBank(*settings()) for _ in range(2))  # type: ignore[arg-type]
+    bank, calm = (bank_of() for _ in range(2))
     rngs = np.random.default_rng(3), np.random.default_rng(3)
     for gate in range(900):
         for each, rng in zip((bank, calm), rngs, strict=True):
@@ -150,8 +141,8 @@ def test_a_camera_that_the_drone_does_not_have_moves_nobody():
 
 
 def test_a_hat_where_nobody_is_moves_nobody():
-    lying = flown(JointBank(*settings()), 900, {1: np.array([3.0, 9.0, 0.0])})  # type: ignore[arg-type]
-    alone = flown(JointBank(*settings()), 900)  # type: ignore[arg-type]
+    lying = flown(bank_of(), 900, {1: np.array([3.0, 9.0, 0.0])})
+    alone = flown(bank_of(), 900)
     for one, other in zip(alone, lying, strict=True):
         assert np.array(other.position_m) == pytest.approx(np.array(one.position_m), abs=1e-12)
     used, refused = lying[1].sensors["sightings"]
@@ -160,29 +151,14 @@ def test_a_hat_where_nobody_is_moves_nobody():
 
 def test_who_might_be_two_is_nobody():
     """Before GPS has told them apart, within a metre or two, a sighting is not used."""
-    estimates = flown(JointBank(*settings()), 4, {1: PLACES[0]})  # type: ignore[arg-type]
+    estimates = flown(bank_of(), 4, {1: PLACES[0]})
     assert estimates[1].sensors["sightings"] == (0, 2)
 
 
 def test_the_jacobian_is_that_of_what_is_expected():
-    a: Moment = (
-        0.0,
-        (1.0, 2.0, 3.0),
-        (0.0, 0.0, 0.0),
-        normalised((0.9, 0.1, -0.2, 0.3)),
-        (0.0, 0.0, 0.0),
-        (0.0, 0.0, 0.0),
-        (0.0, 0.0, 0.0),
-    )
-    b: Moment = (
-        0.0,
-        (4.0, -1.0, 3.5),
-        (0.0, 0.0, 0.0),
-        normalised((0.8, -0.1, 0.2, 0.5)),
-        (0.0, 0.0, 0.0),
-        (0.0, 0.0, 0.0),
-        (0.0, 0.0, 0.0),
-    )
+    zero = (0.0, 0.0, 0.0)
+    a: Moment = (0.0, (1.0, 2.0, 3.0), zero, normalised((0.9, 0.1, -0.2, 0.3)), zero, zero, zero)
+    b: Moment = (0.0, (4.0, -1.0, 3.5), zero, normalised((0.8, -0.1, 0.2, 0.5)), zero, zero, zero)
     hat, eye, n, step = (0.1, -0.2, 0.3), (0.2, 0.1, 0.05), 9, 1e-6
     axes = across((0.6, 0.0, 0.8))
     H = np.zeros((3, 2 * n))
@@ -191,16 +167,7 @@ def test_the_jacobian_is_that_of_what_is_expected():
     def turned(q: tuple[float, ...], k: int) -> tuple[float, float, float, float]:
         half = [0.0, 0.0, 0.0]
         half[k] = step / 2
-        w, x, y, z = q
-        i, j, k_ = half
-        return normalised(
-            (
-                w - i * x - j * y - k_ * z,
-                x + i * w + j * z - k_ * y,
-                y - i * z + j * w + k_ * x,
-                z + i * y - j * x + k_ * w,
-            )
-        )
+        return normalised(multiply((1.0, *half), q))  # type: ignore[arg-type]
 
     def moved(m: Moment, state: int) -> Moment:
         p = list(m[1])

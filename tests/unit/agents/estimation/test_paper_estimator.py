@@ -142,7 +142,7 @@ def test_the_stock_ones_have_names():
     assert estimator_class(ESTIMATORS[0]) is None
     assert estimator_class("paper") is PaperEstimator
     with pytest.raises(DocumentError, match="algorithm"):
-        estimator_class("zsim_agents.estimation.madgwick:Madgwick")
+        estimator_class("zsim_agents.estimation.dead_reckoning:Madgwick")
 
 
 def test_a_scenario_that_chooses_none_resolves_as_before():

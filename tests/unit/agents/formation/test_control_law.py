@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim_agents.formation.control_law import FormationGains, ProportionalLaw
-from zsim_agents.formation.robot_limits import guard, load, near_pairs
+from zsim_agents.formation.control_law import FormationGains, ProportionalLaw, guard, load, near_pairs
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 SPACE = cluster_space(3)
@@ -98,16 +97,9 @@ def test_the_integral_grows_with_the_error_up_to_its_clamp():
     assert not law.integral.any()
 
 
-def test_the_integral_stands_still_while_robots_are_saturated():
-    law = ProportionalLaw(SPACE, GAINS)
-    command = command_at(offset(x_c=-50.0), GOAL, law=law)
-    assert command.factor < 1.0
-    assert not law.integral.any()
-
-
-def test_the_integral_stands_still_while_the_guard_acts():
-    law = ProportionalLaw(SPACE, GAINS)
-    near = offset(p=-1.5, q=-1.5)  # robots 2 and 3 at 1.9 m
+def test_the_integral_stands_still_while_robots_are_saturated_or_guarded():
+    law, near = ProportionalLaw(SPACE, GAINS), offset(p=-1.5, q=-1.5)  # robots 2 and 3 at 1.9 m
+    assert command_at(offset(x_c=-50.0), GOAL, law=law).factor < 1.0
     assert command_at(near, near - 0.01, law=law).guarded
     assert not law.integral.any()
 
@@ -121,15 +113,14 @@ def pair(distance, v_1=(0, 0, 0), v_2=(0, 0, 0)):
     return guard(p_W, np.zeros((2, 3)), v_cmd_W, GAINS.limits)
 
 
-def test_the_guard_leaves_robots_alone_that_are_far_or_part():
-    for distance, v_1, v_2 in (
-        (20.0, (2, 0, 0), (-2, 0, 0)),
-        (2.5, (-1, 0, 0), (1, 0, 0)),
-        (2.5, (0, 2, 0), (0, 2, 0)),
-    ):
-        v_W, guarded, alarmed = pair(distance, v_1, v_2)
-        assert v_W.tolist() == [list(v_1), list(v_2)]
-        assert (guarded, alarmed) == ((), ())
+@pytest.mark.parametrize(
+    ("distance", "v_1", "v_2"),
+    [(20.0, (2, 0, 0), (-2, 0, 0)), (2.5, (-1, 0, 0), (1, 0, 0)), (2.5, (0, 2, 0), (0, 2, 0))],
+)
+def test_the_guard_leaves_robots_alone_that_are_far_or_part(distance, v_1, v_2):
+    v_W, guarded, alarmed = pair(distance, v_1, v_2)
+    assert v_W.tolist() == [list(v_1), list(v_2)]
+    assert (guarded, alarmed) == ((), ())
 
 
 def test_the_guard_lets_robots_come_to_the_minimum_and_no_nearer():
@@ -145,11 +136,9 @@ def test_the_guard_drives_robots_apart_that_are_too_near():
     assert (guarded, alarmed) == (((0, 1),), ((0, 1),))
     assert v_W[1, 0] - v_W[0, 0] == pytest.approx(0.6)
     assert v_W.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-12)
-
-
-def test_the_alarm_is_at_its_threshold():
-    assert pair(1.49)[2] == ((0, 1),)
-    assert pair(1.51)[2] == ()
+    assert (pair(1.49)[2], pair(1.51)[2]) == (((0, 1),), ())
+    v_W, _, _ = pair(0.0)
+    assert v_W[1, 0] - v_W[0, 0] == pytest.approx(GAINS.separation_min_m)
 
 
 def test_the_guard_allows_for_the_way_that_robots_still_go():
@@ -158,11 +147,6 @@ def test_the_guard_allows_for_the_way_that_robots_still_go():
     v_W, guarded, _ = guard(p_W, towards, np.zeros((2, 3)), GAINS.limits)
     assert guarded
     assert v_W[1, 0] - v_W[0, 0] == pytest.approx(2 * GAINS.response_s - 0.5)
-
-
-def test_the_guard_parts_robots_in_one_place():
-    v_W, _, _ = pair(0.0)
-    assert v_W[1, 0] - v_W[0, 0] == pytest.approx(GAINS.separation_min_m)
 
 
 @settings(deadline=None, max_examples=100, derandomize=True)

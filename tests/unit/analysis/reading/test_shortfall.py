@@ -17,7 +17,7 @@ from synthetic_record import Flown
 from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Truth
 from zsim.contract.run_messages import Clock, ClusterRequest, Event
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST
+from zsim_agents.formation.flight_check import HELD_ON_REQUEST
 from zsim_agents.formation.flight_plan import WAITS, waiting_step
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import WaypointTrajectory

@@ -4,12 +4,12 @@ import math
 
 import pytest
 from ardrone_aircraft import PILOT, PlayedAircraft
+from ardrone_readers import configuration_entries
 
 from zsim.contract import flight_messages, messages
 from zsim.math.rotation import LEVEL
-from zsim_bridges.ardrone.wire import at_commands, configuration_text, navdata
-from zsim_bridges.ardrone.wire.navdata import StateBit
-from zsim_bridges.ardrone.wire.navdata_options import FULL_TAGS, GPS_TAG
+from zsim_bridges.ardrone import at_commands, navdata
+from zsim_bridges.ardrone.navdata import FULL_TAGS, GPS_TAG, StateBit
 
 BOOTSTRAP = bytes.fromhex("88776655100c804f0100000000000000ffff0800a6020000")  # captured from an aircraft
 
@@ -166,7 +166,7 @@ class TestConfiguration:
     def test_it_is_sent_to_the_control_port(self, played: PlayedAircraft):
         played.config("video:video_channel", "1")
         played.at(at_commands.Control(0, at_commands.SEND_CONFIGURATION))
-        entries = configuration_text.parse_configuration(played.control[0])
+        entries = configuration_entries(played.control[0])
         assert entries["video:video_channel"] == "1"
         assert entries["control:altitude_max"] == "3000"
         assert entries["custom:session_id"] == "00000000"

@@ -7,10 +7,9 @@ import pytest
 from fake_aircraft import FIELD_UT, STEP_NS, FakeAircraft
 
 from zsim.math.frames import heading
-from zsim_bridges.ardrone.drive.aircraft_session import AircraftSession, AircraftSettings
-from zsim_bridges.ardrone.drive.navdata_readings import NavdataReadings
-from zsim_bridges.vehicle_links.aircraft_state import AircraftPose
-from zsim_bridges.vehicle_links.failsafe import Demand
+from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings, NavdataReadings
+from zsim_bridges.vehicle_links.aircraft_readings import AircraftPose
+from zsim_bridges.vehicle_links.vehicle_session import Demand
 
 ORIGIN = (-34.603, -58.368, 25.0)
 S = 1_000_000_000

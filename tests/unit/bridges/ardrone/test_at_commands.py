@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from zsim_bridges.ardrone.wire import at_commands as at
+from zsim_bridges.ardrone import at_commands as at
 
 FLOATS = {
     -1.0: -1082130432,

@@ -2,7 +2,14 @@
 
 import pytest
 
-from zsim_bridges.ardrone.aircraft.configuration import KEPT_MAX, Configuration, ConfigurationError
+from zsim_bridges.ardrone.configuration import (
+    KEPT_MAX,
+    Configuration,
+    ConfigurationError,
+    CustomList,
+    format_configuration,
+    format_custom_list,
+)
 
 TILT = "control:euler_angle_max"
 
@@ -95,3 +102,12 @@ def test_what_is_no_value_is_refused_with_a_reason(configuration: Configuration,
     with pytest.raises(ConfigurationError, match=reason):
         configuration.set(key, value)
     assert configuration.all() == before
+
+
+def test_the_texts_of_the_control_port():
+    entries = {"general:navdata_demo": "TRUE", "leds:leds_anim": "0,0,0", "network:owner_mac": ""}
+    text = format_configuration(entries)
+    assert text == b"general:navdata_demo = TRUE\nleds:leds_anim = 0,0,0\nnetwork:owner_mac = \n\0"
+    kept = CustomList({"01234567": "a program"}, {"11223344": "somebody, else"}, {})
+    text = format_custom_list(kept)
+    assert text == b"[applis]\r01234567,a program\r[profiles]\r11223344,somebody, else\r[sessions]\r\0"

@@ -6,9 +6,8 @@ import struct
 import pytest
 from ardrone_readers import pyardrone_reads
 
-from zsim_bridges.ardrone.wire import navdata, navdata_options
-from zsim_bridges.ardrone.wire.navdata import NavdataError, NavdataTemplate, StateBit
-from zsim_bridges.ardrone.wire.navdata_options import FULL_TAGS, GPS_TAG, LAYOUTS
+from zsim_bridges.ardrone import navdata
+from zsim_bridges.ardrone.navdata import FULL_TAGS, GPS_TAG, LAYOUTS, NavdataError, NavdataTemplate, StateBit
 
 BOOTSTRAP = bytes.fromhex("88776655100c804f0100000000000000ffff0800a6020000")  # captured from an aircraft
 SIZES = {
@@ -44,13 +43,13 @@ SIZES = {
     29: 32,
     0xFFFF: 8,
 }  # bytes, of the structures of the SDK
-OPTIONS = tuple(tag for tag in LAYOUTS if tag != navdata_options.CHECKSUM_TAG)
+OPTIONS = tuple(tag for tag in LAYOUTS if tag != navdata.CHECKSUM_TAG)
 
 
 def counted(tag: int):
     """Return an option whose numbers differ, as far as a byte can hold them."""
     layout = LAYOUTS[tag]
-    return layout.nested(tuple((7 * tag + k) % 100 for k in range(len(layout.codec.unpack(bytes(layout.codec.size))))))
+    return layout.option(tuple((7 * tag + k) % 100 for k in range(len(layout.codec.unpack(bytes(layout.codec.size))))))
 
 
 def test_the_packet_of_a_real_aircraft():
@@ -89,7 +88,7 @@ def test_what_is_packed_is_unpacked(tag: int):
 def test_a_template_is_the_packet():
     template = NavdataTemplate(FULL_TAGS)
     for tag in FULL_TAGS:
-        template.put(tag, counted(tag))
+        template.filler(tag)(*LAYOUTS[tag].flat(counted(tag)))
     template.filler(26)(77)
     template.filler(GPS_TAG)(1, 2, 3)  # is not in it
     expected = [(tag, counted(tag) if tag != 26 else (77,)) for tag in FULL_TAGS]
@@ -145,7 +144,7 @@ def test_nothing_that_anybody_sends_raises_anything_else():
 def test_pyardrone_reads_every_number_of_every_option():
     template = NavdataTemplate(FULL_TAGS)
     for tag in FULL_TAGS:
-        template.put(tag, counted(tag))
+        template.filler(tag)(*LAYOUTS[tag].flat(counted(tag)))
     read = pyardrone_reads("navdata", template.packet(int(StateBit.FLYING), 12, 1))
     assert read.pop("metadata") == [navdata.MAGIC, 1, 12, 1]
     assert len(read.pop("cks")) == 1

@@ -9,9 +9,15 @@ import pytest
 from refused import has_terms, refused
 
 from zsim.errors import RunError
-from zsim_bridges.ardrone.server.addresses import AllowedHosts, drone_addresses, peer_addresses
-from zsim_bridges.ardrone.server.datagram_ports import DatagramPort, open_datagram_port
-from zsim_bridges.ardrone.server.stream_port import CONNECTIONS_MAX, StreamPort, read_until_end
+from zsim_bridges.ardrone.ports import (
+    CONNECTIONS_MAX,
+    AllowedHosts,
+    DatagramPort,
+    StreamPort,
+    drone_addresses,
+    peer_addresses,
+    read_until_end,
+)
 
 HOME = "127.0.0.1"
 ELSEWHERE = AllowedHosts("192.0.2.1", frozenset({"192.0.2.9"}))  # as on an address that other hosts reach
@@ -88,11 +94,11 @@ def test_a_stranger_s_datagrams_are_counted_and_not_taken():
     async def test(refusals: Refusals) -> None:
         taken: list[bytes] = []
         port = DatagramPort(ELSEWHERE, lambda data, _: taken.append(data), refusals.add)
-        number = await _opened(port)
+        number = await port.open(HOME, 0)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.sendto(b"AT*REF=1,290718208\r", (HOME, number))
             await refusals.came.wait()
-        port.close()
+        await port.close()
         assert taken == []
         assert len(refusals) == 1
         assert has_terms(refusals[0], "127.0.0.1", "--peer")
@@ -104,20 +110,14 @@ def test_a_datagram_of_this_host_is_taken_on_loopback():
     async def test(refusals: Refusals) -> None:
         taken: asyncio.Queue[bytes] = asyncio.Queue()
         port = DatagramPort(HERE, lambda data, _: taken.put_nowait(data), refusals.add)
-        number = await _opened(port)
+        number = await port.open(HOME, 0)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as pilot:
             pilot.sendto(b"hello", (HOME, number))
             assert await taken.get() == b"hello"
-        port.close()
+        await port.close()
         assert refusals == []
 
     run(test)
-
-
-async def _opened(port: DatagramPort) -> int:
-    await open_datagram_port(HOME, 0, port)
-    assert port._transport is not None
-    return port._transport.get_extra_info("sockname")[1]
 
 
 def test_a_stranger_s_connection_is_ended_and_counted():

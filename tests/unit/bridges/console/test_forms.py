@@ -15,8 +15,13 @@ from zsim.scenario import scenario_file
 from zsim.scenario.faults import KINDS, Known, flaws
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.engagement_setup import gains_of
-from zsim_agents.formation.flight_check import place_fault
-from zsim_agents.formation.flight_data import HELD_ON_REQUEST, READY_TO_ENGAGE, REJOINING, EngagementLimits
+from zsim_agents.formation.flight_check import (
+    HELD_ON_REQUEST,
+    READY_TO_ENGAGE,
+    REJOINING,
+    EngagementLimits,
+    place_fault,
+)
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
 from zsim_bridges.console.console_page import SWITCHES, ConsolePage

@@ -2,47 +2,23 @@
 
 import os
 import random
-from typing import Any, get_type_hints
+from typing import Any
 
 import pytest
 
 os.environ["MAVLINK20"] = "1"  # pymavlink reads it when it is imported
+from mavlink_values import random_message
 from pymavlink.dialects.v10 import ardupilotmega as dialect_1
 from pymavlink.dialects.v20 import ardupilotmega as dialect_2
 
-from zsim_bridges.mavlink.wire import dialect, frame
-from zsim_bridges.mavlink.wire.wire_message import BY_ID, MessageLayout, WireMessage
+from zsim_bridges.mavlink import dialect, frame
+from zsim_bridges.mavlink.dialect import BY_ID, MessageLayout, WireMessage
 
 SEED = 17
 COMMAND_CANCEL = 80  # in common.xml, not in the authority's release
 COMMAND_CANCEL_CRC_EXTRA = 14  # of the C library's table
 LAYOUTS = [BY_ID[id_] for id_ in sorted(BY_ID) if id_ != COMMAND_CANCEL]
 LAYOUTS_1 = [layout for layout in LAYOUTS if layout.id <= frame.ID_MAX_1]
-INTEGERS = {"uint8_t": (8, 0), "uint16_t": (16, 0), "uint32_t": (32, 0), "uint64_t": (64, 0)}
-INTEGERS |= {"int8_t": (8, 1), "int16_t": (16, 1), "int32_t": (32, 1), "int64_t": (64, 1)}
-
-
-def random_element(c_type: str, rng: random.Random) -> float:
-    if c_type in ("float", "double"):
-        return rng.randrange(-(2**20), 2**20) / 64  # exact in 32 bits
-    bits, signed = INTEGERS[c_type]
-    return rng.getrandbits(bits) - (2 ** (bits - 1) if signed else 0)
-
-
-def random_value(c_type: str, rng: random.Random) -> Any:
-    element, _, length = c_type.rstrip("]").partition("[")
-    if element == "char":
-        return "".join(rng.choices("ABCxyz_19", k=rng.randint(0, int(length))))
-    if not length:
-        return random_element(element, rng)
-    if element == "uint8_t":
-        return rng.randbytes(int(length))
-    return tuple(random_element(element, rng) for _ in range(int(length)))
-
-
-def random_message(kind: type[WireMessage], rng: random.Random) -> WireMessage:
-    hints = get_type_hints(kind, include_extras=True)
-    return kind(*(random_value(hints[name].__metadata__[0], rng) for name in kind.__struct_fields__))
 
 
 def their_message(module: Any, layout: MessageLayout, ours: WireMessage) -> Any:
@@ -80,7 +56,7 @@ def test_a_frame_of_mavlink_2_is_the_authority_s_byte_for_byte(layout: MessageLa
     rng = random.Random(SEED + layout.id)
     ours, theirs = frame.Link(7, 1), their_link(dialect_2)
     parser, reader = frame.Parser(), their_link(dialect_2)
-    for message in [layout.unpack(b""), *(random_message(layout.kind, rng) for _ in range(20))]:
+    for message in [layout.unpack(b""), *(random_message(layout, rng) for _ in range(20))]:
         packed = ours.pack(message)
         assert packed == theirs_packed(theirs, their_message(dialect_2, layout, message))
         (received,) = parser.feed(packed)
@@ -94,7 +70,7 @@ def test_a_frame_of_mavlink_1_is_the_authority_s_byte_for_byte(layout: MessageLa
     rng = random.Random(SEED + layout.id)
     ours, theirs, parser = frame.Link(7, 1, version=1), their_link(dialect_1), frame.Parser()
     for _ in range(5):
-        message = random_message(layout.kind, rng)
+        message = random_message(layout, rng)
         packed = ours.pack(message)
         assert packed == theirs_packed(theirs, their_message(dialect_1, layout, message))
         (received,) = parser.feed(packed)
@@ -115,17 +91,15 @@ def test_the_authority_s_frames_are_read_as_they_were_meant() -> None:
 
 
 def test_signatures_are_the_authority_s() -> None:
-    from zsim_bridges.mavlink.wire.signing import Signing
-
     key = bytes(range(32))
     link = their_link(dialect_2)
     link.signing.secret_key, link.signing.sign_outgoing, link.signing.timestamp = key, True, 1000
-    signing = Signing(key)
+    signing = frame.Signing(key)
     signing.timestamp = 999
     ours = frame.Link(7, 1, signing).pack(dialect.Heartbeat(type=2, custom_mode=5))
     theirs = bytes(link.heartbeat_encode(2, 0, 0, 5, 0, mavlink_version=0).pack(link))
     assert ours == theirs
-    (received,) = frame.Parser(Signing(key)).feed(theirs)
+    (received,) = frame.Parser(frame.Signing(key)).feed(theirs)
     assert received.signed
 
 
@@ -134,7 +108,7 @@ def read_by_the_authority(count: int) -> None:
     rng, ours, theirs = random.Random(SEED), frame.Link(7, 1), their_link(dialect_2)
     while count > 0:
         layouts = rng.choices(LAYOUTS, k=min(count, 500))
-        data = b"".join(ours.pack(random_message(layout.kind, rng)) for layout in layouts)
+        data = b"".join(ours.pack(random_message(layout, rng)) for layout in layouts)
         cut = rng.randrange(len(data))
         read = [message for part in (data[:cut], data[cut:]) for message in theirs.parse_buffer(part) or []]
         assert [message.get_msgId() for message in read] == [layout.id for layout in layouts]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from zsim.contract import flight_messages, messages, run_messages
 from zsim_bridges.ros1 import driver_messages, tcpros
 from zsim_bridges.ros1.driver_messages import DriverFrames
-from zsim_bridges.vehicle_links.onboard_state import OnboardState
+from zsim_bridges.vehicle_links.drone_link import OnboardState
 
 T_NS = 61_040_000_000
 FRAMES = DriverFrames("drone1")

@@ -23,7 +23,7 @@ def names(module: str) -> set[str]:
 
 def test_the_sources_of_a_kernel_are_all_that_its_module_imports():
     """Where a function is compiled, what it calls and the constants that it names are too, wherever they come from."""
-    assert {"dead_reckoning", "madgwick", "compiled"} <= names("zsim_agents.estimation.estimator_bank")
+    assert {"dead_reckoning", "strapdown", "compiled"} <= names("zsim_agents.estimation.estimator_bank")
     pytest.importorskip("numba")
     flown = {
         "kernel",

@@ -14,10 +14,7 @@ MODULES = (
     "formation.spaces.cluster_space",
     "formation.flight_check",
     "formation.control_law",
-    "formation.spaces.nested_cluster",
-    "formation.spaces.pair_cluster",
-    "formation.robot_limits",
-    "formation.flight_data",
+    "formation.spaces.scenario_space",
     "formation.spaces.template_cluster",
     "formation.trajectory",
     "formation.spaces.triad_cluster",
@@ -31,9 +28,8 @@ pytest.importorskip("numba")
 
 
 def package() -> SimpleNamespace:
-    return SimpleNamespace(
-        **{name.rpartition(".")[2]: importlib.import_module(f"zsim_agents.{name}") for name in MODULES}
-    )
+    loaded = {name.rpartition(".")[2]: importlib.import_module(f"zsim_agents.{name}") for name in MODULES}
+    return SimpleNamespace(**loaded)
 
 
 @pytest.fixture(scope="module")
@@ -41,23 +37,22 @@ def both() -> tuple[SimpleNamespace, SimpleNamespace]:
     """Return the modules as they are, and a copy of them imported where numba is missing."""
     compiled = package()
     with patch.dict(sys.modules, {"numba": None}):
-        for name in [
-            name for name in sys.modules if name.partition(".")[0] == "zsim_agents" or name.startswith("zsim.math")
-        ]:
-            del sys.modules[name]
+        for name in [*sys.modules]:
+            if name.partition(".")[0] == "zsim_agents" or name.startswith("zsim.math"):
+                del sys.modules[name]
         return compiled, package()
 
 
 def space_of(way: SimpleNamespace, n: int):
     """Return a cluster space of these modules; `cluster_space` would import the classes anew, compiled."""
-    return way.pair_cluster.PairCluster() if n == 2 else way.triad_cluster.TriadCluster(n)
+    return way.triad_cluster.PairCluster() if n == 2 else way.triad_cluster.TriadCluster(n)
 
 
 def large_space_of(way: SimpleNamespace, kind: str):
     """Return a template of 10 or 30, or three triads, of these modules."""
     if kind == "triads":
         groups = [(name, way.triad_cluster.TriadCluster(3)) for name in "abc"]
-        return way.nested_cluster.NestedCluster(way.triad_cluster.TriadCluster(3), groups)
+        return way.scenario_space.NestedCluster(way.triad_cluster.TriadCluster(3), groups)
     n = int(kind)
     return way.template_cluster.TemplateCluster(np.random.default_rng(n).normal(scale=6.0, size=(n, 3)))
 
@@ -73,11 +68,7 @@ def robots(n: int, rng: np.random.Generator, scale_m: float = 4.0) -> tuple[np.n
 
 def test_one_way_is_compiled_and_the_other_is_not(both):
     compiled, plain = both
-    for module, name in (
-        ("triad_cluster", "triad_forward"),
-        ("robot_limits", "limited"),
-        ("trajectory", "put_ramped"),
-    ):
+    for module, name in (("triad_cluster", "triad_forward"), ("control_law", "limited"), ("trajectory", "put_ramped")):
         assert hasattr(getattr(getattr(compiled, module), name), "py_func")
         assert not hasattr(getattr(getattr(plain, module), name), "py_func")
 
@@ -177,7 +168,7 @@ def test_ramps_are_the_same(both, n):
 def test_places_are_judged_the_same_at_once_and_in_words(both, n):
     space, plain = (space_of(way, n) for way in both)
     rng, found = np.random.default_rng(40 + n), set()
-    gains, limits = both[0].control_law.FormationGains(), both[0].flight_data.ShapeLimits()
+    gains, limits = both[0].control_law.FormationGains(), both[0].flight_check.ShapeLimits()
     for _ in range(200):
         p_W, yaw = robots(n, rng)
         p_W[:, 2] += 6.0
@@ -195,7 +186,7 @@ def test_places_are_judged_the_same_at_once_and_in_words(both, n):
 @pytest.mark.parametrize("n", SIZES)
 def test_bounds_in_flight_are_those_of_the_judgement_in_words(both, n):
     check, space = both[0].flight_check, space_of(both[0], n)
-    limits = both[0].flight_data.ShapeLimits(spread_min_m=0.0, condition_max=math.inf)
+    limits = both[0].flight_check.ShapeLimits(spread_min_m=0.0, condition_max=math.inf)
     bounds, rng, found = check.bounds_of(space, limits), np.random.default_rng(50 + n), set()
     for _ in range(300):
         c = rng.uniform(0.01, 1.0, 4 * n)
@@ -240,13 +231,12 @@ def test_judgements_are_the_same(both, n):
 FLIGHT = """
 import sys
 import numpy as np
-from zsim_agents.formation.spaces.scenario_space import cluster_space
-from zsim_agents.formation.engagement_setup import rehearse
+from zsim_agents.formation.spaces.scenario_space import NestedCluster, cluster_space
+from zsim_agents.formation.engagement_setup import _rehearse
 from zsim_agents.formation.engagement import Engagement
-from zsim_agents.formation.flight_data import GateInput
+from zsim_agents.formation.flight_check import GateInput
 from zsim_agents.formation.flight_plan import MoveTo
-from zsim_agents.formation.control_law import FormationGains
-from zsim_agents.formation.spaces.nested_cluster import NestedCluster
+from zsim_agents.formation.control_law import FormationGains, ProportionalLaw
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 
 def compiled():
@@ -262,7 +252,7 @@ spaces = {
 kind, gains = sys.argv[1], FormationGains()
 space = spaces[kind] if kind in spaces else cluster_space(int(kind))
 n = space.n
-rehearse(space, gains)
+_rehearse(space, gains, ProportionalLaw)
 before = compiled()
 turn = 2 * np.pi * np.arange(n) / n
 p_W, yaw = np.column_stack((9 * np.cos(turn), 9 * np.sin(turn), np.full(n, 9.0))), np.zeros(n)

@@ -10,11 +10,9 @@ from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_agents.formation.engagement_setup import engagement_of
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
-from zsim_agents.formation.spaces.nested_cluster import NestedCluster
-from zsim_agents.formation.spaces.pair_cluster import PairCluster
-from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_agents.formation.spaces.scenario_space import NestedCluster, scenario_space
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
-from zsim_agents.formation.spaces.triad_cluster import TriadCluster
+from zsim_agents.formation.spaces.triad_cluster import PairCluster, TriadCluster
 
 STARTS = [(0, 5), (-3, 0), (3, 0), (-3, -4), (3, -4), (0, -7), (-6, 4), (6, 4)]
 

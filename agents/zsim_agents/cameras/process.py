@@ -1,0 +1,45 @@
+"""What the processes of cameras and of detectors share: their place in a run, and waiting for messages."""
+
+import threading
+
+from zsim.contract import keys
+from zsim.runtime.participant import Participant
+from zsim.transport.session import RawSample, Session
+
+TICK_S = 0.1  # how often a stop is looked for while nothing arrives
+
+
+class RunProcess:
+    """A process that waits for messages, which arrive in Zenoh's threads.
+
+    Attributes:
+        is_back: whether the link was lost and is back.
+    """
+
+    def __init__(self, link: Session, participant: Participant) -> None:
+        self._link, self._participant = link, participant
+        self._wake_event = threading.Event()
+        self._was_lost = False
+        self.is_back = False
+        link.declare_subscriber(keys.CLOCK, self._on_clock)
+        link.on_link(self._on_link)
+
+    def wake(self) -> None:
+        """Let a waiting `wait` return."""
+        self._wake_event.set()
+
+    def wait(self) -> None:
+        """Return when something has arrived, or after a tick."""
+        self._wake_event.wait(TICK_S)
+        self._wake_event.clear()
+        self._participant.tick()
+
+    def _on_clock(self, sample: RawSample) -> None:
+        self._participant.update_clock(sample.payload)
+        if self._participant.end_reason:
+            self.wake()
+
+    def _on_link(self, up: bool) -> None:
+        self.is_back = self.is_back or (up and self._was_lost)
+        self._was_lost = not up
+        self.wake()

@@ -1,0 +1,438 @@
+"""The joint filter of the drones of a cluster: one covariance of all their errors, corrected by mutual sightings.
+
+Each estimator of such a cluster reads the sensors of all its drones and computes the same filter; it publishes its own
+drones' estimates. For a sighting, first the owner of the seen hat is found, then both drones are corrected. A sighting
+is compared with the states of both drones at the instant of its picture. Errors: R_true = (I + [theta]x) R_WB, as in
+dead_reckoning.
+
+Order of this file: the banks of clusters, the bank of one, its step, and the compiled use of sightings.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.contract import keys, messages
+from zsim.contract.flight_messages import Estimate, Sightings
+from zsim.contract.framing import GateMessages, PerPattern
+from zsim.contract.snapshot import State
+from zsim.errors import DecodeError
+from zsim.math.compiled import Field, columns, portable
+from zsim.math.rotation import Vector, add, cross, dot, matrix, norm, product, scaled, subtract, transposed
+from zsim.scenario.scenario import Drone, Environment, Estimation, Scenario
+from zsim.sensors.camera import Hats
+from zsim.sensors.camera_model import camera_pose
+from zsim_agents.estimation import measurement_update, strapdown
+from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
+from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.estimator_bank import EstimatorBank, sort_readings, write_estimate
+from zsim_agents.estimation.filter_state import COUNT, NOMINAL, SETTING, Moment, Rows, moment, vector
+from zsim_agents.estimation.kalman_update import (
+    add_innovation_covariance,
+    add_projection,
+    block,
+    predict_jointly,
+    put_block,
+    within_gates,
+)
+from zsim_agents.estimation.measurement_update import correct_all
+from zsim_agents.estimation.strapdown import move_columns, recall_known
+
+SIGHTINGS_MAX = 1000  # used per gate; more are a flood
+PICTURES_KEPT = 256  # the last that were used; of 12 drones at 15 Hz, those of 1.4 s
+SIGHTING = columns(  # of one hat
+    "SightingColumns",
+    (
+        Field("drone", "1"),  # the observer
+        Field("t_arrival", "s"),
+        Field("t_sample", "s"),
+        Field("p_BK", "m", 3),  # of the camera
+        Field("direction_B", "1", 3),
+        Field("range", "m"),
+        Field("sigma_direction", "rad"),
+        Field("sigma_range", "m"),
+    ),
+)
+NO_SIGHTINGS = np.empty((0, SIGHTING.size))
+# by which y^T S^-1 y of the second best must exceed that of the best: chosen, a likelihood ratio of 150
+AMBIGUITY = 10.0
+# Standard deviations by which the places of two hats must differ: while the filter knows them less well, as when GPS is
+# averaged on the ground, one hat is occasionally taken for another, and stays so.
+APART = 6.0
+NEAREST_M = 0.1  # nearer, a direction is not defined
+RANGE_MAX_M = 1e4  # no hat is seen farther away
+SIGMA_MIN_RAD, SIGMA_MIN_M = 1e-4, 1e-3  # lost by interpolating past states
+NOBODY = -1
+
+Picture = tuple[int, str, int]  # drone, camera, time of exposure [ns]
+Sighting = tuple[float, ...]  # columns SIGHTING
+
+
+class ClusterBanks:
+    """A JointBank for each cluster of some drones, an EstimatorBank for a drone of none; methods of an EstimatorBank.
+
+    Args:
+        drones: whose estimates are wanted.
+        gate_s: interval of the gates [s].
+
+    Attributes:
+        drones: whose sensors are needed, in the order in which `receive` counts them.
+    """
+
+    def __init__(self, scenario: Scenario, drones: Sequence[str], gate_s: float) -> None:
+        mates = {drone: tuple(cluster.drones) for cluster in scenario.clusters for drone in cluster.drones}
+        groups = list(dict.fromkeys(mates.get(drone, (drone,)) for drone in drones))
+        settings = (scenario.environment, scenario.estimation, gate_s)
+        self._banks = [
+            (JointBank if len(group) > 1 else EstimatorBank)([scenario.drone(name) for name in group], *settings)
+            for group in groups
+        ]
+        self.drones = [drone for group in groups for drone in group]
+        self._places = [(bank, i) for bank, group in zip(self._banks, groups, strict=True) for i in range(len(group))]
+        self._wanted = [self.drones.index(drone) for drone in drones]
+
+    def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
+        bank, place = self._places[i]
+        bank.receive(place, sensor, message, t_arrival_s)
+
+    def receive_gate(self, gate: GateMessages) -> bool:
+        if len(self._banks) > 1:
+            return False  # one bank might accept the gate and another not
+        return self._banks[0].receive_gate(gate)
+
+    def estimate(self, t_s: float) -> list[StateEstimate]:
+        if len(self._banks) == 1:
+            return self._banks[0].estimate(t_s, self._wanted)
+        estimates = [each for bank in self._banks for each in bank.estimate(t_s)]
+        return [estimates[place] for place in self._wanted]
+
+    def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
+        bank, place = self._places[self._wanted[i]]
+        bank.warm_start(place, last)
+
+    def snapshot(self) -> State:
+        return {"banks": [bank.snapshot() for bank in self._banks]}
+
+    def restore(self, state: State) -> None:
+        for bank, saved in zip(self._banks, state["banks"], strict=True):
+            bank.restore(saved)
+
+
+class JointBank(EstimatorBank):
+    """Fuses the sensors and the sightings of the drones of a cluster; arguments as of EstimatorBank."""
+
+    counted = (
+        *EstimatorBank.counted,
+        (keys.SIGHTINGS, COUNT.sightings_used - COUNT.used, COUNT.sightings_refused - COUNT.used),
+    )
+
+    def __init__(
+        self, drones: Sequence[Drone], environment: Environment, estimation: Estimation, gate_s: float
+    ) -> None:
+        super().__init__(drones, environment, estimation, gate_s)
+        count, n = self.rows.covariance.shape[:2]
+        joint = np.zeros((count * n, count * n))
+        for i in range(count):
+            put_block(joint, i, self.rows.covariance[i])
+        self.rows = self.rows._replace(joint=joint, sighted=np.full((count, count), -math.inf))
+        hats = environment.hats if isinstance(environment.hats, Hats) else Hats()
+        x, y, z = hats.position_m
+        self._hat_B: Vector = float(x), float(y), float(z)
+        self._cameras = [{n: camera_pose(c).p_BK.tolist() for n, c in d.sensors.cameras().items()} for d in drones]
+        self._drones = {keys.sensor(drone.name, keys.SIGHTINGS): i for i, drone in enumerate(drones)}
+        self._places = PerPattern(self._sighting_places)
+        self._sighted: dict[Picture, tuple[str, list[Sighting]]] = {}  # of this gate, with the detector
+        self._hats = 0  # of this gate, replaced pictures included
+        self._pictures_used: dict[Picture, None] = {}
+
+    def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
+        if sensor == keys.SIGHTINGS:
+            self._receive_sightings(i, message, t_arrival_s)
+        else:
+            super().receive(i, sensor, message, t_arrival_s)
+
+    def _receive_sightings(self, i: int, message: Sightings, t_arrival_s: float) -> None:
+        p_BK = self._cameras[i].get(message.camera)
+        if p_BK is None or not message.seen:
+            return
+        picture = (i, message.camera, message.t_sample_ns)
+        if self._is_taken(picture, message.source):
+            return
+        camera = i, t_arrival_s, message.t_sample_ns * 1e-9, *p_BK
+        rows = [
+            (*camera, *seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
+            for seen in message.seen[: SIGHTINGS_MAX - self._hats]
+        ]
+        self._hats += len(rows)
+        self._sighted[picture] = (message.source, rows)
+
+    def _is_taken(self, picture: Picture, source: str) -> bool:
+        """Tell whether a picture is used already: two detectors that look at it have the same errors.
+
+        Of two at one gate the first by name counts, whichever came first: other estimators of the cluster do the same.
+        """
+        other = self._sighted.get(picture)
+        return picture in self._pictures_used or (other is not None and other[0] <= source)
+
+    def receive_gate(self, gate: GateMessages) -> bool:
+        if not super().receive_gate(gate):
+            return False
+        for m, i, key in self._places.of(gate):
+            try:
+                message = messages.decode(key, gate.payload(m))
+            except DecodeError:
+                continue
+            self._receive_sightings(i, message, message.t_ns * 1e-9)
+        return True
+
+    def _sighting_places(self, gate: GateMessages) -> list[tuple[int, int, str]]:
+        """Return index in the gate, drone and key of the messages that are sightings."""
+        by_message = ((m, gate.table[which]) for m, which in enumerate(gate.which.tolist()))
+        return [(m, self._drones[key], key) for m, key in by_message if key in self._drones]
+
+    def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
+        super().warm_start(i, last)
+        put_block(self.rows.joint, i, self.rows.covariance[i])
+
+    def snapshot(self) -> State:
+        return {**super().snapshot(), "pictures": [list(picture) for picture in self._pictures_used]}
+
+    def restore(self, state: State) -> None:
+        super().restore(state)
+        self._pictures_used = dict.fromkeys((i, camera, t_ns) for i, camera, t_ns in state["pictures"])
+
+    def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        sightings = self._taken() if self._sighted else NO_SIGHTINGS
+        step_jointly(self.rows, t_s, readings, sightings, self._hat_B, self._estimates)
+        return self._estimates
+
+    def _taken(self) -> NDArray[np.float64]:
+        """Return the sightings of this gate, (M, SIGHTING.size), and forget them."""
+        rows = sorted(row for _, of_picture in self._sighted.values() for row in of_picture)
+        self._pictures_used |= dict.fromkeys(self._sighted)
+        while len(self._pictures_used) > PICTURES_KEPT:
+            del self._pictures_used[next(iter(self._pictures_used))]
+        self._sighted, self._hats = {}, 0
+        return np.array(rows) if rows else NO_SIGHTINGS
+
+
+@portable
+def step_jointly(
+    rows: Rows, t_s: float, readings: np.ndarray, sightings: np.ndarray, hat_B: Vector, estimates: np.ndarray
+) -> None:
+    """Use the readings and sightings of a gate of all drones and write their estimates for `t_s`.
+
+    Args:
+        rows: of N drones; changed.
+        t_s: instant of the gate [s].
+        readings: (M, READING.size), each drone's in the order of their arrival.
+        sightings: (M, SIGHTING.size).
+        hat_B: centre of a hat in the body of its drone [m].
+        estimates: (N, ESTIMATE.size), written.
+    """
+    count, n = rows.covariance.shape[:2]
+    first, after = np.full(count, -1), np.full(readings.shape[0], -1)
+    sort_readings(rows, readings, first, after)
+    for i in range(count):
+        _grow(rows, i, t_s)
+    for i in range(count):
+        P = block(rows.joint, i, n)
+        if not rows.counts[i, COUNT.heading_known]:
+            measurement_update.start_heading(rows, i, P, t_s, readings, first[i], after)
+            put_block(rows.joint, i, P)
+        measurement_update.fuse(rows, i, P, readings, first[i], after)
+    use_sightings(rows, sightings, hat_B)
+    for i in range(count):
+        strapdown.clone(rows, i, rows.joint, i * n)
+        rows.covariance[i] = block(rows.joint, i, n)
+        write_estimate(rows.nominal[i], rows.setting[i], rows.covariance[i], t_s, estimates[i])
+
+
+@portable
+def _grow(rows: Rows, i: int, t_s: float) -> None:
+    """Let the errors of a drone follow its dead reckoning since the last gate."""
+    row, n = rows.nominal[i], rows.covariance.shape[1]
+    if not rows.counts[i, COUNT.running]:
+        strapdown.begin(row, rows.counts[i], t_s)
+    strapdown.coast(row, rows.setting[i], t_s)
+    if row[NOMINAL.t] > row[NOMINAL.t_start]:
+        F, Q = np.eye(n), np.zeros((n, n))
+        strapdown.write_growth(rows, i, F, Q)
+        predict_jointly(rows.joint, i, F, Q)
+    strapdown.begin_interval(row, row[NOMINAL.t])
+
+
+@portable
+def use_sightings(rows: Rows, sightings: np.ndarray, hat_B: Vector) -> None:
+    """Use the sightings of a gate, one after the other; those that no hat explains are counted as refused.
+
+    Args:
+        rows: of all drones; changed.
+        sightings: (M, SIGHTING.size), those of one picture in sequence.
+        hat_B: centre of a hat in the body of its drone [m].
+    """
+    taken = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
+    HJ, S, y = np.zeros((3, rows.joint.shape[0])), np.zeros((3, 3)), np.zeros(3)
+    for m in range(sightings.shape[0]):
+        sighting, i = sightings[m], int(sightings[m, SIGHTING.drone])
+        if m == 0 or sighting[0] != sightings[m - 1, 0] or sighting[2] != sightings[m - 1, 2]:
+            taken[:] = False
+        j = owner(rows, sighting, hat_B, taken, HJ, S, y) if is_possible(rows, sighting) else NOBODY
+        if j == NOBODY:
+            rows.counts[i, COUNT.sightings_refused] += 1
+            continue
+        taken[j] = True
+        rows.counts[i, COUNT.sightings_used] += 1
+        rows.sighted[i, j] = sighting[SIGHTING.t_sample]
+        correct_all(rows, HJ, S, y)
+
+
+@portable
+def is_possible(rows: Rows, sighting: np.ndarray) -> bool:
+    """Tell whether time and values of a sighting are plausible."""
+    i = int(sighting[SIGHTING.drone])
+    age_s = sighting[SIGHTING.t_arrival] - sighting[SIGHTING.t_sample]
+    good = 0.0 <= age_s <= rows.setting[i, SETTING.age_max] and rows.counts[i, COUNT.heading_known] != 0
+    good = good and 0.0 < sighting[SIGHTING.range] < RANGE_MAX_M
+    length = norm(vector(sighting, SIGHTING.direction_B))
+    return good and 0.99 < length < 1.01 and sighting[SIGHTING.sigma_range] > 0.0
+
+
+@portable
+def owner(
+    rows: Rows, sighting: np.ndarray, hat_B: Vector, taken: np.ndarray, HJ: np.ndarray, S: np.ndarray, y: np.ndarray
+) -> int:
+    """Return whose hat was seen; NOBODY where none fits, two do, or the filter could not tell two from each other.
+
+    HJ, S and the innovation y, (3,), are those of the returned hat; `taken` marks the hats already seen in the picture.
+    """
+    count, i = rows.nominal.shape[0], int(sighting[SIGHTING.drone])
+    places, seen = np.zeros((count, 3)), place_of(sighting)
+    best, second, found = math.inf, math.inf, NOBODY
+    trial_HJ, trial_S = np.zeros_like(HJ), np.zeros_like(S)
+    toward = across((1.0, 0.0, 0.0))
+    for j in range(count):
+        if j == i:
+            continue
+        if not rows.counts[j, COUNT.heading_known]:
+            return NOBODY  # it could be anywhere
+        r, axes = predict_sighting(rows, sighting, j, hat_B, trial_HJ, trial_S)
+        places[j, 0], places[j, 1], places[j, 2] = r[0], r[1], r[2]
+        trial_y = innovation(axes, seen, r)
+        distance = distance_squared(rows, trial_S, trial_y)
+        if distance < best:
+            best, second, found, toward = distance, best, j, axes
+            HJ[:], S[:], y[:] = trial_HJ, trial_S, trial_y
+        elif distance < second:
+            second = distance
+    if found == NOBODY or best > rows.limits[3] or second - best < AMBIGUITY or taken[found]:
+        return NOBODY
+    r = (places[found, 0], places[found, 1], places[found, 2])
+    for j in range(count):
+        if j not in (i, found):
+            other = (places[j, 0], places[j, 1], places[j, 2])
+            if distance_squared(rows, S, innovation(toward, other, r)) < APART * APART:
+                return NOBODY
+    return found
+
+
+@portable
+def predict_sighting(
+    rows: Rows, sighting: np.ndarray, j: int, hat_B: Vector, HJ: np.ndarray, S: np.ndarray
+) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
+    """Return the expected place of the hat of drone j, and axes along and across; write H J and S along these.
+
+    Args:
+        sighting: (SIGHTING.size,).
+        j: assumed owner of the hat.
+        HJ: (3, D), written.
+        S: covariance of the innovation, (3, 3), written.
+    """
+    i, n = int(sighting[SIGHTING.drone]), rows.covariance.shape[1]
+    t_s = sighting[SIGHTING.t_sample]
+    a, lag_a, state_a = recall_known(rows, i, t_s, moment(rows.nominal[i]))
+    b, lag_b, state_b = recall_known(rows, j, t_s, moment(rows.nominal[j]))
+    r = expected(a, b, hat_B, vector(sighting, SIGHTING.p_BK))
+    away = max(norm(r), NEAREST_M)
+    axes = across(scaled(r, 1.0 / away))
+    H_i, H_j = np.zeros((3, n)), np.zeros((3, n))
+    write_rows(H_i, H_j, a, b, hat_B, axes, (lag_a, lag_b))
+    move_columns(H_i, 0, 3, state_a)
+    move_columns(H_j, 0, 3, state_b)
+    sideways = away * max(sighting[SIGHTING.sigma_direction], SIGMA_MIN_RAD)
+    along = max(sighting[SIGHTING.sigma_range], SIGMA_MIN_M)
+    HJ[:], S[:] = 0.0, 0.0
+    S[0, 0], S[1, 1], S[2, 2] = along * along, sideways * sideways, sideways * sideways
+    add_projection(rows.joint, H_i, i * n, HJ)
+    add_projection(rows.joint, H_j, j * n, HJ)
+    add_innovation_covariance(HJ, H_i, i * n, S)
+    add_innovation_covariance(HJ, H_j, j * n, S)
+    return r, axes
+
+
+@portable
+def expected(a: Moment, b: Moment, hat_B: Vector, p_BK: Vector) -> Vector:
+    """Return the place of drone b's hat as seen from drone a's camera [m; axes of a's body]."""
+    away = subtract(add(b[1], product(matrix(b[3]), hat_B)), a[1])
+    return subtract(product(transposed(matrix(a[3])), away), p_BK)
+
+
+@portable
+def write_rows(
+    H_i: np.ndarray,
+    H_j: np.ndarray,
+    a: Moment,
+    b: Moment,
+    hat_B: Vector,
+    axes: tuple[Vector, Vector, Vector],
+    lags: tuple[float, float],
+) -> None:
+    """Write the Jacobians of a sighting along three axes of the observer's body, (3, n), which come in as zero.
+
+    H_i is by the errors of the observer, H_j by those of the observed drone.
+    """
+    R_a, hat_W = matrix(a[3]), product(matrix(b[3]), hat_B)
+    away = subtract(add(b[1], hat_W), a[1])
+    for r in range(3):
+        w = product(R_a, axes[r])
+        by_own, by_other = cross(w, away), cross(hat_W, w)
+        for k in range(3):
+            H_j[r, POSITION + k] = w[k]
+            H_i[r, POSITION + k] = -w[k]
+            H_j[r, VELOCITY + k] = -lags[1] * w[k]
+            H_i[r, VELOCITY + k] = lags[0] * w[k]
+            H_i[r, ATTITUDE + k] = by_own[k]
+            H_j[r, ATTITUDE + k] = by_other[k]
+
+
+@portable
+def across(d: Vector) -> tuple[Vector, Vector, Vector]:
+    """Return a unit vector and two perpendicular to it."""
+    side = (0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)
+    e = cross(d, side)
+    e = scaled(e, 1.0 / norm(e))
+    return d, e, cross(d, e)
+
+
+@portable
+def innovation(axes: tuple[Vector, Vector, Vector], seen: Vector, r: Vector) -> np.ndarray:
+    """Return the difference of what was seen and what was expected, along and across, (3,) [m]."""
+    miss = subtract(seen, r)
+    return np.array([dot(axes[0], miss), dot(axes[1], miss), dot(axes[2], miss)])
+
+
+@portable
+def distance_squared(rows: Rows, S: np.ndarray, y: np.ndarray) -> float:
+    """Return y^T S^-1 y."""
+    blocks, distances = np.array([[0, 3]]), np.zeros(1)
+    within_gates(S, y, blocks, rows.limits, distances)
+    return distances[0]
+
+
+@portable
+def place_of(sighting: np.ndarray) -> Vector:
+    """Return where a hat was seen, from the camera in axes of the body [m]."""
+    return scaled(vector(sighting, SIGHTING.direction_B), sighting[SIGHTING.range])

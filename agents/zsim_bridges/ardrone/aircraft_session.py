@@ -1,0 +1,412 @@
+"""The session with one AR.Drone 2.0: it is set up, its navdata is requested and read, and it does what is demanded.
+
+Pure. Units and axes of navdata: millidegrees, millimetres, milli-g; x forward, y right, z down; psi clockwise from
+where the aircraft was switched on. Source: AR.Drone Developer Guide SDK 2.0, chapters 6 to 8.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from zsim.contract.flight_messages import DroneState
+from zsim.contract.messages import Info
+from zsim.math.frames import heading, quaternion_from_rpy
+from zsim.math.rotation import Vector
+from zsim.scenario.scenario import Scenario
+from zsim.schema.quantities import G_M_S2
+from zsim_bridges.ardrone import at_commands, navdata
+from zsim_bridges.ardrone.at_commands import Command, Config, Control, Pcmd, ResetWatchdog
+from zsim_bridges.ardrone.navdata import (
+    FULL_TAGS,
+    GPS_TAG,
+    MICROSECONDS,
+    SECONDS_SHIFT,
+    TAG_OF,
+    ControlState,
+    Navdata,
+    NavdataError,
+    StateBit,
+)
+from zsim_bridges.vehicle_links.aircraft_readings import STILL, AircraftPose, AircraftReadings
+from zsim_bridges.vehicle_links.driver_options import DriverOptions
+from zsim_bridges.vehicle_links.vehicle_session import AircraftState, Demand, UdpChannel, VehicleSession
+
+NAVDATA, AT = 0, 1  # channels
+REQUEST_NS = 100_000_000  # chosen as npm ar-drone: navdata is requested again after as long
+CONFIG_NS = 500_000_000  # chosen: an entry is sent again after as long without its acknowledgement
+WATCHDOG_NS = 1_000_000_000  # half of the aircraft's com_watchdog
+RESTARTED = 100  # packets, chosen: an aircraft whose number falls back by more has been switched on again
+PERIOD_NS = 30_000_000  # Developer Guide 6.3: at most 30 ms between commands
+CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller commands once
+PULSE_NS = 90_000_000  # chosen: three datagrams have the emergency bit, of which two may be lost
+PULSES_NS = 400_000_000  # chosen: longer than a pulse takes to show in navdata, since another one would undo it
+VELOCITY_1_S = 2.5  # chosen: 46 deg of phase with 0.14 s of delay and 0.14 s of tilt lag
+INTEGRAL_1_S2 = 2.0  # chosen: as fast as that phase allows; gusts last some seconds
+DRAG_1_S = 0.58  # 1/s, of speed (tum_ardrone's flight-fitted model)
+STEP_S_MAX = 0.1  # s; over longer pauses no more is integrated
+ANSWER_NS = 240_000_000  # command delay and tilt lag (tum_ardrone: 0.1 s and 0.14 s)
+HOVER = Pcmd(0, 0, 0.0, 0.0, 0.0, 0.0)  # flag 0: hold the place
+STATES: dict[int, DroneState] = {
+    ControlState.FLYING: "flying",
+    ControlState.HOVERING: "hovering",
+    ControlState.TAKING_OFF: "taking_off",
+    ControlState.GO_TO_FIX: "flying",
+    ControlState.LANDING: "landing",
+    ControlState.LOOPING: "flying",
+}
+OPTIONS_MASK = sum(1 << tag for tag in (*FULL_TAGS, GPS_TAG))
+DEMO, TIME, PHYS, ALTITUDE = (TAG_OF[name] for name in ("demo", "time", "phys_measures", "altitude"))
+PRESSURE, MAGNETO = TAG_OF["pressure_raw"], TAG_OF["magneto"]
+UT_PER_LSB = 0.3  # uT, AK8975 data sheet
+SONAR_MM = range(30, 6000)  # mm; outside there was no echo
+GPS_1_S = 0.1  # 1/s, chosen: how fast the position follows the GPS, whose noise is 2 m at 5 Hz, for 0.3 m
+YAW_1_S = 0.1  # 1/s, chosen: how fast the heading follows the magnetometer
+GAP_S_MAX = 0.5  # s; over longer gaps nothing is integrated
+GPS_FIX = 3  # three-dimensional
+
+
+class AircraftSettings(NamedTuple):
+    """The configuration that an aircraft is given.
+
+    Attributes:
+        tilt_rad: euler_angle_max.
+        climb_m_s, yaw_rate_rad_s: control_vz_max, control_yaw.
+        altitude_m: altitude_max.
+        ultrasound: ultrasound_freq of its sonar: 7 (22.2 Hz) or 8 (25 Hz).
+    """
+
+    tilt_rad: float = 0.35  # outdoor default of the SDK
+    climb_m_s: float = 1.0  # likewise
+    yaw_rate_rad_s: float = 1.75  # indoor default of the SDK
+    altitude_m: float = 100.0  # no limit of its own: the driver's fence holds
+    ultrasound: int = 8  # default of the SDK
+
+    def entries(self) -> list[Config]:
+        """Return what is set: `outdoor` first, which brings limits of its own."""
+        entries = {
+            "general:navdata_demo": "FALSE",
+            "general:navdata_options": str(OPTIONS_MASK),
+            "control:outdoor": "TRUE",
+            "control:euler_angle_max": f"{self.tilt_rad:g}",
+            "control:control_vz_max": f"{1e3 * self.climb_m_s:g}",
+            "control:control_yaw": f"{self.yaw_rate_rad_s:g}",
+            "control:altitude_max": f"{1e3 * self.altitude_m:g}",
+            "pic:ultrasound_freq": str(self.ultrasound),
+        }
+        return [Config(0, key, value) for key, value in entries.items()]
+
+
+class AircraftSession(VehicleSession):
+    """The session with one aircraft.
+
+    Args:
+        host: its address.
+        readings: what its navdata is turned into.
+        settings: that it is given.
+        ports: of navdata and AT commands.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        readings: "NavdataReadings",
+        settings: AircraftSettings = AircraftSettings(),  # noqa: B008
+        ports: tuple[int, int] = (navdata.PORT, at_commands.PORT),
+    ) -> None:
+        super().__init__((UdpChannel(host, ports[0]), UdpChannel(host, ports[1])), readings, modulus=1 << 32)
+        self._navdata = readings
+        self._commands = FlightCommands(settings)
+        self._entries = settings.entries()
+        self._pending: deque[Config] = deque(self._entries)
+        self._sequence = 0
+        self._newest = 0
+        self._bits = StateBit(0)
+        self._state: DroneState = "landed"
+        self._battery = 0.0
+        self._requested_ns = self._config_ns = self._cleared_ns = self._watchdog_ns = -WATCHDOG_NS
+        self._sent: Config | None = None  # that waits for its acknowledgement
+
+    @classmethod
+    def of_run(
+        cls, info: Info, scenario: Scenario, options: DriverOptions, host: str, settings: AircraftSettings
+    ) -> "AircraftSession":
+        """Return the session of a driver in a run."""
+        origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
+        place = options.origin_m or scenario.drone(options.drone).position_m
+        yaw_rad = None if options.yaw_deg is None else math.radians(options.yaw_deg)
+        return cls(host, NavdataReadings(origin, place, scenario.environment.magnetic_field_ut, yaw_rad), settings)
+
+    # From the aircraft
+
+    def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
+        """Take a datagram of the aircraft."""
+        if channel != NAVDATA:
+            return
+        try:
+            packet = navdata.unpack(datagram)
+        except NavdataError:
+            self._refused += 1
+            return
+        if self._newest - RESTARTED < packet.sequence <= self._newest:
+            return  # overtaken
+        if packet.sequence < self._newest:
+            self._loss.restart()
+        self._newest = packet.sequence
+        self._loss.add(packet.sequence)
+        self._received_ns = now_ns
+        self._take(packet, now_ns)
+
+    def _take(self, packet: Navdata, now_ns: int) -> None:
+        if StateBit.COM_LOST in packet.state and StateBit.COM_LOST not in self._bits:
+            self.texts.append("the aircraft has lost our commands for a while")
+        if packet.bootstrap and not self._pending:
+            self._pending.extend(self._entries)  # it was switched on again
+        self._bits = packet.state
+        demo = packet.options.get(DEMO)
+        if demo is not None:
+            self._battery = float(min(100, demo.battery_percent))
+            self._state = STATES.get(demo.ctrl_state >> 16, "landed")
+        elif StateBit.FLYING not in packet.state:  # a bootstrap, such as after it was switched on again
+            self._state = "landed"
+        if StateBit.EMERGENCY in packet.state:
+            self._state = "emergency"
+        self._navdata.receive(packet, now_ns)
+
+    # To the aircraft
+
+    def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
+        """Yield the datagrams that are due."""
+        silent_ns = now_ns - max(self._received_ns or 0, self._requested_ns)
+        if silent_ns >= REQUEST_NS:
+            self._requested_ns = now_ns
+            yield NAVDATA, navdata.REQUEST_UNICAST
+        emergency = StateBit.EMERGENCY in self._bits
+        flight = self._commands.advance(now_ns, demand, emergency, self._navdata.pose)
+        datagram = b""
+        for command in [*self._set_up(now_ns), *flight]:
+            self._sequence += 1
+            datagram += at_commands.format_command(command._replace(sequence=self._sequence))
+        if datagram:
+            yield AT, datagram
+
+    def _set_up(self, now_ns: int) -> Iterator[Command]:
+        """Yield the next entry of the configuration; a bit acknowledges each, and is cleared before the next."""
+        if self._received_ns is None:
+            return
+        acknowledged = StateBit.COMMAND_ACK in self._bits
+        if now_ns - self._watchdog_ns >= WATCHDOG_NS:
+            self._watchdog_ns = now_ns
+            yield ResetWatchdog(0)
+        if acknowledged and now_ns - self._cleared_ns >= REQUEST_NS:
+            self._cleared_ns = now_ns
+            if self._sent is not None:
+                self._pending.popleft()
+                self._sent = None
+            yield Control(0, at_commands.ACKNOWLEDGE)
+        elif not acknowledged and self._pending and (self._sent is None or now_ns - self._config_ns >= CONFIG_NS):
+            self._config_ns, self._sent = now_ns, self._pending[0]
+            yield self._pending[0]
+
+    @property
+    def state(self) -> AircraftState:
+        return AircraftState(self._state, self._battery, self._navdata.pose, self._received_ns)
+
+
+class FlightCommands:
+    """The AT commands by which one aircraft does what is demanded, without their numbers.
+
+    REF says take off or land and is repeated while it is meant; PCMD is sent every 30 ms.
+    Source: AR.Drone Developer Guide SDK 2.0, chapter 6.
+    """
+
+    def __init__(self, settings: AircraftSettings) -> None:
+        self._settings = settings
+        self._axes = _Axis(), _Axis()
+        self._sent_ns = -PERIOD_NS
+        self._last: Demand | None = None
+        self._rose_ns = -PULSES_NS  # when the emergency bit last did
+
+    def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
+        """Yield the commands that are due; none if nothing is demanded.
+
+        Args:
+            emergency: whether the aircraft is in its emergency.
+            pose: of the aircraft.
+        """
+        if now_ns - self._sent_ns < (PERIOD_NS if demand == self._last else CHANGED_NS):
+            return
+        self._last, self._sent_ns = demand, now_ns
+        match demand.action:
+            case "none":
+                return
+            case "kill":
+                yield self._toggle(now_ns, due=not emergency)
+            case "land":
+                yield at_commands.ref(0, takes_off=False)
+                yield HOVER
+            case "reset":
+                yield self._toggle(now_ns, due=emergency)
+            case _ if emergency:
+                return
+            case _:
+                yield at_commands.ref(0, takes_off=True)
+                yield self._pcmd(now_ns, demand, pose)
+
+    def _toggle(self, now_ns: int, due: bool) -> Command:
+        """Return the next REF of a pulse of the emergency bit, which the aircraft obeys at its rise."""
+        if due and now_ns - self._rose_ns >= PULSES_NS:
+            self._rose_ns = now_ns
+        return at_commands.ref(0, takes_off=False, emergency=now_ns - self._rose_ns < PULSE_NS)
+
+    def _pcmd(self, now_ns: int, demand: Demand, pose: AircraftPose | None) -> Command:
+        """Return the command towards a velocity; tilts are shares of the limits in the aircraft's configuration."""
+        if demand.action != "fly" or pose is None:
+            self._axes = _Axis(), _Axis()
+            return HOVER
+        settings, wanted, yaw_rad = self._settings, demand.velocity_m_s, float(heading(pose.q_WB))
+        full = G_M_S2 * math.tan(settings.tilt_rad)
+        x, y = (axis.accel(now_ns, wanted[k], pose.velocity_m_s[k], full) for k, axis in enumerate(self._axes))
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        up, turn = wanted[2] / settings.climb_m_s, demand.yaw_rate_rad_s / settings.yaw_rate_rad_s
+        shares = (y * c - x * s) / full, (x * c + y * s) / full, up, turn
+        left, forward, up, yaw_left = (max(-1.0, min(1.0, share)) for share in shares)
+        return Pcmd(0, at_commands.PROGRESSIVE, -left, -forward, up, -yaw_left)
+
+
+class _Axis:
+    """A velocity loop along one axis of W, about the aircraft's own tilt loop.
+
+    The velocity follows a reference that answers with a lag. Its difference from the reference of the time when the
+    aircraft got its commands is wind, and is integrated.
+    """
+
+    def __init__(self) -> None:
+        self._then_ns: int | None = None
+        self._reference = 0.0
+        self._wind_m_s2 = 0.0
+        self._references: deque[tuple[int, float]] = deque()
+
+    def accel(self, now_ns: int, wanted: float, measured: float, most_m_s2: float) -> float:
+        """Return the acceleration that the tilt is to give."""
+        dt_s = 0.0 if self._then_ns is None else min(STEP_S_MAX, (now_ns - self._then_ns) * 1e-9)
+        if self._then_ns is None:
+            self._reference = measured
+        self._then_ns = now_ns
+        slope = VELOCITY_1_S * (wanted - self._reference)
+        self._reference += dt_s * slope
+        error = self._reference_then(now_ns) - measured
+        accel = slope + DRAG_1_S * self._reference + VELOCITY_1_S * error + self._wind_m_s2
+        if abs(accel) < most_m_s2:
+            self._wind_m_s2 += INTEGRAL_1_S2 * error * dt_s
+        return accel
+
+    def _reference_then(self, now_ns: int) -> float:
+        """Return the reference that the velocity measured now answers to."""
+        references = self._references
+        references.append((now_ns, self._reference))
+        while len(references) > 1 and references[1][0] <= now_ns - ANSWER_NS:
+            references.popleft()
+        return references[0][1]
+
+
+class NavdataReadings(AircraftReadings):
+    """What one aircraft measures, and where it has flown since the start.
+
+    Args:
+        origin: of W: latitude, longitude [deg], height [m].
+        position_m: where it stands at the start [W].
+        field_ut: of the Earth [uT; W], by which its heading is known.
+        yaw_rad: its heading at the start, if that is stated; None for the magnetometer.
+    """
+
+    def __init__(
+        self,
+        origin: tuple[float, float, float],
+        position_m: Vector,
+        field_ut: Vector,
+        yaw_rad: float | None = None,
+    ) -> None:
+        super().__init__(origin)
+        self._x, self._y, self._ground_m = position_m
+        self._north_rad = math.atan2(field_ut[1], field_ut[0])
+        self._stated_yaw_rad = yaw_rad
+        self._yaw_offset_rad: float | None = None
+        self._then_ns: int | None = None
+        self._gps_ns: int | None = None
+
+    def receive(self, packet: Navdata, now_ns: int) -> None:
+        """Take a packet that arrives now."""
+        options, taken_ns = packet.options, now_ns
+        if time := options.get(TIME):
+            stamp_ns = (time.time >> SECONDS_SHIFT) * 1_000_000_000 + (time.time & MICROSECONDS) * 1_000
+            taken_ns = self.clock.taken_ns(stamp_ns, now_ns)
+        if demo := options.get(DEMO):
+            self._on_demo(demo, options, taken_ns)
+        if phys := options.get(PHYS):
+            accel = tuple(G_M_S2 * part / 1e3 for part in _flipped(phys.phys_accs_mg))
+            gyro = tuple(map(math.radians, _flipped(phys.phys_gyros_deg_s)))
+            self.read("imu", taken_ns, accel, gyro)
+        if mag := options.get(MAGNETO):
+            self.read("mag", taken_ns, tuple(UT_PER_LSB * part for part in _flipped((mag.mx, mag.my, mag.mz))))
+        if (pressure := options.get(PRESSURE)) and pressure.pressure_pa > 0:
+            height_m = self.pose.position_m[2] if self.pose else self._ground_m
+            self.read_pressure(taken_ns, float(pressure.pressure_pa), height_m)
+        if altitude := options.get(ALTITUDE):
+            raw_mm = altitude.altitude_raw_mm
+            self.read("sonar", taken_ns, raw_mm / 1e3, raw_mm in SONAR_MM)
+        if (gps := options.get(GPS_TAG)) and gps.data_available:
+            self._on_gps(gps, taken_ns)
+
+    def _on_demo(self, demo: Any, options: dict[int, Any], taken_ns: int) -> None:
+        """Integrate the aircraft's own velocity, in its heading."""
+        roll, pitch = math.radians(demo.phi_mdeg / 1e3), -math.radians(demo.theta_mdeg / 1e3)
+        yaw = -math.radians(demo.psi_mdeg / 1e3)
+        dt_s = 0.0 if self._then_ns is None else (taken_ns - self._then_ns) * 1e-9
+        self._then_ns = taken_ns
+        if mag := options.get(MAGNETO):
+            self._align(yaw, self._magnetic_yaw(roll, pitch, _flipped((mag.mx, mag.my, mag.mz))), dt_s)
+        yaw += self._yaw_offset_rad or 0.0
+        vx, vy, vz = own = _flipped((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
+        velocity = vx * math.cos(yaw) - vy * math.sin(yaw), vx * math.sin(yaw) + vy * math.cos(yaw), vz
+        if 0.0 < dt_s < GAP_S_MAX:
+            self._x, self._y = self._x + dt_s * velocity[0], self._y + dt_s * velocity[1]
+        w, x, y, z = quaternion_from_rpy((roll, pitch, yaw)).tolist()
+        position = self._x, self._y, self._ground_m + max(0, demo.altitude_mm) / 1e3
+        rate = self._last["imu"][1] if "imu" in self._last else STILL
+        self.pose = AircraftPose(taken_ns, position, velocity, (w, x, y, z), rate)
+        self.read("flow", taken_ns, own, 1.0)
+
+    def _magnetic_yaw(self, roll: float, pitch: float, m: Vector) -> float:
+        """Return the heading by the field of the Earth seen in B."""
+        y, z = m[1] * math.cos(roll) - m[2] * math.sin(roll), m[1] * math.sin(roll) + m[2] * math.cos(roll)
+        x = m[0] * math.cos(pitch) + z * math.sin(pitch)
+        return self._north_rad - math.atan2(y, x)
+
+    def _align(self, yaw: float, magnetic: float, dt_s: float) -> None:
+        """Let the heading follow the magnetometer slowly; a stated one is kept."""
+        if self._stated_yaw_rad is not None:
+            if self._yaw_offset_rad is None:
+                self._yaw_offset_rad = self._stated_yaw_rad - yaw
+            return
+        if self._yaw_offset_rad is None:
+            self._yaw_offset_rad = magnetic - yaw
+        error = math.remainder(magnetic - yaw - self._yaw_offset_rad, 2 * math.pi)
+        self._yaw_offset_rad += min(1.0, YAW_1_S * max(0.0, dt_s)) * error
+
+    def _on_gps(self, gps: Any, taken_ns: int) -> None:
+        """Take a fix once, and let the position follow it."""
+        place = gps.latitude_deg, gps.longitude_deg, gps.elevation_m
+        values = self.gps_values(place, gps.speed_m_s, math.radians(gps.degree), gps.ehpe_m, GPS_FIX, gps.satellites)
+        before_ns, fix = self._gps_ns, (place, gps.speed_m_s, gps.degree)
+        if fix != self._fix and self.read("gps", taken_ns, *values):
+            self._gps_ns, self._fix = taken_ns, fix
+            if before_ns is not None:  # the first one is worse than the place that is stated
+                x, y, _ = values[3]
+                share = min(1.0, GPS_1_S * (taken_ns - before_ns) * 1e-9)
+                self._x, self._y = self._x + share * (x - self._x), self._y + share * (y - self._y)
+
+
+def _flipped(v: Any) -> Vector:
+    """Return a vector in forward, right, down of the body in B."""
+    return float(v[0]), -float(v[1]), -float(v[2])

@@ -1,0 +1,267 @@
+"""Navdata: the packets that an aircraft sends from UDP port 5554, and their options as a table.
+
+A packet is a header (magic, state bits, sequence number, vision flag; uint32 each), options, and last the checksum
+option, the sum of all bytes before it. An option begins with its tag and its size in bytes, both uint16, these four
+bytes included. All is little-endian and packed. The table has the form that `wire_table` describes: angles are in
+millidegrees where a name says so, theta nose up, phi to the right, psi clockwise; axes x forward, y right, z down.
+
+Source: AR.Drone Developer Guide SDK 2.0, chapter 7; ARDroneLib (SDK 2.0.1), navdata_common.h and config.h; the GPS
+option of firmware 2.4 and later: its branch `gps`.
+"""
+
+import struct
+from collections import namedtuple
+from collections.abc import Callable, Iterable, Sequence
+from enum import IntEnum, IntFlag
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zsim_bridges.vehicle_links.wire_table import Entry, WireLayout, read_table
+
+PORT = 5554  # UDP (ARDroneLib, config.h)
+REQUEST_UNICAST = b"\x01\x00\x00\x00"  # what a program sends to be sent navdata (ARDroneLib, navdata client)
+MAGIC = 0x5566_7788
+MAGICS = (MAGIC, 0x5566_7789)  # of a drone with a newer firmware (npm ar-drone, parseNavdata.js)
+DEMO_RATE_HZ, FULL_RATE_HZ = 15, 200  # Developer Guide 7.1
+SECONDS_SHIFT, MICROSECONDS = 21, (1 << 21) - 1  # of option time: seconds above, microseconds below (navdata_common.h)
+HEADER = struct.Struct("<HH")  # tag, size
+CHECKSUM_TAG = 0xFFFF
+GPS_TAG = 27  # zimmu_3000 of 12 bytes in older SDKs
+_START = struct.Struct("<IIII")
+_SUM = struct.Struct("<HHI")
+_MOST = 1 << 32
+
+_TABLE = f"""
+0 demo ctrl_state,battery_percent:I theta_mdeg,phi_mdeg,psi_mdeg:f altitude_mm:i vx_mm_s,vy_mm_s,vz_mm_s:f
+    num_frames:I detection_camera_rot:9f detection_camera_trans:3f detection_tag_index,detection_camera_type:I
+    drone_camera_rot:9f drone_camera_trans:3f
+1 time time:I
+2 raw_measures raw_accs:3H raw_gyros:3h raw_gyros_110:2h vbat_raw_mv:I us_debut_echo,us_fin_echo:H
+    us_association_echo,us_distance_echo,us_courbe_temps,us_courbe_valeur,us_courbe_ref,flag_echo_ini,nb_echo:H
+    sum_echo:I alt_temp_raw_mm:i gradient:h
+3 phys_measures accs_temp_degc:f gyro_temp:H phys_accs_mg:3f phys_gyros_deg_s:3f alim3V3,vrefEpson,vrefIDG:I
+4 gyros_offsets offset_g:3f
+5 euler_angles theta_a_mdeg,phi_a_mdeg:f
+6 references ref_theta,ref_phi,ref_theta_I,ref_phi_I,ref_pitch,ref_roll,ref_yaw,ref_psi:i
+    vx_ref,vy_ref,theta_mod,phi_mod,k_v_x,k_v_y:f k_mode:I ui_time,ui_theta,ui_phi,ui_psi,ui_psi_accuracy:f ui_seq:i
+7 trims angular_rates_trim_r,euler_angles_trim_theta,euler_angles_trim_phi:f
+8 rc_references rc_ref_pitch,rc_ref_roll,rc_ref_yaw,rc_ref_gaz,rc_ref_ag:i
+9 pwm motor:4B sat_motor:4B gaz_feed_forward,gaz_altitude,altitude_integral,vz_ref:f u_pitch,u_roll,u_yaw:i yaw_u_I:f
+    u_pitch_planif,u_roll_planif,u_yaw_planif:i u_gaz_planif:f current_motor_ma:4H altitude_prop,altitude_der:f
+10 altitude altitude_vision_mm:i altitude_vz:f altitude_ref_mm,altitude_raw_mm:i obs_accZ,obs_alt:f obs_x:3f
+    obs_state:I est_vb:2f est_state:I
+11 vision_raw vision_tx_raw,vision_ty_raw,vision_tz_raw:f
+12 vision_of of_dx:5f of_dy:5f
+13 vision vision_state:I vision_misc:i vision_phi_trim,vision_phi_ref_prop,vision_theta_trim,vision_theta_ref_prop:f
+    new_raw_picture:i theta_capture,phi_capture,psi_capture:f altitude_capture:i time_capture:I body_v:3f
+    delta_phi,delta_theta,delta_psi:f gold_defined,gold_reset:I gold_x,gold_y:f
+14 vision_perf time_szo,time_corners,time_compute,time_tracking,time_trans,time_update:f time_custom:20f
+15 trackers_send locked:30i point:60i
+16 vision_detect nb_detected:I type:4I xc:4I yc:4I width:4I height:4I dist_cm:4I orientation_angle_deg:4f rotation:36f
+    translation:12f camera_source:4I
+17 watchdog watchdog:i
+18 adc_data_frame version:I data_frame:32B
+19 video_stream quant:B frame_size,frame_number,atcmd_ref_seq,atcmd_mean_ref_gap_ms:I atcmd_var_ref_gap:f
+    atcmd_ref_quality,out_bitrate,desired_bitrate:I data:5i tcp_queue_level,fifo_queue_level:I
+20 games double_tap_counter,finish_line_counter:I
+21 pressure_raw up:i ut:h temperature_ddegc,pressure_pa:i
+22 magneto mx,my,mz:h magneto_raw_mg:3f magneto_rectified:3f magneto_offset:3f
+    heading_unwrapped_deg,heading_gyro_unwrapped_deg,heading_fusion_unwrapped_deg:f magneto_calibration_ok:B
+    magneto_state:I magneto_radius,error_mean,error_var:f
+23 wind_speed wind_speed_m_s,wind_angle_rad,wind_compensation_theta,wind_compensation_phi:f state_x:6f magneto_debug:3f
+24 kalman_pressure offset_pressure,est_z_mm,est_zdot_mm_s,est_bias_PWM,est_biais_pression,offset_US,prediction_US:f
+    cov_alt,cov_PWM,cov_vitesse:f bool_effet_sol:I somme_inno:f flag_rejet_US:I u_multisinus,gaz_altitude:f
+    flag_multisinus,flag_multisinus_debut:I
+25 hdvideo_stream hdvideo_state,storage_fifo_nb_packets,storage_fifo_size,usbkey_size_kb,usbkey_freespace_kb:I
+    frame_number,usbkey_remaining_time_s:I
+26 wifi link_quality:I
+{GPS_TAG} gps latitude_deg,longitude_deg,elevation_m,hdop:d data_available,zero_validated,wpt_validated:i
+    lat0_deg,lon0_deg,lat_fused_deg,lon_fused_deg:d gps_state:I X_traj,X_ref,Y_traj,Y_ref:f
+    theta_p,phi_p,theta_i,phi_i,theta_d,phi_d:f vdop,pdop:d speed_m_s:f last_frame_time:I
+    degree,degree_mag,ehpe_m,ehve_m_s,c_n0:f satellites:I channels:24B plugged:i ephemeris:I vx_traj,vy_traj:f
+    firmware_status:I
+28 camera_settings temperature:h
+29 host flag:i gaz,yaw,phi,theta,magneto_psi,magneto_psi_accuracy:f
+{CHECKSUM_TAG} cks value:I
+"""
+
+
+class OptionLayout(WireLayout):
+    """The layout of an option; `make` makes the NamedTuple of its fields.
+
+    Attributes:
+        size: bytes, tag and size included.
+    """
+
+    def __init__(self, entry: Entry) -> None:
+        super().__init__(entry.fields)
+        self.tag, self.name = entry.number, entry.name
+        self.size = HEADER.size + self.codec.size
+        self.make: Callable[..., Any] = namedtuple(entry.name, [field.name for field in entry.fields])
+
+    def zeros(self) -> Any:
+        """Return the option with all numbers zero."""
+        return self.option(self.codec.unpack(bytes(self.codec.size)))
+
+    def option(self, numbers: Sequence[Any]) -> Any:
+        """Return the option of the numbers on the wire."""
+        return self.make(*self.nested(numbers))
+
+
+LAYOUTS = {entry.number: OptionLayout(entry) for entry in read_table(_TABLE)}
+"""By tag."""
+TAG_OF = {layout.name: tag for tag, layout in LAYOUTS.items()}
+FULL_TAGS = tuple(tag for tag in LAYOUTS if tag < GPS_TAG)
+"""The options of a packet of all options: 1904 bytes. The GPS is sent only on request, because readers differ in what
+its tag means."""
+
+
+StateBit = IntFlag(
+    "StateBit",
+    "FLYING VIDEO VISION ANGULAR_SPEED_CONTROL ALTITUDE_CONTROL USER_FEEDBACK COMMAND_ACK CAMERA_READY "
+    "TRAVELLING USB_READY NAVDATA_DEMO NAVDATA_BOOTSTRAP MOTORS_FAULT COM_LOST SOFTWARE_FAULT BATTERY_LOW "
+    "USER_EMERGENCY TIMER_ELAPSED MAGNETO_NEEDS_CALIBRATION ANGLES_OUT_OF_RANGE TOO_MUCH_WIND "
+    "ULTRASOUND_DEAF CUTOUT PIC_VERSION_OK AT_THREAD NAVDATA_THREAD VIDEO_THREAD ACQUISITION_THREAD "
+    "CONTROL_WATCHDOG ADC_WATCHDOG COM_WATCHDOG EMERGENCY",
+)
+"""The state word of a packet (ARDroneLib, config.h)."""
+
+
+ControlState = IntEnum(
+    "ControlState",
+    "DEFAULT INIT LANDED FLYING HOVERING TEST TAKING_OFF GO_TO_FIX LANDING LOOPING",
+    start=0,
+)
+"""The upper half of demo's ctrl_state (ARDroneLib, control_states.h)."""
+
+
+class Hovering(IntEnum):
+    """The lower half of ctrl_state while it hovers, as far as it is used (control_states.h)."""
+
+    OK = 0
+    LOST_COM = 8
+    MAGNETO_CALIBRATION = 12
+
+
+class NavdataError(ValueError):
+    """A datagram is no navdata; the text says why."""
+
+
+class Navdata(NamedTuple):
+    """A packet.
+
+    Attributes:
+        vision: whether the camera defines a frame.
+        options: by tag, each a NamedTuple of its fields.
+        unknown: options that are not in the table, or have another size there, by tag.
+    """
+
+    state: StateBit
+    sequence: int
+    vision: int
+    options: dict[int, Any]
+    unknown: dict[int, bytes]
+
+    @property
+    def bootstrap(self) -> bool:
+        return StateBit.NAVDATA_BOOTSTRAP in self.state
+
+
+def checksum(packet: bytes | bytearray | memoryview) -> int:
+    """Return the sum of all bytes before the checksum option."""
+    return int(np.frombuffer(packet, np.uint8).sum(dtype=np.uint64)) % _MOST
+
+
+def pack(state: int, sequence: int, vision: int, options: Iterable[tuple[int, Iterable[Any]]] = ()) -> bytes:
+    """Return a packet.
+
+    Args:
+        state: bits.
+        sequence: from 1 on.
+        vision: flag of the header.
+        options: tag and values of each, in the order of the wire.
+
+    Raises:
+        struct.error: a value is out of the range of its field.
+    """
+    parts = [_START.pack(MAGIC, state, sequence, vision)]
+    for tag, values in options:
+        layout = LAYOUTS[tag]
+        parts += [HEADER.pack(tag, layout.size), layout.codec.pack(*layout.flat(values))]
+    body = b"".join(parts)
+    return body + _SUM.pack(CHECKSUM_TAG, _SUM.size, checksum(body))
+
+
+def unpack(datagram: bytes) -> Navdata:
+    """Return a packet.
+
+    Raises:
+        NavdataError: it is none, or its checksum is wrong.
+    """
+    if len(datagram) < _START.size + _SUM.size:
+        raise NavdataError(f"has {len(datagram)} bytes; must have at least {_START.size + _SUM.size}")
+    magic, state, sequence, vision = _START.unpack_from(datagram)
+    if magic not in MAGICS:
+        raise NavdataError(f"begins with 0x{magic:08x}; must be one of {', '.join(f'0x{each:08x}' for each in MAGICS)}")
+    options: dict[int, Any] = {}
+    unknown: dict[int, bytes] = {}
+    at = _START.size
+    while True:
+        tag, size = _option_header(datagram, at)
+        if tag == CHECKSUM_TAG:
+            if size != _SUM.size:
+                raise NavdataError(f"the checksum's size is {size}; must be {_SUM.size}")
+            found, expected = _SUM.unpack_from(datagram, at)[2], checksum(datagram[:at])
+            if found != expected:
+                raise NavdataError(f"the checksum is {found}; must be {expected}")
+            return Navdata(StateBit(state), sequence, vision, options, unknown)
+        layout = LAYOUTS.get(tag)
+        if layout is not None and layout.size == size:
+            options[tag] = layout.option(layout.codec.unpack_from(datagram, at + HEADER.size))
+        else:
+            unknown[tag] = datagram[at + HEADER.size : at + size]
+        at += size
+
+
+def _option_header(datagram: bytes, at: int) -> tuple[int, int]:
+    if at + HEADER.size > len(datagram):
+        raise NavdataError("has no checksum")
+    tag, size = HEADER.unpack_from(datagram, at)
+    if size < HEADER.size or at + size > len(datagram):
+        raise NavdataError(f"option {tag} at byte {at} has the size {size}, beyond the packet's {len(datagram)} bytes")
+    return tag, size
+
+
+class NavdataTemplate:
+    """A packet that is made once and filled anew for each sending; options keep their values until then.
+
+    Args:
+        tags: of its options, in the order of the wire.
+    """
+
+    def __init__(self, tags: Sequence[int]) -> None:
+        self.tags = tuple(tags)
+        self._packet = bytearray(pack(0, 0, 0, ((tag, LAYOUTS[tag].zeros()) for tag in tags)))
+        self._end = len(self._packet) - _SUM.size
+        self._body = np.frombuffer(self._packet, np.uint8)[: self._end]
+        self._places: dict[int, int] = {}
+        at = _START.size
+        for tag in tags:
+            self._places[tag] = at + HEADER.size
+            at += LAYOUTS[tag].size
+
+    def filler(self, tag: int) -> Callable[..., None]:
+        """Return what writes the flat numbers of an option; it does nothing for one that the packet does not have."""
+        at, packet = self._places.get(tag), self._packet
+        if at is None:
+            return lambda *_: None
+        pack_into = LAYOUTS[tag].codec.pack_into
+        return lambda *numbers: pack_into(packet, at, *numbers)
+
+    def packet(self, state: int, sequence: int, vision: int) -> bytes:
+        """Return the packet with its header and its checksum."""
+        _START.pack_into(self._packet, 0, MAGIC, state, sequence, vision)
+        total = int(self._body.sum(dtype=np.uint64)) % _MOST
+        _SUM.pack_into(self._packet, self._end, CHECKSUM_TAG, _SUM.size, total)
+        return bytes(self._packet)

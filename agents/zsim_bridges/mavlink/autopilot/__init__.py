@@ -1,1 +1,0 @@
-"""What an autopilot is to its clients: enumerations, axes, modes, parameters, and the state of its vehicle. Pure."""

@@ -1,0 +1,575 @@
+"""The session with one MAVLink vehicle: its telemetry is requested, followed and read, and it does what is demanded.
+
+Pure. Sources: https://mavlink.io/en/services/ (heartbeat, command, timesync, message intervals); PX4
+px4_custom_mode.h; ArduPilot Copter mode.h; https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+from zsim.contract.flight_messages import DroneState
+from zsim.contract.messages import Info
+from zsim.math.frames import geodetic_to_enu, heading
+from zsim.math.rotation import LEVEL, Vector
+from zsim.scenario.scenario import Scenario
+from zsim.schema.quantities import G_M_S2
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.dialect import LAYOUTS, UINT16_UNKNOWN, attitude_ned, frd, ned
+from zsim_bridges.mavlink.enums import (
+    FORCE,
+    TYPE_ONBOARD_CONTROLLER,
+    Autopilot,
+    BaseMode,
+    Cmd,
+    LandedState,
+    MavFrame,
+    Result,
+    SystemStatus,
+    TypeMask,
+)
+from zsim_bridges.mavlink.frame import Link, Parser, Received, Signing
+from zsim_bridges.mavlink.personality import COPTER_MODES, PX4_MODES, FlightMode
+from zsim_bridges.vehicle_links.aircraft_readings import STILL, AircraftPose, AircraftReadings, ClockOffset
+from zsim_bridges.vehicle_links.driver_options import DriverOptions
+from zsim_bridges.vehicle_links.vehicle_session import (
+    Action,
+    AircraftState,
+    Demand,
+    LinkFigures,
+    UdpChannel,
+    VehicleSession,
+)
+
+SYSTEM, COMPONENT = 245, 191  # of this driver; MAV_COMP_ID_ONBOARD_COMPUTER
+HEARTBEAT_NS = 1_000_000_000  # https://mavlink.io/en/services/heartbeat.html
+TIMESYNC_NS = 500_000_000  # chosen: ten round trips in the window of a clock's offset
+REQUEST_NS = 3_000_000_000  # chosen: after which a missing stream is requested again
+STRANGERS_MAX = 256  # other systems that are reported, each once
+CLIMBED = 0.85  # chosen: of the height of a take-off, from which on it counts as up
+REPEAT_NS = 1_000_000_000  # chosen: an autopilot answers a command within some 0.1 s
+KILL_REPEAT_NS = 200_000_000  # chosen: the one command that must not be lost
+SETPOINT_NS = 40_000_000  # 25 Hz: PX4 takes 2 Hz for silence
+CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller commands once
+STREAMED_NS = 600_000_000  # PX4 wants more than 0.5 s of setpoints before OFFBOARD
+VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
+HERE = (0.0, 0.0, 0.0, math.nan, math.nan, math.nan)  # the first parameters of NAV_LAND and NAV_TAKEOFF: no place
+_RATES_HZ: dict[type, float] = {
+    dialect.AttitudeQuaternion: 50,
+    dialect.LocalPositionNed: 50,
+    dialect.GpsRawInt: 5,
+    dialect.GlobalPositionInt: 5,
+    dialect.OpticalFlow: 15,
+    dialect.DistanceSensor: 25,
+    dialect.ExtendedSysState: 10,
+    dialect.SysStatus: 1,
+}
+ACCEL_GYRO, MAG, PRESSURE = 0x003F, 0x01C0, 0x0200  # HIGHRES_IMU_UPDATED_FLAGS
+DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
+FLOW_NS = 66_000_000  # 15 Hz, the rate of the AR.Drone's own: between two velocities while no flow is measured
+FLOW_LOST_NS = 1_000_000_000  # chosen: then the estimated velocity replaces the flow
+UT_PER_GAUSS, PA_PER_HPA = 100.0, 100.0
+DOP_M = 2.0  # m for a dilution of 1, usual for a single frequency
+
+
+class ExternalControl(NamedTuple):
+    """An autopilot whose velocity is controlled from outside: the mode for that, and what leads to it.
+
+    Attributes:
+        custom_mode: as its heartbeats show it.
+        parameters: of DO_SET_MODE that leads there, from the second on.
+        takes_off: whether it takes off in this mode; else in a mode of its own.
+        own: further modes while nobody but this driver has control: it may be led back from them.
+        landing: in which it lands, be it for this driver, its pilot, or its own failsafe.
+        rates_hz: of the messages that are requested.
+    """
+
+    custom_mode: int
+    parameters: tuple[float, ...]
+    takes_off: bool
+    own: tuple[int, ...]
+    landing: int
+    rates_hz: dict[type, float]
+
+
+CONTROL = {
+    Autopilot.PX4: ExternalControl(
+        PX4_MODES[FlightMode.OFFBOARD],
+        (6, 0),
+        takes_off=False,
+        own=(PX4_MODES[FlightMode.TAKEOFF], PX4_MODES[FlightMode.HOLD]),  # it holds also when setpoints stay away
+        landing=PX4_MODES[FlightMode.LAND],
+        rates_hz={**_RATES_HZ, dialect.HighresImu: 200.0},
+    ),
+    Autopilot.ARDUPILOTMEGA: ExternalControl(  # it has no HIGHRES_IMU
+        COPTER_MODES[FlightMode.OFFBOARD],
+        (4,),
+        takes_off=True,
+        own=(),
+        landing=COPTER_MODES[FlightMode.LAND],
+        rates_hz={**_RATES_HZ, dialect.ScaledImu: 200.0, dialect.ScaledPressure: 25.0},
+    ),
+}
+
+
+class AutopilotSession(VehicleSession):
+    """The session with one vehicle.
+
+    Args:
+        channel: its UDP port.
+        origin: of W: latitude, longitude [deg], height [m].
+        takeoff_height_m: over the ground.
+        system: its system id; 0 for the first autopilot that shows itself.
+        local_origin_m: origin of its local frame [m; W]; None for what it reports.
+        key: of signatures, both ways; None for none.
+        unix_s: wall time since 1970, which signatures carry.
+    """
+
+    def __init__(
+        self,
+        channel: UdpChannel,
+        origin: tuple[float, float, float],
+        takeoff_height_m: float,
+        system: int = 0,
+        local_origin_m: Vector | None = None,
+        key: bytes | None = None,
+        unix_s: Callable[[], float] = time.time,
+    ) -> None:
+        self._telemetry = TelemetryReadings(origin, local_origin_m)
+        super().__init__((channel,), self._telemetry, modulus=256)
+        self._system = system
+        self._takeoff_height_m = takeoff_height_m
+        self._sequence = DemandSequence(takeoff_height_m)
+        self._signing = Signing(key) if key else None
+        self._unix_s = unix_s
+        self._link, self._parser = Link(SYSTEM, COMPONENT, self._signing), Parser(self._signing)
+        self._autopilot: AutopilotState | None = None
+        self._newest_ns: dict[type, int] = {}
+        self._requested_ns: dict[type, int] = {}
+        self._heartbeat_ns = self._timesync_ns = -HEARTBEAT_NS
+        self._strangers: set[tuple[int, int]] = set()
+        self._ground_m: float | None = None
+        self._action: Action = "none"
+        self._taken_over = False
+        self._answers: list[Any] = []
+
+    @classmethod
+    def of_run(
+        cls,
+        info: Info,
+        scenario: Scenario,
+        options: DriverOptions,
+        channel: UdpChannel,
+        system: int = 0,
+        key: bytes | None = None,
+    ) -> "AutopilotSession":
+        """Return the session of a driver in a run."""
+        origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
+        height_m = scenario.drone(options.drone).takeoff_height_m
+        return cls(channel, origin, height_m, system, options.origin_m, key)
+
+    # From the vehicle
+
+    def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
+        """Take a datagram of the vehicle."""
+        for received in self._parser.feed(datagram):
+            if self._is_vehicle(received):
+                self._loss.add(received.seq)
+                self._received_ns = now_ns
+                self._newest_ns[type(received.message)] = now_ns
+                self._take(received.message, now_ns)
+
+    def _is_vehicle(self, received: Received) -> bool:
+        """Return whether a message is of the vehicle; the first heartbeat of an autopilot decides which one that is."""
+        message: Any = received.message
+        address = received.system_id, received.component_id
+        if self._autopilot is not None and address == self._autopilot.address:
+            return True
+        wanted = self._autopilot is None and self._system in (0, received.system_id)
+        if wanted and isinstance(message, dialect.Heartbeat) and message.autopilot in CONTROL:
+            self._autopilot = AutopilotState(address, CONTROL[message.autopilot])
+            return True
+        system = self._autopilot.address[0] if self._autopilot else self._system
+        if system not in (0, received.system_id):
+            self._refused += 1
+            if address not in self._strangers and len(self._strangers) < STRANGERS_MAX:
+                self._strangers.add(address)
+                self.texts.append(f"messages of system {address[0]}, component {address[1]}, are not read")
+        return False
+
+    def _take(self, message: Any, now_ns: int) -> None:
+        assert self._autopilot is not None
+        match message:
+            case dialect.Timesync(tc1=0):
+                self._answers = [dialect.Timesync(tc1=now_ns, ts1=message.ts1)]
+            case dialect.Timesync():
+                if 0 <= now_ns - message.ts1 < HEARTBEAT_NS:
+                    self._telemetry.add_round_trip(now_ns - message.ts1, now_ns)
+            case dialect.Statustext():
+                self.texts.append(f"the vehicle reports: {message.text}")
+            case dialect.CommandAck() if message.result not in (Result.ACCEPTED, Result.IN_PROGRESS):
+                self.texts.append(f"the vehicle answers command {message.command} with MAV_RESULT {message.result}")
+            case _:
+                self._autopilot.receive(message)
+                self._telemetry.receive(message, now_ns)
+                self._report_mode(self._autopilot)
+
+    def _report_mode(self, autopilot: "AutopilotState") -> None:
+        """Print when somebody else takes the vehicle over in the air, and when it is given back."""
+        taken_over = autopilot.is_taken_over(self._action == "land")
+        if taken_over != self._taken_over:
+            self._taken_over = taken_over
+            what = "somebody else has control" if taken_over else "it is given back"
+            self.texts.append(f"{what} (mode {autopilot.custom_mode:#x})")
+
+    # To the vehicle
+
+    def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
+        """Yield the datagrams that are due."""
+        self._action = demand.action
+        for message in self._messages(now_ns, demand):
+            yield 0, self._link.pack(message)
+
+    def _messages(self, now_ns: int, demand: Demand) -> Iterator[Any]:
+        yield from self._answers
+        self._answers = []
+        if now_ns - self._heartbeat_ns >= HEARTBEAT_NS:
+            self._heartbeat_ns = now_ns
+            if self._signing:
+                self._signing.advance(self._unix_s())
+            yield dialect.Heartbeat(TYPE_ONBOARD_CONTROLLER, Autopilot.INVALID, 0, 0, SystemStatus.ACTIVE, 3)
+        autopilot = self._autopilot
+        if autopilot is None:
+            return
+        if now_ns - self._timesync_ns >= TIMESYNC_NS:
+            self._timesync_ns = now_ns
+            yield dialect.Timesync(tc1=0, ts1=now_ns)
+        for kind, rate_hz in autopilot.control.rates_hz.items():
+            if now_ns - max(self._newest_ns.get(kind, 0), self._requested_ns.get(kind, 0)) > REQUEST_NS:
+                self._requested_ns[kind] = now_ns
+                yield autopilot.command(Cmd.SET_MESSAGE_INTERVAL, LAYOUTS[kind].id, 1e6 / rate_hz)
+        kind = dialect.GpsGlobalOrigin
+        if not self._telemetry.has_origin and now_ns - self._requested_ns.get(kind, 0) > REQUEST_NS:
+            self._requested_ns[kind] = now_ns
+            yield autopilot.command(Cmd.REQUEST_MESSAGE, LAYOUTS[kind].id)
+        yield from self._sequence.advance(now_ns, demand, autopilot)
+
+    # What is known
+
+    @property
+    def state(self) -> AircraftState:
+        if self._autopilot is None:
+            return AircraftState(received_ns=self._received_ns)
+        state = self._autopilot.state(self._action == "fly", self._has_climbed(self._autopilot))
+        return AircraftState(state, self._telemetry.battery_percent, self._telemetry.pose, self._received_ns)
+
+    def _has_climbed(self, autopilot: "AutopilotState") -> bool:
+        """Return whether the vehicle has reached the height of its take-off since it last stood on the ground."""
+        pose = self._telemetry.pose
+        if pose is None:
+            return False
+        height_m = pose.position_m[2]
+        if not autopilot.armed:
+            self._ground_m = height_m
+        if self._ground_m is None:
+            return True  # it was in the air when this driver began
+        if height_m - self._ground_m >= CLIMBED * self._takeoff_height_m:
+            self._ground_m = None
+        return self._ground_m is None
+
+    def figures(self, now_ns: int) -> LinkFigures:
+        figures = super().figures(now_ns)
+        return figures._replace(refused=figures.refused + sum(self._parser.refused.values()))
+
+
+class AutopilotState:
+    """What an autopilot tells of its flight.
+
+    Attributes:
+        address: its system and component.
+        control: how it is controlled.
+        armed, custom_mode: by its last heartbeat.
+        landed: its MAV_LANDED_STATE.
+        sea_height_m: over the sea, by its GPS.
+    """
+
+    def __init__(self, address: tuple[int, int], control: ExternalControl) -> None:
+        self.address = address
+        self.control = control
+        self.armed = False
+        self.custom_mode = 0
+        self.landed: int = LandedState.UNDEFINED
+        self.sea_height_m = 0.0
+        self._terminated = False
+
+    def receive(self, message: Any) -> None:
+        """Take a message."""
+        match message:
+            case dialect.Heartbeat():
+                self.armed = bool(message.base_mode & BaseMode.ARMED)
+                self.custom_mode = message.custom_mode
+                self._terminated = message.system_status == SystemStatus.TERMINATED
+            case dialect.ExtendedSysState():
+                self.landed = message.landed_state
+            case dialect.GlobalPositionInt():
+                self.sea_height_m = message.alt / 1e3
+
+    def is_taken_over(self, lands: bool) -> bool:
+        """Return whether somebody else, first of all its pilot, has chosen its mode in the air.
+
+        Args:
+            lands: whether this driver lands it.
+        """
+        control, mode = self.control, self.custom_mode
+        own = mode in (control.custom_mode, *control.own) or (lands and mode == control.landing)
+        return self.armed and self.landed in (LandedState.IN_AIR, LandedState.LANDING) and not own
+
+    @property
+    def is_controlled(self) -> bool:
+        """Whether it is in the mode in which it is controlled from outside."""
+        return self.custom_mode == self.control.custom_mode
+
+    def command(self, number: int, *parameters: float) -> dialect.CommandLong:
+        """Return a command to it, with its parameters from the first on."""
+        return dialect.CommandLong(*self.address, number, 0, *parameters)
+
+    def state(self, flies: bool, climbed: bool) -> DroneState:
+        """Return its state as the contract names it.
+
+        Args:
+            flies: whether it has a setpoint to fly.
+            climbed: whether it has reached the height of its take-off.
+        """
+        if self._terminated:
+            return "emergency"
+        if not self.armed or self.landed in (LandedState.UNDEFINED, LandedState.ON_GROUND):
+            return "landed"
+        if self.landed == LandedState.LANDING:
+            return "landing"
+        if self.landed == LandedState.TAKEOFF or not climbed:
+            return "taking_off"
+        return "flying" if flies else "hovering"
+
+
+class DemandSequence:
+    """The commands and setpoints by which one autopilot does what is demanded.
+
+    Commands are repeated until the telemetry shows their effect; setpoints are sent at once when they change, and
+    repeated while they hold.
+
+    Args:
+        takeoff_height_m: over the ground.
+    """
+
+    def __init__(self, takeoff_height_m: float) -> None:
+        self._takeoff_height_m = takeoff_height_m
+        self._action = "none"
+        self._commanded_ns: dict[str, int] = {}
+        self._setpoint: Demand | None = None
+        self._setpoint_ns = self._stream_ns = 0
+
+    def advance(self, now_ns: int, demand: Demand, autopilot: AutopilotState) -> Iterator[Any]:
+        """Yield the messages that are due."""
+        if demand.action != self._action:
+            self._action = demand.action
+            self._commanded_ns.clear()
+        match demand.action:
+            case "hold" | "fly" | "land" if autopilot.is_taken_over(demand.action == "land"):
+                return
+            case "take_off":
+                yield from self._take_off(now_ns, autopilot)
+            case "hold" | "fly":
+                yield from self._fly(now_ns, demand, autopilot)
+            case "land" if autopilot.landed not in (LandedState.LANDING, LandedState.ON_GROUND):
+                yield from self._repeat("land", now_ns, autopilot.command(Cmd.NAV_LAND, *HERE, 0.0))
+            case "kill":
+                kill = autopilot.command(Cmd.COMPONENT_ARM_DISARM, 0, FORCE)
+                yield from self._repeat("kill", now_ns, kill, KILL_REPEAT_NS if autopilot.armed else REPEAT_NS)
+
+    def _take_off(self, now_ns: int, autopilot: AutopilotState) -> Iterator[Any]:
+        """Yield the next command: the mode, if it takes off in that, arm, take off."""
+        takes_off = autopilot.control.takes_off
+        if takes_off and not autopilot.is_controlled:
+            yield from self._enter_mode(now_ns, autopilot)
+        elif not autopilot.armed:
+            yield from self._repeat("arm", now_ns, autopilot.command(Cmd.COMPONENT_ARM_DISARM, 1))
+        elif autopilot.landed == LandedState.ON_GROUND:
+            # ArduPilot's height is over home, PX4's over the sea.
+            height_m = (0.0 if takes_off else autopilot.sea_height_m) + self._takeoff_height_m
+            yield from self._repeat("take off", now_ns, autopilot.command(Cmd.NAV_TAKEOFF, *HERE, height_m))
+
+    def _fly(self, now_ns: int, demand: Demand, autopilot: AutopilotState) -> Iterator[Any]:
+        """Yield a setpoint, and the command for the mode in which it is obeyed."""
+        age_ns = now_ns - self._setpoint_ns
+        if age_ns > STREAMED_NS:
+            self._stream_ns = now_ns
+        if age_ns >= (CHANGED_NS if demand != self._setpoint else SETPOINT_NS):
+            self._setpoint, self._setpoint_ns = demand, now_ns
+            yield setpoint(demand, autopilot)
+        streamed = now_ns - self._stream_ns >= STREAMED_NS
+        if streamed and autopilot.landed == LandedState.IN_AIR and not autopilot.is_controlled:
+            yield from self._enter_mode(now_ns, autopilot)
+
+    def _enter_mode(self, now_ns: int, autopilot: AutopilotState) -> Iterator[Any]:
+        enter = autopilot.command(Cmd.DO_SET_MODE, BaseMode.CUSTOM, *autopilot.control.parameters)
+        return self._repeat("mode", now_ns, enter)
+
+    def _repeat(self, name: str, now_ns: int, message: Any, period_ns: int = REPEAT_NS) -> Iterator[Any]:
+        if now_ns - self._commanded_ns.get(name, -REPEAT_NS) >= period_ns:
+            self._commanded_ns[name] = now_ns
+            yield message
+
+
+def setpoint(demand: Demand, autopilot: AutopilotState) -> dialect.SetPositionTargetLocalNed:
+    """Return the setpoint of a velocity and a yaw rate; zero, unless the demand is to fly."""
+    flies = demand.action == "fly"
+    vx, vy, vz = ned(demand.velocity_m_s if flies else STILL)
+    system, component = autopilot.address
+    return dialect.SetPositionTargetLocalNed(
+        target_system=system,
+        target_component=component,
+        coordinate_frame=MavFrame.LOCAL_NED,
+        type_mask=VELOCITY_AND_YAW_RATE,
+        vx=vx,
+        vy=vy,
+        vz=vz,
+        yaw_rate=-demand.yaw_rate_rad_s if flies else 0.0,
+    )
+
+
+class TelemetryReadings(AircraftReadings):
+    """What one vehicle tells of itself.
+
+    Args:
+        origin: of W: latitude, longitude [deg], height [m].
+        local_origin_m: origin of its local frame [m; W]; None for what its GPS_GLOBAL_ORIGIN says, or that of W.
+
+    Attributes:
+        battery_percent: of its charge.
+        clock, unix_clock: of messages stamped with the time since its start, and with the time since 1970.
+        has_origin: whether the origin of its local frame is known.
+    """
+
+    def __init__(self, origin: tuple[float, float, float], local_origin_m: Vector | None = None) -> None:
+        super().__init__(origin)
+        self._local_origin_m = local_origin_m or (0.0, 0.0, 0.0)
+        self.has_origin = local_origin_m is not None
+        self.battery_percent = 0.0
+        self.unix_clock = ClockOffset()
+        self._q_WB, self._w_WB_B = LEVEL, STILL
+        self._flow_ns = self._measured_flow_ns = -FLOW_LOST_NS
+        self._pressure_pa = 0.0
+        self._handlers = {
+            dialect.AttitudeQuaternion: self._on_attitude,
+            dialect.LocalPositionNed: self._on_position,
+            dialect.HighresImu: self._on_imu,
+            dialect.ScaledImu: self._on_scaled_imu,
+            dialect.ScaledPressure: self._on_pressure,
+            dialect.GpsRawInt: self._on_gps,
+            dialect.GpsGlobalOrigin: self._on_origin,
+            dialect.OpticalFlow: self._on_flow,
+            dialect.DistanceSensor: self._on_distance,
+            dialect.SysStatus: self._on_system,
+        }
+
+    def add_round_trip(self, duration_ns: int, now_ns: int) -> None:
+        """Take how long a question for the vehicle's time took."""
+        self.clock.add_round_trip(duration_ns, now_ns)
+        self.unix_clock.add_round_trip(duration_ns, now_ns)
+
+    def receive(self, message: Any, now_ns: int) -> bool:
+        """Take a message that arrives now; return whether it is one that is read here, and finite."""
+        handler = self._handlers.get(type(message))
+        values = (getattr(message, name) for name in message.__struct_fields__)
+        if handler is None or not all(math.isfinite(value) for value in values if isinstance(value, float)):
+            return False
+        handler(message, now_ns)
+        return True
+
+    def _since_boot(self, m: Any, now_ns: int) -> int:
+        """Return when a message was made, by the clock of this process."""
+        return self.clock.taken_ns(m.time_boot_ms * 1_000_000, now_ns)
+
+    def _since_1970(self, m: Any, now_ns: int) -> int:
+        return self.unix_clock.taken_ns(m.time_usec * 1_000, now_ns)
+
+    # State
+
+    def _on_attitude(self, m: Any, now_ns: int) -> None:
+        q = attitude_ned((m.q1, m.q2, m.q3, m.q4))
+        length = math.hypot(*q)
+        if length > 0.5:  # else it is no attitude at all
+            w, x, y, z = (part / length for part in q)
+            self._q_WB, self._w_WB_B = (w, x, y, z), frd((m.rollspeed, m.pitchspeed, m.yawspeed))
+
+    def _on_position(self, m: Any, now_ns: int) -> None:
+        x, y, z = ned((m.x, m.y, m.z))
+        ox, oy, oz = self._local_origin_m
+        vx, vy, vz = velocity = ned((m.vx, m.vy, m.vz))
+        taken_ns = self._since_boot(m, now_ns)
+        self.pose = AircraftPose(taken_ns, (x + ox, y + oy, z + oz), velocity, self._q_WB, self._w_WB_B)
+        if taken_ns - max(self._measured_flow_ns + FLOW_LOST_NS, self._flow_ns + FLOW_NS) >= 0:
+            self._flow_ns = taken_ns
+            yaw = float(heading(self._q_WB))
+            forward, left = vx * math.cos(yaw) + vy * math.sin(yaw), vy * math.cos(yaw) - vx * math.sin(yaw)
+            self.read("flow", taken_ns, (forward, left, vz), 1.0)
+
+    def _on_origin(self, m: Any, now_ns: int) -> None:
+        if not self.has_origin:
+            x, y, z = geodetic_to_enu((m.latitude / 1e7, m.longitude / 1e7, m.altitude / 1e3), self._origin).tolist()
+            self._local_origin_m = (x, y, z)
+            self.has_origin = True
+
+    def _on_system(self, m: Any, now_ns: int) -> None:
+        if m.battery_remaining >= 0:  # -1: it does not know
+            self.battery_percent = float(min(100, m.battery_remaining))
+
+    # Sensors
+
+    def _on_imu(self, m: Any, now_ns: int) -> None:
+        taken_ns, updated = self._since_1970(m, now_ns), m.fields_updated
+        if updated & ACCEL_GYRO == ACCEL_GYRO:
+            self.read("imu", taken_ns, frd((m.xacc, m.yacc, m.zacc)), frd((m.xgyro, m.ygyro, m.zgyro)))
+        if updated & MAG == MAG:
+            self._read_field(taken_ns, UT_PER_GAUSS, m)
+        if updated & PRESSURE:
+            self._read_new_pressure(taken_ns, PA_PER_HPA * m.abs_pressure)
+
+    def _on_scaled_imu(self, m: Any, now_ns: int) -> None:
+        """Take what ArduPilot sends: mg, mrad/s, mgauss."""
+        taken_ns, g = self._since_boot(m, now_ns), G_M_S2 / 1e3
+        accel, gyro = (g * m.xacc, g * m.yacc, g * m.zacc), (m.xgyro / 1e3, m.ygyro / 1e3, m.zgyro / 1e3)
+        self.read("imu", taken_ns, frd(accel), frd(gyro))
+        if m.xmag or m.ymag or m.zmag:
+            self._read_field(taken_ns, UT_PER_GAUSS / 1e3, m)
+
+    def _read_field(self, taken_ns: int, unit_ut: float, m: Any) -> None:
+        self.read("mag", taken_ns, frd((unit_ut * m.xmag, unit_ut * m.ymag, unit_ut * m.zmag)))
+
+    def _on_pressure(self, m: Any, now_ns: int) -> None:
+        self._read_new_pressure(self._since_boot(m, now_ns), PA_PER_HPA * m.press_abs)
+
+    def _read_new_pressure(self, taken_ns: int, pressure_pa: float) -> None:
+        if pressure_pa != self._pressure_pa:
+            self._pressure_pa = pressure_pa
+            self.read_pressure(taken_ns, pressure_pa, self.pose.position_m[2] if self.pose else 0.0)
+
+    def _on_gps(self, m: Any, now_ns: int) -> None:
+        place = m.lat / 1e7, m.lon / 1e7, (m.alt_ellipsoid or m.alt) / 1e3
+        if (place, m.time_usec) == self._fix:
+            return
+        self._fix = place, m.time_usec
+        sigma_m = m.h_acc / 1e3 or (DOP_M * m.eph / 100.0 if m.eph != UINT16_UNKNOWN else 0.0)
+        course = math.radians(m.cog / 100.0)
+        values = self.gps_values(place, m.vel / 100.0, course, sigma_m, min(m.fix_type, 3), m.satellites_visible)
+        self.read("gps", self._since_1970(m, now_ns), *values)
+
+    def _on_flow(self, m: Any, now_ns: int) -> None:
+        taken_ns = self._measured_flow_ns = self._since_1970(m, now_ns)
+        self.read("flow", taken_ns, (m.flow_comp_m_x, -m.flow_comp_m_y, self.climb_m_s), m.quality / 255.0)
+
+    def _on_distance(self, m: Any, now_ns: int) -> None:
+        if m.orientation == DOWNWARD:
+            valid = m.min_distance <= m.current_distance <= m.max_distance
+            self.read("sonar", self._since_boot(m, now_ns), m.current_distance / 100.0, valid)

@@ -1,0 +1,293 @@
+"""MAVLink's messages, of the dialects common and ardupilotmega, as far as vehicles and their clients use them.
+
+`dialect.Heartbeat(type=2)` is a HEARTBEAT, a record with the fields of its definition. The table has the form that
+`wire_table` describes, and the units of the definitions; a default is the definition's value for "not known". At the
+end are the conversions between axes: W is east, north, up and B forward, left, up; MAVLink's are north, east, down and
+forward, right, down.
+
+Sources: https://mavlink.io/en/messages/common.html and ardupilotmega.html for the definitions and frames;
+https://mavlink.io/en/guide/serialization.html for the order of the bytes, CRC_EXTRA and the checksum;
+https://mavlink.io/en/services/mission.html#mission_item_int for whole numbers.
+"""
+
+import math
+from binascii import crc_hqx
+from operator import attrgetter
+from struct import calcsize
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from zsim.math.rotation import Quaternion, Vector
+from zsim_bridges.vehicle_links.wire_table import Entry, WireLayout, read_table
+
+DEGREES, LOCAL_M = 1e-7, 1e-4  # unit of x and y in messages that have them as whole numbers
+INT32_UNKNOWN = 2**31 - 1  # INT32_MAX: NaN among whole numbers of 32 bits
+UINT16_UNKNOWN = 65535  # likewise of 16 bits
+_S = math.sqrt(0.5)
+_TARGET = "target_system,target_component:B"
+_GOAL = "vx,vy,vz:f[m/s] afx,afy,afz:f[m/s/s] yaw:f[rad] yaw_rate:f[rad/s]"
+_IMU = "xacc,yacc,zacc:h[mG] xgyro,ygyro,zgyro:h[mrad/s] xmag,ymag,zmag:h[mgauss]"
+_PLACE = "latitude,longitude:i[degE7] altitude:i[mm]"
+_HOME = f"{_PLACE} x,y,z:f[m] q:4f approach_x,approach_y,approach_z:f[m] | time_usec:Q[us]"
+_CHANNELS = [f"chan{i}_raw:H[us]" for i in range(1, 19)]
+_SERVOS = [f"servo{i}_raw:H[us]" for i in range(1, 17)]
+_PARAMS = "param1,param2,param3,param4:f"
+_ITEM = f"{_TARGET} seq:H frame:B command:H current,autocontinue:B {_PARAMS}"
+
+_TABLE = f"""
+# A system and its link: life, time, versions, texts, files, signing
+0 HEARTBEAT type,autopilot,base_mode:B custom_mode:I system_status,mavlink_version:B
+1 SYS_STATUS onboard_control_sensors_present,onboard_control_sensors_enabled,onboard_control_sensors_health:I
+    load:H[d%] voltage_battery:H[mV] current_battery:h[cA] battery_remaining:b[%] drop_rate_comm:H[c%]
+    errors_comm,errors_count1,errors_count2,errors_count3,errors_count4:H | onboard_control_sensors_present_extended:I
+    onboard_control_sensors_enabled_extended,onboard_control_sensors_health_extended:I
+2 SYSTEM_TIME time_unix_usec:Q[us] time_boot_ms:I[ms]
+4 PING time_usec:Q[us] seq:I {_TARGET}
+5 CHANGE_OPERATOR_CONTROL target_system,control_request,version:B passkey:25c
+109 RADIO_STATUS rssi,remrssi:B txbuf:B[%] noise,remnoise:B rxerrors,fixed:H
+110 FILE_TRANSFER_PROTOCOL target_network,{_TARGET} payload:251s
+111 TIMESYNC tc1,ts1:q[ns]
+117 LOG_REQUEST_LIST {_TARGET} start,end:H
+118 LOG_ENTRY id,num_logs,last_log_num:H time_utc:I[s] size:I[bytes]
+125 POWER_STATUS Vcc,Vservo:H[mV] flags:H
+147 BATTERY_STATUS id,battery_function,type:B temperature:h[cdegC]=32767 voltages:10H[mV]=65535 current_battery:h[cA]=-1
+    current_consumed:i[mAh]=-1 energy_consumed:i[hJ]=-1 battery_remaining:b[%]=-1
+    | time_remaining:i[s] charge_state:B voltages_ext:4H[mV] mode:B fault_bitmask:I
+148 AUTOPILOT_VERSION capabilities:Q flight_sw_version,middleware_sw_version,os_sw_version,board_version:I
+    flight_custom_version,middleware_custom_version,os_custom_version:8s vendor_id,product_id:H uid:Q | uid2:18s
+152 MEMINFO brkval:H freemem:H[bytes] | freemem32:I[bytes]
+183 AUTOPILOT_VERSION_REQUEST {_TARGET}
+245 EXTENDED_SYS_STATE vtol_state,landed_state:B
+253 STATUSTEXT severity:B text:50c | id:H chunk_seq:B
+256 SETUP_SIGNING {_TARGET} secret_key:32s initial_timestamp:Q
+
+# Commands, parameters, rates
+11 SET_MODE target_system,base_mode:B custom_mode:I
+20 PARAM_REQUEST_READ {_TARGET} param_id:16c param_index:h
+21 PARAM_REQUEST_LIST {_TARGET}
+22 PARAM_VALUE param_id:16c param_value:f param_type:B param_count,param_index:H
+23 PARAM_SET {_TARGET} param_id:16c param_value:f param_type:B
+66 REQUEST_DATA_STREAM {_TARGET} req_stream_id:B req_message_rate:H[Hz] start_stop:B
+67 DATA_STREAM stream_id:B message_rate:H[Hz] on_off:B
+75 COMMAND_INT {_TARGET} frame:B command:H current,autocontinue:B {_PARAMS} x,y:i z:f
+76 COMMAND_LONG {_TARGET} command:H confirmation:B {_PARAMS} param5,param6,param7:f
+77 COMMAND_ACK command:H result:B | progress:B result_param2:i {_TARGET}
+80 COMMAND_CANCEL {_TARGET} command:H
+244 MESSAGE_INTERVAL message_id:H interval_us:i[us]
+345 PARAM_ERROR {_TARGET} param_id:16c param_index:h error:B
+
+# Missions, geofences and rally points; x and y of an item are 1e-7 deg as whole numbers, 1e-4 m in local frames
+37 MISSION_REQUEST_PARTIAL_LIST {_TARGET} start_index,end_index:h | mission_type:B
+38 MISSION_WRITE_PARTIAL_LIST {_TARGET} start_index,end_index:h | mission_type:B
+39 MISSION_ITEM {_ITEM} x,y,z:f | mission_type:B
+40 MISSION_REQUEST {_TARGET} seq:H | mission_type:B
+41 MISSION_SET_CURRENT {_TARGET} seq:H
+42 MISSION_CURRENT seq:H | total:H mission_state,mission_mode:B
+43 MISSION_REQUEST_LIST {_TARGET} | mission_type:B
+44 MISSION_COUNT {_TARGET} count:H | mission_type:B
+45 MISSION_CLEAR_ALL {_TARGET} | mission_type:B
+46 MISSION_ITEM_REACHED seq:H
+47 MISSION_ACK {_TARGET} type:B | mission_type:B
+51 MISSION_REQUEST_INT {_TARGET} seq:H | mission_type:B
+73 MISSION_ITEM_INT {_ITEM} x,y:i z:f | mission_type:B
+
+# What steers a vehicle
+69 MANUAL_CONTROL target:B x,y,z,r:h buttons:H
+    | buttons2:H enabled_extensions:B s,t,aux1,aux2,aux3,aux4,aux5,aux6:h
+70 RC_CHANNELS_OVERRIDE {_TARGET} {" ".join(_CHANNELS[:8])} | {" ".join(_CHANNELS[8:])}
+82 SET_ATTITUDE_TARGET time_boot_ms:I[ms] {_TARGET} type_mask:B q:4f
+    body_roll_rate,body_pitch_rate,body_yaw_rate:f[rad/s] thrust:f
+84 SET_POSITION_TARGET_LOCAL_NED time_boot_ms:I[ms] {_TARGET} coordinate_frame:B type_mask:H x,y,z:f[m] {_GOAL}
+86 SET_POSITION_TARGET_GLOBAL_INT time_boot_ms:I[ms] {_TARGET} coordinate_frame:B type_mask:H
+    lat_int,lon_int:i[degE7] alt:f[m] {_GOAL}
+144 FOLLOW_TARGET timestamp:Q[ms] est_capabilities:B lat,lon:i[degE7] alt:f[m] vel:3f[m/s] acc:3f[m/s/s] attitude_q:4f
+    rates:3f position_cov:3f custom_state:Q
+
+# Places: origin, home, targets, fence, poses from outside
+48 SET_GPS_GLOBAL_ORIGIN target_system:B {_PLACE} | time_usec:Q[us]
+49 GPS_GLOBAL_ORIGIN {_PLACE} | time_usec:Q[us]
+62 NAV_CONTROLLER_OUTPUT nav_roll,nav_pitch:f[deg] nav_bearing,target_bearing:h[deg] wp_dist:H[m] alt_error:f[m]
+    aspd_error:f[m/s] xtrack_error:f[m]
+83 ATTITUDE_TARGET time_boot_ms:I[ms] type_mask:B q:4f body_roll_rate,body_pitch_rate,body_yaw_rate:f[rad/s] thrust:f
+85 POSITION_TARGET_LOCAL_NED time_boot_ms:I[ms] coordinate_frame:B type_mask:H x,y,z:f[m] {_GOAL}
+87 POSITION_TARGET_GLOBAL_INT time_boot_ms:I[ms] coordinate_frame:B type_mask:H
+    lat_int,lon_int:i[degE7] alt:f[m] {_GOAL}
+102 VISION_POSITION_ESTIMATE usec:Q[us] x,y,z:f[m] roll,pitch,yaw:f[rad] | covariance:21f reset_counter:B
+138 ATT_POS_MOCAP time_usec:Q[us] q:4f x,y,z:f[m] | covariance:21f
+149 LANDING_TARGET time_usec:Q[us] target_num,frame:B angle_x,angle_y:f[rad] distance:f[m] size_x,size_y:f[rad]
+    | x,y,z:f[m] q:4f type,position_valid:B
+162 FENCE_STATUS breach_status:B breach_count:H breach_type:B breach_time:I[ms] | breach_mitigation:B
+242 HOME_POSITION {_HOME}
+243 SET_HOME_POSITION target_system:B {_HOME}
+
+# Estimated state of a vehicle; attitudes are body to NED, w first
+30 ATTITUDE time_boot_ms:I[ms] roll,pitch,yaw:f[rad] rollspeed,pitchspeed,yawspeed:f[rad/s]
+31 ATTITUDE_QUATERNION time_boot_ms:I[ms] q1,q2,q3,q4:f rollspeed,pitchspeed,yawspeed:f[rad/s] | repr_offset_q:4f
+32 LOCAL_POSITION_NED time_boot_ms:I[ms] x,y,z:f[m] vx,vy,vz:f[m/s]
+33 GLOBAL_POSITION_INT time_boot_ms:I[ms] lat,lon:i[degE7] alt,relative_alt:i[mm] vx,vy,vz:h[cm/s] hdg:H[cdeg]
+74 VFR_HUD airspeed,groundspeed:f[m/s] heading:h[deg] throttle:H[%] alt:f[m] climb:f[m/s]
+141 ALTITUDE time_usec:Q[us]
+    altitude_monotonic,altitude_amsl,altitude_local,altitude_relative,altitude_terrain,bottom_clearance:f[m]
+178 AHRS2 roll,pitch,yaw:f[rad] altitude:f[m] lat,lng:i[degE7]
+193 EKF_STATUS_REPORT flags:H velocity_variance,pos_horiz_variance,pos_vert_variance,compass_variance:f
+    terrain_alt_variance:f | airspeed_variance:f
+230 ESTIMATOR_STATUS time_usec:Q[us] flags:H
+    vel_ratio,pos_horiz_ratio,pos_vert_ratio,mag_ratio,hagl_ratio,tas_ratio:f pos_horiz_accuracy,pos_vert_accuracy:f[m]
+331 ODOMETRY time_usec:Q[us] frame_id,child_frame_id:B x,y,z:f[m] q:4f vx,vy,vz:f[m/s]
+    rollspeed,pitchspeed,yawspeed:f[rad/s] pose_covariance,velocity_covariance:21f
+    | reset_counter,estimator_type:B quality:b[%]
+
+# What sensors measured
+24 GPS_RAW_INT time_usec:Q[us] fix_type:B lat,lon:i[degE7] alt:i[mm] eph,epv:H=65535 vel:H[cm/s]=65535
+    cog:H[cdeg]=65535 satellites_visible:B
+    | alt_ellipsoid:i[mm] h_acc,v_acc:I[mm] vel_acc:I[mm/s] hdg_acc:I[degE5] yaw:H[cdeg]
+26 SCALED_IMU time_boot_ms:I[ms] {_IMU} | temperature:h[cdegC]
+27 RAW_IMU time_usec:Q[us] {_IMU} | id:B temperature:h[cdegC]
+29 SCALED_PRESSURE time_boot_ms:I[ms] press_abs,press_diff:f[hPa] temperature:h[cdegC]
+    | temperature_press_diff:h[cdegC]
+36 SERVO_OUTPUT_RAW time_usec:I[us] port:B {" ".join(_SERVOS[:8])} | {" ".join(_SERVOS[8:])}
+65 RC_CHANNELS time_boot_ms:I[ms] chancount:B {" ".join(_CHANNELS)} rssi:B
+100 OPTICAL_FLOW time_usec:Q[us] sensor_id:B flow_x,flow_y:h flow_comp_m_x,flow_comp_m_y:f[m/s] quality:B
+    ground_distance:f[m] | flow_rate_x,flow_rate_y:f[rad/s]
+105 HIGHRES_IMU time_usec:Q[us] xacc,yacc,zacc:f[m/s/s] xgyro,ygyro,zgyro:f[rad/s] xmag,ymag,zmag:f[gauss]
+    abs_pressure,diff_pressure:f[hPa] pressure_alt:f temperature:f[degC] fields_updated:H | id:B
+106 OPTICAL_FLOW_RAD time_usec:Q[us] sensor_id:B integration_time_us:I[us] integrated_x,integrated_y:f[rad]
+    integrated_xgyro,integrated_ygyro,integrated_zgyro:f[rad] temperature:h[cdegC] quality:B
+    time_delta_distance_us:I[us] distance:f[m]
+116 SCALED_IMU2 time_boot_ms:I[ms] {_IMU} | temperature:h[cdegC]
+132 DISTANCE_SENSOR time_boot_ms:I[ms] min_distance,max_distance,current_distance:H[cm] type,id,orientation:B
+    covariance:B[cm^2]=255 | horizontal_fov,vertical_fov:f[rad] quaternion:4f signal_quality:B[%]
+173 RANGEFINDER distance:f[m] voltage:f[V]
+231 WIND_COV time_usec:Q[us] wind_x,wind_y,wind_z:f[m/s] var_horiz,var_vert:f[m/s] wind_alt:f[m]
+    horiz_accuracy,vert_accuracy:f[m/s]
+241 VIBRATION time_usec:Q[us] vibration_x,vibration_y,vibration_z:f clipping_0,clipping_1,clipping_2:I
+"""
+
+_C_TYPES = {
+    "c": "char", "s": "uint8_t", "B": "uint8_t", "b": "int8_t", "H": "uint16_t", "h": "int16_t", "I": "uint32_t",
+    "i": "int32_t", "Q": "uint64_t", "q": "int64_t", "f": "float", "d": "double",
+}  # fmt: skip
+_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+
+
+def checksum(data: bytes) -> int:
+    """Return the CRC-16/MCRF4XX of some bytes: the polynomial of CCITT in reflected bits, from 0xFFFF on.
+
+    `crc_hqx` is the same polynomial with the bits in the other order, in C.
+    """
+    crc = crc_hqx(data.translate(_REVERSED), 0xFFFF)
+    return _REVERSED[crc & 0xFF] << 8 | _REVERSED[crc >> 8]
+
+
+class WireMessage(msgspec.Struct, gc=False):
+    """Base of all messages."""
+
+
+class MessageLayout(WireLayout):
+    """How messages of one kind lie in a payload: larger fields first, extensions as they are defined.
+
+    Attributes:
+        kind: class of the messages.
+        id, name: of the definition.
+        crc_extra: sums up the definition, so that sides with different ones do not understand each other.
+        size: with the extensions [bytes].
+        base_size: without them, as in MAVLink 1.
+        wire_order: names of the fields as they lie in a payload.
+    """
+
+    def __init__(self, entry: Entry) -> None:
+        base = sorted(entry.fields, key=lambda field: -calcsize(f"<{field.code}"))
+        super().__init__([*entry.fields, *entry.extensions], [*base, *entry.extensions])
+        self.id, self.name = entry.number, entry.name
+        self.size, self.base_size = self.codec.size, WireLayout(base).codec.size
+        text = f"{self.name} ".encode()
+        for field in base:
+            text += f"{_C_TYPES[field.code]} {field.name} ".encode() + bytes([field.length] if field.length else [])
+        crc = checksum(text)
+        self.crc_extra = crc & 0xFF ^ crc >> 8
+        self.crc_extra_byte = bytes([self.crc_extra])
+        self.wire_order = tuple(field.name for field in (*base, *entry.extensions))
+        self._wire_values = attrgetter(*self.wire_order) if len(self.wire_order) > 1 else self._only_value
+        name = self.name.replace("_", " ").title().replace(" ", "")
+        fields = [(field.name, type(field.default_value), field.default_value) for field in self.fields]
+        kind: Any = msgspec.defstruct(name, fields, bases=(WireMessage,), gc=False, module=__name__)
+        self.kind: type[WireMessage] = kind
+
+    def _only_value(self, message: WireMessage) -> tuple[Any]:
+        return (getattr(message, self.wire_order[0]),)
+
+    def pack(self, message: WireMessage) -> bytes:
+        """Return the payload, with its extensions, and with the zeros at its end.
+
+        Raises:
+            struct.error, OverflowError: a value is out of the range of its type, or an array has another length.
+        """
+        values = self._wire_values(message)
+        return self.codec.pack(*(values if self.is_flat else self.flat(values)))
+
+    def unpack(self, payload: bytes) -> WireMessage:
+        """Return the message of a payload; what is missing at its end is 0, what it has beyond is left out."""
+        if len(payload) != self.size:
+            payload = payload[: self.size].ljust(self.size, b"\0")
+        return self.kind(*self.nested(self.codec.unpack(payload)))
+
+
+BY_ID = {entry.number: MessageLayout(entry) for entry in read_table(_TABLE)}
+LAYOUTS: dict[type[WireMessage], MessageLayout] = {layout.kind: layout for layout in BY_ID.values()}
+globals().update({kind.__name__: kind for kind in LAYOUTS})
+
+if TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any: ...
+
+
+def ned(v_W: Vector) -> Vector:
+    """Return a vector of W in north, east, down; its own inverse."""
+    return v_W[1], v_W[0], -v_W[2]
+
+
+def frd(v_B: Vector) -> Vector:
+    """Return a vector of B in forward, right, down; its own inverse."""
+    return v_B[0], -v_B[1], -v_B[2]
+
+
+def attitude_ned(q_WB: Quaternion) -> Quaternion:
+    """Return the attitude forward-right-down to north-east-down, w first and not negative; its own inverse.
+
+    W to NED is half a turn about (1, 1, 0), FRD to B half a turn about x.
+    """
+    w, x, y, z = q_WB
+    w, x, y, z = -x, w, z, -y
+    q = -_S * (x + y), _S * (w + z), _S * (w - z), _S * (y - x)
+    return q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
+
+
+def wrapped(angle_rad: float) -> float:
+    """Return an angle in [-pi, pi]."""
+    return math.remainder(angle_rad, math.tau)
+
+
+def yaw_ned(yaw_W: float) -> float:
+    """Return a yaw counter-clockwise from east as one clockwise from north [rad]; its own inverse."""
+    return wrapped(0.5 * math.pi - yaw_W)
+
+
+def from_int(value: int, unit: float) -> float:
+    """Return a whole number in a unit; NaN where it is not known."""
+    return math.nan if value == INT32_UNKNOWN else unit * value
+
+
+def to_int(value: float, unit: float) -> int:
+    """Return a value as a whole number in a unit."""
+    return round(value / unit) if math.isfinite(value) else INT32_UNKNOWN
+
+
+def global_ints(place: Vector) -> tuple[int, int, int]:
+    """Return latitude [deg], longitude [deg] and height [m] as whole numbers [1e-7 deg, 1e-7 deg, mm]."""
+    return round(1e7 * place[0]), round(1e7 * place[1]), round(1000 * place[2])
+
+
+def int16(value: float) -> int:
+    """Return the nearest whole number of 16 bits, within 32767 either way."""
+    return max(-32767, min(32767, round(value)))

@@ -1,1 +1,0 @@
-"""A MAVLink vehicle as a drone of a run: what a driver reads of it and sends to it. Pure."""

@@ -1,0 +1,230 @@
+"""From what a vehicle is to hold to the commands of its drone: targets, position loop, climbs, the firmware's modes.
+
+The position loop is proportional: the firmware holds velocities itself, with loops three times as fast.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+from zsim.math.rotation import Quaternion, Vector
+from zsim_bridges.mavlink.dialect import wrapped
+from zsim_bridges.mavlink.personality import Parameters, SpeedLimits
+from zsim_bridges.mavlink.vehicle_state import VehicleState
+from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName
+
+K_POSITION_1_S = 0.8  # 1/s; that of the firmware's own hold
+K_YAW_1_S = 1.5  # 1/s, chosen: a turn of 90 deg in 2 s
+YAW_RATE_MAX_RAD_S = 1.0  # rad/s, chosen: half of MC_YAWRAUTO_MAX's 60 deg/s would be slow at this gain
+PLACE_MAX_M = 1e6  # m; positions farther away are refused
+ANSWER_NS = 1_000_000_000  # ns within which the drone is to begin a take-off or a landing
+ARRIVED_M = 0.3  # m of the height at which a climb is over
+STEP_NS = 40_000_000  # ns; the position loop is closed 25 times a second
+BURST = 500  # commands at once: half of what the world records of a source that is not in the lockstep
+REPEAT_NS = 100_000_000  # ns; the firmware takes a commander that is silent for 0.5 s for dead
+
+Axes = tuple[float | None, float | None, float | None]
+NOWHERE: Axes = (None, None, None)
+
+
+class Target(NamedTuple):
+    """A position or velocity to be held.
+
+    Attributes:
+        position_m: in W, None in axes where only the velocity counts.
+        velocity_m_s: flown, and added to what the position asks for.
+        yaw_rad: counter-clockwise from east; None to turn at the rate.
+        yaw_rate_rad_s: counter-clockwise.
+        along_heading: the velocity is forward, left, up instead of in W.
+        speed_m_s: limit of the horizontal speed; None for the vehicle's.
+    """
+
+    position_m: Axes = NOWHERE
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+    yaw_rad: float | None = None
+    yaw_rate_rad_s: float = 0.0
+    along_heading: bool = False
+    speed_m_s: float | None = None
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether it never comes to rest."""
+        return any(self.velocity_m_s) or (self.yaw_rad is None and self.yaw_rate_rad_s != 0.0)
+
+    def leads_up(self, z_m: float) -> bool:
+        """Return whether it leads above z in W."""
+        z = self.position_m[2]
+        return self.velocity_m_s[2] > 0.0 or (z is not None and z > z_m)
+
+    def distance_m(self, position_m: Vector) -> float:
+        """Return how far a vehicle is from its position."""
+        pairs = zip(self.position_m, position_m, strict=True)
+        return math.hypot(*(0.0 if p is None else p - own for p, own in pairs))
+
+
+class TiltTarget(NamedTuple):
+    """A tilt to be held: attitude B to W, thrust [N], yaw rate [rad/s] counter-clockwise."""
+
+    q_WB: Quaternion
+    thrust_n: float
+    yaw_rate_rad_s: float
+
+    @property
+    def is_moving(self) -> bool:
+        """A vehicle that holds a tilt flies away."""
+        return True
+
+    def leads_up(self, z_m: float) -> bool:
+        """No take-off begins with a tilt."""
+        return False
+
+
+def steer(target: Target, position_m: Vector, yaw_rad: float, limits: SpeedLimits) -> tuple[Vector, float]:
+    """Return the velocity [m/s] in the axes of the target's own, and the yaw rate [rad/s], that lead to a target."""
+    x, y, z = (
+        v + (0.0 if p is None else K_POSITION_1_S * (p - own))
+        for v, p, own in zip(target.velocity_m_s, target.position_m, position_m, strict=True)
+    )
+    most = limits.horizontal_m_s if target.speed_m_s is None else min(target.speed_m_s, limits.horizontal_m_s)
+    speed = math.hypot(x, y)
+    share = most / speed if speed > most else 1.0
+    velocity = share * x, share * y, max(-limits.down_m_s, min(limits.up_m_s, z))
+    if target.yaw_rad is None:
+        return velocity, target.yaw_rate_rad_s
+    rate = K_YAW_1_S * wrapped(target.yaw_rad - yaw_rad)
+    return velocity, max(-YAW_RATE_MAX_RAD_S, min(YAW_RATE_MAX_RAD_S, rate))
+
+
+def is_place(position_m: Axes) -> bool:
+    """Return whether a position is finite and near enough to be flown to."""
+    return all(p is None or (math.isfinite(p) and abs(p) < PLACE_MAX_M) for p in position_m)
+
+
+class FlightControl:
+    """Sends a drone the commands by which it does what is asked.
+
+    The world takes one more command of a source with each gate, so each gate allows one here; a new target is sent at
+    once while the burst lasts.
+
+    Attributes:
+        target: what is held; None while nothing is sent.
+        climb_to_m: z in W of the climb under way.
+    """
+
+    def __init__(self, parameters: Parameters, state: VehicleState, sender: CommandSender) -> None:
+        self._parameters = parameters
+        self._state = state
+        self._sender = sender
+        self.target: Target | TiltTarget | None = None
+        self.climb_to_m: float | None = None
+        self._asked: tuple[Literal["takeoff", "land"], int] | None = None  # a mode of the firmware, and since when
+        self._is_pending = False  # a target that could not be sent at once
+        self._allowed = BURST
+        self._sent_ns = -REPEAT_NS
+        self._stepped_ns = self._now_ns = 0
+
+    def advance(self, t_ns: int) -> None:
+        """Follow the gates."""
+        self._now_ns = t_ns
+        self._allowed = min(BURST, self._allowed + 1)
+
+    @property
+    def is_climbing(self) -> bool:
+        return self.climb_to_m is not None
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether what is held never comes to rest."""
+        return self.target is not None and self.target.is_moving
+
+    @property
+    def is_asking(self) -> bool:
+        """Whether the firmware has yet to do what was asked."""
+        return self._asked is not None
+
+    def hold(self, target: Target | TiltTarget) -> None:
+        """Hold a target from now on, and send it at once; a climb under way is finished first."""
+        self.target = target
+        if self._state.is_steerable and not self.is_climbing:
+            self._is_pending = self._allowed <= BURST // 10  # the rest is for repetitions
+            if not self._is_pending:
+                self._send()
+
+    def hold_here(self) -> None:
+        """Hold where the vehicle is, whatever was under way."""
+        self.climb_to_m = None
+        if self._state.is_steerable:
+            self.hold(Target(self._state.position_m))
+
+    def climb(self, z_m: float) -> None:
+        """Climb, or take off, to z in W above where the vehicle is."""
+        self.target, self.climb_to_m = None, z_m
+        if not self._state.is_airborne:
+            self.ask("takeoff")
+
+    def continue_climb(self) -> bool:
+        """Do what a climb needs now; return whether it has just ended."""
+        z_m = self.climb_to_m
+        if z_m is None:
+            return False
+        if self.target is None:
+            x, y, _ = self._state.position_m
+            self.target = Target((x, y, z_m))
+        if abs(self._state.position_m[2] - z_m) >= ARRIVED_M:
+            return False
+        self.climb_to_m = None
+        return True
+
+    def ask(self, mode: Literal["takeoff", "land"]) -> None:
+        """Ask the firmware for a mode; again only if it does not answer."""
+        if self._asked is None or self._asked[0] != mode or self._state.t_ns - self._asked[1] > ANSWER_NS:
+            self._asked = mode, self._state.t_ns
+            if mode == "land":
+                self.target = self.climb_to_m = None
+            self.send_mode(mode)
+
+    def send_mode(self, mode: ModeName) -> None:
+        """Send a mode: take off, land, stop the rotors, or leave the emergency."""
+        self._allowed -= 1
+        self._sender.mode(self._now_ns, mode)
+
+    def on_airborne(self) -> None:
+        """Note that the drone flies."""
+        if self._asked and self._asked[0] == "takeoff":
+            self._asked = None
+
+    def is_takeoff_overdue(self) -> bool:
+        """Return whether the drone still stands although it was asked to take off."""
+        if self._asked is None or self._asked[0] != "takeoff" or self._state.is_airborne:
+            return False
+        return self._state.t_ns - self._asked[1] > ANSWER_NS
+
+    def release(self) -> None:
+        """Send no more commands."""
+        self.target = self.climb_to_m = self._asked = None
+
+    def has_arrived(self) -> bool:
+        """Return whether the target is reached."""
+        position_m, radius_m = self._state.position_m, self._parameters["acceptance_m"]
+        return isinstance(self.target, Target) and self.target.distance_m(position_m) < radius_m
+
+    def send_due(self) -> None:
+        """Send what is due at a gate."""
+        if isinstance(self.target, Target) and self.target.position_m != NOWHERE:
+            if self._state.t_ns - self._stepped_ns >= STEP_NS:
+                self._send()
+        elif self.target is not None and (self._now_ns - self._sent_ns >= REPEAT_NS or self._is_pending):
+            self._send()
+
+    def _send(self) -> None:
+        target, state = self.target, self._state
+        if target is None:
+            return
+        self._stepped_ns, self._is_pending = state.t_ns, False
+        self._sent_ns = self._now_ns
+        self._allowed -= 1
+        if isinstance(target, Target):
+            velocity, yaw_rate = steer(target, state.position_m, state.yaw_rad, self._parameters.speeds)
+            frame = "heading" if target.along_heading else "world"
+            self._sender.velocity(self._now_ns, velocity, yaw_rate, frame)
+        else:
+            self._sender.attitude(self._now_ns, target.q_WB, target.thrust_n, target.yaw_rate_rad_s)

@@ -1,0 +1,363 @@
+"""`zsim mavlink serve`: the drones of a run as MAVLink vehicles on UDP.
+
+Each vehicle has two ports, as in PX4's simulation: one for ground stations, one for programs.
+"""
+
+import asyncio
+import contextlib
+import errno
+import hashlib
+import socket
+import struct
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+from zsim.contract import keys
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event
+from zsim.errors import RunError
+from zsim.runtime.participant import Participant
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Drone
+from zsim.transport.session import Session
+from zsim_bridges.intake import TrafficIntake
+from zsim_bridges.mavlink.dialect import WireMessage
+from zsim_bridges.mavlink.enums import COMPONENT_AUTOPILOT
+from zsim_bridges.mavlink.frame import Link, Parser, Received, Signing, Version
+from zsim_bridges.mavlink.mavlink_vehicle import MavlinkVehicle, Options
+from zsim_bridges.mavlink.personality import PERSONALITIES
+from zsim_bridges.mavlink.telemetry import Level
+from zsim_bridges.vehicle_links.drone_link import CommandSender
+from zsim_bridges.vehicle_links.server import Say, VehicleServer
+from zsim_bridges.web import is_loopback
+
+ANSWER_S = 1.0  # wall time for which an answer of the world is waited for, aside from the traffic
+TICK_S = 0.1  # wall time between two looks at what is due by wall time
+SWITCH_S = 5e-4  # s after which the thread that takes in a gate lets a setpoint pass; Python's own is 5 ms
+SYSTEM_IDS = 254  # 255 is the ground station's by custom
+DATAGRAM_MAX = 1400  # bytes; fits into a frame of Ethernet
+READ_MAX = 65_536  # bytes
+READS_MAX = 64  # datagrams at once, then others have their turn
+LEARNT_MAX = 8  # programs at once, on one port
+SILENT_S = 30.0  # wall time after which a silent program is forgotten
+REASONS = {
+    "bad_crc": "a frame with a wrong checksum",
+    "unknown": "a message that is not in the dialect",
+    "incompatible": "a frame with flags that are not known",
+    "truncated": "a frame that is cut",
+    "unsigned": "a frame without a signature",
+    "bad_signature": "a frame with a wrong signature",
+    "replayed": "a signed frame that was sent before",
+    "noise": "bytes that are no frame",
+    "unsent": "a message of its own whose values do not fit into their fields",
+    "stranger": "a datagram of who is not the configured peer",
+}
+Address = tuple[str, int]
+
+
+class MavlinkOptions(NamedTuple):
+    """How the drones are offered.
+
+    Attributes:
+        autopilot: whose modes and parameters they have.
+        level: of the rates of telemetry.
+        listen: address on which the ports are opened.
+        gcs, gcs_local: the ground station, and the first port that talks to it.
+        api, api_local: the first of the programs' ports, and the first port that talks to them.
+        key: of signatures; None for none.
+        version: of MAVLink in what is sent.
+        rate: pace that is asked of a run as fast as possible; None for none.
+        first_system_id: of the first drone; +1 each.
+    """
+
+    autopilot: str
+    level: Level
+    listen: str
+    gcs: Address
+    gcs_local: int
+    api: Address
+    api_local: int
+    key: bytes | None
+    version: Version
+    rate: float | None
+    first_system_id: int
+
+
+class Served(NamedTuple):
+    """A vehicle and its ports."""
+
+    vehicle: MavlinkVehicle
+    ports: "VehiclePorts"
+
+    def flush(self) -> None:
+        """Send what the vehicle has to send."""
+        self.ports.send(self.vehicle.take())
+
+
+class MavlinkServer(VehicleServer):
+    """One run's drones as MAVLink vehicles.
+
+    Raises:
+        RunError: the run has too many drones, or a port cannot be opened.
+    """
+
+    options: MavlinkOptions
+
+    def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: MavlinkOptions) -> None:
+        super().__init__(link, info, observer, say, options)
+        self._signing = Signing(options.key) if options.key else None
+        self._counted: Counter[str] = Counter()
+        self._requests = ThreadPoolExecutor(1)  # one after the other
+        drones = scenario_file.from_text(info.scenario).drones
+        first = options.first_system_id
+        if first + len(drones) - 1 > SYSTEM_IDS:
+            allowed = f"MAVLink has {SYSTEM_IDS} system ids, of which --first-system-id is {first}"
+            raise RunError(f"{observer.name}: the run has {len(drones)} drones; {allowed}")
+        self._served = {drone.name: self._offer(i, drone) for i, drone in enumerate(drones)}
+        self._routes: dict[str, tuple[str, str]] = {}  # drone and name of the message, by key
+        for drone in self._served:
+            names = {keys.sensor(drone, name): name for name in keys.SENSORS}
+            names |= {keys.truth(drone): "truth", keys.estimate(drone): "estimate", keys.status(drone): "status"}
+            self._routes |= {key: (drone, name) for key, name in names.items()}
+
+    def _offer(self, index: int, drone: Drone) -> Served:
+        options, system_id, source = self.options, self.options.first_system_id + index, self.observer.name
+        # 64 bits by which programs recognize a vehicle: unique in all runs
+        unique_id = int.from_bytes(hashlib.sha256(f"{self.info.run_id}/{drone.name}".encode()).digest()[:8])
+        shown = Options(system_id, PERSONALITIES[options.autopilot], options.level, source, unique_id)
+        vehicle = MavlinkVehicle(drone, self.info.origin, CommandSender(drone.name, source, self.link.put), shown)
+
+        def on_received(received: Received) -> None:
+            vehicle.on_message(received, time.monotonic_ns())
+            served.flush()
+
+        peers = (
+            (options.gcs_local + index, options.gcs),
+            (options.api_local + index, (options.api[0], options.api[1] + index)),
+        )
+        ports = [VehiclePort((options.listen, port), peer, self._signing, on_received) for port, peer in peers]
+        packer = Link(system_id, COMPONENT_AUTOPILOT, self._signing, options.version)
+        served = Served(vehicle, VehiclePorts(ports, packer))
+        return served
+
+    async def open(self, stack: contextlib.AsyncExitStack) -> None:
+        sys.setswitchinterval(SWITCH_S)
+        loop, options, last = asyncio.get_running_loop(), self.options, len(self._served) - 1
+        for served in self._served.values():
+            stack.callback(served.ports.close, loop)
+            served.ports.open(loop, time.monotonic)
+        stack.callback(self._requests.shutdown, wait=False, cancel_futures=True)
+        for what, (host, port), local, step in (
+            ("ground station", options.gcs, options.gcs_local, 0),
+            ("programs", options.api, options.api_local, last),
+        ):
+            to = f"{port} to {port + step}" if step else f"{port}"
+            own = f"{local} to {local + last}" if last else f"{local}"
+            self.say(f"{what}: UDP {host}:{to}, from {options.listen}:{own}")
+        stack.callback(loop.create_task(self._tick_always()).cancel)
+
+    async def take_in(self, intake: TrafficIntake) -> None:
+        """Take in what has arrived; of a drone's messages the newest of each."""
+        newest: dict[str, bytes] = {}
+        for arrived in intake.arrivals():
+            for key, payload in arrived:
+                if key in self._routes:
+                    newest[key] = payload
+                else:
+                    self.on_run(key, payload)
+        for served in self._update(newest):
+            served.vehicle.step()
+            self._report_mission(served)
+            served.flush()
+            await asyncio.sleep(0)  # setpoints that have arrived meanwhile go first
+
+    def _update(self, newest: dict[str, bytes]) -> list[Served]:
+        """Update the states of the drones; return those that have reached a gate."""
+        stepping: dict[str, Served] = {}
+        for key, payload in newest.items():
+            message = self.decoded(key, payload)
+            if message is not None:
+                drone, name = self._routes[key]
+                self._served[drone].vehicle.state.update(name, message)
+                if name == "status":
+                    stepping[drone] = self._served[drone]
+        return list(stepping.values())
+
+    def _report_mission(self, served: Served) -> None:
+        """Tell the world how far a mission was flown, for the record; no gate waits for it."""
+        vehicle = served.vehicle
+        for report in vehicle.flight.mission.reports:
+            args = {"drone": vehicle.name, **report._asdict()}
+            self._requests.submit(self.link.request, keys.CONTROL, "mission", self.observer.name, args, ANSWER_S)
+        vehicle.flight.mission.reports.clear()
+
+    def on_event(self, payload: bytes) -> None:
+        event = self.decoded(keys.EVENT, payload)
+        if isinstance(event, Event):
+            for served in self._served.values():
+                served.vehicle.on_event(event)
+
+    async def _tick_always(self) -> None:
+        while True:
+            if self._signing:
+                self._signing.advance(time.time())
+            for drone, served in self._served.items():
+                served.vehicle.tick(time.monotonic_ns())
+                served.flush()
+                self._count_refused(drone, served.ports.refused())
+            await asyncio.sleep(TICK_S)
+
+    def _count_refused(self, drone: str, counts: Counter[str]) -> None:
+        """Count what clients sent and was refused; print each reason once."""
+        for reason, count in counts.items():
+            mark = f"{drone} {reason}"
+            before = self._counted[mark]
+            if count and not before:
+                self.say(f"{drone}: {REASONS[reason]}; counted from now on")
+            self._counted[mark] = count
+            self.observer.health.refused += count - before
+
+
+class VehiclePorts:
+    """Both ports of a vehicle, with one numbering of what is sent.
+
+    Args:
+        link: packs the messages.
+    """
+
+    def __init__(self, ports: "Sequence[VehiclePort]", link: Link) -> None:
+        self._ports = ports
+        self._link = link
+        self._unsent = 0
+
+    def open(self, loop: asyncio.AbstractEventLoop, wall_s: Callable[[], float]) -> None:
+        for port in self._ports:
+            port.open(loop, wall_s)
+
+    def close(self, loop: asyncio.AbstractEventLoop) -> None:
+        for port in self._ports:
+            port.close(loop)
+
+    def send(self, messages: Sequence[WireMessage]) -> None:
+        """Send messages to all peers, many in a datagram; those with values out of range are counted instead."""
+        datagrams: list[bytes] = []
+        for message in messages:
+            try:
+                frame = self._link.pack(message)
+            except (struct.error, OverflowError, ValueError):
+                self._unsent += 1
+                continue
+            if datagrams and len(datagrams[-1]) + len(frame) <= DATAGRAM_MAX:
+                datagrams[-1] += frame
+            else:
+                datagrams.append(frame)
+        for port in self._ports:
+            port.send(datagrams)
+
+    def refused(self) -> Counter[str]:
+        """Return how much was refused so far, by reason."""
+        counts = Counter({"unsent": self._unsent})
+        for port in self._ports:
+            counts += port.parser.refused
+            counts["stranger"] += port.peers.refused
+        return counts
+
+
+class VehiclePort:
+    """One UDP port.
+
+    Args:
+        local: on which it is opened.
+        peer: to which it sends from the start.
+        signing: of what is sent and read.
+        on_received: called with each message of a peer.
+
+    Raises:
+        RunError: the port cannot be opened.
+    """
+
+    def __init__(
+        self, local: Address, peer: Address, signing: Signing | None, on_received: Callable[[Received], Any]
+    ) -> None:
+        self._socket = _bound(local)
+        self._on_received = on_received
+        self.peers = Peers(peer)
+        self.parser = Parser(signing)
+
+    def open(self, loop: asyncio.AbstractEventLoop, wall_s: Callable[[], float]) -> None:
+        """Read from now on."""
+        self._wall_s = wall_s
+        loop.add_reader(self._socket.fileno(), self._read)
+
+    def close(self, loop: asyncio.AbstractEventLoop) -> None:
+        loop.remove_reader(self._socket.fileno())
+        self._socket.close()
+
+    def send(self, datagrams: Sequence[bytes]) -> None:
+        """Send to all peers; what a full buffer does not take is lost, as on any radio."""
+        for address in self.peers.addresses(self._wall_s()) if datagrams else ():
+            for datagram in datagrams:
+                with contextlib.suppress(OSError):  # nobody there, no route, no room
+                    self._socket.sendto(datagram, address)
+
+    def _read(self) -> None:
+        for _ in range(READS_MAX):
+            try:
+                data, address = self._socket.recvfrom(READ_MAX)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError:
+                continue  # a datagram sent before could not be delivered
+            if self.peers.accepts(address, self._wall_s()):
+                for received in self.parser.feed(data):
+                    self._on_received(received)
+
+
+def _bound(local: Address) -> socket.socket:
+    family = socket.AF_INET6 if ":" in local[0] else socket.AF_INET
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    opened.setblocking(False)
+    try:
+        opened.bind(local)
+    except OSError as error:
+        opened.close()
+        taken = error.errno in (errno.EADDRINUSE, errno.EACCES)  # by another process, or reserved by the system
+        advice = "other ports with --gcs-local and --api-local" if taken else "an address of this host with --listen"
+        raise RunError(f"UDP {local[0]}:{local[1]} cannot be opened ({error.strerror}); give {advice}") from error
+    return opened
+
+
+class Peers:
+    """The peers of one port: the configured one, and programs on this machine that speak to it.
+
+    Args:
+        configured: to which everything is sent from the start.
+
+    Attributes:
+        refused: datagrams of others.
+    """
+
+    def __init__(self, configured: Address) -> None:
+        self._configured = configured
+        self._learnt: dict[Address, float] = {}
+        self.refused = 0
+
+    def accepts(self, address: Address, wall_s: float) -> bool:
+        """Return whether a datagram from an address is read; programs on this machine become peers."""
+        if address == self._configured:
+            return True
+        known = address in self._learnt
+        if not is_loopback(address[0]) or (not known and len(self._learnt) >= LEARNT_MAX):
+            self.refused += 1
+            return False
+        self._learnt[address] = wall_s
+        return True
+
+    def addresses(self, wall_s: float) -> list[Address]:
+        """Return to whom to send now."""
+        self._learnt = {address: last_s for address, last_s in self._learnt.items() if wall_s - last_s <= SILENT_S}
+        return [self._configured, *self._learnt]

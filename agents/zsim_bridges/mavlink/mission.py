@@ -1,0 +1,454 @@
+"""Missions of waypoints: their items, a vehicle's progress in them, and the transfers of items, also of fences.
+
+Sources: https://mavlink.io/en/messages/common.html#mav_commands for the items, and
+https://mavlink.io/en/services/mission.html for the protocol.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+from zsim.math.rotation import Vector
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.dialect import DEGREES, LOCAL_M, WireMessage, from_int, ned, to_int, yaw_ned
+from zsim_bridges.mavlink.enums import ALL_MISSION_TYPES, FENCE, MISSION, Cmd, MavFrame, MissionResult
+from zsim_bridges.mavlink.flight_control import Target, is_place
+from zsim_bridges.mavlink.personality import Parameters
+from zsim_bridges.mavlink.vehicle_state import VehicleState
+
+JUMPS_MAX = 1000  # in succession without a waypoint between them: a circle of jumps
+ABSOLUTE = (MavFrame.GLOBAL, MavFrame.GLOBAL_INT)
+RELATIVE = (
+    MavFrame.GLOBAL_RELATIVE_ALT,
+    MavFrame.GLOBAL_RELATIVE_ALT_INT,
+    MavFrame.GLOBAL_TERRAIN_ALT,  # the ground of zsim is level
+    MavFrame.GLOBAL_TERRAIN_ALT_INT,
+)
+LOCAL = (MavFrame.LOCAL_NED, MavFrame.LOCAL_ENU)
+FRAMES = (*ABSOLUTE, *RELATIVE, *LOCAL, MavFrame.MISSION)
+COMMANDS = (
+    Cmd.NAV_WAYPOINT,
+    Cmd.NAV_LOITER_UNLIM,
+    Cmd.NAV_LOITER_TIME,
+    Cmd.NAV_RETURN_TO_LAUNCH,
+    Cmd.NAV_LAND,
+    Cmd.NAV_TAKEOFF,
+    Cmd.NAV_DELAY,
+    Cmd.DO_JUMP,
+    Cmd.DO_CHANGE_SPEED,
+)
+ITEMS_MAX = 1000  # chosen: of one mission; autopilots keep some hundreds
+RETRY_NS = 500_000_000  # ns of wall time until an item is requested again
+TRIES_MAX = 10
+FENCE_COMMANDS = (
+    Cmd.FENCE_RETURN_POINT,
+    Cmd.FENCE_POLYGON_INCLUSION,
+    Cmd.FENCE_POLYGON_EXCLUSION,
+    Cmd.FENCE_CIRCLE_INCLUSION,
+    Cmd.FENCE_CIRCLE_EXCLUSION,
+)
+Address = tuple[int, int]
+"""System and component id."""
+
+
+class PlanItem(NamedTuple):
+    """An item: x and y are latitude and longitude [deg], or [m] in local frames; z is [m]. NaN is a value left out."""
+
+    frame: int
+    command: int
+    params: tuple[float, float, float, float]
+    x: float
+    y: float
+    z: float
+    autocontinue: bool = True
+
+    @property
+    def has_place(self) -> bool:
+        """Whether it names a place, beside a height; one of x and y is enough."""
+        return any(math.isfinite(value) and value for value in (self.x, self.y))
+
+
+class MissionReport(NamedTuple):
+    """How far a mission was flown, for the record of the run.
+
+    Attributes:
+        items: of the mission, without ArduPilot's item 0.
+        done: how many of them were flown.
+        reason: why it was aborted; "" if it was not.
+        failsafe: whether the vehicle itself aborted it, and no client.
+    """
+
+    state: Literal["active", "finished", "aborted"]
+    items: int
+    done: int
+    reason: str = ""
+    failsafe: bool = False
+
+
+class MissionStep(NamedTuple):
+    """What a mission asks for now: a target, or another action; z in W for a climb."""
+
+    action: Literal["fly", "climb", "land", "return", "over"]
+    target: Target = Target()
+    z_m: float = 0.0
+
+
+def place_of(item: PlanItem, state: VehicleState) -> Vector:
+    """Return p_W [m] of an item; if x or y is left out, that of the vehicle."""
+    own_x, own_y, _ = state.position_m
+    z = item.z if math.isfinite(item.z) else 0.0
+    if item.frame in LOCAL:
+        x, y, up = ned((item.x, item.y, z)) if item.frame == MavFrame.LOCAL_NED else (item.x, item.y, z)
+        return x if math.isfinite(x) else own_x, y if math.isfinite(y) else own_y, up
+    height_m = z if item.frame in ABSOLUTE else state.to_global(state.home_or_here_m)[2] + z
+    latitude_deg, longitude_deg, _ = state.to_global(state.position_m)
+    if item.has_place:
+        latitude_deg = item.x if math.isfinite(item.x) else latitude_deg
+        longitude_deg = item.y if math.isfinite(item.y) else longitude_deg
+        return state.to_local(latitude_deg, longitude_deg, height_m)
+    return own_x, own_y, state.to_local(latitude_deg, longitude_deg, height_m)[2]
+
+
+class Mission:
+    """A mission and the progress in it.
+
+    Args:
+        first: number of its first item; ArduPilot's item 0 is home.
+        turns: whether the yaw of a waypoint is flown.
+
+    Attributes:
+        items: of the mission, without ArduPilot's item 0.
+        reached: numbers of items that have been reached, to be reported to clients.
+        reports: of how far it was flown, to be sent to the world.
+    """
+
+    def __init__(self, first: int = 0, turns: bool = True) -> None:
+        self.first = first
+        self._turns = turns
+        self.items: list[PlanItem] = []
+        self.reached: list[int] = []
+        self.reports: list[MissionReport] = []
+        self._reported: int | None = None  # items flown at the last report; None while it is not flown
+        self._index = 0
+        self._since_ns: int | None = None  # at this item
+        self._speed_m_s: float | None = None
+        self._jumps: dict[int, int] = {}  # left, by item
+        self._climbed = False
+
+    @property
+    def current(self) -> int:
+        """The number of the present item."""
+        return self.first + min(self._index, max(0, len(self.items) - 1))
+
+    @property
+    def _item(self) -> PlanItem | None:
+        return self.items[self._index] if self._index < len(self.items) else None
+
+    @property
+    def is_landing(self) -> bool:
+        """Whether the present item ends on the ground."""
+        item = self._item
+        return item is not None and item.command in (Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH)
+
+    def load(self, items: Sequence[PlanItem]) -> None:
+        """Replace the items, and begin with the first."""
+        self.items = list(items)
+        self._rewind()
+
+    def _rewind(self) -> None:
+        self._index, self._speed_m_s, self._jumps = 0, None, {}
+        self._enter(0)
+
+    def set_current(self, number: int) -> bool:
+        """Continue with an item; False if there is none of that number."""
+        index = max(0, number - self.first)
+        if index >= len(self.items):
+            return False
+        self._enter(index)
+        return True
+
+    # Reports
+
+    def start(self) -> None:
+        """Report that it is flown from now on, unless it is flown already."""
+        if self._reported is None:
+            self._reported = self._index
+            self.reports.append(MissionReport("active", len(self.items), self._index))
+
+    def note_progress(self) -> None:
+        """Report what more of it has been flown; a jump back is none."""
+        if self._reported is not None and self._index > self._reported:
+            self._reported = self._index
+            self.reports.append(MissionReport("active", len(self.items), self._index))
+
+    def finish(self) -> None:
+        """Report that all of it has been flown."""
+        if self._reported is not None:
+            self.reports.append(MissionReport("finished", len(self.items), len(self.items)))
+            self._reported = None
+
+    def abort(self, reason: str, failsafe: bool) -> None:
+        """Report that it is flown no longer, unless it has ended already."""
+        if self._reported is not None:
+            self.reports.append(MissionReport("aborted", len(self.items), self._reported, reason, failsafe))
+            self._reported = None
+
+    # Steps
+
+    def on_climbed(self) -> None:
+        """Note that the climb that was asked for is over."""
+        self._climbed = True
+
+    def takeoff_height_m(self, state: VehicleState) -> float | None:
+        """Return z in W to which the mission takes off; None if it does not begin with a take-off."""
+        item = self._item
+        return place_of(item, state)[2] if item and item.command == Cmd.NAV_TAKEOFF else None
+
+    def step(self, state: VehicleState, parameters: Parameters) -> MissionStep:
+        """Return what is to be done now, past the items that have been done."""
+        for _ in range(JUMPS_MAX):
+            item = self._item
+            if item is None:
+                self._rewind()
+                break
+            step = self._step(item, state, parameters)
+            if step is not None:
+                return step
+        return MissionStep("over")
+
+    def _step(self, item: PlanItem, state: VehicleState, parameters: Parameters) -> MissionStep | None:
+        """Return what an item asks for; None once it is done."""
+        match item.command:
+            case Cmd.DO_CHANGE_SPEED:
+                self._speed_m_s = item.params[1] if item.params[1] > 0 else self._speed_m_s
+            case Cmd.DO_JUMP:
+                return self._jump(item)
+            case Cmd.NAV_TAKEOFF:
+                if not self._climbed:
+                    return MissionStep("climb", z_m=place_of(item, state)[2])
+            case Cmd.NAV_RETURN_TO_LAUNCH:
+                return MissionStep("return")
+            case Cmd.NAV_LAND:
+                return self._land(item, state, parameters)
+            case Cmd.NAV_DELAY:
+                return self._wait(Target(state.position_m), item.params[0], state)
+            case _:
+                return self._visit(item, state, parameters)
+        self._enter(self._index + 1)
+        return None
+
+    def _land(self, item: PlanItem, state: VehicleState, parameters: Parameters) -> MissionStep:
+        if not item.has_place or self._since_ns is not None:
+            return MissionStep("land")
+        x, y, _ = place_of(item, state)
+        target = Target((x, y, None), speed_m_s=self._speed_m_s)
+        if target.distance_m(state.position_m) < parameters["acceptance_m"]:
+            self._since_ns = state.t_ns
+            return MissionStep("land")
+        return MissionStep("fly", target)
+
+    def _visit(self, item: PlanItem, state: VehicleState, parameters: Parameters) -> MissionStep | None:
+        yaw_deg = item.params[3]
+        yaw = yaw_ned(math.radians(yaw_deg)) if self._turns and math.isfinite(yaw_deg) else None
+        target = Target(place_of(item, state), yaw_rad=yaw, speed_m_s=self._speed_m_s)
+        if self._since_ns is None:
+            radius_m = item.params[1] if item.command == Cmd.NAV_WAYPOINT and item.params[1] > 0 else None
+            if target.distance_m(state.position_m) > (radius_m or parameters["acceptance_m"]):
+                return MissionStep("fly", target)
+            self.reached.append(self.first + self._index)
+        stay_s = math.inf if item.command == Cmd.NAV_LOITER_UNLIM else item.params[0]
+        return self._wait(target, stay_s, state)
+
+    def _wait(self, target: Target, stay_s: float, state: VehicleState) -> MissionStep | None:
+        """Stay for some time; neither 0 nor NaN is any."""
+        if self._since_ns is None:
+            self._since_ns = state.t_ns
+        if (state.t_ns - self._since_ns) * 1e-9 < stay_s:
+            return MissionStep("fly", target)
+        self._enter(self._index + 1)
+        return None
+
+    def _jump(self, item: PlanItem) -> None:
+        left = self._jumps.setdefault(self._index, int(max(-1.0, min(1e6, item.params[1]))))
+        index = int(max(0.0, min(1e6, item.params[0]))) - self.first
+        if left and 0 <= index < len(self.items):
+            self._jumps[self._index] = left - 1 if left > 0 else left
+            self._enter(index)
+        else:
+            self._enter(self._index + 1)
+
+    def _enter(self, index: int) -> None:
+        self._index, self._since_ns, self._climbed = index, None, False
+
+
+class MissionProtocol:
+    """The transfers of one vehicle.
+
+    Args:
+        send: sends a message.
+        loaded: called with the type and the items of a complete upload, or of a removal.
+        home: returns item 0 of ArduPilot's missions; None for PX4, whose item 0 is the first waypoint, and which asks
+            for items as MISSION_ITEM_INT first.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[WireMessage], None],
+        loaded: Callable[[int, list[PlanItem]], None],
+        home: Callable[[], PlanItem] | None,
+    ) -> None:
+        self._send = send
+        self._loaded = loaded
+        self._home = home
+        self._items: dict[int, list[PlanItem]] = {}
+        self._upload: _Upload | None = None
+
+    def on_message(self, message: WireMessage, sender: Address, wall_ns: int) -> bool:
+        """Take a message of the protocol; False for any other.
+
+        Args:
+            wall_ns: wall time, of any zero.
+        """
+        match message:
+            case dialect.MissionCount():
+                self._begin(message, sender, wall_ns)
+            case dialect.MissionItemInt() | dialect.MissionItem():
+                self._take(message, sender, wall_ns)
+            case dialect.MissionRequestList(mission_type=type_):
+                self._send(dialect.MissionCount(*sender, count=len(self._stored(type_)), mission_type=type_))
+            case dialect.MissionRequestInt() | dialect.MissionRequest():
+                self._answer(message, sender)
+            case dialect.MissionClearAll(mission_type=type_):
+                for each in (MISSION, FENCE) if type_ == ALL_MISSION_TYPES else (type_,):
+                    self._items[each] = []
+                    self._loaded(each, [])
+                self._acknowledge(sender, type_, MissionResult.ACCEPTED)
+            case dialect.MissionAck():
+                pass
+            case _:
+                return False
+        return True
+
+    def tick(self, wall_ns: int) -> None:
+        """Request an item again that has not come."""
+        upload = self._upload
+        if upload is None or wall_ns - upload.asked_ns < RETRY_NS:
+            return
+        upload.tries += 1
+        if upload.tries > TRIES_MAX:
+            self._end(upload, MissionResult.OPERATION_CANCELLED)
+        else:
+            self._request(upload, wall_ns)
+
+    # Uploads
+
+    def _begin(self, count: dialect.MissionCount, sender: Address, wall_ns: int) -> None:
+        upload = _Upload(sender, count.mission_type, count.count)
+        if count.count > ITEMS_MAX:
+            self._end(upload, MissionResult.NO_SPACE)
+        elif count.mission_type not in (MISSION, FENCE):
+            self._end(upload, MissionResult.UNSUPPORTED)
+        elif count.count == 0:
+            self._finish(upload)
+        else:
+            self._upload = upload
+            self._request(upload, wall_ns)
+
+    def _request(self, upload: "_Upload", wall_ns: int) -> None:
+        upload.asked_ns = wall_ns
+        as_int = (self._home is None) != bool(upload.tries % 2)  # some clients know one of the two only
+        kind = dialect.MissionRequestInt if as_int else dialect.MissionRequest
+        self._send(kind(*upload.sender, seq=len(upload.items), mission_type=upload.type))
+
+    def _take(self, message: dialect.MissionItemInt | dialect.MissionItem, sender: Address, wall_ns: int) -> None:
+        upload = self._upload
+        if upload is None or upload.sender != sender or message.seq != len(upload.items):
+            return  # repeated, or not asked for
+        item = item_of(message)
+        is_home = upload.type == MISSION and self._home is not None and message.seq == 0
+        fault = None if is_home else item_fault(item, upload.type)
+        if fault is not None:
+            self._end(upload, fault)
+            return
+        upload.items.append(item)
+        upload.tries = 0
+        if len(upload.items) == upload.count:
+            self._finish(upload)
+        else:
+            self._request(upload, wall_ns)
+
+    def _finish(self, upload: "_Upload") -> None:
+        items = upload.items[1:] if self._home and upload.type == MISSION else upload.items
+        self._items[upload.type] = items
+        self._loaded(upload.type, items)
+        self._end(upload, MissionResult.ACCEPTED)
+
+    def _end(self, upload: "_Upload", result: MissionResult) -> None:
+        self._upload = None
+        self._acknowledge(upload.sender, upload.type, result)
+
+    def _acknowledge(self, sender: Address, type_: int, result: MissionResult) -> None:
+        self._send(dialect.MissionAck(*sender, type=result, mission_type=type_))
+
+    # Downloads
+
+    def _stored(self, type_: int) -> list[PlanItem]:
+        """Return all items of a type, including ArduPilot's item 0."""
+        items = self._items.get(type_, [])
+        return [self._home(), *items] if self._home and type_ == MISSION else items
+
+    def _answer(self, request: dialect.MissionRequestInt | dialect.MissionRequest, sender: Address) -> None:
+        items = self._stored(request.mission_type)
+        if request.seq >= len(items):
+            self._acknowledge(sender, request.mission_type, MissionResult.INVALID_SEQUENCE)
+            return
+        item, kind, x, y = items[request.seq], dialect.MissionItem, items[request.seq].x, items[request.seq].y
+        if isinstance(request, dialect.MissionRequestInt):
+            unit = LOCAL_M if item.frame in LOCAL else DEGREES
+            kind, x, y = dialect.MissionItemInt, to_int(item.x, unit), to_int(item.y, unit)
+        begin = *sender, request.seq, item.frame, item.command, 0, int(item.autocontinue)
+        self._send(kind(*begin, *item.params, x, y, item.z, request.mission_type))
+
+
+class _Upload:
+    """An upload under way."""
+
+    def __init__(self, sender: Address, type_: int, count: int) -> None:
+        self.sender = sender
+        self.type = type_
+        self.count = count
+        self.items: list[PlanItem] = []
+        self.asked_ns = 0
+        self.tries = 0
+
+
+def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> PlanItem:
+    """Return the item in a message."""
+    x, y = message.x, message.y
+    if isinstance(message, dialect.MissionItemInt):
+        unit = LOCAL_M if message.frame in LOCAL else DEGREES
+        x, y = from_int(message.x, unit), from_int(message.y, unit)
+    params = message.param1, message.param2, message.param3, message.param4
+    return PlanItem(message.frame, message.command, params, x, y, message.z, bool(message.autocontinue))
+
+
+def item_fault(item: PlanItem, type_: int) -> MissionResult | None:
+    """Return what is wrong with an item; None if nothing is."""
+    known: tuple[Any, ...] = COMMANDS if type_ == MISSION else FENCE_COMMANDS
+    if item.command not in known:
+        return MissionResult.UNSUPPORTED
+    if item.frame not in FRAMES:
+        return MissionResult.UNSUPPORTED_FRAME
+    is_whole = item.has_place and math.isfinite(item.x) and math.isfinite(item.y)
+    z = 0.0 if math.isnan(item.z) and item.command == Cmd.NAV_LAND else item.z
+    x, y = (0.0 if math.isnan(value) else value for value in (item.x, item.y))  # left out
+    if item.frame in LOCAL:
+        is_good = is_place((x, y, z))
+    else:
+        is_good = is_place((None, None, z)) and abs(x) <= 90.0 and abs(y) <= 180.0
+    return None if is_good and (type_ != FENCE or is_whole) else MissionResult.INVALID
+
+
+def home_item(latitude_deg: float, longitude_deg: float, height_m: float) -> PlanItem:
+    """Return item 0 of ArduPilot's missions."""
+    return PlanItem(MavFrame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), latitude_deg, longitude_deg, height_m)

@@ -1,0 +1,534 @@
+"""The telemetry of a vehicle: its messages, each built from one state at a gate, and how often each is sent.
+
+A builder declares the message that it builds, its rates, and the sensor whose samples it follows. It returns None when
+there is nothing to send, or the sensor has failed. Messages that are due at one gate are sent in the order of the
+builders here.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, Literal, NamedTuple, TypeVar
+
+from zsim.math import frames
+from zsim.math.rotation import Vector
+from zsim.scenario.scenario import Drone
+from zsim.schema.quantities import G_M_S2
+from zsim.vehicles.vehicle_catalogue import vehicle_of
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.dialect import (
+    LAYOUTS,
+    UINT16_UNKNOWN,
+    WireMessage,
+    attitude_ned,
+    frd,
+    global_ints,
+    int16,
+    ned,
+    yaw_ned,
+)
+from zsim_bridges.mavlink.enums import (
+    TYPE_QUADROTOR,
+    BaseMode,
+    EstimatorFlag,
+    GpsFix,
+    LandedState,
+    MavFrame,
+    SensorBit,
+    SystemStatus,
+    TypeMask,
+)
+from zsim_bridges.mavlink.flight_control import Target
+from zsim_bridges.mavlink.personality import BY_STICKS, FlightMode, Personality
+from zsim_bridges.mavlink.vehicle_flight import Flight
+from zsim_bridges.mavlink.vehicle_state import VehicleState
+
+Level = Literal["normal", "full"]
+SECOND_NS = 1_000_000_000
+RATE_MAX_HZ = 50.0  # Hz; one of each with a gate of 20 ms
+IMU_RATE_MAX_HZ = 200.0  # Hz; each sample of the inertial unit
+GATE_NS = round(SECOND_NS / RATE_MAX_HZ)
+MAVLINK_VERSION = 3  # of HEARTBEAT
+NAN = math.nan
+MG_PER_M_S2 = 1000.0 / G_M_S2
+GAUSS_PER_UT, MILLIGAUSS_PER_UT = 0.01, 10.0
+INERTIAL, MAGNETIC, BAROMETRIC = 0x03F, 0x1C0, 0xA00  # HIGHRES_IMU_UPDATED_FLAGS
+ALL_HEALTHY = sum(part.value for part in SensorBit if part is not SensorBit.GEOFENCE)
+ALL_ESTIMATED = sum(flag.value for flag in EstimatorFlag)
+LANDED_STATES = {
+    "landed": LandedState.ON_GROUND,
+    "taking_off": LandedState.TAKEOFF,
+    "hovering": LandedState.IN_AIR,
+    "flying": LandedState.IN_AIR,
+    "landing": LandedState.LANDING,
+    "emergency": LandedState.UNDEFINED,
+}
+BREACH_NONE, BREACH_ALTITUDE, BREACH_BOUNDARY = 0, 2, 3  # FENCE_BREACH
+
+
+class TelemetrySource:
+    """What telemetry is built from; values that several messages need are computed once a gate.
+
+    Attributes:
+        state, flight, personality: of the vehicle.
+        voltage_v, capacity_mah: of its battery, nominal.
+        breach: the fence that it is outside of; breaches: how often so far; breach_ns: since when.
+    """
+
+    def __init__(self, drone: Drone, state: VehicleState, flight: Flight, personality: Personality) -> None:
+        self.state = state
+        self.flight = flight
+        self.personality = personality
+        self.voltage_v = vehicle_of(drone.model).battery.voltage_v
+        self.capacity_mah = drone.battery_mah
+        self.breach = BREACH_NONE
+        self.breaches = self.breach_ns = 0
+
+    def advance(self) -> None:
+        """Forget what was computed for the previous gate."""
+        for name in ("rpy_ned_rad", "place", "position_ned_m", "velocity_ned_m_s"):
+            self.__dict__.pop(name, None)
+
+    def sample(self, sensor: str) -> Any:
+        """Return the newest sample of a sensor; None if there is none, or it has failed."""
+        sample = self.state.samples.get(sensor)
+        return None if sample is None or self.state.has_failed(sensor) else sample
+
+    @property
+    def boot_ms(self) -> int:
+        """Simulated time since the start [ms]."""
+        return self.state.t_ns // 1_000_000 & 0xFFFFFFFF
+
+    @property
+    def boot_us(self) -> int:
+        return self.state.t_ns // 1000
+
+    @property
+    def battery_percent(self) -> float:
+        return self.state.status.battery_percent if self.state.status else 0.0
+
+    @cached_property
+    def rpy_ned_rad(self) -> Vector:
+        return self.state.rpy_ned_rad
+
+    @cached_property
+    def place(self) -> Vector:
+        """Latitude [deg], longitude [deg], height [m]."""
+        return self.state.to_global(self.state.position_m)
+
+    @cached_property
+    def position_ned_m(self) -> Vector:
+        return ned(self.state.position_m)
+
+    @cached_property
+    def velocity_ned_m_s(self) -> Vector:
+        return ned(self.state.velocity_m_s)
+
+
+Builder = Callable[[TelemetrySource], WireMessage | None]
+BuilderT = TypeVar("BuilderT", bound=Builder)
+Rates = tuple[float, float]
+"""At the levels normal and full [Hz of simulated time]."""
+
+
+class Row(NamedTuple):
+    """A message of telemetry: its builder, its rates, and the sensor whose samples it follows."""
+
+    build: Builder
+    px4: Rates | None
+    ardupilot: Rates | None
+    sensor: str | None
+
+
+ROWS: dict[type[WireMessage], Row] = {}
+
+
+def builds(
+    kind: type[WireMessage],
+    both: Rates | None = None,
+    px4: Rates | None = None,
+    ardupilot: Rates | None = None,
+    sensor: str | None = None,
+) -> Callable[[BuilderT], BuilderT]:
+    """Return a decorator that registers a builder; without rates its message is sent on request alone."""
+
+    def register(build: BuilderT) -> BuilderT:
+        ROWS[kind] = Row(build, px4 or both, ardupilot or both, sensor)
+        return build
+
+    return register
+
+
+@builds(dialect.Heartbeat)
+def heartbeat(s: TelemetrySource) -> WireMessage:
+    flight, modes = s.flight, s.personality.modes
+    base = BaseMode.CUSTOM | BaseMode.STABILIZE
+    base |= BaseMode.MANUAL_INPUT if flight.mode in BY_STICKS else BaseMode.GUIDED | BaseMode.AUTO
+    if flight.is_armed:
+        base |= BaseMode.ARMED
+    status = SystemStatus.ACTIVE if flight.is_armed else SystemStatus.STANDBY
+    if s.state.state == "emergency":
+        status = SystemStatus.EMERGENCY
+    elif s.state.is_airborne and (s.state.is_battery_low or s.breach):
+        status = SystemStatus.CRITICAL
+    custom = modes[FlightMode.MISSION if flight.foreign_commander else flight.mode]
+    return dialect.Heartbeat(TYPE_QUADROTOR, s.personality.autopilot, base, custom, status, MAVLINK_VERSION)
+
+
+@builds(dialect.SysStatus, both=(1.0, 5.0))
+def sys_status(s: TelemetrySource) -> WireMessage:
+    return dialect.SysStatus(
+        onboard_control_sensors_present=ALL_HEALTHY,
+        onboard_control_sensors_enabled=ALL_HEALTHY,
+        onboard_control_sensors_health=int(s.state.health()),
+        voltage_battery=round(1000 * s.voltage_v),
+        current_battery=-1,
+        battery_remaining=round(s.battery_percent),
+    )
+
+
+@builds(dialect.SystemTime, both=(1.0, 1.0))
+def system_time(s: TelemetrySource) -> WireMessage:
+    return dialect.SystemTime(time_boot_ms=s.boot_ms)
+
+
+@builds(dialect.Attitude, both=(10.0, 50.0))
+def attitude(s: TelemetrySource) -> WireMessage:
+    return dialect.Attitude(s.boot_ms, *s.rpy_ned_rad, *frd(s.state.rate_rad_s))
+
+
+@builds(dialect.LocalPositionNed, both=(10.0, 50.0))
+def local_position_ned(s: TelemetrySource) -> WireMessage:
+    return dialect.LocalPositionNed(s.boot_ms, *s.position_ned_m, *s.velocity_ned_m_s)
+
+
+@builds(dialect.GlobalPositionInt, both=(5.0, 50.0))
+def global_position_int(s: TelemetrySource) -> WireMessage:
+    velocity = (int16(100 * v) for v in s.velocity_ned_m_s)
+    heading = round(math.degrees(s.rpy_ned_rad[2]) % 360.0 * 100) % 36000
+    altitude_mm = round(1000 * s.state.altitude_m)
+    return dialect.GlobalPositionInt(s.boot_ms, *global_ints(s.place), altitude_mm, *velocity, heading)
+
+
+@builds(dialect.GpsRawInt, both=(5.0, 5.0), sensor="gps")
+def gps_raw_int(s: TelemetrySource) -> WireMessage:
+    gps = s.sample("gps")
+    if gps is None:
+        return dialect.GpsRawInt(s.boot_us, GpsFix.NO_FIX if "gps" in s.state.samples else GpsFix.NO_GPS)
+    vx, vy, _ = gps.velocity_m_s
+    course = math.degrees(math.atan2(vx, vy)) % 360.0
+    latitude, longitude, altitude = global_ints((gps.latitude_deg, gps.longitude_deg, gps.altitude_m))
+    sigma_mm = min(round(1000 * gps.sigma_m), 2**32 - 1)
+    return dialect.GpsRawInt(
+        time_usec=gps.t_sample_ns // 1000,
+        fix_type=min(gps.fix, 8),
+        lat=latitude,
+        lon=longitude,
+        alt=altitude,
+        eph=100,  # HDOP 1: zsim has a standard deviation alone
+        epv=100,
+        vel=min(UINT16_UNKNOWN - 1, round(100 * math.hypot(vx, vy))),
+        cog=round(100 * course) % 36000,
+        satellites_visible=min(gps.satellites, 254),
+        alt_ellipsoid=altitude,
+        h_acc=sigma_mm,
+        v_acc=sigma_mm,
+    )
+
+
+@builds(dialect.VfrHud, both=(4.0, 20.0))
+def vfr_hud(s: TelemetrySource) -> WireMessage:
+    vx, vy, vz = s.state.velocity_m_s
+    speed = math.hypot(vx, vy)
+    heading = round(math.degrees(s.rpy_ned_rad[2])) % 360
+    return dialect.VfrHud(speed, speed, heading, 50 if s.state.is_airborne else 0, s.place[2], vz)
+
+
+@builds(dialect.BatteryStatus, both=(0.5, 1.0))
+def battery_status(s: TelemetrySource) -> WireMessage:
+    voltage_mv = min(UINT16_UNKNOWN - 1, round(1000 * s.voltage_v))
+    return dialect.BatteryStatus(
+        current_consumed=max(0, round(s.capacity_mah * (1.0 - s.battery_percent / 100.0))),
+        voltages=(voltage_mv, *(UINT16_UNKNOWN,) * 9),
+        type=1,  # MAV_BATTERY_TYPE_LIPO
+        battery_remaining=round(s.battery_percent),
+        charge_state=2 if s.state.is_battery_low else 1,  # LOW, OK of MAV_BATTERY_CHARGE_STATE
+    )
+
+
+@builds(dialect.ExtendedSysState, both=(2.0, 5.0))
+def extended_sys_state(s: TelemetrySource) -> WireMessage:
+    return dialect.ExtendedSysState(0, LANDED_STATES[s.state.state])
+
+
+@builds(dialect.HomePosition, both=(0.5, 1.0))
+def home_position(s: TelemetrySource) -> WireMessage | None:
+    home_m = s.state.home_m
+    if home_m is None:
+        return None
+    place = global_ints(s.state.to_global(home_m))
+    return dialect.HomePosition(*place, *ned(home_m), (1.0, 0.0, 0.0, 0.0), time_usec=s.boot_us)
+
+
+@builds(dialect.GpsGlobalOrigin, both=(0.2, 1.0))
+def gps_global_origin(s: TelemetrySource) -> WireMessage:
+    return dialect.GpsGlobalOrigin(*global_ints(s.state.origin), s.boot_us)
+
+
+@builds(dialect.PositionTargetLocalNed, both=(2.0, 10.0))
+def position_target_local_ned(s: TelemetrySource) -> WireMessage | None:
+    target = s.flight.target
+    if not isinstance(target, Target):
+        return None
+    x, y, z = target.position_m
+    mask = TypeMask.AX | TypeMask.AY | TypeMask.AZ
+    for p, bit in ((x, TypeMask.Y), (y, TypeMask.X), (z, TypeMask.Z)):  # x of W is y of MAVLink
+        mask |= bit if p is None else TypeMask(0)
+    mask |= TypeMask.YAW_RATE if target.yaw_rad is not None else TypeMask.YAW
+    frame, axes = (MavFrame.BODY_NED, frd) if target.along_heading else (MavFrame.LOCAL_NED, ned)
+    position = ned((0.0 if x is None else x, 0.0 if y is None else y, 0.0 if z is None else z))
+    yaw = yaw_ned(target.yaw_rad) if target.yaw_rad is not None else 0.0
+    return dialect.PositionTargetLocalNed(
+        s.boot_ms, frame, mask, *position, *axes(target.velocity_m_s), 0.0, 0.0, 0.0, yaw, -target.yaw_rate_rad_s
+    )
+
+
+@builds(dialect.MissionCurrent, both=(1.0, 1.0))
+def mission_current(s: TelemetrySource) -> WireMessage:
+    mission = s.flight.mission
+    return dialect.MissionCurrent(mission.current, mission.first + len(mission.items))
+
+
+@builds(dialect.DistanceSensor, both=(2.0, 10.0), sensor="sonar")
+def distance_sensor(s: TelemetrySource) -> WireMessage | None:
+    sonar = s.sample("sonar")
+    if sonar is None:
+        return None
+    return dialect.DistanceSensor(
+        s.boot_ms,
+        min_distance=3,
+        max_distance=600,
+        current_distance=max(0, min(65535, round(100 * sonar.range_m))) if sonar.valid else 601,
+        type=1,  # MAV_DISTANCE_SENSOR_ULTRASOUND
+        orientation=25,  # MAV_SENSOR_ROTATION_PITCH_270: downwards
+    )
+
+
+@builds(dialect.Vibration, both=(0.1, 1.0))
+def vibration(s: TelemetrySource) -> WireMessage:
+    return dialect.Vibration(s.boot_us)
+
+
+@builds(dialect.AttitudeQuaternion, px4=(10.0, 50.0))
+def attitude_quaternion(s: TelemetrySource) -> WireMessage:
+    return dialect.AttitudeQuaternion(s.boot_ms, *attitude_ned(s.state.q_WB), *frd(s.state.rate_rad_s))
+
+
+@builds(dialect.Odometry, px4=(0.0, 30.0))
+def odometry(s: TelemetrySource) -> WireMessage:
+    w, x, y, z = s.state.q_WB
+    forward, left, up = frames.rotate((w, -x, -y, -z), s.state.velocity_m_s).tolist()
+    level, height = (sigma * sigma for sigma in s.state.sigma_m)
+    return dialect.Odometry(
+        s.boot_us,
+        MavFrame.LOCAL_NED,
+        MavFrame.BODY_FRD,
+        *s.position_ned_m,
+        attitude_ned(s.state.q_WB),
+        *frd((forward, left, up)),
+        *frd(s.state.rate_rad_s),
+        (level, *(0.0,) * 5, level, *(0.0,) * 4, height, *(0.0,) * 3, NAN, 0.0, 0.0, NAN, 0.0, NAN),
+        (NAN, *(0.0,) * 20),
+        estimator_type=3,  # MAV_ESTIMATOR_TYPE_GPS_INS
+    )
+
+
+@builds(dialect.HighresImu, px4=(5.0, 50.0), sensor="imu")
+def highres_imu(s: TelemetrySource) -> WireMessage | None:
+    imu = s.sample("imu")
+    if imu is None:
+        return None
+    mag, baro = s.state.samples.get("mag"), s.state.samples.get("baro")
+    field = tuple(GAUSS_PER_UT * b for b in frd(mag.field_ut)) if mag else (0.0, 0.0, 0.0)
+    pressure_hpa, height_m = (baro.pressure_pa / 100.0, baro.altitude_m) if baro else (0.0, 0.0)
+    updated = INERTIAL | (MAGNETIC if mag else 0) | (BAROMETRIC if baro else 0)
+    return dialect.HighresImu(
+        imu.t_sample_ns // 1000,
+        *frd(imu.accel_m_s2),
+        *frd(imu.gyro_rad_s),
+        *field,
+        abs_pressure=pressure_hpa,
+        pressure_alt=height_m,
+        fields_updated=updated,
+    )
+
+
+def _inertial(imu: Any) -> WireMessage:
+    """Return HIGHRES_IMU of a sample of the inertial unit alone."""
+    t_us = imu.t_sample_ns // 1000
+    return dialect.HighresImu(t_us, *frd(imu.accel_m_s2), *frd(imu.gyro_rad_s), fields_updated=INERTIAL)
+
+
+@builds(dialect.Altitude, px4=(1.0, 10.0))
+def altitude(s: TelemetrySource) -> WireMessage:
+    z, height = s.state.position_m[2], s.place[2]
+    return dialect.Altitude(s.boot_us, z, height, z, s.state.altitude_m, NAN, NAN)
+
+
+def _estimator_flags(s: TelemetrySource) -> int:
+    """Return the flags of a complete estimate, without the absolute position if the GPS has failed."""
+    if s.state.is_estimated and s.state.has_failed("gps"):
+        return ALL_ESTIMATED & ~(EstimatorFlag.POS_HORIZ_ABS | EstimatorFlag.PRED_POS_HORIZ_ABS)
+    return ALL_ESTIMATED
+
+
+@builds(dialect.EstimatorStatus, px4=(1.0, 5.0))
+def estimator_status(s: TelemetrySource) -> WireMessage:
+    level, up = s.state.sigma_m
+    flags = _estimator_flags(s)
+    return dialect.EstimatorStatus(s.boot_us, flags, pos_horiz_accuracy=level, pos_vert_accuracy=up)
+
+
+def _milli_readings(s: TelemetrySource) -> tuple[int, ...] | None:
+    """Return specific force [mg], body rate [mrad/s] and magnetic field [mgauss]."""
+    imu, mag = s.sample("imu"), s.state.samples.get("mag")
+    if imu is None:
+        return None
+    accel = (int16(MG_PER_M_S2 * a) for a in frd(imu.accel_m_s2))
+    gyro = (int16(1000 * w) for w in frd(imu.gyro_rad_s))
+    field = (int16(MILLIGAUSS_PER_UT * b) for b in frd(mag.field_ut)) if mag else (0, 0, 0)
+    return *accel, *gyro, *field
+
+
+@builds(dialect.RawImu, ardupilot=(2.0, 50.0))
+def raw_imu(s: TelemetrySource) -> WireMessage | None:
+    values = _milli_readings(s)
+    return dialect.RawImu(s.boot_us, *values) if values else None
+
+
+@builds(dialect.ScaledImu, ardupilot=(0.0, 50.0))
+def scaled_imu(s: TelemetrySource) -> WireMessage | None:
+    values = _milli_readings(s)
+    return dialect.ScaledImu(s.boot_ms, *values) if values else None
+
+
+@builds(dialect.EkfStatusReport, ardupilot=(1.0, 10.0))
+def ekf_status_report(s: TelemetrySource) -> WireMessage:
+    return dialect.EkfStatusReport(_estimator_flags(s))
+
+
+@builds(dialect.FenceStatus, ardupilot=(1.0, 2.0))
+def fence_status(s: TelemetrySource) -> WireMessage:
+    return dialect.FenceStatus(int(s.breach != 0), min(s.breaches, 0xFFFF), s.breach, s.breach_ns // 1_000_000)
+
+
+@builds(dialect.ScaledPressure, px4=(1.0, 5.0), ardupilot=(2.0, 10.0))
+def scaled_pressure(s: TelemetrySource) -> WireMessage | None:
+    baro = s.sample("baro")
+    return dialect.ScaledPressure(s.boot_ms, baro.pressure_pa / 100.0) if baro else None
+
+
+@builds(dialect.OpticalFlow, px4=(0.0, 15.0), sensor="flow")
+def optical_flow(s: TelemetrySource) -> WireMessage | None:
+    flow = s.sample("flow")
+    if flow is None:
+        return None
+    forward, left, _ = flow.velocity_m_s
+    quality = max(0, min(255, round(255 * flow.quality)))
+    return dialect.OpticalFlow(s.boot_us, 0, 0, 0, forward, -left, quality, s.state.altitude_m)
+
+
+STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM, as ArduCopter fills them
+    1: (dialect.RawImu, dialect.ScaledPressure, dialect.ScaledImu),
+    2: (dialect.SysStatus, dialect.MissionCurrent, dialect.GpsRawInt, dialect.FenceStatus),
+    6: (dialect.GlobalPositionInt, dialect.LocalPositionNed),
+    10: (dialect.Attitude,),
+    11: (dialect.VfrHud,),
+    12: (dialect.SystemTime, dialect.EkfStatusReport, dialect.DistanceSensor, dialect.BatteryStatus, dialect.Vibration),
+}
+ALL_STREAMS = 0
+BY_ID = {LAYOUTS[kind].id: kind for kind in ROWS}
+
+
+class Telemetry:
+    """What one vehicle sends, and how often; clients may change the rates.
+
+    Args:
+        level: of the rates at the start.
+    """
+
+    def __init__(self, source: TelemetrySource, level: Level) -> None:
+        self._source = source
+        self._defaults: dict[type[WireMessage], float] = {}
+        self._interval_ns: dict[type[WireMessage], int] = {}
+        self._due_ns: dict[type[WireMessage], int] = {}
+        for kind, row in ROWS.items():
+            rates = row.px4 if source.personality.is_px4 else row.ardupilot
+            if rates:
+                self._defaults[kind] = rates[1 if level == "full" else 0]
+                self._put(kind, self._defaults[kind])
+
+    def _put(self, kind: type[WireMessage], rate_hz: float) -> None:
+        if rate_hz <= 0:
+            self._interval_ns.pop(kind, None)
+            return
+        most_hz = IMU_RATE_MAX_HZ if kind is dialect.HighresImu else RATE_MAX_HZ
+        self._interval_ns[kind] = round(SECOND_NS / min(rate_hz, most_hz))
+        self._due_ns[kind] = 0
+
+    def due(self, t_ns: int) -> list[WireMessage]:
+        """Return the messages that are due at a gate."""
+        self._source.advance()
+        arrived = self._source.state.take_arrived()
+        messages: list[WireMessage] = []
+        for kind, interval_ns in self._interval_ns.items():
+            due_ns = self._due_ns[kind]
+            if t_ns >= due_ns + _delay_ns(kind, interval_ns, arrived):
+                self._due_ns[kind] = max(due_ns + interval_ns, t_ns + interval_ns // 2)
+                message = ROWS[kind].build(self._source)
+                if message is not None:
+                    if kind is dialect.HighresImu and interval_ns < GATE_NS:  # every sample since the last gate
+                        messages += map(_inertial, arrived.get("imu", ())[:-1])
+                    messages.append(message)
+        return messages
+
+    def build(self, message_id: int) -> WireMessage | None:
+        """Return a message now; None for one that this vehicle does not send."""
+        kind = BY_ID.get(message_id)
+        self._source.advance()
+        return ROWS[kind].build(self._source) if kind else None
+
+    def put_interval(self, message_id: int, interval_us: float) -> bool:
+        """Send a message at an interval: -1 never, 0 as at the start; False for one that this vehicle does not send."""
+        kind = BY_ID.get(message_id)
+        if kind is None:
+            return False
+        if kind is not dialect.Heartbeat:
+            default_hz = self._defaults.get(kind, 0.0)
+            self._put(kind, default_hz if interval_us == 0 else max(0.0, 1e6 / interval_us))
+        return True
+
+    def interval_us(self, message_id: int) -> int:
+        """Return the interval of a message: -1 if it is not sent, 0 if there is no such message."""
+        kind = BY_ID.get(message_id)
+        if kind is None:
+            return 0
+        if kind is dialect.Heartbeat:
+            return 1_000_000
+        return self._interval_ns[kind] // 1000 if kind in self._interval_ns else -1
+
+    def put_stream(self, stream: int, rate_hz: float) -> None:
+        """Send a group of messages at a rate, as in the old protocol."""
+        for number, kinds in STREAMS.items():
+            if stream in (ALL_STREAMS, number):
+                for kind in kinds:
+                    if kind in self._defaults:
+                        self._put(kind, rate_hz)
+
+
+def _delay_ns(kind: type[WireMessage], interval_ns: int, arrived: Mapping[str, Sequence[Any]]) -> int:
+    """Return how long a due message waits: one of a sensor for a sample, at the latest two intervals."""
+    sensor = ROWS[kind].sensor
+    if sensor is None:
+        return 0
+    return -interval_ns // 2 if arrived.get(sensor) else 2 * interval_ns

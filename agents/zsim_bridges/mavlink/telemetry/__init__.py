@@ -1,1 +1,0 @@
-"""What a vehicle sends of itself, and how often. Pure."""

@@ -1,0 +1,323 @@
+"""The flight of one vehicle: armed or not, its mode, and what that asks for.
+
+A landed drone of zsim has no state of its own for armed: armed means that it takes off on command.
+"""
+
+from collections.abc import Callable
+
+from zsim_bridges.mavlink.enums import Severity
+from zsim_bridges.mavlink.flight_control import ARRIVED_M, FlightControl, Target, TiltTarget
+from zsim_bridges.mavlink.mission import Mission
+from zsim_bridges.mavlink.personality import HOLDING, FlightMode, Parameters, Personality
+from zsim_bridges.mavlink.vehicle_state import VehicleState
+from zsim_bridges.vehicle_links.drone_link import CommandSender
+
+OVER_ON_GROUND = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RETURN, FlightMode.MISSION)
+Report = Callable[[Severity, str], None]
+
+
+class Flight:
+    """The flight of one vehicle; requests return None, or the reason for their refusal.
+
+    Args:
+        name: of this process among the commanders of drones.
+        sender: of commands to the drone.
+        report: called with texts for the operator.
+
+    Attributes:
+        mode: the present one.
+        mission: its items, and the progress in them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        personality: Personality,
+        parameters: Parameters,
+        state: VehicleState,
+        sender: CommandSender,
+        report: Report,
+    ) -> None:
+        self._name = name
+        self._personality = personality
+        self._parameters = parameters
+        self._state = state
+        self._report = report
+        self._control = FlightControl(parameters, state, sender)
+        self._is_armed = self._was_airborne = False
+        self._armed_ns = 0
+        self._setpoint_ns: int | None = None  # simulated time of a client's newest setpoint
+        self._return_stage = 0
+        self._mission_returns = False  # whether its return is an item of the mission
+        self.mode = personality.first_mode
+        self.mission = Mission(first=0 if personality.is_px4 else 1, turns=personality.is_px4)
+
+    # Requests of clients
+
+    @property
+    def target(self) -> Target | TiltTarget | None:
+        """What is held; None while nothing is sent."""
+        return self._control.target
+
+    @property
+    def is_armed(self) -> bool:
+        return self._state.is_airborne or self._is_armed
+
+    @property
+    def foreign_commander(self) -> str | None:
+        """Who else flies the drone."""
+        commander = self._state.status.commander if self._state.status else None
+        return commander if commander != self._name else None
+
+    def refusal(self) -> str | None:
+        """Return why nothing can be asked of the drone now."""
+        if self._state.status is None:
+            return "no status of the drone yet"
+        if self.foreign_commander:
+            return f"flown by {self.foreign_commander}"
+        return "emergency: rotors are stopped; reboot" if self._state.state == "emergency" else None
+
+    def arm(self, force: bool) -> str | None:
+        """Arm it."""
+        if self.is_armed:
+            return None
+        failed = [] if force else self._state.failed_sensors()
+        reason = self.refusal() or (f"{', '.join(failed)} failed" if failed else None)
+        if reason is None:
+            self._is_armed, self._armed_ns = True, self._state.t_ns
+            self._state.home_m = self._state.position_m
+            self._report(Severity.INFO, "Armed")
+            if self.mode is FlightMode.MISSION and self._personality.is_px4 and self.mission.items:
+                self._begin_mission_on_ground()
+        return reason
+
+    def disarm(self, force: bool) -> str | None:
+        """Disarm it; in the air, if forced, the rotors stop at once."""
+        if not self._state.is_airborne:
+            if self._is_armed:
+                self._stand("Disarmed")
+            return None
+        if force:
+            self.terminate()
+        return None if force else "in flight; land first, or force"
+
+    def terminate(self) -> None:
+        """Stop the rotors at once, whoever flies it."""
+        self.mission.abort("a client stopped its rotors", failsafe=False)
+        self._control.send_mode("emergency")
+        self._stand("Emergency: rotors stopped")
+
+    def reboot(self) -> str | None:
+        """Begin again, on the ground only; leave an emergency."""
+        if self._state.is_airborne:
+            return "in flight"
+        if self._state.state == "emergency":
+            self._control.send_mode("reset")
+        self._stand("Rebooted")
+        self.mode = self._personality.first_mode
+        return None
+
+    def take_off(self, altitude_m: float) -> str | None:
+        """Take off to an altitude over home."""
+        has_mode = FlightMode.TAKEOFF in self._personality.modes
+        reason = self.refusal() or self._takeoff_refusal()
+        if reason is None and not has_mode and self.mode is not FlightMode.OFFBOARD:
+            reason = "a take-off needs GUIDED"
+        if reason:
+            return reason
+        if has_mode:
+            self.mode = FlightMode.TAKEOFF
+        self._is_armed = True
+        self._control.climb(self._state.home_or_here_m[2] + altitude_m)
+        return None
+
+    def set_mode(self, mode: FlightMode) -> str | None:
+        """Change the mode."""
+        reason = self.refusal()
+        if reason and (self._state.is_airborne or self.foreign_commander):
+            return reason
+        if self._state.state == "landing" and mode is not FlightMode.LAND:
+            return "landing; it ends on the ground"
+        return self._enter(mode)
+
+    def go_to(self, target: Target) -> str | None:
+        """Fly to a position and hold it."""
+        reason = self.refusal() or (None if self._state.is_steerable else f"{self._state.state}, not flying")
+        if reason is None:
+            self.mode = FlightMode.HOLD if FlightMode.TAKEOFF in self._personality.modes else FlightMode.OFFBOARD
+            self._is_armed = True
+            self._control.climb_to_m = None
+            self._control.hold(target)
+        return reason
+
+    def set_point(self, target: Target | TiltTarget) -> str | None:
+        """Take a setpoint of a stream; it is flown in OFFBOARD (GUIDED), and at once."""
+        self._setpoint_ns = self._state.t_ns
+        if self.mode is not FlightMode.OFFBOARD:
+            return None if self._personality.is_px4 else "not in GUIDED"
+        reason = self.refusal()
+        if reason is None and not self._control.is_climbing:
+            self._control.hold(target)
+            leads_up = target.leads_up(self._state.position_m[2] + ARRIVED_M)
+            if leads_up and self._is_armed and not self._state.is_airborne:
+                self._control.ask("takeoff")
+        return reason
+
+    def steer_by_sticks(self, target: Target) -> None:
+        """Fly as a joystick asks, in the modes that hold otherwise."""
+        if self.mode in HOLDING and self._state.is_steerable and self._is_armed and not self.refusal():
+            self._setpoint_ns = self._state.t_ns
+            self._control.hold(target)
+
+    def start_mission(self, first: int | None = None) -> str | None:
+        """Fly the mission, from a given item or the present one on."""
+        reason = self.refusal() or self._takeoff_refusal()
+        if reason is None and first is not None and not self.mission.set_current(first):
+            reason = f"no item {first}"
+        return reason or self.set_mode(FlightMode.MISSION)
+
+    # Gates
+
+    def step(self) -> None:
+        """Do what is due at a gate, after the state has been updated."""
+        self._control.advance(self._state.t_ns)
+        self.mission.note_progress()
+        if self.mode is not FlightMode.MISSION and not (self.mode is FlightMode.RETURN and self._mission_returns):
+            self.mission.abort(f"a client chose {self.mode.name}", failsafe=False)
+        self._follow_drone()
+        if self.foreign_commander:
+            self._control.release()
+        elif self._state.is_steerable and self._is_armed:
+            self._control.on_airborne()
+            self._fly()
+            self._control.send_due()
+        elif self._control.is_takeoff_overdue():
+            self._control.release()
+            self._report(Severity.ERROR, "Take-off refused by the drone")
+            self.mission.abort("the drone refused the take-off", failsafe=True)
+
+    def _follow_drone(self) -> None:
+        """Follow what the drone does by itself."""
+        state, airborne = self._state.state, self._state.is_airborne
+        if state == "emergency":
+            self.mission.abort("its rotors were stopped", failsafe=True)
+            self._control.release()
+            self._is_armed = False
+        elif self._was_airborne and not airborne:
+            if self.mission.is_landing:
+                self.mission.finish()
+            else:
+                self.mission.abort("it landed by itself", failsafe=True)
+            self._stand("Landed; disarmed")
+        elif self._is_armed and not airborne and not self._control.is_asking:
+            delay_s = self._parameters["disarm_s"]
+            if delay_s > 0 and self._state.t_ns - self._armed_ns > delay_s * 1e9:
+                self.mission.abort("no take-off", failsafe=True)
+                self._stand("Disarmed: no take-off")
+        if state == "landing" and self.mode not in OVER_ON_GROUND:
+            self._control.release()
+            self.mode = FlightMode.LAND
+        self._was_airborne = airborne
+
+    def _fly(self) -> None:
+        """Do what the mode asks in the air."""
+        if self._control.is_climbing:
+            if self._control.continue_climb():
+                if self.mode is FlightMode.TAKEOFF:
+                    self.mode = FlightMode.HOLD
+                elif self.mode is FlightMode.MISSION:
+                    self.mission.on_climbed()
+        elif self.mode is FlightMode.MISSION:
+            self._fly_mission()
+        elif self.mode is FlightMode.RETURN:
+            self._fly_home()
+        elif self.mode is FlightMode.LAND:
+            self._control.ask("land")
+        elif self.mode is FlightMode.OFFBOARD or self._control.is_moving:
+            self._watch_stream()
+
+    def _fly_mission(self) -> None:
+        step = self.mission.step(self._state, self._parameters)
+        match step.action:
+            case "land":
+                self._control.ask("land")
+            case "climb":
+                self._control.climb(step.z_m)
+            case "return":
+                self._enter(FlightMode.RETURN)
+                self._mission_returns = True
+            case "fly" if step.target != self.target:
+                self._control.hold(step.target)
+            case "over":
+                self._report(Severity.INFO, "Mission finished")
+                self.mission.finish()
+                self._enter(FlightMode.HOLD)
+
+    def _fly_home(self) -> None:
+        """Climb to the height of returns, fly home, land, one after the other."""
+        home_x, home_y, home_z = self._state.home_or_here_m
+        x, y, z = self._state.position_m
+        target = self.target
+        if self._return_stage == 0:
+            self._return_stage = 1
+            self._control.hold(Target((x, y, max(z, home_z + self._parameters["return_altitude_m"]))))
+        elif self._return_stage == 1 and isinstance(target, Target) and self._control.has_arrived():
+            self._return_stage = 2
+            self._control.hold(Target((home_x, home_y, target.position_m[2])))
+        elif self._return_stage == 2 and (target is None or self._control.has_arrived()):
+            self._control.ask("land")
+
+    def _is_stream_silent(self) -> bool:
+        """Return whether no setpoint has come for too long, or ever."""
+        silence_ns = self._parameters["stream_s"] * 1e9
+        return self._setpoint_ns is None or self._state.t_ns - self._setpoint_ns > silence_ns
+
+    def _watch_stream(self) -> None:
+        """Hold when setpoints cease; ArduPilot holds a position anyway."""
+        if not self._is_stream_silent() or self.target is None:
+            return
+        if self.mode is FlightMode.OFFBOARD and self._personality.is_px4:
+            self._report(Severity.WARNING, "Offboard lost: no setpoints; holding")
+            self._enter(FlightMode.HOLD)
+        elif self._control.is_moving:
+            self._control.hold_here()
+
+    def _takeoff_refusal(self) -> str | None:
+        return "landing" if self._state.state == "landing" else None if self.is_armed else "not armed"
+
+    def _enter(self, mode: FlightMode) -> str | None:
+        needs_stream = mode is FlightMode.OFFBOARD and self._personality.is_px4
+        if needs_stream and self._is_stream_silent():
+            return "OFFBOARD needs a stream of setpoints first"
+        if mode is FlightMode.MISSION and not self.mission.items:
+            return "no mission"
+        if mode is FlightMode.TAKEOFF:
+            return self.take_off(self._parameters["takeoff_altitude_m"])
+        self.mode, self._mission_returns, self._return_stage = mode, False, 0
+        if self._state.is_airborne:
+            self._is_armed = True
+            if mode is FlightMode.MISSION:
+                self.mission.start()
+            if mode is FlightMode.LAND:
+                self._control.ask("land")
+            elif mode in HOLDING or (mode is FlightMode.OFFBOARD and not needs_stream):
+                self._control.hold_here()
+            else:
+                self._control.climb_to_m = None
+        elif mode is FlightMode.MISSION and self._is_armed:
+            self._begin_mission_on_ground()
+        return None
+
+    def _begin_mission_on_ground(self) -> None:
+        self.mission.start()
+        z_m = self.mission.takeoff_height_m(self._state)
+        takeoff_m = self._state.home_or_here_m[2] + self._parameters["takeoff_altitude_m"]
+        self._control.climb(takeoff_m if z_m is None else z_m)
+
+    def _stand(self, text: str) -> None:
+        """Be disarmed."""
+        self._control.release()
+        self._is_armed = False
+        if self.mode in OVER_ON_GROUND or (self.mode is FlightMode.OFFBOARD and self._personality.is_px4):
+            self.mode = self._personality.first_mode
+        self._report(Severity.INFO, text)

@@ -1,0 +1,190 @@
+"""The state of a vehicle: the estimate, or the truth where no estimator runs, and the health of its sensors."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from zsim.contract import flight_messages, messages
+from zsim.contract.messages import Origin
+from zsim.math import frames
+from zsim.math.frames import anchor, geodetic
+from zsim.math.rotation import LEVEL, Vector
+from zsim.scenario.scenario import Drone
+from zsim_bridges.mavlink import dialect
+from zsim_bridges.mavlink.enums import SensorBit
+
+ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an older estimate is not used
+SAMPLES_MISSED = 5  # periods of a sensor without a sample: it has failed
+UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may publish zeros
+LOW_BATTERY_PERCENT = 20.0  # chosen: above BAT_CRIT_THR and the like, so that the pilot is warned before they act
+AIRBORNE = ("taking_off", "hovering", "flying", "landing")
+SENSORS = {
+    "imu": SensorBit.GYRO | SensorBit.ACCEL,
+    "mag": SensorBit.MAG,
+    "baro": SensorBit.BARO,
+    "gps": SensorBit.GPS,
+    "sonar": SensorBit.LASER_POSITION,
+    "flow": SensorBit.FLOW,
+}
+CONTROLS = (
+    SensorBit.RATE_CONTROL
+    | SensorBit.ATTITUDE_CONTROL
+    | SensorBit.YAW_POSITION
+    | SensorBit.ALTITUDE_CONTROL
+    | SensorBit.POSITION_CONTROL
+    | SensorBit.MOTORS
+    | SensorBit.AHRS
+)
+
+
+class VehicleState:
+    """The state of one vehicle.
+
+    Args:
+        drone: of the scenario.
+        origin: of W on the Earth.
+
+    Attributes:
+        t_ns: simulated time of the newest status.
+        status: of the drone; None before the first.
+        position_m, velocity_m_s: in W.
+        q_WB, rate_rad_s: attitude, and body rate in B.
+        is_estimated: whether these are the estimator's.
+        sigma_m: standard deviation of the horizontal and of the vertical position; 0 for the truth.
+        samples: the newest of each sensor, by name.
+        home_m: home in W, first where it was switched on; None before it is known.
+    """
+
+    def __init__(self, drone: Drone, origin: Origin) -> None:
+        self.t_ns = self._first_ns = 0
+        self.status: flight_messages.Status | None = None
+        self.position_m: Vector = drone.position_m
+        self.velocity_m_s: Vector = (0.0, 0.0, 0.0)
+        self.rate_rad_s: Vector = (0.0, 0.0, 0.0)
+        self.q_WB = LEVEL
+        self.is_estimated = False
+        self.sigma_m = (0.0, 0.0)
+        self.samples: dict[str, Any] = {}
+        self._arrived: dict[str, list[Any]] = {}
+        self.home_m: Vector | None = None
+        self.origin = (origin.latitude_deg, origin.longitude_deg, origin.height_m)
+        self._anchor = anchor(*self.origin)
+        self._estimate_ns = -ESTIMATE_AGE_MAX_NS - 1
+        self._silence_max_ns = {
+            name: round(1e9 * SAMPLES_MISSED / getattr(drone.sensors, name).rate_hz) for name in SENSORS
+        }
+
+    def update(self, name: str, message: Any) -> None:
+        """Take in a message of the drone or of its estimator.
+
+        Args:
+            name: of the sensor; `truth`, `estimate`, `status`.
+            message: decoded.
+        """
+        match message:
+            case flight_messages.Status():
+                if self.status is None:
+                    self._first_ns = message.t_ns
+                self.status, self.t_ns = message, message.t_ns
+                if self.home_m is None:
+                    self.home_m = self.position_m
+            case flight_messages.Truth():
+                self._on_truth(message)
+            case flight_messages.Estimate():
+                self._on_estimate(message)
+            case _:
+                self.samples[name] = message
+                self._arrived.setdefault(name, []).append(message)
+                if isinstance(message, messages.Imu):
+                    self.rate_rad_s = message.gyro_rad_s
+
+    def take_arrived(self) -> dict[str, list[Any]]:
+        """Return the samples received since the last call, by sensor."""
+        arrived, self._arrived = self._arrived, {}
+        return arrived
+
+    def _on_truth(self, truth: flight_messages.Truth) -> None:
+        if truth.t_ns - self._estimate_ns <= ESTIMATE_AGE_MAX_NS:
+            return
+        self.is_estimated, self.sigma_m = False, (0.0, 0.0)
+        self.position_m, self.velocity_m_s, self.q_WB = truth.position_m, truth.velocity_m_s, truth.orientation_wxyz
+
+    def _on_estimate(self, estimate: flight_messages.Estimate) -> None:
+        if abs(math.hypot(*estimate.orientation_wxyz) - 1.0) > UNIT_SLACK:
+            return
+        self._estimate_ns, self.is_estimated = estimate.t_ns, True
+        self.position_m, self.velocity_m_s = estimate.position_m, estimate.velocity_m_s
+        self.q_WB = estimate.orientation_wxyz
+        variances = estimate.covariance
+        level, up = max(0.0, variances[0] + variances[7]), max(0.0, variances[14])
+        self.sigma_m = math.sqrt(level / 2.0), math.sqrt(up)
+
+    @property
+    def is_airborne(self) -> bool:
+        return self.status is not None and self.status.state in AIRBORNE
+
+    @property
+    def is_steerable(self) -> bool:
+        """Whether the firmware accepts setpoints."""
+        return self.status is not None and self.status.state in ("hovering", "flying")
+
+    @property
+    def state(self) -> str:
+        """The state in its status; `landed` before the first."""
+        return self.status.state if self.status else "landed"
+
+    @property
+    def yaw_rad(self) -> float:
+        """Counter-clockwise from east."""
+        return float(frames.heading(self.q_WB))
+
+    @property
+    def is_battery_low(self) -> bool:
+        return self.status is not None and self.status.battery_percent < LOW_BATTERY_PERCENT
+
+    def has_failed(self, sensor: str) -> bool:
+        """Return whether a sensor has been silent for too long."""
+        sample = self.samples.get(sensor)
+        return self.t_ns - (sample.t_ns if sample else self._first_ns) > self._silence_max_ns[sensor]
+
+    def failed_sensors(self) -> list[str]:
+        """Return the names of the sensors that are silent."""
+        return [name for name in SENSORS if self.has_failed(name)]
+
+    def health(self) -> SensorBit:
+        """Return the healthy parts of the vehicle."""
+        healthy = CONTROLS | SensorBit.BATTERY | SensorBit.PREARM_CHECK
+        for name, part in SENSORS.items():
+            healthy |= SensorBit(0) if self.has_failed(name) else part
+        if self.is_battery_low:
+            healthy &= ~SensorBit.BATTERY
+        if self.state == "emergency":
+            healthy &= ~SensorBit.PREARM_CHECK
+        return healthy
+
+    def to_global(self, position_m: Vector) -> Vector:
+        """Return latitude [deg], longitude [deg] and ellipsoidal height [m] of a point in W."""
+        (place,) = geodetic(np.array([position_m]), *self._anchor).tolist()
+        return place[0], place[1], place[2]
+
+    def to_local(self, latitude_deg: float, longitude_deg: float, height_m: float) -> Vector:
+        """Return p_W [m] of a point on the Earth."""
+        x, y, z = frames.geodetic_to_enu((latitude_deg, longitude_deg, height_m), self.origin).tolist()
+        return x, y, z
+
+    @property
+    def home_or_here_m(self) -> Vector:
+        """Home in W; the present position before home is known."""
+        return self.home_m or self.position_m
+
+    @property
+    def altitude_m(self) -> float:
+        """Height over home."""
+        return self.position_m[2] - self.home_or_here_m[2]
+
+    @property
+    def rpy_ned_rad(self) -> Vector:
+        """Roll, pitch and yaw in MAVLink's axes."""
+        roll, pitch, yaw = frames.rpy_from_quaternion(dialect.attitude_ned(self.q_WB)).tolist()
+        return roll, pitch, yaw

@@ -1,0 +1,430 @@
+"""The driver as a process: an aircraft at the other end of a wire is one drone of a run.
+
+The session with the aircraft and the failsafe are pure and have files of their own; here are the messages of the drone,
+keys, sockets and the event loop.
+"""
+
+import asyncio
+import contextlib
+import errno
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+from zsim.contract import flight_messages, keys, messages
+from zsim.contract.flight_messages import Connection
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import RUN_ENDED, ControlAnswer
+from zsim.errors import DecodeError, RunError
+from zsim.runtime.participant import Participant
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Drone, Scenario
+from zsim.sensors.sensor_catalogue import STOCK
+from zsim.transport.session import Query, RawSample, Session
+from zsim.vehicles.vehicle import ROTORS_MIN
+from zsim_bridges.vehicle_links.aircraft_readings import STILL, AircraftPose, ClockOffset, Reading
+from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_run
+from zsim_bridges.vehicle_links.failsafe import LINK_LOST_S, Failsafe
+from zsim_bridges.vehicle_links.vehicle_session import STANDING, AircraftState, UdpChannel, VehicleSession
+
+TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
+REPORT_S = 1.0  # s, wall; of the link's figures
+LANDING_S = 30.0  # s, wall; how long it waits for the aircraft to be down before it leaves
+PATIENCE_S = 5.0  # s, wall, chosen: heartbeats come once a second; then it prints what may be amiss
+FORMER_S = 2.0  # s, wall, chosen: a driver that this one replaces keeps its port for some 10 ms more
+AGAIN_S = 0.02  # s, wall, chosen: between two tries to open a port
+WAITING_MAX = 4000  # readings, 10 s of an IMU at 200 Hz and all else; then the oldest are dropped
+EXTRAPOLATED_NS = 500_000_000  # chosen: an older pose is not extrapolated further; it says where the aircraft was
+Say = Callable[[str], None]
+SessionMaker = Callable[[Info, Scenario, DriverOptions], VehicleSession]
+
+
+def drive(
+    link: Session,
+    info: Info,
+    observer: Participant,
+    stopped: Callable[[], bool],
+    say: Say,
+    options: DriverOptions,
+    make_session: SessionMaker,
+) -> None:
+    """Drive one aircraft in one run until the run is over.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        observer: of this process in it.
+        stopped: called now and then; True ends the run.
+        say: prints a line.
+        options: of the driver.
+        make_session: returns the session with the aircraft.
+
+    Raises:
+        RunError: the drone is not external, or the run does not keep the pace of the wall clock.
+    """
+    check_run(info, observer.name, options.drone)
+    session = make_session(info, scenario_file.from_text(info.scenario), options)
+    asyncio.run(DriverProcess(link, info, observer, options, session, say).run(stopped))
+
+
+class DriverProcess:
+    """One aircraft in one run.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        observer: of this process in it.
+        options: of the driver.
+        session: with the aircraft.
+        say: prints a line.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        info: Info,
+        observer: Participant,
+        options: DriverOptions,
+        session: VehicleSession,
+        say: Say,
+    ) -> None:
+        self._link, self._observer, self._session = link, observer, session
+        self._say_line = say
+        self._drone = options.drone
+        self._clock = DriverClock(info.rate or 1.0)
+        scenario = scenario_file.from_text(info.scenario)
+        self._failsafe = Failsafe(scenario.silence, options.limits, options.armed)
+        rotors = next(len(drone.rotors) for drone in info.drones if drone.name == options.drone) or ROTORS_MIN
+        hover_rad_s = hover_speed(scenario.drone(options.drone), rotors, scenario.environment.gravity_m_s2)
+        self._external = ExternalDrone(options.drone, self._clock.to_simulated, (hover_rad_s,) * rotors)
+        self._sockets = [AircraftSocket(partial(self._receive, number)) for number in range(len(session.channels))]
+        self._reported_s = 0.0
+        self._reported: tuple[Connection, str, str] | None = None
+        self._report_seq = self._ignored = 0
+        self._has_clock = False  # before the first, messages cannot be stamped
+        self._hint_s = time.monotonic() + PATIENCE_S
+
+    async def run(self, stopped: Callable[[], bool]) -> None:
+        """Carry messages both ways until the run is over or a stop is requested; then land."""
+        try:
+            for socket, channel in zip(self._sockets, self._session.channels, strict=True):
+                await socket.open(channel)
+            self._subscribe(asyncio.get_running_loop())
+            while not (stopped() or self._observer.end_reason):
+                self._tick()
+                await asyncio.sleep(TICK_S)
+            await self._land_and_leave(stopped())
+        finally:
+            for socket in self._sockets:
+                socket.close()
+
+    def _subscribe(self, loop: asyncio.AbstractEventLoop) -> None:
+        def in_loop(handle: Callable[..., None], *values: Any) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(handle, *values)
+
+        def on_clock(sample: RawSample) -> None:
+            in_loop(self._on_clock, sample.payload)
+
+        def on_accepted(sample: RawSample) -> None:
+            in_loop(self._on_accepted, sample.key, sample.payload)
+
+        self._link.declare_subscriber(keys.CLOCK, on_clock)
+        self._link.declare_subscriber(keys.accepted(self._drone, "*"), on_accepted)
+        self._link.declare_queryable(keys.driver(self._drone), partial(in_loop, self._on_request))
+
+    def _say(self, text: str) -> None:
+        self._say_line(f"{self._observer.name}: {text}")
+
+    # From the run and the aircraft
+
+    def _receive(self, channel: int, datagram: bytes) -> None:
+        self._session.receive(channel, datagram, self._clock.now_ns())
+        self._external.add(self._session.take_readings())
+
+    def _on_clock(self, payload: bytes) -> None:
+        """Publish the gate that the world has reached."""
+        clock = self._observer.update_clock(payload)
+        self._has_clock = self._has_clock or clock is not None
+        if clock is None or clock.state != "running":
+            return
+        now_ns = self._clock.now_ns()
+        self._clock.on_gate(clock.t_ns)
+        self._failsafe.on_clock(now_ns)
+        vehicle = self._session.state
+        if self._failsafe.phase == "killed":
+            vehicle = vehicle._replace(state="emergency")
+        if vehicle.received_ns is not None and now_ns - vehicle.received_ns < LINK_LOST_S * 1e9:
+            for key, message in self._external.gate(clock.t_ns, vehicle, self._failsafe.commander):
+                self._link.put(key, message)
+
+    def _on_accepted(self, key: str, payload: bytes) -> None:
+        """Pass a command on at once."""
+        try:
+            command = messages.decode(key, payload)
+        except DecodeError:
+            self._observer.health.refused += 1
+            return
+        refusal = self._failsafe.on_command(command, self._clock.now_ns(), self._session.state)
+        if refusal is None:
+            self._send()
+            return
+        self._observer.health.refused += 1
+        self._ignored += 1
+        if self._ignored == 1 or isinstance(command, flight_messages.Mode):
+            self._say(f"{keys.leaf(key)} of {command.source} is not obeyed: {refusal}")
+
+    def _on_request(self, query: Query) -> None:
+        """Answer an operator."""
+        now_ns = self._clock.now_ns()
+        try:
+            request = query.request()
+        except DecodeError as error:
+            self._observer.health.refused += 1
+            query.answer(ControlAnswer(False, str(error)))
+            return
+        source, error = request.source or "somebody", None
+        match request.op:
+            case "arm":
+                error = self._failsafe.arm(now_ns, self._session.state)
+            case "disarm":
+                error = self._failsafe.disarm(self._session.state)
+            case "kill":
+                self._failsafe.kill(now_ns, source)
+            case op:
+                error = f"op is {op[:40]!r}; must be one of arm, disarm, kill"
+        query.answer(ControlAnswer(error is None, error or ""))
+        self._say(f"{source} asks {request.op}: {error or 'done'}")
+        self._send()
+        self._report(now_ns)
+
+    # To the aircraft and the run
+
+    def _tick(self) -> None:
+        self._send()
+        self._observer.tick()
+        for text in self._session.texts:
+            self._say(text)
+        self._session.texts.clear()
+        self._hint()
+        is_due = time.monotonic() - self._reported_s > REPORT_S or self._reported != self._reported_now()
+        if is_due and self._has_clock:
+            self._report(self._clock.now_ns())
+
+    def _hint(self) -> None:
+        """Print once what may be amiss if an aircraft does not show itself."""
+        if time.monotonic() < self._hint_s:
+            return
+        self._hint_s = math.inf
+        if self._session.state.received_ns is None:
+            channel, refused = self._session.channels[0], self._session.figures(self._clock.now_ns()).refused
+            silence = self._sockets[0].fault.lower() or "nothing comes"
+            what = f"{refused} messages came that are not its own" if refused else silence
+            advice = "check its address, that it is switched on, and over MAVLink its system id and key"
+            self._say(f"no aircraft at {channel.host}:{channel.port} ({what}); {advice}")
+
+    def _send(self) -> None:
+        """Send the aircraft what is due."""
+        now_ns = self._clock.now_ns()
+        demand = self._failsafe.demand(now_ns, self._session.state)
+        for channel, datagram in self._session.advance(now_ns, demand):
+            self._sockets[channel].send(datagram)
+
+    def _reported_now(self) -> tuple[Connection, str, str]:
+        received_ns, now_ns = self._session.state.received_ns, self._clock.now_ns()
+        state: Connection = "armed" if self._failsafe.armed else "connected"
+        if received_ns is None:
+            state = "waiting"
+        elif now_ns - received_ns > LINK_LOST_S * 1e9:
+            state = "lost"
+        return state, self._failsafe.phase, self._failsafe.reason
+
+    def _report(self, now_ns: int) -> None:
+        """Publish the state of the link; print its changes."""
+        state, phase, reason = now = self._reported_now()
+        if now != self._reported:
+            self._say(f"link {state}, {phase}{f' ({reason})' if reason else ''}")
+        self._reported, self._reported_s = now, time.monotonic()
+        figures = self._session.figures(now_ns)
+        received_ns, channel = self._session.state.received_ns, self._session.channels[0]
+        message = flight_messages.LinkState(
+            t_ns=self._observer.now_ns,
+            seq=self._report_seq,
+            source=self._observer.name,
+            peer=f"{channel.host}:{channel.port}",
+            state=state,
+            age_ms=None if received_ns is None else (now_ns - received_ns) / 1e6,
+            loss_percent=figures.loss_percent,
+            round_trip_ms=figures.round_trip_ms,
+            clock_offset_ms=figures.clock_offset_ms,
+            refused=figures.refused,
+        )
+        self._report_seq += 1
+        self._link.put(keys.link(self._drone), message)
+
+    async def _land_and_leave(self, interrupted: bool) -> None:
+        """Land what still flies for this driver, or finish a kill; a driver that replaces this one takes it over."""
+        if self._observer.superseded:
+            return
+        reason = "its driver is stopped" if interrupted else self._observer.end_reason or RUN_ENDED
+        if not interrupted:
+            self._observer.leave(reason)  # the run is over for everybody; the aircraft may still be on its way down
+        self._failsafe.land(reason, self._clock.now_ns())
+        until_s = time.monotonic() + LANDING_S
+        if self._failsafe.phase == "landing":
+            self._say(f"{reason}; it lands; a second Ctrl-C leaves it to itself")
+        while (stopping := self._failsafe.is_stopping(self._session.state)) and time.monotonic() < until_s:
+            self._tick()
+            await asyncio.sleep(TICK_S)
+        if stopping:
+            state = self._session.state.state
+            self._say(f"it is still {state} after {LANDING_S:g} s; take it over by hand")
+
+
+class DriverClock:
+    """The clock of the driver, which goes at the rate of the run's, and the simulated time at its times.
+
+    Args:
+        rate: simulated per wall seconds.
+        wall_ns: monotonic wall time.
+    """
+
+    def __init__(self, rate: float, wall_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._rate, self._wall_ns = rate, wall_ns
+        self._offset = ClockOffset()
+
+    def now_ns(self) -> int:
+        return round(self._wall_ns() * self._rate)
+
+    def on_gate(self, t_ns: int) -> None:
+        """Take a clock of the run that has just arrived."""
+        self._offset.add(t_ns, self.now_ns())
+
+    def to_simulated(self, now_ns: int) -> int:
+        """Return simulated time at a time of this clock."""
+        return self._offset.to_remote(now_ns)
+
+
+class ExternalDrone:
+    """An aircraft's readings as the messages of one drone, gate by gate. Pure.
+
+    Args:
+        drone: its name.
+        to_simulated: simulated time at a time of this process's clock.
+        hover_rad_s: speed of each rotor at which the drone hovers: no wire tells how fast they turn, and others fly in
+            their downwash.
+    """
+
+    def __init__(
+        self, drone: str, to_simulated: Callable[[int], int], hover_rad_s: tuple[float, ...] = (0.0,) * 4
+    ) -> None:
+        self._hover_rad_s = hover_rad_s
+        self._drone = drone
+        self._to_simulated = to_simulated
+        self._readings: deque[Reading] = deque(maxlen=WAITING_MAX)
+        self._seq: dict[str, int] = {}
+        self._gate_ns = -1
+
+    def add(self, readings: Iterable[Reading]) -> None:
+        """Keep readings for the next gate."""
+        self._readings.extend(readings)
+
+    def gate(self, t_ns: int, vehicle: AircraftState, commander: str | None) -> list[tuple[str, Any]]:
+        """Return keys and messages of a gate in order: samples by time, truth, and status; nothing for an old gate."""
+        if t_ns <= self._gate_ns or vehicle.pose is None:
+            return []
+        self._gate_ns = t_ns
+        sent = [*self._samples(t_ns), self._truth(t_ns, vehicle.pose, turning=vehicle.state not in STANDING)]
+        key = keys.status(self._drone)
+        status = (vehicle.state, vehicle.battery_percent, False, commander, len(sent))
+        return [*sent, (key, flight_messages.Status(t_ns, self._next(key), *status))]
+
+    def _samples(self, t_ns: int) -> list[tuple[str, Any]]:
+        """Return the messages of what has been measured, in order of time; none is of the future."""
+        taken = [(min(t_ns, self._to_simulated(reading.taken_ns)), reading) for reading in self._readings]
+        self._readings.clear()
+        taken.sort(key=lambda entry: entry[0])
+        samples = []
+        for sample_ns, reading in taken:
+            key = keys.sensor(self._drone, reading.sensor)
+            message = STOCK[reading.sensor].message
+            samples.append((key, message(t_ns, self._next(key), max(0, sample_ns), *reading.values)))
+        return samples
+
+    def _truth(self, t_ns: int, pose: AircraftPose, turning: bool) -> tuple[str, Any]:
+        """Return the pose at the gate, extrapolated by its velocity."""
+        age_ns = max(0, min(EXTRAPOLATED_NS, t_ns - self._to_simulated(pose.taken_ns)))
+        x, y, z = (p + age_ns * 1e-9 * v for p, v in zip(pose.position_m, pose.velocity_m_s, strict=True))
+        key = keys.truth(self._drone)
+        rotors = self._hover_rad_s if turning else (0.0,) * len(self._hover_rad_s)
+        motion = ((x, y, z), pose.velocity_m_s, pose.q_WB, pose.w_WB_B, STILL, rotors)
+        return key, flight_messages.Truth(t_ns, self._next(key), *motion)
+
+    def _next(self, key: str) -> int:
+        self._seq[key] = self._seq.get(key, -1) + 1
+        return self._seq[key]
+
+
+def hover_speed(drone: Drone, rotors: int, gravity_m_s2: float) -> float:
+    """Return the speed [rad/s] at which each of a number of rotors carries its share of a drone."""
+    return math.sqrt(drone.mass_kg * gravity_m_s2 / (rotors * drone.thrust_n_s2))
+
+
+class AircraftSocket(asyncio.DatagramProtocol):
+    """A UDP socket to one port of the aircraft.
+
+    Args:
+        receive: called with each datagram.
+
+    Attributes:
+        fault: why the newest datagram could not be delivered, such as that nobody listens; empty for none.
+    """
+
+    def __init__(self, receive: Callable[[bytes], None]) -> None:
+        self._receive = receive
+        self._transport: asyncio.DatagramTransport | None = None
+        self.fault = ""
+
+    async def open(self, channel: UdpChannel) -> None:
+        """Open it.
+
+        Raises:
+            RunError: the port here is taken, or the aircraft's address cannot be reached.
+        """
+        local = ("0.0.0.0", channel.local_port) if channel.local_port else None
+        until_s = time.monotonic() + FORMER_S
+        loop = asyncio.get_running_loop()
+        while self._transport is None:
+            try:
+                to = channel.host, channel.port
+                self._transport, _ = await loop.create_datagram_endpoint(lambda: self, remote_addr=to, local_addr=local)
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE or time.monotonic() > until_s:
+                    raise RunError(_not_opened(channel, error)) from error
+                await asyncio.sleep(AGAIN_S)
+
+    def send(self, datagram: bytes) -> None:
+        if self._transport is not None:
+            self._transport.sendto(datagram)
+
+    def close(self) -> None:
+        if self._transport is not None:
+            self._transport.close()
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        self._receive(data)
+
+    def error_received(self, exc: Exception) -> None:
+        """Note that nobody listens there yet; what is due is sent again."""
+        self.fault = getattr(exc, "strerror", None) or str(exc)
+
+
+def _not_opened(channel: UdpChannel, error: OSError) -> str:
+    """Return why there is no socket for a channel, and what to do."""
+    why = error.strerror or str(error)
+    if error.errno in (errno.EADDRINUSE, errno.EACCES):
+        return f"UDP port {channel.local_port} here cannot be had: {why}; give another --local-port, or end who has it"
+    return f"{channel.host}:{channel.port} cannot be reached: {why}; give the address of the aircraft"

@@ -1,0 +1,181 @@
+"""A bridge's link to one drone: the commands that it sends, and the state that the drone's electronics know. Pure."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from zsim.contract import flight_messages, keys, messages
+from zsim.math import frames as rotations
+from zsim.math.rotation import LEVEL, Vector
+from zsim.sensors.sensor import Mount
+from zsim_agents.estimation.dead_reckoning import madgwick_step
+
+BETA_RAD_S = 0.02  # of Madgwick's filter: levels within seconds, and is little disturbed by manoeuvres
+UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may publish zeros
+STEP_S_MAX = 0.1  # longer gaps in the IMU's samples are not integrated over
+POSITIONS_KEPT = 32  # gates whose integrated position is remembered; an estimate is a few gates late at most
+ModeName = Literal["takeoff", "land", "emergency", "reset"]
+
+
+class CommandSender:
+    """Sends commands to a drone under the name of a process, numbered by key.
+
+    Args:
+        drone: its name.
+        source: process name under which commands are sent.
+        put: publishes a message on a key.
+    """
+
+    def __init__(self, drone: str, source: str, put: Callable[[str, Any], None]) -> None:
+        self._source = source
+        self._put = put
+        self._drone = drone
+        self._seq: dict[str, int] = {}
+
+    def mode(self, t_ns: int, mode: ModeName) -> None:
+        """Take off, land, stop the rotors at once, or leave the emergency."""
+        self._send("mode", flight_messages.Mode, t_ns, mode)
+
+    def velocity(
+        self,
+        t_ns: int,
+        velocity_m_s: Sequence[float],
+        yaw_rate_rad_s: float,
+        frame: Literal["heading", "world"] = "world",
+    ) -> None:
+        """Fly a velocity in W, or in the heading frame, and turn counter-clockwise."""
+        x, y, z = velocity_m_s
+        self._send("velocity", flight_messages.Velocity, t_ns, (x, y, z), yaw_rate_rad_s, frame)
+
+    def tilt(self, t_ns: int, forward: float, left: float, up: float, yaw_left: float, hover: bool) -> None:
+        """Fly as the AR.Drone's own commands do: shares of its limits in [-1, 1], or hover."""
+        self._send("ardrone", flight_messages.Ardrone, t_ns, forward, left, up, yaw_left, hover)
+
+    def attitude(self, t_ns: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float) -> None:
+        """Hold the tilt of an attitude with a thrust [N] and a yaw rate."""
+        w, x, y, z = q_WB
+        self._send("attitude", flight_messages.Attitude, t_ns, (w, x, y, z), thrust_n, yaw_rate_rad_s)
+
+    def _send(self, kind: str, message: Callable[..., Any], t_ns: int, *fields: Any) -> None:
+        key = keys.command(self._drone, kind)
+        seq = self._seq.get(key, 0)
+        self._seq[key] = seq + 1
+        self._put(key, message(t_ns, seq, self._source, *fields))
+
+
+class OnboardState:
+    """The state of one aircraft: newest sensor samples, attitude, altitude, odometry.
+
+    The attitude is that of the drone's estimator or, if none runs, of Madgwick's filter on the drone's own IMU, whose
+    heading is 0 at the start, like that of the aircraft at power-on. The position is integrated from the optical flow.
+
+    Args:
+        imu: pose of the IMU in the body.
+        mag: pose of the magnetometer.
+
+    Attributes:
+        imu, mag, baro, flow, status, estimate: newest, in the axes of the body; None before the first.
+        attitude: B to W.
+        altitude_m: over the ground, from the sonar; beyond its range, continued by the barometer.
+        position_m: integrated since the start, with the altitude.
+        origin_m: origin of the integrated position in W, by the estimator; None without an estimate.
+    """
+
+    def __init__(self, imu: Mount | None = None, mag: Mount | None = None) -> None:
+        mounts = {messages.Imu: imu, messages.Mag: mag}
+        self._q_BS = {
+            kind: rotations.quaternion_from_rpy(np.radians(mount.rpy_deg))
+            for kind, mount in mounts.items()
+            if mount and any(mount.rpy_deg)
+        }
+        self.imu: messages.Imu | None = None
+        self.mag: messages.Mag | None = None
+        self.baro: messages.Baro | None = None
+        self.flow: messages.Flow | None = None
+        self.status: flight_messages.Status | None = None
+        self.estimate: flight_messages.Estimate | None = None
+        self.attitude = LEVEL
+        self.altitude_m = 0.0
+        self._ground_baro_m: float | None = None
+        self._x_m = self._y_m = 0.0
+        self._positions: deque[tuple[int, Vector]] = deque(maxlen=POSITIONS_KEPT)
+        self.origin_m: Vector | None = None
+
+    def update(self, message: Any) -> Any:
+        """Update by a message of the drone or of its estimator; return it in the axes of the body."""
+        q_BS = self._q_BS.get(type(message))
+        message = message if q_BS is None else _rotated(message, q_BS)
+        match message:
+            case messages.Imu():
+                self._on_imu(message)
+            case messages.Mag():
+                self.mag = message
+            case messages.Baro():
+                self._on_baro(message)
+            case messages.Sonar():
+                self._on_sonar(message)
+            case messages.Flow():
+                self._on_flow(message)
+            case flight_messages.Estimate():
+                self._on_estimate(message)
+            case flight_messages.Status():
+                self.status = message
+                self._positions.append((message.t_ns, self.position_m))
+        return message
+
+    @property
+    def position_m(self) -> Vector:
+        return self._x_m, self._y_m, self.altitude_m
+
+    def _on_imu(self, imu: messages.Imu) -> None:
+        before, self.imu = self.imu, imu
+        if self.estimate is None and before is not None:
+            dt = (imu.t_sample_ns - before.t_sample_ns) * 1e-9
+            if 0.0 < dt < STEP_S_MAX:
+                self.attitude = madgwick_step(self.attitude, imu.gyro_rad_s, imu.accel_m_s2, BETA_RAD_S, dt)
+
+    def _on_baro(self, baro: messages.Baro) -> None:
+        self.baro = baro
+        if self._ground_baro_m is not None:
+            self.altitude_m = max(0.0, baro.altitude_m - self._ground_baro_m)
+
+    def _on_sonar(self, sonar: messages.Sonar) -> None:
+        if sonar.valid:
+            self.altitude_m = sonar.range_m * max(0.0, float(rotations.rotation_matrix(self.attitude)[2, 2]))
+            self._ground_baro_m = None
+        elif self._ground_baro_m is None and self.baro is not None:
+            self._ground_baro_m = self.baro.altitude_m - self.altitude_m
+
+    def _on_flow(self, flow: messages.Flow) -> None:
+        before, self.flow = self.flow, flow
+        if before is None:
+            return
+        dt = (flow.t_sample_ns - before.t_sample_ns) * 1e-9
+        yaw, (vx, vy, _) = float(rotations.heading(self.attitude)), flow.velocity_m_s
+        self._x_m += dt * (vx * math.cos(yaw) - vy * math.sin(yaw))
+        self._y_m += dt * (vx * math.sin(yaw) + vy * math.cos(yaw))
+
+    def _on_estimate(self, estimate: flight_messages.Estimate) -> None:
+        if abs(math.hypot(*estimate.orientation_wxyz) - 1.0) < UNIT_SLACK:
+            self.estimate = estimate
+            self.attitude = estimate.orientation_wxyz
+        position = next((position for t_ns, position in self._positions if t_ns == estimate.t_ns), None)
+        if position is not None:
+            x, y, z = estimate.position_m
+            self.origin_m = (x - position[0], y - position[1], z - position[2])
+
+
+def warm_up() -> None:
+    """Compile, or load, the kernels before the first gate."""
+    madgwick_step(LEVEL, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), BETA_RAD_S, STEP_S_MAX)
+
+
+def _rotated(sample: Any, q_BS: np.ndarray) -> Any:
+    """Return a sample of the IMU or the magnetometer with its vectors in the axes of the body."""
+    names = [name for name in ("accel_m_s2", "gyro_rad_s", "field_ut") if hasattr(sample, name)]
+    vectors = {name: tuple(rotations.rotate(q_BS, getattr(sample, name)).tolist()) for name in names}
+    return msgspec.structs.replace(sample, **vectors)

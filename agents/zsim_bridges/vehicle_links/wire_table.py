@@ -1,0 +1,113 @@
+"""The messages of a wire as a table of text, and how the fields of one lie in its bytes.
+
+An entry of a table begins a line with number and name; its fields follow in the order of their definition, on as many
+indented lines as they need:
+
+    77 COMMAND_ACK command:H result:B | progress:B result_param2:i target_system,target_component:B
+    148 EXAMPLE voltages:10H[mV]=65535 text:50c uid:18s
+
+`name:code` has the codes of the struct module, a count before the code of an array; names with commas between them are
+fields of one kind. Two codes are the table's own: `s` is an array of bytes, `c` a text. A unit may follow in brackets,
+and the value of a field that is not given (else zero) behind `=`. Fields behind `|` are extensions.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from operator import itemgetter
+from struct import Struct
+from typing import Any, NamedTuple
+
+_ENTRY = re.compile(r"^(\d+) (\w+)(.*(?:\n +\S.*)*)", re.MULTILINE)
+_FIELD = re.compile(r"([\w,]+):(\d*)([a-zA-Z])(?:\[[^\]]*\])?(?:=(\S+))?")
+
+
+class WireField(NamedTuple):
+    """A field: `length` is None where it is no array, `default` the value of each of its numbers."""
+
+    name: str
+    code: str
+    length: int | None
+    default: int
+
+    @property
+    def format(self) -> str:
+        """The format of the struct module."""
+        return f"{self.length or ''}{'s' if self.code == 'c' else self.code}"
+
+    @property
+    def is_array(self) -> bool:
+        """Whether the struct module has several values for it; texts and arrays of bytes are one."""
+        return self.length is not None and self.code not in "cs"
+
+    @property
+    def default_value(self) -> Any:
+        if self.code in "cs":
+            return "" if self.code == "c" else b""
+        number = float(self.default) if self.code in "fd" else self.default
+        return (number,) * self.length if self.length else number
+
+
+class Entry(NamedTuple):
+    """An entry of a table."""
+
+    number: int
+    name: str
+    fields: list[WireField]
+    extensions: list[WireField]
+
+
+def read_table(text: str) -> Iterator[Entry]:
+    """Yield the entries of a table."""
+    for number, name, rest in _ENTRY.findall(text):
+        fields, _, extensions = rest.partition("|")
+        yield Entry(int(number), name, list(_fields(fields)), list(_fields(extensions)))
+
+
+def _fields(text: str) -> Iterator[WireField]:
+    for names, length, code, default in _FIELD.findall(text):
+        for name in names.split(","):
+            yield WireField(name, code, int(length) if length else None, int(default or 0))
+
+
+class WireLayout:
+    """How fields lie in bytes: little-endian, one directly behind another.
+
+    Args:
+        fields: in the order of their definition.
+        wire: in the order of their bytes, where that is another.
+
+    Attributes:
+        codec: of the flat values, in the order of the bytes.
+        is_flat: whether these are the fields' own values.
+    """
+
+    def __init__(self, fields: Sequence[WireField], wire: Sequence[WireField] | None = None) -> None:
+        self.fields, self._wire = tuple(fields), tuple(wire or fields)
+        self.codec = Struct("<" + "".join(field.format for field in self._wire))
+        self.is_flat = not any(field.length for field in fields)
+        places: dict[str, int | slice] = {}
+        at = 0
+        for field in self._wire:
+            length = field.length if field.is_array and field.length else 1
+            places[field.name] = slice(at, at + length) if field.is_array else at
+            at += length
+        found = [places[field.name] for field in fields]
+        self._pick = itemgetter(*found) if len(found) > 1 else lambda flat: (flat[found[0]],)
+        self._texts = [place for place, field in enumerate(fields) if field.code == "c"]
+
+    def flat(self, values: Iterable[Any]) -> Iterator[Any]:
+        """Yield the values for the codec of the fields' values, both in the order of the bytes."""
+        for field, value in zip(self._wire, values, strict=True):
+            if field.is_array:
+                yield from value
+            else:
+                yield value.encode() if field.code == "c" else value
+
+    def nested(self, flat: Sequence[Any]) -> Sequence[Any]:
+        """Return the fields' values, in the order of their definition, of what the codec returns."""
+        values = self._pick(flat)
+        if self._texts:
+            values = list(values)
+            for place in self._texts:
+                values[place] = values[place].partition(b"\0")[0].decode(errors="replace")
+        return values
