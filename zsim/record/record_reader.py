@@ -158,14 +158,15 @@ class RecordReader:
     def _indexed(self, chunk: _Chunk, content: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return channel and place of every message of a chunk: by its indexes, if they lead to all of its content."""
         at = [(index.start + HEAD.size + INDEX_HEAD.size, INDEX_ENTRY * index.messages) for index in chunk.indexes]
-        entries = np.frombuffer(b"".join([self._source[start : start + size] for start, size in at]), "<u8")
-        channel = np.repeat([index.channel for index in chunk.indexes], [index.messages for index in chunk.indexes])
-        places = entries[1::2].astype(np.int64)
-        if len(places) and places.min() >= 0 and places.max() <= len(content) - MESSAGE.size:
-            heads = heads_at(content, places)
-            is_whole = int(heads["length"].sum()) + HEAD.size * len(places) == len(content)
-            if is_whole and (heads["opcode"] == Opcode.MESSAGE).all() and (heads["channel"] == channel).all():
-                return channel.astype(np.int64), places
+        data = b"".join([self._source[start : start + size] for start, size in at])
+        if data and len(data) == sum(size for _, size in at):  # a damaged size may lead beyond the end of the file
+            places = np.frombuffer(data, "<u8")[1::2].astype(np.int64)
+            channel = np.repeat([index.channel for index in chunk.indexes], [index.messages for index in chunk.indexes])
+            if places.min() >= 0 and places.max() <= len(content) - MESSAGE.size:
+                heads = heads_at(content, places)
+                is_whole = int(heads["length"].sum()) + HEAD.size * len(places) == len(content)
+                if is_whole and (heads["opcode"] == Opcode.MESSAGE).all() and (heads["channel"] == channel).all():
+                    return channel.astype(np.int64), places
         found = indexes_of(content)
         channel = np.repeat(list(found), [len(each) // 2 for each in found.values()])
         places = [place for each in found.values() for place in each[1::2]]

@@ -358,7 +358,7 @@ def test_a_process_that_was_expected_and_is_lost_is_one(
 
 def test_the_step_is_read_from_the_reason() -> None:
     assert waiting_step(f"trajectory{WAITS}a: b; c") == ("trajectory", "a: b; c")
-    assert waiting_step(f"held on request; target{WAITS}no") == ("target", "no")
+    assert waiting_step(f"held; target{WAITS}no") == ("target", "no")
     assert waiting_step("ready to engage") is None
 
 
