@@ -125,25 +125,26 @@ class Recorder:
         self._beside = [self._link.subscribe(expression) for expression in ("view/**", keys.camera("*", "*"))]
         self._link.declare_process(self._name)
         self._link.on_link(self._on_link)
-        if self._writer.has_former:
-            self._resume()
-            self._print(f"{self._name}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
-        else:
-            self._write_lasting()
-        self._catch_up()
-        self._join()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
-        ticker.start()
         try:
+            if self._writer.has_former:
+                self._resume()
+                self._print(f"{self._name}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
+            else:
+                self._write_lasting()
+            self._catch_up()
+            self._join()
+            ticker.start()
             reason = self._loop()
             self._write_held()
             self._writer.close()
-        except RecordError as error:
+        except RecordError as error:  # also while it joins; without a bye the world would wait for its restart
             self._part.leave(str(error))
             raise
         finally:
             self._over.set()
-            ticker.join()
+            if ticker.is_alive():
+                ticker.join()
         if self._left_out:
             why = f"a record holds {CHANNELS_MAX} keys, and theirs are further ones"
             self._print(f"{self._name}: {self._left_out} messages are not on record: {why}")

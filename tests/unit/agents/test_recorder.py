@@ -1,6 +1,8 @@
 """The recorder: what was sent before it came, once and without a gap, and garbage as it came."""
 
+import errno
 import os
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.contract.messages import DroneInfo, Imu, Info, Origin
 from zsim.contract.run_messages import RUN_ENDED, Clock, ControlAnswer, Event, Faults
 from zsim.errors import RecordError
-from zsim.record import Completeness, RecordReader, RecordWriter, completeness
+from zsim.record import Completeness, RecordReader, RecordWriter, completeness, record_writer
 from zsim.record.completeness import GateGap
 from zsim.record.mcap_layout import places
 from zsim_agents import recorder
@@ -247,6 +249,27 @@ def test_the_record_of_another_run_is_left_alone(tmp_path: Path):
     with refused(RecordError, "run.mcap", "exists"):
         recorded(path, [])
     assert path.read_bytes() == before
+
+
+def test_a_disk_that_is_full_while_it_joins_is_a_bye(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The world has its join then: without a bye it would wait for a recorder that is started again."""
+    link = FakeLink()
+    link.last = dict([pair(keys.INFO, INFO)])
+    link.on_request = lambda key, args: page(gates(0))
+
+    write_all = record_writer.write_all
+
+    def write(file: FileIO, data: bytes) -> None:
+        if file.tell():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write_all(file, data)
+
+    monkeypatch.setattr(record_writer, "write_all", write)
+    with refused(RecordError, "run.mcap", os.strerror(errno.ENOSPC)) as full:
+        record(link, INFO, tmp_path / "run.mcap")  # type: ignore[arg-type]
+    (join,) = link.published_on("process/recorder/join")
+    (bye,) = link.published_on("process/recorder/bye")
+    assert (bye.reason, bye.incarnation) == (str(full.value), join.incarnation)
 
 
 def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
