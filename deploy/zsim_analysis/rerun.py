@@ -353,7 +353,7 @@ class RerunBus(Bus):
             self._feed(recorded)
         self.answer_all()
         waiting = [p.name for p in self._world.blocking() if p.name in self._rerun]
-        if waiting and self.failure:
+        if self.failure and (waiting or self._world.ended is not None):
             raise RunFailedError(f"flown again, {self.failure}")
         if waiting and self._world.clock.state != "waiting":
             at = f"before {gate.t_ns / 1e9:.2f} s"
