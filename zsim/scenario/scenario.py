@@ -327,7 +327,7 @@ class Document(Scenario, frozen=True, kw_only=True):
     """The content of a scenario file: a scenario, and what all its drones share."""
 
     sensors: Sensors | None = None
-    vehicle: SharedVehicle | None = None
+    vehicle: SharedVehicle | None = None  # type: ignore[valid-type]
 
 
 def space_name(space: str | None, robots: int, template: bool) -> str:

@@ -266,7 +266,10 @@ def sensor_of(message: type[Struct]) -> str:
 
 @cache
 def _message_type(name: str, fields: tuple[tuple[str, str], ...], sensor: str) -> type[Sample]:
-    own: Any = [(field, tuple[(Number,) * int(word[7:-1])] if "[" in word else _TYPES[word]) for field, word in fields]
+    own: Any = [
+        (field, tuple[(Number,) * int(word[7:-1])] if "[" in word else _TYPES[word])  # type: ignore[misc]
+        for field, word in fields
+    ]
     made: Any = msgspec.defstruct(name, own, bases=(Sample,), namespace={"__sensor__": sensor}, frozen=True, gc=False)
     return made
 
