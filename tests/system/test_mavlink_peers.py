@@ -4,6 +4,7 @@ import math
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from federation import ONE, Federation
@@ -34,7 +35,8 @@ def commands() -> Iterator[bytes]:
 
 def results(frames: list[Received]) -> list[int]:
     """Return what commands were answered with."""
-    return [each.message.result for each in frames if isinstance(each.message, dialect.CommandAck)]
+    messages: list[Any] = [each.message for each in frames]
+    return [message.result for message in messages if isinstance(message, dialect.CommandAck)]
 
 
 def test_a_stranger_flies_nothing_and_the_peer_does(lab: Lab, federation: Federation) -> None:
