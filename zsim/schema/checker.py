@@ -11,7 +11,7 @@ from difflib import get_close_matches
 from functools import lru_cache
 from itertools import islice
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 from msgspec import inspect as types
@@ -110,7 +110,7 @@ def _check_many(value: Any, info: types.ListType | types.VarTupleType | types.Di
     if len(value) > (most or len(value)):
         return
     if isinstance(info, types.DictType):
-        for key, item in value.items():
+        for key, item in cast("dict[Any, Any]", value).items():
             where = field_path(path, key)
             yield from ((at, f"as a key {text}") for at, text in _check(key, info.key_type, where))
             yield from _check(item, info.value_type, where)

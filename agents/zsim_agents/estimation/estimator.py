@@ -103,7 +103,8 @@ class Estimator(Agent):
         if self._external:  # no estimate of a drone whose driver has been silent since the last gate
             named = [each for each in named if each[0] not in self._silent]
             self._silent = set(self._external)
-        make, source, self._last, outputs = flight_messages.Estimate, self.source, {}, []
+        make: Any = flight_messages.Estimate  # the type of an estimate does not say how long its sequences are
+        source, self._last, outputs = self.source, {}, []
         for drone, key, estimate in named:
             self._last[drone] = message = make(t_ns, self.next_seq(key), *estimate, source=source)
             outputs.append(Output(key, message))

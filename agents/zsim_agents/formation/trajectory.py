@@ -283,8 +283,9 @@ def reference_of(space: ClusterSpace, state: State) -> Reference:
         for name, value in state.items()
         if name != "kind"
     }
-    made = _KINDS[state["kind"]]
-    return made(space, **arguments) if made in (ExpressionTrajectory, WaypointTrajectory) else made(**arguments)
+    kind = _KINDS[state["kind"]]
+    make: Any = kind
+    return make(space, **arguments) if kind in (ExpressionTrajectory, WaypointTrajectory) else make(**arguments)
 
 
 class Variable(NamedTuple):
