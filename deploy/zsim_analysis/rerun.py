@@ -49,23 +49,14 @@ JOINED = ("join", "restart", "superseded")  # events of admitted joins
 
 
 class RerunResult(NamedTuple):
-    """The result of flying a run again.
+    """The result of flying a run again."""
 
-    Attributes:
-        compared: with the truth on record.
-        sha256: of the truth.
-        until: why the comparison ended before the record, empty if it did not.
-        refused: requests that were carried out on record and are refused now.
-        first_output: the first output of an agent that differs, empty if none does.
-        failure: of a user's code, empty if none failed.
-    """
-
-    compared: "TruthComparison"
-    sha256: str
-    until: str
-    refused: list[str]
-    first_output: str
-    failure: str
+    compared: "TruthComparison"  # with the truth on record
+    sha256: str  # of the truth
+    until: str  # why the comparison ended before the record, empty if it did not
+    refused: list[str]  # requests that were carried out on record and are refused now
+    first_output: str  # the first output of an agent that differs, empty if none does
+    failure: str  # of a user's code, empty if none failed
 
 
 def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:

@@ -35,17 +35,11 @@ Values = NDArray[Any] | list[Any]
 
 
 class MessageSelection(NamedTuple):
-    """Keys and times to be exported.
+    """Keys and times to be exported."""
 
-    Attributes:
-        expressions: key expressions as Zenoh's; none: every key.
-        from_s: simulated time of the first message [s], None: the start.
-        to_s: of the last one.
-    """
-
-    expressions: tuple[str, ...] = ()
-    from_s: float | None = None
-    to_s: float | None = None
+    expressions: tuple[str, ...] = ()  # key expressions as Zenoh's; none: every key
+    from_s: float | None = None  # simulated time of the first message [s], None: the start
+    to_s: float | None = None  # of the last one
 
     def keys(self, reader: RecordReader) -> list[str]:
         """Return the selected keys on record."""
@@ -68,41 +62,25 @@ def subject(key: str) -> str:
 
 
 class RowBatch(NamedTuple):
-    """Rows of one table, in order of time.
+    """Rows of one table, in order of time."""
 
-    Attributes:
-        kind: of the messages.
-        only: the subject of all rows, if each subject has a table of its own.
-        names: subject of each.
-        messages: decoded.
-        wall_ns: when each reached the recorder.
-    """
-
-    kind: type[Struct]
-    only: str
-    names: list[str]
-    messages: list[Any]
-    wall_ns: list[int]
+    kind: type[Struct]  # of the messages
+    only: str  # the subject of all rows, if each subject has a table of its own
+    names: list[str]  # subject of each
+    messages: list[Any]  # decoded
+    wall_ns: list[int]  # when each reached the recorder
 
 
 class Columns(NamedTuple):
-    """The columns that one field of a message becomes.
+    """The columns that one field of a message becomes."""
 
-    Attributes:
-        name: unique in the table.
-        kind: of all its columns.
-        columns: their names.
-        values: returns a value per row, or a table (rows, columns); None or NaN where there is none.
-        names: of the variables, one column each; empty for other fields.
-        keys: the columns of each key of a map; empty for other fields.
-    """
-
-    name: str
-    kind: Kind
-    columns: tuple[str, ...]
+    name: str  # unique in the table
+    kind: Kind  # of all its columns
+    columns: tuple[str, ...]  # their names
+    # returns a value per row, or a table (rows, columns); None or NaN where there is none
     values: Callable[[RowBatch], Values]
-    names: tuple[str, ...] = ()
-    keys: Mapping[str, slice] = {}
+    names: tuple[str, ...] = ()  # of the variables, one column each; empty for other fields
+    keys: Mapping[str, slice] = {}  # the columns of each key of a map; empty for other fields
 
 
 def table_columns(kind: type[Struct], names: Mapping[str, Sequence[str]]) -> tuple[Columns, ...]:

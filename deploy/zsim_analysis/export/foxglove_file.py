@@ -58,19 +58,12 @@ ROTOR_RADIUS = 0.57  # of the arm, if the rotors are not known: 0.102 m at the A
 
 
 class ConvertedRun(NamedTuple):
-    """The content of a written file.
+    """The content of a written file."""
 
-    Attributes:
-        topics: messages by topic.
-        variables: by cluster, the fields of its numbers.
-        rotors: of every drone, in the order of the scenario.
-        refused: number of messages that could not be read.
-    """
-
-    topics: dict[str, int]
-    variables: dict[str, tuple[str, ...]]
-    rotors: dict[str, list[RotorDisc]]
-    refused: int
+    topics: dict[str, int]  # messages by topic
+    variables: dict[str, tuple[str, ...]]  # by cluster, the fields of its numbers
+    rotors: dict[str, list[RotorDisc]]  # of every drone, in the order of the scenario
+    refused: int  # number of messages that could not be read
 
 
 def convert(

@@ -39,17 +39,11 @@ Progress = Callable[[int, int], None]  # messages read so far, and their number
 
 
 class ExportResult(NamedTuple):
-    """The result of an export.
+    """The result of an export."""
 
-    Attributes:
-        paths: that were written.
-        tables: name and rows of each table, or topic and messages.
-        notes: what a reader should know: whether the record was cut or damaged, and what was left out.
-    """
-
-    paths: tuple[Path, ...]
-    tables: dict[str, int]
-    notes: list[str]
+    paths: tuple[Path, ...]  # that were written
+    tables: dict[str, int]  # name and rows of each table, or topic and messages
+    notes: list[str]  # what a reader should know: whether the record was cut or damaged, and what was left out
 
 
 def export(

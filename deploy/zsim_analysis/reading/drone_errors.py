@@ -19,19 +19,13 @@ INSTANTS = 1500  # at which distances are computed, spread over the flight: more
 
 
 class EstimateErrors(NamedTuple):
-    """Estimate − truth of one drone at K instants.
+    """Estimate − truth of one drone at K instants."""
 
-    Attributes:
-        t_s: (K,) simulated time.
-        error: (K, 4) x, y, z in W [m], heading wrapped to ±π [rad].
-        sigma: (K, 4) their standard deviations as stated by the estimator.
-        nees: (K,) normalised error squared of position and velocity, eᵀ P⁻¹ e; NaN where P is singular. Its mean is
-            DEGREES where the stated covariance is true [Bar-Shalom, Li, Kirubarajan 2001, 5.4.2].
-    """
-
-    t_s: Array
-    error: Array
-    sigma: Array
+    t_s: Array  # (K,) simulated time
+    error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
+    sigma: Array  # (K, 4) their standard deviations as stated by the estimator
+    # (K,) normalised error squared of position and velocity, eᵀ P⁻¹ e; NaN where P is singular. Its mean is DEGREES
+    # where the stated covariance is true [Bar-Shalom, Li, Kirubarajan 2001, 5.4.2].
     nees: Array
 
     def share_inside(self, rows: np.ndarray) -> Array:
@@ -40,14 +34,10 @@ class EstimateErrors(NamedTuple):
 
 
 class VelocityResponse(NamedTuple):
-    """Commanded and flown velocity of one drone at C instants, those of its commands.
+    """Commanded and flown velocity of one drone at C instants, those of its commands."""
 
-    Attributes:
-        t_s: (C,) simulated time.
-        commanded, flown: (C, 4) forward, left, up [m/s], yaw rate [rad/s], by the true heading.
-    """
-
-    t_s: Array
+    t_s: Array  # (C,) simulated time
+    # commanded, flown: (C, 4) forward, left, up [m/s], yaw rate [rad/s], by the true heading
     commanded: Array
     flown: Array
 

@@ -35,25 +35,20 @@ class ParameterErrors(Struct, frozen=True):
 
 @dataclass
 class Formation:
-    """K instants of a cluster of n drones; m or rad, NaN where unknown.
-
-    Attributes:
-        t_s: (K,) simulated time.
-        desired, value, true: (K, 4n).
-        est_error, true_error: (K, 4n) value − desired and true − desired, angles wrapped to ±π.
-        phases: (K,).
-    """
+    """K instants of a cluster of n drones; m or rad, NaN where unknown."""
 
     name: str
     drones: tuple[str, ...]
     names: tuple[str, ...]
-    t_s: Array
+    t_s: Array  # (K,) simulated time
+    # desired, value, true: (K, 4n)
     desired: Array
     value: Array
     true: Array
+    # est_error, true_error: (K, 4n) value − desired and true − desired, angles wrapped to ±π
     est_error: Array
     true_error: Array
-    phases: list[str]
+    phases: list[str]  # (K,)
 
     def column(self, name: str) -> int:
         return self.names.index(name)
@@ -201,13 +196,10 @@ class GoalErrors(NamedTuple):
     """Errors (K, 4n) of a formation against its plan's target; NaN once its plan leads it elsewhere.
 
     The paper's Figure 5 shows these errors, which include the climb from the ground.
-
-    Attributes:
-        goal: (4n,) m or rad, NaN for variables that the target does not name.
-        est, true: (K, 4n) estimate − goal and truth − goal, angles wrapped to ±π.
     """
 
-    goal: Array
+    goal: Array  # (4n,) m or rad, NaN for variables that the target does not name
+    # est, true: (K, 4n) estimate − goal and truth − goal, angles wrapped to ±π
     est: Array
     true: Array
 

@@ -33,23 +33,15 @@ TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
 
 @dataclass
 class Track:
-    """True motion of one drone, W and B as in the contract.
-
-    Attributes:
-        t_ns: (T,) instants of truth, ascending and unique.
-        truth: (T, 13) position [m], velocity [m/s], orientation w first, angular velocity [rad/s; B].
-        status_t_ns: (S,) instants of status.
-        states: (S,) state of the firmware by name.
-        battery_percent: (S,).
-        external: the body is external, so that `truth` is the pose published by its driver, which is an estimate.
-    """
+    """True motion of one drone, W and B as in the contract."""
 
     name: str
-    t_ns: Times
-    truth: Array
-    status_t_ns: Times
-    states: list[str]
-    battery_percent: Array
+    t_ns: Times  # (T,) instants of truth, ascending and unique
+    truth: Array  # (T, 13) position [m], velocity [m/s], orientation w first, angular velocity [rad/s; B]
+    status_t_ns: Times  # (S,) instants of status
+    states: list[str]  # (S,) state of the firmware by name
+    battery_percent: Array  # (S,)
+    # the body is external, so that `truth` is the pose published by its driver, which is an estimate
     external: bool = False
 
     @property
@@ -72,49 +64,31 @@ class Track:
 
 @dataclass
 class DroneEstimates:
-    """Published estimates of one drone.
+    """Published estimates of one drone."""
 
-    Attributes:
-        t_ns: (E,) ascending and unique.
-        p_W: (E, 3) position [m].
-        v_W: (E, 3) velocity [m/s].
-        yaw, yaw_sigma: (E,) heading and its standard deviation [rad].
-        covariance: (E, 6, 6) of position and velocity [SI].
-    """
-
-    t_ns: Times
-    p_W: Array
-    v_W: Array
+    t_ns: Times  # (E,) ascending and unique
+    p_W: Array  # (E, 3) position [m]
+    v_W: Array  # (E, 3) velocity [m/s]
+    # yaw, yaw_sigma: (E,) heading and its standard deviation [rad]
     yaw: Array
     yaw_sigma: Array
-    covariance: Array
+    covariance: Array  # (E, 6, 6) of position and velocity [SI]
 
 
 @dataclass
 class VelocityCommands:
-    """Velocity commands of one drone that were sent by its commander.
+    """Velocity commands of one drone that were sent by its commander."""
 
-    Attributes:
-        t_ns: (C,) ascending and unique.
-        velocity: (C, 3) [m/s] as sent.
-        yaw_rate: (C,) [rad/s].
-        in_W: (C,) whether the velocity is in W; otherwise x is forward and y left by the sender's estimated heading.
-    """
-
-    t_ns: Times
-    velocity: Array
-    yaw_rate: Array
+    t_ns: Times  # (C,) ascending and unique
+    velocity: Array  # (C, 3) [m/s] as sent
+    yaw_rate: Array  # (C,) [rad/s]
+    # (C,) whether the velocity is in W; otherwise x is forward and y left by the sender's estimated heading
     in_W: NDArray[np.bool_]
 
 
 @dataclass
 class ClusterStates:
-    """Published states of one cluster's controller: K instants, n variables.
-
-    Attributes:
-        reasons: (K,) why it waits or is held.
-        requests: accepted and refused, from sources other than its plan.
-    """
+    """Published states of one cluster's controller: K instants, n variables."""
 
     name: str
     drones: tuple[str, ...]
@@ -123,8 +97,8 @@ class ClusterStates:
     value: Array
     desired: Array
     phases: list[str]
-    reasons: list[str]
-    requests: list[ClusterRequest]
+    reasons: list[str]  # (K,) why it waits or is held
+    requests: list[ClusterRequest]  # accepted and refused, from sources other than its plan
 
 
 @dataclass
@@ -143,16 +117,7 @@ class RecordedProcess:
 
 @dataclass
 class RecordedFlight:
-    """A flight with all that a report needs of it; fields that are not on record are None or empty.
-
-    Attributes:
-        messages: number on record, over all keys.
-        completeness: of the record.
-        wall_s: wall time from the first to the last truth message, by the recorder's clock.
-        began_ns: wall time of the first truth message, nanoseconds since 1970; None without truth.
-        undecoded: number of payloads that are not of the type of their key.
-        estimates, commands: by drone; empty unless requested.
-    """
+    """A flight with all that a report needs of it; fields that are not on record are None or empty."""
 
     info: Info | None
     scenario: Scenario | None
@@ -160,11 +125,12 @@ class RecordedFlight:
     clusters: list[ClusterStates]
     events: list[Event]
     processes: list[RecordedProcess]
-    messages: int
-    completeness: Completeness
-    wall_s: float
-    undecoded: int = 0
-    began_ns: int | None = None
+    messages: int  # number on record, over all keys
+    completeness: Completeness  # of the record
+    wall_s: float  # wall time from the first to the last truth message, by the recorder's clock
+    undecoded: int = 0  # number of payloads that are not of the type of their key
+    began_ns: int | None = None  # wall time of the first truth message, nanoseconds since 1970; None without truth
+    # estimates, commands: by drone; empty unless requested
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
 

@@ -106,26 +106,17 @@ def command_age_ms(path: Path) -> dict[str, float] | None:
 
 
 class DriverLink(Struct, frozen=True):
-    """Quality of the link to one external drone over a run; None for figures that its driver did not report.
+    """Quality of the link to one external drone over a run; None for figures that its driver did not report."""
 
-    Attributes:
-        peer: address of the aircraft.
-        age_max_ms: largest reported age of the newest datagram, in wall time.
-        loss_mean_percent, loss_max_percent: of the datagrams sent by the aircraft.
-        round_trip_ms: median.
-        lost: number of times that the link was lost, which is after a second of silence.
-        lost_s: total duration of the losses, simulated time.
-        refused: datagrams that were malformed or of another sender, over all consecutive drivers.
-    """
-
-    peer: str
-    age_max_ms: float | None
+    peer: str  # address of the aircraft
+    age_max_ms: float | None  # largest reported age of the newest datagram, in wall time
+    # loss_mean_percent, loss_max_percent: of the datagrams sent by the aircraft
     loss_mean_percent: float | None
     loss_max_percent: float | None
-    round_trip_ms: float | None
-    lost: int
-    lost_s: float
-    refused: int
+    round_trip_ms: float | None  # median
+    lost: int  # number of times that the link was lost, which is after a second of silence
+    lost_s: float  # total duration of the losses, simulated time
+    refused: int  # datagrams that were malformed or of another sender, over all consecutive drivers
 
     def __str__(self) -> str:
         figures = (
@@ -182,23 +173,14 @@ class AgentProcess(NamedTuple):
 
 
 class RecordedAgents(NamedTuple):
-    """The agents that took part in a run.
+    """The agents that took part in a run."""
 
-    Attributes:
-        processes: whose agents can be run again; empty if there is a reason not to.
-        why_not: that reason.
-        requests: to their controllers, in order.
-        fingerprints: numeric, of these processes.
-        truth_sha256: as reported by the world at the end of the run, None if the record has no end.
-        failure: of a user's code in one of these processes, by which the run ended; empty if there was none.
-    """
-
-    processes: tuple[AgentProcess, ...]
-    why_not: str
-    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]
-    fingerprints: frozenset[str]
-    truth_sha256: str | None
-    failure: str
+    processes: tuple[AgentProcess, ...]  # whose agents can be run again; empty if there is a reason not to
+    why_not: str  # that reason
+    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]  # to their controllers, in order
+    fingerprints: frozenset[str]  # numeric, of these processes
+    truth_sha256: str | None  # as reported by the world at the end of the run, None if the record has no end
+    failure: str  # of a user's code in one of these processes, by which the run ended; empty if there was none
 
     @property
     def names(self) -> frozenset[str]:

@@ -43,24 +43,18 @@ LEADS = ("hold", "land", "target", "trajectory")  # requests by which a formatio
 
 
 class Shortfall(Struct, frozen=True):
-    """A deviation of a flight from its plan, or an incident.
+    """A deviation of a flight from its plan, or an incident."""
 
-    Attributes:
-        kind: of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (not flown
-            to its end), strayed (far from its place), override (flown by others); of a cluster: plan (a step refused to
-            the end, or flown in part), engagement (never), held (for long), request (led by others), early (the run
-            ended before it was due), window (contains instants at which a cluster was not engaged); collision; process
-            (an expected one died, failed, or never joined); record (incomplete).
-        subject: the cluster, the drone, the process, or "record"; of a collision both, as "drone1, drone2".
-        t_s: its beginning, simulated time.
-        fails: the flight is no example of its plan; the command ends with code 1.
-    """
-
+    # of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (not flown to its
+    # end), strayed (far from its place), override (flown by others); of a cluster: plan (a step refused to the end,
+    # or flown in part), engagement (never), held (for long), request (led by others), early (the run ended before it
+    # was due), window (contains instants at which a cluster was not engaged); collision; process (an expected one
+    # died, failed, or never joined); record (incomplete)
     kind: str
-    subject: str
-    t_s: float
+    subject: str  # the cluster, the drone, the process, or "record"; of a collision both, as "drone1, drone2"
+    t_s: float  # its beginning, simulated time
     text: str
-    fails: bool
+    fails: bool  # the flight is no example of its plan; the command ends with code 1
 
 
 class Verdict(Struct, frozen=True):

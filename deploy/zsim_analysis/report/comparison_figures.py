@@ -69,13 +69,9 @@ NAME_MAX = 20  # characters of a run's name beside its lane
 
 @dataclass
 class ComparedRun:
-    """One of several runs.
+    """One of several runs."""
 
-    Attributes:
-        name: unique among the runs.
-    """
-
-    name: str
+    name: str  # unique among the runs
     directory: Path
     flight: RecordedFlight
     formations: list[Formation]

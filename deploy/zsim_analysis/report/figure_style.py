@@ -255,19 +255,12 @@ class Band(Struct, frozen=True):
 
 
 class TimeMarks(Struct, frozen=True):
-    """Marks on the time axes of a flight; times [s], None where it never happened.
+    """Marks on the time axes of a flight; times [s], None where it never happened."""
 
-    Attributes:
-        takeoff_s: of the first drone.
-        engaged_s: of the formation.
-        bands: phases, faults and take-overs.
-        span_s: the run, which every time axis shows whole; None: only what is drawn.
-    """
-
-    takeoff_s: float | None = None
-    engaged_s: float | None = None
-    bands: tuple[Band, ...] = ()
-    span_s: tuple[float, float] | None = None
+    takeoff_s: float | None = None  # of the first drone
+    engaged_s: float | None = None  # of the formation
+    bands: tuple[Band, ...] = ()  # phases, faults and take-overs
+    span_s: tuple[float, float] | None = None  # the run, which every time axis shows whole; None: only what is drawn
 
     def has(self, kind: str) -> bool:
         """Return whether there is a band of a kind."""

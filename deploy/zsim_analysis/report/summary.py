@@ -50,21 +50,14 @@ class EventLine(Struct, frozen=True):
 
 
 class ClusterErrors(Struct, frozen=True):
-    """How one cluster flew within the window.
+    """How one cluster flew within the window."""
 
-    Attributes:
-        drones: of the cluster.
-        errors: over the instants of the window at which it was engaged; None each if it never was.
-        paper_std: Table I beside a flight of Test 1, otherwise empty.
-        engaged_share: share of the window's instants at which it was engaged; None without any.
-        phases: shares of the window's instants by phase.
-    """
-
-    drones: tuple[str, ...]
+    drones: tuple[str, ...]  # of the cluster
+    # over the instants of the window at which it was engaged; None each if it never was
     errors: dict[str, ParameterErrors]
-    paper_std: dict[str, float] = {}
-    engaged_share: float | None = None
-    phases: dict[str, float] = {}
+    paper_std: dict[str, float] = {}  # Table I beside a flight of Test 1, otherwise empty
+    engaged_share: float | None = None  # share of the window's instants at which it was engaged; None without any
+    phases: dict[str, float] = {}  # shares of the window's instants by phase
 
     @property
     def part(self) -> str:
@@ -77,66 +70,45 @@ class ClusterErrors(Struct, frozen=True):
 
 
 class RecordFacts(Struct, frozen=True):
-    """The record from which the report was made.
-
-    Attributes:
-        complete: nothing that the world published is missing, nor the end of the run.
-        state: that, and what is missing, in words.
-        gates: on record.
-        gates_missing: by the clocks.
-        gaps: runs of missing gates: their number, and the first and the last of them.
-        messages_missing: of the world, by their sequence numbers.
-        undecoded: messages that are not of the type of their key.
-        truth_instants: truth messages in the hash: those of simulated drones.
-        truth_missing: truth messages that a complete run of this length would have in addition.
-        truth_sha256: as TruthHash of all truth messages, by time, then in the order of the drones.
-    """
+    """The record from which the report was made."""
 
     messages: int
-    complete: bool
-    state: str
-    gates: int
-    gates_missing: int
-    gaps: list[dict[str, float]]
-    messages_missing: int
-    undecoded: int
-    truth_instants: int
-    truth_missing: int
-    truth_sha256: str
+    complete: bool  # nothing that the world published is missing, nor the end of the run
+    state: str  # that, and what is missing, in words
+    gates: int  # on record
+    gates_missing: int  # by the clocks
+    gaps: list[dict[str, float]]  # runs of missing gates: their number, and the first and the last of them
+    messages_missing: int  # of the world, by their sequence numbers
+    undecoded: int  # messages that are not of the type of their key
+    truth_instants: int  # truth messages in the hash: those of simulated drones
+    truth_missing: int  # truth messages that a complete run of this length would have in addition
+    truth_sha256: str  # as TruthHash of all truth messages, by time, then in the order of the drones
 
 
 class RunSummary(Struct, frozen=True):
-    """The content of summary.json; None if the record does not show a value.
-
-    Attributes:
-        date: when it was flown, to the second in UTC (ISO 8601).
-        changed: texts `a.b.c=value` by which the scenario differs from its file.
-        as_planned: the flight followed its plan, as far as the run went; `shortfalls` has the deviations.
-        links: to the aircraft that flew as external drones, by drone.
-        window_note: why the window is not that of the scenario, empty if it is.
-    """
+    """The content of summary.json; None if the record does not show a value."""
 
     scenario: str | None
     seed: int | None
     mode: str | None
     run_id: str | None
-    date: str | None
-    changed: list[str] | None
+    date: str | None  # when it was flown, to the second in UTC (ISO 8601)
+    changed: list[str] | None  # texts `a.b.c=value` by which the scenario differs from its file
     versions: dict[str, str]
     fingerprint: str | None
     real_time_factor: float | None
     wall_s: float
     sim_s: float
     ended: str
-    as_planned: bool
+    as_planned: bool  # the flight followed its plan, as far as the run went; `shortfalls` has the deviations
     shortfalls: list[Shortfall]
     deadlines: int | None
     deadline_misses: int | None
     deadline_misses_by: dict[str, int]
     command_age_ms: dict[str, float] | None
-    links: dict[str, DriverLink]
+    links: dict[str, DriverLink]  # to the aircraft that flew as external drones, by drone
     window_s: tuple[float, float]
-    window_note: str
+    window_note: str  # why the window is not that of the scenario, empty if it is
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None

@@ -46,25 +46,16 @@ _VALUE = re.compile(r" is [^;]*")  # the part of a fault that differs from run t
 
 
 class SweepPlan(Struct, frozen=True, kw_only=True):
-    """One scenario and its variations: the same plan gives the same runs, on any host and in any order.
+    """One scenario and its variations: the same plan gives the same runs, on any host and in any order."""
 
-    Attributes:
-        source: name of the scenario's file, for messages.
-        document: the file with the overrides of the command line, presets not yet expanded.
-        vary: texts of `--vary`, in their order.
-        runs: their number; a plan with more runs begins with the same ones.
-        records: whether every run keeps its record.
-        changed: texts `a.b.c=value` by which the command line differs from the file; None: not known.
-        version: of zsim; another one need not give the same numbers.
-    """
-
-    source: str
-    document: dict[str, Any]
-    vary: tuple[str, ...]
-    runs: int
-    records: bool = False
+    source: str  # name of the scenario's file, for messages
+    document: dict[str, Any]  # the file with the overrides of the command line, presets not yet expanded
+    vary: tuple[str, ...]  # texts of `--vary`, in their order
+    runs: int  # their number; a plan with more runs begins with the same ones
+    records: bool = False  # whether every run keeps its record
+    # texts `a.b.c=value` by which the command line differs from the file; None: not known
     changed: tuple[str, ...] | None = None
-    version: str = __version__
+    version: str = __version__  # of zsim; another one need not give the same numbers
 
 
 def difference(old: SweepPlan, new: SweepPlan) -> str | None:
@@ -99,16 +90,11 @@ def is_sweep(folder: Path) -> bool:
 
 
 class Seeds(Struct, frozen=True):
-    """A distinct seed for every run or, paired, for every run of a combination: all combinations have the same ones.
-
-    Attributes:
-        paired: drawn values are the same for all combinations, too.
-        values: the seeds; none: they are drawn from the scenario's own.
-    """
+    """A distinct seed for every run or, paired, for every run of a combination: all combinations have the same ones."""
 
     path: str = SEED
-    paired: bool = False
-    values: tuple[int, ...] = ()
+    paired: bool = False  # drawn values are the same for all combinations, too
+    values: tuple[int, ...] = ()  # the seeds; none: they are drawn from the scenario's own
 
     def draw(self, seed: int, count: int) -> list[int]:
         """Return the first seeds, drawn from a scenario's seed; a larger count begins with the same ones."""

@@ -41,21 +41,13 @@ _TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa
 
 
 class SweepRequest(Struct, frozen=True):
-    """What to fly, where to, and by which processes.
+    """What to fly, where to, and by which processes."""
 
-    Attributes:
-        plan: what is flown.
-        out: folder of the sweep.
-        workers: processes on this host, None: one per core.
-        dask: address of a Dask scheduler whose workers are used instead.
-        force: whether the folder may hold other files.
-    """
-
-    plan: SweepPlan
-    out: Path
-    workers: int | None = None
-    dask: str | None = None
-    force: bool = False
+    plan: SweepPlan  # what is flown
+    out: Path  # folder of the sweep
+    workers: int | None = None  # processes on this host, None: one per core
+    dask: str | None = None  # address of a Dask scheduler whose workers are used instead
+    force: bool = False  # whether the folder may hold other files
 
 
 class WorkerPool(Protocol):

@@ -426,17 +426,11 @@ TICKS_MAX = 8  # labelled values of an axis; of more, some
 
 
 class Place(Struct, frozen=True):
-    """Where a point of the grid is drawn.
+    """Where a point of the grid is drawn."""
 
-    Attributes:
-        x: of its middle.
-        room: the range of x over which its runs are spread.
-        series: index of its combination of the other fields.
-    """
-
-    x: float
-    room: tuple[float, float]
-    series: int = 0
+    x: float  # of its middle
+    room: tuple[float, float]  # the range of x over which its runs are spread
+    series: int = 0  # index of its combination of the other fields
 
 
 class GridAxis:

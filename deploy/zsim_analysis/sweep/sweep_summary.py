@@ -64,11 +64,7 @@ def share_interval(count: int, of: int, level: float = LEVEL) -> ConfidenceInter
 
 
 class Distribution(Struct, frozen=True):
-    """The distribution of a quantity over runs of a point.
-
-    Attributes:
-        samples: all of them if they are too few for an interval, otherwise empty.
-    """
+    """The distribution of a quantity over runs of a point."""
 
     runs: int
     mean: ConfidenceInterval
@@ -78,7 +74,7 @@ class Distribution(Struct, frozen=True):
     p95: float
     least: float
     greatest: float
-    samples: tuple[float, ...] = ()
+    samples: tuple[float, ...] = ()  # all of them if they are too few for an interval, otherwise empty
 
 
 def distribution(samples: Samples) -> Distribution | None:
@@ -105,14 +101,10 @@ def count_text(count: int, of: int) -> str:
 
 
 class FormationParameter(Struct, frozen=True):
-    """A variable of a formation.
-
-    Attributes:
-        cluster: the formation's name, None if there is only one.
-    """
+    """A variable of a formation."""
 
     name: str
-    cluster: str | None = None
+    cluster: str | None = None  # the formation's name, None if there is only one
 
     @property
     def unit(self) -> str:
@@ -144,35 +136,24 @@ def parameters(columns: Iterable[str], clusters: Sequence[str]) -> dict[str, For
 
 
 class GridPoint(Struct, frozen=True):
-    """One combination of the grid's values.
-
-    Attributes:
-        values: by path; empty if only seeds and drawn values vary.
-        names: the abbreviated values, unique for each field.
-        runs: finished ones.
-        ended_well: share of them; None without a run.
-        without_collision: share of those that ended well in which no drone collided with anything, or fell.
-        engaged: runs that ended well with every cluster engaged at some instant of the judged window; None if no run
-            has a cluster.
-        as_planned: share of those that ended well that followed their plan.
-        excluded: runs that ended well and did not follow their plan: they are in no spread and no difference.
-        spreads: by column of the table, of those that ended well and followed their plan.
-        least_separation_m: of all that ended well, None if no run has any.
-        differences: by column, of its value less that at the first point in the run with the same seed, over the pairs
-            of runs of which both are in the spreads; empty at the first point, and if seeds are not paired.
-    """
+    """One combination of the grid's values."""
 
     label: str
-    values: dict[str, Any]
-    names: dict[str, str]
-    runs: int
-    ended_well: ConfidenceInterval | None
+    values: dict[str, Any]  # by path; empty if only seeds and drawn values vary
+    names: dict[str, str]  # the abbreviated values, unique for each field
+    runs: int  # finished ones
+    ended_well: ConfidenceInterval | None  # share of them; None without a run
+    # share of those that ended well in which no drone collided with anything, or fell
     without_collision: ConfidenceInterval | None
+    # runs that ended well with every cluster engaged at some instant of the judged window; None if no run has a
+    # cluster
     engaged: int | None
-    as_planned: ConfidenceInterval | None
-    spreads: dict[str, Distribution]
-    excluded: int = 0
-    least_separation_m: float | None = None
+    as_planned: ConfidenceInterval | None  # share of those that ended well that followed their plan
+    spreads: dict[str, Distribution]  # by column of the table, of those that ended well and followed their plan
+    excluded: int = 0  # runs that ended well and did not follow their plan: they are in no spread and no difference
+    least_separation_m: float | None = None  # of all that ended well, None if no run has any
+    # by column, of its value less that at the first point in the run with the same seed, over the pairs of runs of
+    # which both are in the spreads; empty at the first point, and if seeds are not paired
     differences: dict[str, Distribution] = {}
 
     @property
@@ -187,46 +168,35 @@ class GridPoint(Struct, frozen=True):
 
 
 class SweepSummary(Struct, frozen=True):
-    """summary.json of a sweep.
-
-    Attributes:
-        changed: texts `a.b.c=value` by which the scenario differs from its file; None: not known.
-        dates: when the first and the last run were flown (ISO 8601, UTC); None if no run has a date.
-        not_engaged: runs that ended well, but a cluster was never engaged within the judged window.
-        not_as_planned: number of runs that ended well and did not follow their plan, by the first deviation; texts
-            that differ in figures only are one.
-        judged_unengaged: runs that ended well whose window holds instants at which a cluster was not engaged.
-        window_notes: number of runs that ended well, by why their window is not that of the scenario.
-        windows_s: the judged windows, least start and greatest end of all runs; None if no run has one.
-        paper_std: Table I by parameter, empty for any flight but Test 1.
-        parameters: of the formations, by the prefix of their columns.
-        metrics: columns of the user's metrics.
-        unmeasured: number of runs that have none of those, by the reason.
-    """
+    """summary.json of a sweep."""
 
     scenario: str
     seed: int
     vary: tuple[str, ...]
-    changed: tuple[str, ...] | None
+    changed: tuple[str, ...] | None  # texts `a.b.c=value` by which the scenario differs from its file; None: not known
+    # when the first and the last run were flown (ISO 8601, UTC); None if no run has a date
     dates: tuple[str, str] | None
     runs: int
     finished: int
     failed: dict[str, int]
-    not_engaged: int
+    not_engaged: int  # runs that ended well, but a cluster was never engaged within the judged window
+    # number of runs that ended well and did not follow their plan, by the first deviation; texts that differ in
+    # figures only are one
     not_as_planned: dict[str, int]
-    judged_unengaged: int
+    judged_unengaged: int  # runs that ended well whose window holds instants at which a cluster was not engaged
+    # the judged windows, least start and greatest end of all runs; None if no run has one
     windows_s: tuple[float, float] | None
-    paper_std: dict[str, float]
+    paper_std: dict[str, float]  # Table I by parameter, empty for any flight but Test 1
     level: float
     flown_wall_s: float
     hosts: dict[str, int]
     fingerprints: dict[str, int]
     version: str
-    parameters: dict[str, FormationParameter]
-    metrics: tuple[str, ...]
-    unmeasured: dict[str, int]
+    parameters: dict[str, FormationParameter]  # of the formations, by the prefix of their columns
+    metrics: tuple[str, ...]  # columns of the user's metrics
+    unmeasured: dict[str, int]  # number of runs that have none of those, by the reason
     points: list[GridPoint]
-    window_notes: dict[str, int] = {}
+    window_notes: dict[str, int] = {}  # number of runs that ended well, by why their window is not that of the scenario
 
     def json(self) -> bytes:
         """Return the text of summary.json; unknown values are null."""
