@@ -56,9 +56,7 @@ class MessageSelection(NamedTuple):
 def subject(key: str) -> str:
     """Return the drone, cluster or process of a key; `world` if it concerns all."""
     kind, whose, what = keys.parts(key)
-    if kind == "view":
-        return what or "world"
-    return whose if what else "world"
+    return (what or "world") if kind == "view" else whose if what else "world"
 
 
 class RowBatch(NamedTuple):
@@ -84,12 +82,7 @@ class Columns(NamedTuple):
 
 
 def table_columns(kind: type[Struct], names: Mapping[str, Sequence[str]]) -> tuple[Columns, ...]:
-    """Return the columns of a message's table.
-
-    Args:
-        kind: of the message.
-        names: the names, or keys, that occur in each open field, in their order.
-    """
+    """Return the columns of a message's table, given the names, or keys, that occur in each open field."""
     opens = open_fields(kind)
     hidden = {"t_ns", "seq", *(["names"] if "named" in opens.values() else [])}  # `names` are in the others' columns
     own = [field for field in _fields(kind) if field.name not in hidden]
@@ -142,7 +135,7 @@ def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) 
         info = others[0] if len(others) == 1 else info
     match info:
         case inspect.IntType():
-            return [Columns(name, "whole", (name,), lambda batch: [_whole(getattr(m, name)) for m in batch.messages])]
+            return [_plain(name, "whole", lambda value: value if abs(value or 0) <= WHOLE_MAX else None)]
         case inspect.FloatType():
             return [_plain(name, "number")]
         case inspect.BoolType():
@@ -150,15 +143,20 @@ def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) 
         case inspect.StrType() | inspect.LiteralType():
             return [_plain(name, "text")]
     if components := _components(name, info):
-        return [Columns(name, "number", tuple(components), lambda batch: _vectors(batch, name, len(components)))]
+        count = len(components)
+
+        def vectors(batch: RowBatch) -> Values:
+            return np.array([getattr(m, name)[:count] for m in batch.messages], np.float64).reshape(-1, count)
+
+        return [Columns(name, "number", tuple(components), vectors)]
     if isinstance(info, inspect.StructType) and all(isinstance(part.type, _NUMERIC) for part in info.fields):
         return [_part(name, part.name) for part in info.fields]
     return [Columns(name, "text", (name,), lambda batch: [json_text(getattr(m, name)) for m in batch.messages])]
 
 
-def _plain(name: str, kind: Kind) -> Columns:
+def _plain(name: str, kind: Kind, convert: Callable[[Any], Any] = lambda value: value) -> Columns:
     def values(batch: RowBatch) -> Values:
-        return [None if (value := getattr(m, name)) is UNSET else value for m in batch.messages]
+        return [None if (value := getattr(m, name)) is UNSET else convert(value) for m in batch.messages]
 
     return Columns(name, kind, (name,), values)
 
@@ -200,10 +198,6 @@ def _keyed(name: str, names: Sequence[str], pairs: bool) -> Columns:
     return Columns(name, "number", columns, values, keys=places)
 
 
-def _vectors(batch: RowBatch, name: str, count: int) -> Values:
-    return np.array([getattr(m, name)[:count] for m in batch.messages], np.float64).reshape(-1, count)
-
-
 def _components(name: str, info: inspect.Type) -> list[str]:
     """Return the columns of a field with a fixed number of numbers, none for any other field."""
     if isinstance(info, inspect.VarTupleType) and info.min_length == info.max_length == 36:
@@ -216,11 +210,6 @@ def _components(name: str, info: inspect.Type) -> list[str]:
     if name.endswith(QUATERNION):
         return [f"{name.removesuffix(QUATERNION)}_{part}" for part in "wxyz"]
     return [f"{name}_{part}" for part in ("xyz" if count == 3 else range(count))]
-
-
-def _whole(value: int | None) -> int | None:
-    """Return an integer, None if it does not fit 64 bits."""
-    return value if value is not None and -WHOLE_MAX <= value <= WHOLE_MAX else None
 
 
 def _tidy(name: str) -> str:
@@ -292,7 +281,6 @@ class TableSurvey:
         self._tables: dict[type[Struct], tuple[Columns, ...]] = {}
 
     def table(self, kind: type[Struct]) -> tuple[Columns, ...]:
-        """Return the columns of a type's table."""
         if kind not in self._tables:
             names = {field: list(each) for field, each in self._names.get(kind, {}).items()}
             self._tables[kind] = table_columns(kind, names)
@@ -362,12 +350,9 @@ class DecodedMessages:
 def batches(
     decoded: Iterable[tuple[Recorded, Any]], width: Callable[[type[Struct]], int], by_name: bool = False
 ) -> Iterator[RowBatch]:
-    """Yield all rows; a table's batches come in order of time.
+    """Yield all rows, those of a table in order of time, given messages in order of time.
 
-    Args:
-        decoded: messages in order of time.
-        width: number of columns of a table, by which its batches have fewer rows.
-        by_name: whether each drone, cluster and process has tables of its own.
+    Batches of wide tables have fewer rows. With `by_name`, each drone, cluster and process has tables of its own.
     """
     incomplete: dict[tuple[type[Struct], str], RowBatch] = {}
     for recorded, message in _rows(decoded):

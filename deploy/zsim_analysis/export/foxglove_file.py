@@ -78,7 +78,11 @@ def convert(
     scenario = scenario_of(info)
     decoded = DecodedMessages(selection.messages(reader, wanted), _decode, lambda done: progress(done, total))
     rotors = _rotors(info, scenario, dict.fromkeys(subject(key) for key in wanted if key.startswith("drone/")))
-    file = FoxgloveFile(path, rotors, _spaces(scenario))
+    spaces: dict[str, ClusterSpace] = {}
+    for cluster in scenario.clusters if scenario else ():
+        with suppress(ValueError, NotTrustedError):
+            spaces[cluster.name] = scenario_space(scenario, cluster)
+    file = FoxgloveFile(path, rotors, spaces)
     with deferred_signals() as check:
         try:
             for instant in chain(_cameras_before(reader, selection, wanted), _instants(decoded)):
@@ -133,16 +137,6 @@ def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, 
     return rotors
 
 
-def _spaces(scenario: Scenario | None) -> dict[str, ClusterSpace]:
-    spaces: dict[str, ClusterSpace] = {}
-    if scenario is None:
-        return spaces
-    for cluster in scenario.clusters:
-        with suppress(ValueError, NotTrustedError):
-            spaces[cluster.name] = scenario_space(scenario, cluster)
-    return spaces
-
-
 @dataclass
 class Instant:
     """Messages of one time: the last one of each key, but all events and all of cameras."""
@@ -157,34 +151,29 @@ class Instant:
     pictures: list[tuple[str, CameraImage]] = field(default_factory=list)
     cameras: list[tuple[str, CameraInfo]] = field(default_factory=list)
 
-    def add(self, key: str, message: Any) -> None:
-        """Add a message of a type that is drawn."""
-        match message:
-            case Event():
-                self.events.append(message)
-            case CameraImage():
-                self.pictures.append((key, message))
-            case CameraInfo():
-                self.cameras.append((key, message))
-            case Truth():
-                self.truth[subject(key)] = message
-            case Estimate():
-                self.estimates[subject(key)] = message
-            case Status():
-                self.status[subject(key)] = message
-            case Gps():
-                self.gps[subject(key)] = message
-            case ClusterState():
-                self.states[subject(key)] = message
-
 
 def _instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
     """Gather messages, which come in order of time, by their time; `world/info` is left out."""
     drawn = ((recorded.key, message) for recorded, message in decoded if not isinstance(message, Info))
     for t_ns, group in groupby(drawn, key=lambda pair: pair[1].t_ns):
         instant = Instant(t_ns)
+        newest: dict[type, dict[str, Any]] = {
+            Truth: instant.truth,
+            Estimate: instant.estimates,
+            Status: instant.status,
+            Gps: instant.gps,
+            ClusterState: instant.states,
+        }
         for key, message in group:
-            instant.add(key, message)
+            match message:
+                case Event():
+                    instant.events.append(message)
+                case CameraImage():
+                    instant.pictures.append((key, message))
+                case CameraInfo():
+                    instant.cameras.append((key, message))
+                case _:
+                    newest[type(message)][subject(key)] = message
         yield instant
 
 
@@ -226,11 +215,7 @@ class FoxgloveFile:
         self.counts: Counter[str] = Counter()
 
     def close(self) -> None:
-        """End the file.
-
-        Raises:
-            OSError: it could not be written.
-        """
+        """End the file; raise OSError if it could not be written."""
         self._file.close()
         self._checked_file.close()
 
@@ -239,11 +224,7 @@ class FoxgloveFile:
         return {name: numbers.numbers for name, numbers in self._variables.items()}
 
     def write(self, instant: Instant) -> None:
-        """Write all messages of an instant.
-
-        Raises:
-            OSError: it could not be written.
-        """
+        """Write all messages of an instant; raise OSError if it cannot be written."""
         self._checked_file.check()
         self._status.update(instant.status)
         if not self._has_static_scene and instant.truth:
@@ -261,15 +242,14 @@ class FoxgloveFile:
         for event in instant.events:
             self._log(LOG, LogChannel, made.log_line(event), event.t_ns)
         for key, info in instant.cameras:
-            drone, camera = _camera_of(key)
-            calibration = made.camera_calibration(info, made.camera_frame(drone, camera))
-            self._log(f"/drone/{drone}/{camera}_camera/calibration", CameraCalibrationChannel, calibration, info.t_ns)
-            placed = [(made.camera_frame(drone, camera), info.position_m, info.orientation_wxyz)]
+            drone, frame = _camera_of(key)
+            calibration = made.camera_calibration(info, frame)
+            self._log(f"/{frame}/calibration", CameraCalibrationChannel, calibration, info.t_ns)
+            placed = [(frame, info.position_m, info.orientation_wxyz)]
             self._log(TF, FrameTransformsChannel, made.transforms(info.t_ns, placed, made.frame(drone)), info.t_ns)
         for key, image in instant.pictures:
-            drone, camera = _camera_of(key)
-            picture = made.compressed_image(image, made.camera_frame(drone, camera))
-            self._log(f"/drone/{drone}/{camera}_camera/image", CompressedImageChannel, picture, image.t_ns)
+            _, frame = _camera_of(key)
+            self._log(f"/{frame}/image", CompressedImageChannel, made.compressed_image(image, frame), image.t_ns)
         self._write_scene(instant)
 
     def _write_frames(self, instant: Instant) -> None:
@@ -369,9 +349,9 @@ class FoxgloveFile:
 
 
 def _camera_of(key: str) -> tuple[str, str]:
-    """Return drone and camera of a camera's key."""
+    """Return drone and frame of a camera by its key; x of the frame is to the right of the picture, y down, z ahead."""
     _, drone, what = keys.parts(key)
-    return drone, what.split("/")[1]
+    return drone, f"{made.frame(drone)}/{what.split('/')[1]}_camera"
 
 
 class CheckedFile:
@@ -389,37 +369,26 @@ class CheckedFile:
         self._at = self._end = 0  # position and end of the file as the library knows them
 
     def write(self, data: bytes | bytearray) -> int:
-        """Write bytes; return how many."""
         self._try(self._file.write, data)
         self._at += len(data)
         self._end = max(self._end, self._at)
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Set the position; return it."""
         self._try(self._file.seek, offset, whence)
         self._at = offset + {SEEK_SET: 0, SEEK_CUR: self._at, SEEK_END: self._end}[whence]
         return self._at
 
     def flush(self) -> None:
-        """Write what is buffered."""
         self._try(self._file.flush)
 
     def check(self) -> None:
-        """Raise the error of a failed write.
-
-        Raises:
-            OSError: a write has failed.
-        """
+        """Raise OSError if a write has failed."""
         if self._failure is not None:
             raise self._failure
 
     def close(self) -> None:
-        """End the file.
-
-        Raises:
-            OSError: a write has failed.
-        """
+        """End the file; raise OSError if a write has failed."""
         self.flush()
         try:
             self._file.close()

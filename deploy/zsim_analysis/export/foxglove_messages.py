@@ -59,7 +59,11 @@ class NumericMessageType:
         self._number_keys = [_key(tag, _EIGHT) for tag in range(1, len(numbers) + 1)]
         self._text_keys = [_key(len(numbers) + place, _BYTES) for place in range(1, len(texts) + 1)]
         fields = [*((each, _DOUBLE) for each in numbers), *((each, _STRING) for each in texts)]
-        described = b"".join(_bytes(2, _field(*field, place)) for place, field in enumerate(fields, start=1))
+        described = b""
+        for number, (field, kind) in enumerate(fields, start=1):  # a FieldDescriptorProto each
+            counted = ((3, number), (4, _OPTIONAL), (5, kind))
+            rest = b"".join(_key(tag, 0) + _varint(value) for tag, value in counted)
+            described += _bytes(2, _bytes(1, field.encode()) + rest)
         file = (
             _bytes(1, f"{PACKAGE}/{name}.proto".encode())
             + _bytes(2, PACKAGE.encode())
@@ -74,12 +78,6 @@ class NumericMessageType:
         encoded = [text.encode() for text in texts]
         parts += [key + _varint(len(text)) + text for key, text in zip(self._text_keys, encoded, strict=True)]
         return b"".join(parts)
-
-
-def _field(name: str, kind: int, number: int) -> bytes:
-    """Return a FieldDescriptorProto."""
-    counted = ((3, number), (4, _OPTIONAL), (5, kind))
-    return _bytes(1, name.encode()) + b"".join(_key(field, 0) + _varint(value) for field, value in counted)
 
 
 def _bytes(field: int, content: bytes) -> bytes:
@@ -155,28 +153,17 @@ def frame(drone: str) -> str:
     return f"drone/{drone}"
 
 
-def camera_frame(drone: str, camera: str) -> str:
-    """Return the name of a camera's frame: x to the right of the picture, y down, z ahead."""
-    return f"{frame(drone)}/{camera}_camera"
-
-
 # Messages
 
 
 def transforms(t_ns: int, frames: Iterable[FramePose], parent: str = WORLD) -> fox.FrameTransforms:
     """Return the poses of frames in another one."""
-    at = timestamp(t_ns)
-    frame_transforms = [
-        fox.FrameTransform(
-            timestamp=at,
-            parent_frame_id=parent,
-            child_frame_id=child,
-            translation=vector(position),
-            rotation=quaternion(orientation),
-        )
-        for child, position, orientation in frames
-    ]
-    return fox.FrameTransforms(transforms=frame_transforms)
+    placed = []
+    for child, position, orientation in frames:
+        pose: dict[str, Any] = {"translation": vector(position), "rotation": quaternion(orientation)}
+        names = {"parent_frame_id": parent, "child_frame_id": child}
+        placed.append(fox.FrameTransform(timestamp=timestamp(t_ns), **names, **pose))
+    return fox.FrameTransforms(transforms=placed)
 
 
 def cluster_frame(names: Sequence[str], values: Sequence[float]) -> tuple[Values, Values] | None:
@@ -294,40 +281,18 @@ def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> fox.SceneUpd
 
 def _drone(at: fox.Timestamp, name: str, discs: Sequence[RotorDisc], mark: str) -> fox.SceneEntity:
     arm_m = arm_of(discs)
-    cubes = [
-        fox.CubePrimitive(
-            pose=pose([arm_m * each for each in box.middle]),
-            size=vector([arm_m * each for each in box.size]),
-            color=colour(box.colour),
-        )
-        for box in BODY
-    ]
-    cylinders = [
-        fox.CylinderPrimitive(
-            pose=pose((disc.x_m, disc.y_m, 0.2 * arm_m)),
-            size=vector((2 * disc.radius_m, 2 * disc.radius_m, 0.03 * arm_m)),
-            bottom_scale=1.0,
-            top_scale=1.0,
-            color=colour(mark, 0.5),
-        )
-        for disc in discs
-    ]
+    cubes, cylinders = [], []
+    for box in BODY:
+        middle, size = ([arm_m * each for each in part] for part in (box.middle, box.size))
+        cubes.append(fox.CubePrimitive(pose=pose(middle), size=vector(size), color=colour(box.colour)))
+    for disc in discs:
+        size = vector((2 * disc.radius_m, 2 * disc.radius_m, 0.03 * arm_m))
+        look: dict[str, Any] = {"bottom_scale": 1.0, "top_scale": 1.0, "color": colour(mark, 0.5)}
+        cylinders.append(fox.CylinderPrimitive(pose=pose((disc.x_m, disc.y_m, 0.2 * arm_m)), size=size, **look))
     ends = [end for disc in discs for end in ((0.0, 0.0, 0.0), (disc.x_m, disc.y_m, 0.0))]
-    arms = fox.LinePrimitive(
-        type=fox.LinePrimitiveLineType.LineList,
-        pose=pose((0, 0, 0)),
-        thickness=0.1 * arm_m,
-        points=[_point(end) for end in ends],
-        color=colour(DARK),
-    )
-    label = fox.TextPrimitive(
-        pose=pose((0, 0, 2 * arm_m)),
-        billboard=True,
-        font_size=12.0,
-        scale_invariant=True,
-        color=colour(mark),
-        text=name,
-    )
+    arms = _line(ends, colour(DARK), fox.LinePrimitiveLineType.LineList, 0.1 * arm_m, scale_invariant=False)
+    look = {"billboard": True, "font_size": 12.0, "scale_invariant": True, "color": colour(mark)}
+    label = fox.TextPrimitive(pose=pose((0, 0, 2 * arm_m)), text=name, **look)
     parts: dict[str, Any] = {"cubes": cubes, "cylinders": cylinders, "lines": [arms], "texts": [label]}
     return fox.SceneEntity(timestamp=at, id=name, frame_id=frame(name), frame_locked=True, **parts)
 
@@ -393,22 +358,17 @@ class DroneTrails:
         return fox.SceneUpdate(entities=entities)
 
 
-def _point(v: Vector) -> fox.Point3:
-    x, y, z = map(float, v)
-    return fox.Point3(x=x, y=y, z=z)
-
-
 def _line(
-    points: Iterable[Any], tint: fox.Color, kind: fox.LinePrimitiveLineType, width_px: float = LINE_PX
+    points: Iterable[Any],
+    tint: fox.Color,
+    kind: fox.LinePrimitiveLineType,
+    width: float = LINE_PX,
+    scale_invariant: bool = True,
 ) -> fox.LinePrimitive:
-    return fox.LinePrimitive(
-        type=kind,
-        pose=pose((0, 0, 0)),
-        thickness=width_px,
-        scale_invariant=True,
-        points=[_point(each) for each in points],
-        color=tint,
-    )
+    """Return a line with its width in pixels, or in metres if it is not scale invariant."""
+    corners = [fox.Point3(x=x, y=y, z=z) for x, y, z in (map(float, each) for each in points)]
+    look: dict[str, Any] = {"thickness": width, "scale_invariant": scale_invariant, "color": tint}
+    return fox.LinePrimitive(type=kind, pose=pose((0, 0, 0)), points=corners, **look)
 
 
 def _entity(at: fox.Timestamp, name: str, **parts: Any) -> fox.SceneEntity:

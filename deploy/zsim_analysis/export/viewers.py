@@ -161,7 +161,6 @@ def _path(topic: str, field: str) -> str:
 
 
 def has_rerun() -> bool:
-    """Return whether Rerun's library is installed."""
     return find_spec("rerun") is not None
 
 
@@ -170,8 +169,7 @@ def write_blueprint(path: Path, application: str, run: ConvertedRun) -> None:
     os.environ.setdefault("RUST_LOG", "error")  # otherwise Rerun warns of the entry name derived from an odd name
     import rerun.blueprint as rrb
 
-    scene = _scene(run)
-    left = rrb.Vertical(scene, rrb.TextLogView(name="log", origin=LOG), row_shares=[3, 1])
+    left = rrb.Vertical(_scene(run), rrb.TextLogView(name="log", origin=LOG), row_shares=[3, 1])
     views = []
     for title, curves in plots(run):
         series = _series(curves)

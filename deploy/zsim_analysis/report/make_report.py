@@ -32,7 +32,7 @@ from zsim_analysis.report.drone_figures import (
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
 from zsim_analysis.report.formation_figures import ROWS_MAX, draw_errors, draw_parameters, numbered, parameter_groups
 from zsim_analysis.report.paper import PAPER_NOTE, flies_paper_test
-from zsim_analysis.report.summary import PAPER_COLUMN, EventLine, RunSummary, error_table, summarise
+from zsim_analysis.report.summary import PAPER_COLUMN, RunSummary, error_table, summarise
 
 FAULTS_MAX = 6  # at the head of a page
 REFERENCE = (
@@ -48,12 +48,7 @@ Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 def make_report(
     directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
 ) -> RunSummary:
-    """Read DIR/run.mcap, write DIR/summary.json, DIR/figures/*.png and DIR/report.html.
-
-    Args:
-        directory: the run directory.
-        progress: called with a text at each step.
-        formats: of `zsim_analysis.report.FORMATS`, in which each figure is written too.
+    """Read DIR/run.mcap, write DIR/summary.json, DIR/figures/*.png and DIR/report.html, as `write_report`.
 
     Raises:
         RecordError: there is no record, or it holds no truth of any drone.
@@ -70,10 +65,7 @@ def judge(
 ) -> tuple[RecordedFlight, list[Formation], RunSummary]:
     """Return the flight of a record, its formations and its summary.
 
-    Args:
-        record: its path.
-        progress: called with a text at each step.
-        answers: include the drones' estimates and velocity commands.
+    With `answers` it includes the drones' estimates and velocity commands. `progress` receives a text at each step.
 
     Raises:
         RecordError: there is no record, or it holds no truth of any drone.
@@ -201,7 +193,16 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
     seed = "–" if summary.seed is None else summary.seed
     separation = summary.min_separation_m
     versions = dict.fromkeys(version for name, version in summary.versions.items() if name != "report")
-    misses = "not known"
+    kinds, misses = {each.kind for each in summary.shortfalls}, "not known"
+    but_for = {
+        "as far as the run went": "early" in kinds,
+        "but for what others asked or flew": bool(kinds & {"override", "request"}),
+        "but for a short hold": "held" in kinds,
+    }
+    planned = ", ".join(part for part, holds in but_for.items() if holds) or "yes"
+    begun = [event for event in summary.events if event.kind == "fault"]
+    faults = [f"{event.text.removesuffix(' begins')} at {seconds_text(event.t_s)} s" for event in begun[:FAULTS_MAX]]
+    faults += [f"{len(begun) - FAULTS_MAX} more"] if len(begun) > FAULTS_MAX else []
     if summary.deadline_misses is not None:
         by = ", ".join(f"{name} {count}" for name, count in summary.deadline_misses_by.items() if count)
         misses = f"{summary.deadline_misses} of {summary.deadlines or 0}{f' ({by})' if by else ''}"
@@ -212,8 +213,8 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
         ("Version", ", ".join(versions) or "not known"),
         ("Mode", summary.mode or "not known"),
         ("Ended", summary.ended),
-        ("Flown as planned", _planned(summary)),
-        *(("Injected faults", text) for text in _faults(summary.events)),
+        ("Flown as planned", planned if summary.as_planned else "no"),
+        *([("Injected faults", ", ".join(faults))] if faults else []),
         ("Record", summary.record.state),
         ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
         ("Deadlines missed", misses),
@@ -233,27 +234,6 @@ def changed_text(changed: Sequence[str] | None) -> str:
 def date_text(date: str | None) -> str:
     """Return a date of ISO 8601 to the minute, for readers."""
     return f"{date[:16].replace('T', ' ')} UTC" if date else "not known"
-
-
-def _planned(summary: RunSummary) -> str:
-    if not summary.as_planned:
-        return "no"
-    kinds = {each.kind for each in summary.shortfalls}
-    parts = {
-        "as far as the run went": "early" in kinds,
-        "but for what others asked or flew": bool(kinds & {"override", "request"}),
-        "but for a short hold": "held" in kinds,
-    }
-    return ", ".join(part for part, holds in parts.items() if holds) or "yes"
-
-
-def _faults(events: Sequence[EventLine]) -> Iterator[str]:
-    """Yield one text about the injected faults, if there were any."""
-    begun = [event for event in events if event.kind == "fault"]
-    faults = [f"{event.text.removesuffix(' begins')} at {seconds_text(event.t_s)} s" for event in begun[:FAULTS_MAX]]
-    more = [f"{len(begun) - FAULTS_MAX} more"] if len(begun) > FAULTS_MAX else []
-    if faults:
-        yield ", ".join([*faults, *more])
 
 
 def template(name: str, package: str = "zsim_analysis.report") -> Template:

@@ -11,10 +11,10 @@ The folder of a sweep:
 import os
 import sys
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 import pyarrow as pa
@@ -50,14 +50,6 @@ class SweepRequest(Struct, frozen=True):
     force: bool = False  # whether the folder may hold other files
 
 
-class WorkerPool(Protocol):
-    """Flies tasks on worker processes, here or on other hosts."""
-
-    def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
-        """Yield the rows of tasks as they are finished; when closed, fly no further."""
-        ...
-
-
 def sweep(request: SweepRequest) -> list[Row]:
     """Fly the runs that the folder does not hold yet; return all that it then holds, also after Ctrl-C.
 
@@ -77,21 +69,19 @@ def sweep(request: SweepRequest) -> list[Row]:
                 screen.say(f"{len(done)} of them {'is' if len(done) == 1 else 'are'} done already")
             try:
                 if missing:
-                    _fly(folder, _pool(request, len(missing), screen.say), missing, screen)
+                    _fly(folder, request, missing, screen)
             finally:
                 rows = folder.compact()
     return rows
 
 
-def _pool(request: SweepRequest, missing: int, say: Callable[[str], None]) -> WorkerPool:
+def _fly(folder: "SweepFolder", request: SweepRequest, missing: list[int], screen: "SweepScreen") -> None:
     if request.dask is None:
-        return ProcessPool(min(request.workers or cores(), missing), say)
-    from zsim_analysis.sweep.dask_pool import DaskPool
+        pool = ProcessPool(min(request.workers or cores(), len(missing)), screen.say)
+    else:
+        from zsim_analysis.sweep.dask_pool import DaskPool
 
-    return DaskPool(request.dask, say)
-
-
-def _fly(folder: "SweepFolder", pool: WorkerPool, missing: list[int], screen: "SweepScreen") -> None:
+        pool = DaskPool(request.dask, screen.say)
     with folder.journal() as journal, closing(pool.rows(_tasks(folder, missing))) as rows:
         for row in rows:
             journal.append(row)
@@ -145,7 +135,6 @@ class SweepScreen:
             self.say(self.line())
 
     def say(self, text: str) -> None:
-        """Show a line that stays."""
         self.console.print(cell(text), soft_wrap=True)
 
     def finished(self, failed: bool) -> None:
@@ -197,11 +186,9 @@ class SweepFolder:
         self.design = SweepDesign(plan)
 
     def record(self, run: int) -> Path:
-        """Return the folder of a run's record."""
         return self.path / RUNS / f"{run:06d}"
 
     def journal(self) -> "Journal":
-        """Return the journal, opened to be continued."""
         return Journal(self.path / JOURNAL)
 
     def rows(self) -> list[Row]:
@@ -237,10 +224,7 @@ def load(path: Path) -> SweepFolder:
 def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFolder]:
     """Yield the folder of a sweep, new or continued, locked against other sweeps.
 
-    Args:
-        path: of the folder.
-        plan: of the sweep.
-        force: accept one that holds other files; a run, or another sweep, is always refused.
+    With `force` it may hold other files; a run, or another sweep, is always refused.
 
     Raises:
         RunError: another sweep is at work there, or it holds something else.
@@ -327,10 +311,7 @@ class Journal:
 
 def read_journal(path: Path) -> list[Row]:
     """Return the whole lines of a journal, none if there is no such file."""
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        return []
+    content = path.read_bytes() if path.exists() else b""
     return msgspec.json.Decoder().decode_lines(content[: content.rfind(b"\n") + 1])
 
 
@@ -382,19 +363,15 @@ def _schema(rows: Sequence[Row], axes: Sequence[Axis]) -> pa.Schema:
         (name, next(_TYPES[each] for each in (*getattr(kind, "__args__", ()), kind) if each in _TYPES))
         for name, kind in FIXED.items()
     ]
-    varied = [(axis.path, _varied_type(axis)) for axis in axes if axis.path != SEED]
+    varied: list[tuple[str, pa.DataType | None]] = []  # None: of values that are not all of one kind
+    for axis in axes:
+        kinds = {type(value) for value in axis.values} if isinstance(axis, Grid) else {float}
+        if kinds == {int, float}:
+            kinds = {float}
+        if axis.path != SEED:
+            varied.append((axis.path, _TYPES.get(kinds.pop()) if len(kinds) == 1 else None))
     known = {*FIXED, *(path for path, _ in varied)}
     errors = {name: (name, pa.float64()) for row in rows for name in row if name not in known}
     fields = [*fixed[:3], *varied, *fixed[3:], *errors.values()]
     mixed = {b"encoding": b"json"}  # of values of different types
     return pa.schema([pa.field(name, kind or pa.string(), metadata=None if kind else mixed) for name, kind in fields])
-
-
-def _varied_type(axis: Axis) -> pa.DataType | None:
-    """Return the type of a column whose values are all of one kind, None for any others."""
-    if not isinstance(axis, Grid):
-        return pa.float64()
-    kinds = {type(value) for value in axis.values}
-    if kinds <= {int, float}:
-        return _TYPES[float if float in kinds else int]
-    return _TYPES.get(kinds.pop()) if len(kinds) == 1 else None

@@ -5,7 +5,6 @@ Order of this file: the figures; one quantity in a panel; means and their interv
 
 import re
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 from msgspec import Struct
 
+from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.shortfall import span_text
 from zsim_analysis.report import figure_style as style
 from zsim_analysis.sweep.design import Grid, SweepDesign
@@ -22,7 +22,6 @@ from zsim_analysis.sweep.sweep_summary import (
     RUNS_MIN,
     SEPARATION,
     ConfidenceInterval,
-    FormationParameter,
     Samples,
     SweepResults,
     count_text,
@@ -52,30 +51,22 @@ class Panel(Struct, frozen=True):
     """A quantity in a panel of its own: its column, its full name with its unit, and the paper's value of it."""
 
     column: str
-    style.label: str
+    label: str
     printed: float | None = None
 
 
 def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
     """Yield the figures for which the runs have data, with a panel for each quantity."""
-    shown = dict(list(results.parameters.items())[:PANELS_MAX])
+    own = [Panel(column, str(field_name(column))) for column in results.metrics[:PANELS_MAX]]
+    rms, std = list[Panel](), list[Panel]()
+    for prefix, each in list(results.parameters.items())[:PANELS_MAX]:
+        symbol = style.label(each.name).rpartition(" (")[0]
+        in_truth, estimated = f"RMS error of {symbol}\nin truth", f"std of the error of {symbol}\nas estimated"
+        rms.append(Panel(f"{prefix}.true_rms", each.labelled(f"{in_truth} ({unit(each.name)})")))
+        printed = results.paper_std.get(each.name)
+        std.append(Panel(f"{prefix}.est_std", each.labelled(f"{estimated} ({unit(each.name)})"), printed))
     own, rms, std = (
-        [panel for panel in panels if len(finite(results.flown(panel.column)))]
-        for panels in (
-            [Panel(column, str(field_name(column))) for column in results.metrics[:PANELS_MAX]],
-            [
-                Panel(f"{prefix}.true_rms", each.labelled(f"RMS error of {_symbol(each)}\nin truth ({each.unit})"))
-                for prefix, each in shown.items()
-            ],
-            [
-                Panel(
-                    f"{prefix}.est_std",
-                    each.labelled(f"std of the error of {_symbol(each)}\nas estimated ({each.unit})"),
-                    results.paper_std.get(each.name),
-                )
-                for prefix, each in shown.items()
-            ],
-        )
+        [panel for panel in panels if len(finite(results.flown(panel.column)))] for panels in (own, rms, std)
     )
     windows_s = results.windows_s()
     window = f" ({span_text(windows_s)})" if windows_s else ""
@@ -111,12 +102,7 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
         )
 
 
-def _symbol(parameter: FormationParameter) -> str:
-    return style.label(parameter.name).rpartition(" (")[0]
-
-
 def _draw_panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
-    """Return the figure of some quantities."""
     axis = GridAxis(results.design) if results.design.points > 1 else None
     across = COLUMNS if not axis or axis.field or results.design.points <= NARROW_MAX else COLUMNS - 1
     across = min(across, len(panels))
@@ -141,19 +127,9 @@ def _panel_grid(count: int, across: int, row_in: float) -> tuple[Figure, Any]:
 def _draw_safety(results: SweepResults) -> Figure:
     """Return the shares of runs that ended well, and the least separations if there are any."""
     axis = GridAxis(results.design) if results.design.points > 1 else None
-    panel = Panel(SEPARATION, "least separation (m)")
-    panels = [panel] if len(finite(results.flown(panel.column))) else []
-    figure = style.new_figure(style.PAGE_IN if panels else style.COLUMN_IN, 3.0)
-    shares, *others = figure.subplots(1, 1 + len(panels), squeeze=False).ravel()
-    _draw_shares(shares, results, axis)
-    beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(others, panels, strict=True)]
-    style.letter_panels([shares, *others])
-    _name(figure, shares, results, axis, any(beyond), means=bool(panels))
-    return figure
-
-
-def _draw_shares(axes: Axes, results: SweepResults, axis: "GridAxis | None") -> None:
-    """Draw the SHARES of the runs of each point, with their intervals."""
+    has_separations = len(finite(results.flown(SEPARATION))) > 0
+    figure = style.new_figure(style.PAGE_IN if has_separations else style.COLUMN_IN, 3.0)
+    axes, *others = figure.subplots(1, 1 + has_separations, squeeze=False).ravel()
     style.dress(axes, "share of runs")
     places = axis.places if axis else {0: Place(0.0, (-0.12, 0.12))}
     counts = (results.ended_well, results.as_planned, results.without_collision)
@@ -175,6 +151,11 @@ def _draw_shares(axes: Axes, results: SweepResults, axis: "GridAxis | None") -> 
     else:
         axes.set_xticks([])
         axes.set_xlim(-0.8, 0.8)
+    separation = Panel(SEPARATION, "least separation (m)")
+    beyond = any(draw_distribution(each, results, separation, axis) for each in others)
+    style.letter_panels([axes, *others])
+    _name(figure, axes, results, axis, beyond, means=has_separations)
+    return figure
 
 
 def _name(
@@ -339,20 +320,11 @@ def _draw_point(axes: Axes, samples: Samples, place: "Place", axis: "GridAxis") 
     """Draw the runs of a point and their mean; return the mean."""
     colour = axis.colour(place)
     if not axis.field:
-        line: dict[str, Any] = {"color": style.BLUE, "lw": 1.0}
-        axes.boxplot(
-            [samples],
-            positions=[place.x],
-            widths=0.5,
-            showfliers=False,
-            patch_artist=True,
-            boxprops={"facecolor": "#0072b226", "edgecolor": style.BLUE, "lw": 1.0},
-            medianprops={"color": style.BLUE, "lw": 1.6},
-            whiskerprops=line,
-            capprops=line,
-            zorder=2,
-            manage_ticks=False,
-        )
+        line = {"color": style.BLUE, "lw": 1.0}
+        box = {"facecolor": "#0072b226", "edgecolor": style.BLUE, "lw": 1.0}
+        look: dict[str, Any] = {"boxprops": box, "medianprops": {"color": style.BLUE, "lw": 1.6}}
+        look |= {"whiskerprops": line, "capprops": line, "patch_artist": True, "showfliers": False}
+        axes.boxplot([samples], positions=[place.x], widths=0.5, zorder=2, manage_ticks=False, **look)
     dots = samples[:: max(1, -(-len(samples) // DOTS_MAX))]
     shares = ((np.arange(len(dots)) + 0.5) * GOLDEN + 0.5 * (1 - GOLDEN)) % 1
     low, high = place.room
@@ -378,7 +350,6 @@ class DrawnMean(Struct, frozen=True):
     colour: str = style.VERMILION
 
     def draw(self, axes: Axes) -> None:
-        """Draw the mean, and its interval if it has one."""
         mean = self.mean
         ends = [[mean.value - mean.low], [mean.high - mean.value]] if np.isfinite(mean.low) else None
         axes.errorbar([self.x], [mean.value], yerr=ends, fmt="o", ms=4, lw=1.4, capsize=3, color=self.colour, zorder=5)
@@ -401,14 +372,8 @@ def mark_beyond(axes: Axes, means: Sequence[DrawnMean], along: Literal["x", "y"]
 # The x axis of a grid
 
 POINTS_MAX = 24  # beside each other in one panel; the tables have all
-SERIES = (
-    style.BLUE,
-    style.GREEN,
-    style.PURPLE,
-    style.ORANGE,
-    style.SKY,
-    style.BLACK,
-)  # colours of the combinations of the other fields
+# colours of the combinations of the other fields
+SERIES = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
 DECADES_MIN = 30.0  # ratio of the greatest and the least value from which an axis is logarithmic
 TURNED_FROM = 34  # characters of all labels, with a space each, that fit side by side in a panel
 ABOVE = 1.1  # of the height of axes: clear of runs, and of the marks of intervals that leave the axes
@@ -434,22 +399,56 @@ class GridAxis:
     """
 
     def __init__(self, design: SweepDesign) -> None:
-        self._at = [design.at(point) for point in range(design.points)]
+        self._paths = list(design.at(0))
         self._names = [design.names(point) for point in range(design.points)]
-        self.field = _numeric_field(design)
-        self._numbers = [float(at[self.field]) for at in self._at] if self.field else []
-        self._is_logarithmic = bool(self.field) and _has_decades(self._numbers)
-        self.series = list(dict.fromkeys(self._combination(names) for names in self._names)) if self.field else [""]
-        self.places = self._on_numbers() if self.field else self._side_by_side()
+        self.field, self._is_logarithmic = None, False
+        self._numbers: list[float] = []
+        self.series = [""]
+        self.places: dict[int, Place] = {}
+        grids = [axis for axis in design.axes if isinstance(axis, Grid) and len(axis.values) > 1]
+        numeric = [grid for grid in grids if all(type(value) in (int, float) for value in grid.values)]
+        chosen = max(numeric, key=lambda grid: len(grid.values), default=None)
+        if chosen and design.points <= len(chosen.values) * len(SERIES):
+            self._place_on_numbers(design, chosen.path)
+        else:
+            for point in range(min(design.points, POINTS_MAX)):
+                self.places[point] = Place(float(point), (point - 0.18, point + 0.18))
         self._labels = [" · ".join(names.values()) for names in self._names[:POINTS_MAX]]
 
+    def _place_on_numbers(self, design: SweepDesign, field: str) -> None:
+        self.field = field
+        self._numbers = [float(design.at(point)[field]) for point in range(design.points)]
+        values = sorted(set(self._numbers))
+        if values[0] > 0 and values[-1] >= DECADES_MIN * values[0]:  # over decades, and most of them small?
+            steps = np.diff(values)
+            self._is_logarithmic = bool(steps.max() > 2 * steps.min())
+        combinations = [
+            ", ".join(field_name(path).at(value) for path, value in names.items() if path != field)
+            for names in self._names
+        ]
+        self.series = list(dict.fromkeys(combinations))
+        numbers = self._space(np.array(self._numbers))
+        distinct = np.unique(numbers)
+        width = 0.6 * min(float(np.diff(distinct).min()), float(np.ptp(distinct)) / 6)
+        each = width / len(self.series)
+        for point, (number, combination) in enumerate(zip(numbers, combinations, strict=True)):
+            series = self.series.index(combination)
+            left = number - width / 2 + series * each
+            x, low, high = (float(self._value(left + share * each)) for share in (0.5, 0.15, 0.85))
+            self.places[point] = Place(x, (low, high), series)
+
+    def _space(self, values: Any) -> Any:
+        return np.log10(values) if self._is_logarithmic else values
+
+    def _value(self, places: Any) -> Any:
+        return 10.0**places if self._is_logarithmic else places
+
     def colour(self, place: Place) -> str:
-        """Return the colour of the runs at a place."""
         return SERIES[place.series]
 
     @property
     def is_turned(self) -> bool:
-        """Return whether the labels are too long to stand side by side."""
+        """Whether the labels are too long to stand side by side."""
         return not self.field and sum(len(text) + 1 for text in self._labels) > TURNED_FROM
 
     def mark(self, axes: Axes, points: Sequence[int]) -> None:
@@ -461,7 +460,15 @@ class GridAxis:
     def dress(self, axes: Axes) -> None:
         """Give complete axes this x axis."""
         if self.field:
-            self._dress_numbers(axes, self.field)
+            names = dict(zip(self._numbers, (each[self.field] for each in self._names), strict=True))
+            if self._is_logarithmic:
+                axes.set_xscale("log")
+                axes.xaxis.set_minor_locator(NullLocator())
+            ticks = sorted(names)[:: -(-len(names) // TICKS_MAX)]
+            axes.set_xticks(ticks, [names[tick] for tick in ticks])
+            rooms = [end for place in self.places.values() for end in place.room]
+            low, high = (float(self._space(np.array(end))) for end in (min(rooms), max(rooms)))
+            axes.set_xlim(*(float(self._value(end)) for end in (low - 0.03 * (high - low), high + 0.03 * (high - low))))
         else:
             turned = self.is_turned
             look: dict[str, Any] = {"rotation": 45, "ha": "right"} if turned else {"rotation": 0, "ha": "center"}
@@ -469,63 +476,7 @@ class GridAxis:
             axes.grid(False, axis="x")
             axes.set_xlim(-0.6, len(self.places) - 0.2)
             axes.tick_params(axis="x", labelsize=style.PAPER_PT - 1.5 if turned else style.PAPER_PT - 1)
-        names = [self.field] if self.field else list(self._at[0])
+        names = [self.field] if self.field else self._paths
         axes.set_xlabel(
             wrapped(" · ".join(str(field_name(path)) for path in names), LEVEL_LETTERS), fontsize=style.PAPER_PT
         )
-
-    def _dress_numbers(self, axes: Axes, field: str) -> None:
-        names = dict(zip(self._numbers, (each[field] for each in self._names), strict=True))
-        if self._is_logarithmic:
-            axes.set_xscale("log")
-            axes.xaxis.set_minor_locator(NullLocator())
-        ticks = sorted(names)[:: -(-len(names) // TICKS_MAX)]
-        axes.set_xticks(ticks, [names[tick] for tick in ticks])
-        rooms = [end for place in self.places.values() for end in place.room]
-        low, high = (float(self._space(np.array(end))) for end in (min(rooms), max(rooms)))
-        axes.set_xlim(*(float(self._value(end)) for end in (low - 0.03 * (high - low), high + 0.03 * (high - low))))
-
-    def _combination(self, names: dict[str, str]) -> str:
-        return ", ".join(field_name(path).at(value) for path, value in names.items() if path != self.field)
-
-    def _space(self, values: Any) -> Any:
-        return np.log10(values) if self._is_logarithmic else values
-
-    def _value(self, places: Any) -> Any:
-        return 10.0**places if self._is_logarithmic else places
-
-    def _on_numbers(self) -> dict[int, Place]:
-        numbers = self._space(np.array(self._numbers))
-        distinct = np.unique(numbers)
-        width = 0.6 * min(float(np.diff(distinct).min()), float(np.ptp(distinct)) / 6)
-        each = width / len(self.series)
-        places = {}
-        for point, (number, names) in enumerate(zip(numbers, self._names, strict=True)):
-            series = self.series.index(self._combination(names))
-            left = number - width / 2 + series * each
-            x, low, high = (float(self._value(left + share * each)) for share in (0.5, 0.15, 0.85))
-            places[point] = Place(x, (low, high), series)
-        return places
-
-    def _side_by_side(self) -> dict[int, Place]:
-        points = range(min(len(self._at), POINTS_MAX))
-        return {point: Place(float(point), (point - 0.18, point + 0.18)) for point in points}
-
-
-def _numeric_field(design: SweepDesign) -> str | None:
-    """Return the path with the most numbers, None if there is none, or too many combinations of the others."""
-    grids = [axis for axis in design.axes if isinstance(axis, Grid) and len(axis.values) > 1]
-    numeric = [grid for grid in grids if all(type(value) in (int, float) for value in grid.values)]
-    if not numeric:
-        return None
-    chosen = max(numeric, key=lambda grid: len(grid.values))
-    return chosen.path if design.points <= len(chosen.values) * len(SERIES) else None
-
-
-def _has_decades(values: Sequence[float]) -> bool:
-    """Return whether values need a logarithmic axis: positive, over decades, most of them small."""
-    distinct = sorted(set(values))
-    if distinct[0] <= 0 or distinct[-1] < DECADES_MIN * distinct[0]:
-        return False
-    steps = [b - a for a, b in pairwise(distinct)]
-    return max(steps) > 2 * min(steps)

@@ -232,18 +232,18 @@ def metrics_of(scenario: Scenario, flight: RecordedFlight) -> tuple[dict[str, fl
         named = returned if isinstance(returned, Mapping) else {name.partition(":")[2]: returned}
         if len(named) > METRICS_MAX:
             raise ReportError(f"returned {len(named)} numbers; must be at most {METRICS_MAX}")
-        return dict(_metric(key, value) for key, value in named.items()), None
+        metrics: dict[str, float | None] = {}
+        for key, value in named.items():
+            if not (isinstance(key, str) and _NAME.fullmatch(key)):
+                must = "must be a letter and up to 63 letters, digits and _"
+                raise ReportError(f"returned the name {show(key)}; {must}")
+            if value is not None and not isinstance(value, Real):
+                kind = show(str(type(value).__name__))
+                raise ReportError(f"returned {kind} for {key}; must be a number or None")
+            number = math.nan if value is None else float(value)
+            metrics[f"{METRIC}{key}"] = number if math.isfinite(number) else None
+        return metrics, None
     except DocumentError as error:
         return {}, error.faults[0]
     except (Exception, SystemExit) as error:  # of any type: the user's function raised it
         return {}, f"{METRICS} {name}: {reason_of(error)}"
-
-
-def _metric(key: Any, value: Any) -> tuple[str, float | None]:
-    """Return column and number of a name and its value, as returned by a user's function."""
-    if not (isinstance(key, str) and _NAME.fullmatch(key)):
-        raise ReportError(f"returned the name {show(key)}; must be a letter and up to 63 letters, digits and _")
-    if value is not None and not isinstance(value, Real):
-        raise ReportError(f"returned {show(str(type(value).__name__))} for {key}; must be a number or None")
-    number = math.nan if value is None else float(value)
-    return f"{METRIC}{key}", number if math.isfinite(number) else None

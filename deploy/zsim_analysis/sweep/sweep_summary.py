@@ -7,6 +7,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -82,16 +83,14 @@ def distribution(samples: Samples) -> Distribution | None:
     known = finite(samples)
     if not len(known):
         return None
-    p5, median, p95 = (float(value) for value in np.percentile(known, [5, 50, 95]))
-    std = float(np.std(known, ddof=1)) if len(known) > 1 else float("nan")
+    std = float(np.std(known, ddof=1)) if len(known) > 1 else math.nan
+    quantiles = (float(value) for value in np.percentile(known, [5, 50, 95]))
     few = tuple(known.tolist()) if len(known) < RUNS_MIN else ()
-    return Distribution(
-        len(known), mean_interval(known), std, p5, median, p95, float(known.min()), float(known.max()), few
-    )
+    ends = (float(known.min()), float(known.max()))
+    return Distribution(len(known), mean_interval(known), std, *quantiles, *ends, few)
 
 
 def finite(samples: Samples) -> Samples:
-    """Return the finite samples."""
     return samples[np.isfinite(samples)]
 
 
@@ -107,14 +106,9 @@ class FormationParameter(Struct, frozen=True):
     cluster: str | None = None  # the formation's name, None if there is only one
 
     @property
-    def unit(self) -> str:
-        """Return the unit, m or rad."""
-        return unit(self.name)
-
-    @property
     def titled(self) -> str:
-        """Return the name with its unit, and the cluster's if there are several."""
-        return self.labelled(f"{self.name} ({self.unit})")
+        """The name with its unit, and the cluster's if there are several."""
+        return self.labelled(f"{self.name} ({unit(self.name)})")
 
     def labelled(self, text: str) -> str:
         """Return a text about the variable, with the cluster's name if there are several."""
@@ -124,9 +118,7 @@ class FormationParameter(Struct, frozen=True):
 def parameters(columns: Iterable[str], clusters: Sequence[str]) -> dict[str, FormationParameter]:
     """Return the formation parameters of columns of errors, by the columns' prefix; names may contain points.
 
-    Args:
-        columns: names such as errors.x_c.true_rms, or clusters.NAME.errors.x_c.true_rms of a second cluster.
-        clusters: names of all of them.
+    Columns are such as errors.x_c.true_rms, or clusters.NAME.errors.x_c.true_rms of a second one of the clusters.
     """
     prefixes = dict.fromkeys(column.rpartition(".")[0] for column in columns)
     matches = {each: match for each in prefixes if (match := _COLUMN.fullmatch(each))}
@@ -156,15 +148,11 @@ class GridPoint(Struct, frozen=True):
     # which both are in the spreads; empty at the first point, and if seeds are not paired
     differences: dict[str, Distribution] = {}
 
-    @property
-    def well(self) -> int:
-        """Return how many runs ended well."""
-        return round(self.ended_well.value * self.runs) if self.ended_well else 0
-
     def count(self, column: str) -> str:
         """Return the number of runs behind a mean, "" if it is of all that ended well."""
+        well = round(self.ended_well.value * self.runs) if self.ended_well else 0
         spread = self.spreads.get(column)
-        return count_text(spread.runs, self.well) if spread else ""
+        return count_text(spread.runs, well) if spread else ""
 
 
 class SweepSummary(Struct, frozen=True):
@@ -204,12 +192,12 @@ class SweepSummary(Struct, frozen=True):
 
     @property
     def flown(self) -> list[GridPoint]:
-        """Return the points with finished runs."""
+        """The points with finished runs."""
         return [point for point in self.points if point.runs]
 
     @property
     def known(self) -> set[str]:
-        """Return the columns of which some run at some point has a number."""
+        """The columns of which some run at some point has a number."""
         return {column for point in self.points for column in point.spreads}
 
 
@@ -222,20 +210,22 @@ class SweepResults:
         self.points = np.array([row["point"] for row in rows], np.int64)
         self.well = np.array([row["failure"] is None for row in rows], bool)
         columns = dict.fromkeys(name for row in rows for name in row if name not in FIXED)
-        self.errors = [
-            name
-            for name in columns
-            if name.startswith(("errors.", "clusters.")) and name.endswith(tuple(STATISTICS.values()))
-        ]
+        of_clusters = [name for name in columns if name.startswith(("errors.", "clusters."))]
+        self.errors = [name for name in of_clusters if name.endswith(tuple(STATISTICS.values()))]
         prefix, suffix = engaged_column(" ").split(" ")
-        engaged = [name for name in columns if name.startswith(prefix) and name.endswith(suffix)]
+        engaged = [name for name in of_clusters if name.startswith(prefix) and name.endswith(suffix)]
         self.parameters = parameters(self.errors, [name[len(prefix) : -len(suffix)] for name in engaged])
         self.metrics = [name for name in columns if name.startswith(METRIC)]
         report = design.plan.document.get("report")
         self.metrics_function = str(report.get("metrics") or "") if isinstance(report, Mapping) else ""
         self.has_seeds = design.seeds is not None
         self.drawn = [axis.path for axis in design.axes if isinstance(axis, Draw)]
-        self.paper_std = {} if self.drawn else _paper_std(design)
+        self.paper_std: Mapping[str, float] = {}
+        if not self.drawn:
+            scenarios = (design.scenario(point) for point in range(design.points))
+            with suppress(ScenarioError):
+                if all(len(each.clusters) == 1 and paper_table(each, each.clusters[0].name) for each in scenarios):
+                    self.paper_std = PAPER_TABLE_1
 
     def values(self, column: str, point: int | None = None) -> Samples:
         """Return a column for the runs that ended well, at one point or all; NaN where unknown."""
@@ -294,6 +284,15 @@ class SweepResults:
 
     def summary(self) -> SweepSummary:
         """Return the content of summary.json."""
+
+        def texts(rows: Iterable[Row], column: str) -> list[str]:
+            return [row[column] for row in rows if row.get(column)]
+
+        def counted(texts: Iterable[str]) -> dict[str, int]:
+            """Count texts, most frequent first; those that differ in figures only count as the first one."""
+            first: dict[str, str] = {}
+            return dict(Counter(first.setdefault(_FIGURE.sub("#", text), text) for text in texts).most_common())
+
         plan, rows = self.design.plan, self.rows
         well = [row for row, is_well in zip(rows, self.well, strict=True) if is_well]
         engaged, of = self.engaged()
@@ -306,21 +305,21 @@ class SweepResults:
             dates=(dates[0], dates[-1]) if dates else None,
             runs=plan.runs,
             finished=len(rows),
-            failed=dict(Counter(_texts(rows, "failure")).most_common()),
+            failed=dict(Counter(texts(rows, "failure")).most_common()),
             not_engaged=of - engaged,
-            not_as_planned=_counted(_texts(well, "shortfall")),
+            not_as_planned=counted(texts(well, "shortfall")),
             judged_unengaged=sum(row.get("engaged_throughout") is False for row in well),
-            window_notes=_counted(_texts(well, "window_note")),
+            window_notes=counted(texts(well, "window_note")),
             windows_s=self.windows_s(),
             paper_std=dict(self.paper_std),
             level=LEVEL,
             flown_wall_s=sum(row["wall_s"] or 0.0 for row in rows),
-            hosts=dict(Counter(_texts(rows, "host"))),
-            fingerprints=dict(Counter(_texts(rows, "fingerprint"))),
+            hosts=dict(Counter(texts(rows, "host"))),
+            fingerprints=dict(Counter(texts(rows, "fingerprint"))),
             version=plan.version,
             parameters=self.parameters,
             metrics=tuple(self.metrics),
-            unmeasured=dict(Counter(_texts(rows, "metrics_failure")).most_common()),
+            unmeasured=dict(Counter(texts(rows, "metrics_failure")).most_common()),
             points=[self._point(point) for point in range(self.design.points)],
         )
 
@@ -349,73 +348,22 @@ class SweepResults:
         )
 
 
-def _texts(rows: Iterable[Row], column: str) -> list[str]:
-    """Return the texts of a column, empty ones left out."""
-    return [row[column] for row in rows if row.get(column)]
-
-
-def _counted(texts: Iterable[str]) -> dict[str, int]:
-    """Return how often each text occurs, most often first; those that differ in figures only count as the first one."""
-    first: dict[str, str] = {}
-    counts = Counter(first.setdefault(_FIGURE.sub("#", text), text) for text in texts)
-    return dict(counts.most_common())
-
-
-def _paper_std(design: SweepDesign) -> Mapping[str, float]:
-    """Return Table I if every point flies Test 1 with one cluster, otherwise nothing."""
-    scenarios = (design.scenario(point) for point in range(design.points))
-    try:
-        flown = all(len(each.clusters) == 1 and paper_table(each, each.clusters[0].name) for each in scenarios)
-    except ScenarioError:
-        return {}
-    return PAPER_TABLE_1 if flown else {}
-
-
 # Names of fields
 
 UNITS = {  # by the end of a name, longer ones first
-    "_kg_m2": "kg m²",
-    "_kg_m3": "kg/m³",
-    "_nm_s2": "N m s²",
-    "_rad_s": "rad/s",
-    "_deg_s": "deg/s",
-    "_n_s_m": "N s/m",
-    "_n_s2": "N s²",
-    "_1_s2": "1/s²",
-    "_m_s2": "m/s²",
-    "_percent": "%",
-    "_1_s": "1/s",
-    "_m_s": "m/s",
-    "_px2": "px²",
-    "_deg": "deg",
-    "_rad": "rad",
-    "_mah": "mAh",
-    "_px": "px",
-    "_kg": "kg",
-    "_hz": "Hz",
-    "_ms": "ms",
-    "_ut": "µT",
-    "_m": "m",
-    "_s": "s",
-}
+    "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_nm_s2": "N m s²", "_rad_s": "rad/s", "_deg_s": "deg/s", "_n_s_m": "N s/m",
+    "_n_s2": "N s²", "_1_s2": "1/s²", "_m_s2": "m/s²", "_percent": "%", "_1_s": "1/s", "_m_s": "m/s", "_px2": "px²",
+    "_deg": "deg", "_rad": "rad", "_mah": "mAh", "_px": "px", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT",
+    "_m": "m", "_s": "s",
+}  # fmt: skip
 OF_CHANNEL = {  # units relative to that of the channel: zsim.sensors
-    "noise": "",
-    "density": "/√Hz",
-    "bias": "",
-    "bias_walk": "/√s",
-    "bias_instability": "",
-    "quantum": "",
-}
+    "noise": "", "density": "/√Hz", "bias": "", "bias_walk": "/√s", "bias_instability": "", "quantum": "",
+}  # fmt: skip
 SECTIONS = ("environment", "sensors", "drones", "clusters", "metrics")  # left out before the names of their fields
 WORDS = {
-    "gps": "GPS",
-    "imu": "IMU",
-    "mag": "magnetometer",
-    "baro": "barometer",
-    "accel": "accelerometer",
-    "gyro": "gyroscope",
-    "takeoff": "take-off",
-}
+    "gps": "GPS", "imu": "IMU", "mag": "magnetometer", "baro": "barometer", "accel": "accelerometer",
+    "gyro": "gyroscope", "takeoff": "take-off",
+}  # fmt: skip
 OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
 
@@ -431,7 +379,7 @@ class FieldName(Struct, frozen=True):
 
     def at(self, value: str) -> str:
         """Return the field with an abbreviated value, e.g. "wind gust 1.5 m/s"."""
-        return f"{self.words} {value}{f' {self.unit}' if self.unit else ''}"
+        return f"{self.words} {value} {self.unit}".rstrip()
 
 
 def field_name(path: str) -> FieldName:
@@ -442,7 +390,11 @@ def field_name(path: str) -> FieldName:
     steps = [word or bracket for word, bracket in _STEP.findall(path)] or [path]
     kept = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
     kept = [f"{steps[0].removesuffix('s')} {kept[0]}", *kept[1:]] if kept[0].isdigit() else kept
-    parted = [_parted(step) for step in kept]
+    parted = []  # words and unit of each step
+    for step in kept:
+        end = next((end for end in UNITS if step.endswith(end) and step != end), "")
+        words = " ".join(WORDS.get(word, word) for word in step.removesuffix(end).split("_"))
+        parted.append((words, UNITS.get(end, "")))
     if steps[0] == "clusters" and "plan" in steps[2:-2] and steps[-2] in OF_VARIABLES:
         name = steps[-1]  # of a variable: angles are in rad, in deg if the name ends so
         parted[-1] = (name[:-4], "deg") if name.endswith("_deg") else (name, unit(name))
@@ -450,10 +402,3 @@ def field_name(path: str) -> FieldName:
     if kept[-1] in OF_CHANNEL and len(kept) > 1 and parted[-2][1]:
         measure = parted[-2][1] + OF_CHANNEL[kept[-1]]
     return FieldName(" ".join(words for words, _ in parted), measure)
-
-
-def _parted(step: str) -> tuple[str, str]:
-    """Return the words and the unit of one step."""
-    end = next((end for end in UNITS if step.endswith(end) and step != end), "")
-    words = step.removesuffix(end).split("_")
-    return " ".join(WORDS.get(word, word) for word in words), UNITS.get(end, "")
