@@ -63,12 +63,8 @@ def test_a_spread() -> None:
 
 
 def test_parameters_are_found_in_the_names_of_columns() -> None:
-    columns = [
-        "errors.x_c.est_std",
-        "errors.x_c.true_rms",
-        "errors.left.p.true_rms",
-        "clusters.a.b.errors.yaw.true_rms",
-    ]
+    columns = ["errors.x_c.est_std", "errors.x_c.true_rms", "errors.left.p.true_rms"]
+    columns.append("clusters.a.b.errors.yaw.true_rms")
     found = parameters(columns, ["main", "a.b"])
     assert found == {
         "errors.x_c": FormationParameter("x_c", "main"),
@@ -111,12 +107,8 @@ def test_differences_are_of_runs_with_the_same_seed() -> None:
     assert apart.high - apart.low > 5
     assert {"min_separation_m", "errors.x_c.true_rms"} <= set(summary.points[1].differences)
     unpaired = plan("seed", "a.b=0,1,2", runs=12)
-    assert (
-        not SweepResults(SweepDesign(unpaired), [well(unpaired, run) for run in range(12)])
-        .summary()
-        .points[2]
-        .differences
-    )
+    results = SweepResults(SweepDesign(unpaired), [well(unpaired, run) for run in range(12)])
+    assert not results.summary().points[2].differences
 
 
 @pytest.mark.parametrize(
@@ -148,8 +140,5 @@ def test_differences_are_of_runs_with_the_same_seed() -> None:
 )
 def test_a_path_has_words_and_a_unit(path: str, name: str) -> None:
     assert str(field_name(path)) == name
-
-
-def test_a_value_stands_with_its_unit() -> None:
-    assert field_name("environment.wind.gust_m_s").at("1.5") == "wind gust 1.5 m/s"
-    assert field_name("estimation.flow").at("true") == "estimation flow true"
+    words, _, unit = name.partition(" (")
+    assert field_name(path).at("1.5") == f"{words} 1.5 {unit.removesuffix(')')}".rstrip()
