@@ -30,15 +30,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim.schema.message import Message
 from zsim_agents.hosting import hosted
-from zsim_analysis.reading.recorded_run import (
-    GateInputs,
-    RecordedAgents,
-    RecordedRun,
-    decode_or_none,
-    gates,
-    open_run,
-    recorded_agents,
-)
+from zsim_analysis.reading import recorded_run
 from zsim_world.run.coordinator import FLIGHT_REQUESTS
 from zsim_world.run.world import World
 
@@ -66,7 +58,7 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
     Raises:
         RunError, RecordError: there is no record, or it is not one from the start of a flight.
     """
-    with open_run(place) as record:
+    with recorded_run.open_run(place) as record:
         if record.info.replay_of:
             raise RunError(f"{place}: is the record of a replay; rerun that of run {record.info.replay_of}")
         if not plugin.may_import() and (names := record.scenario.own_code()):
@@ -75,7 +67,7 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
         if external := record.scenario.external():
             reason = f"has drones whose bodies are external ({listed(external)}); they cannot be flown again"
             raise RunError(f"{place}: {reason}")
-        agents = recorded_agents(record.reader, record.info, record.scenario)
+        agents = recorded_run.recorded_agents(record.reader, record.info, record.scenario)
         nobody = agents._replace(processes=(), requests=(), failure="")
         here, recorded_by = fingerprint(), record.info.version
         if others := {record.info.fingerprint, *agents.fingerprints} - {here}:
@@ -107,7 +99,7 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> str:
         return fault
 
 
-def _fly(record: RecordedRun, agents: RecordedAgents) -> RerunResult:
+def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) -> RerunResult:
     """Fly from gate to gate of a record, as far as it is whole."""
     reader, info, scenario = record
     world = World(scenario, info.mode, 0.0, time.monotonic_ns, info.run_id)
@@ -117,7 +109,7 @@ def _fly(record: RecordedRun, agents: RecordedAgents) -> RerunResult:
     until, due_ns, throttle, start_s = "", 0, RateLimit(PERIOD_S), time.monotonic()
     line = {"state": "world and agents" if agents.processes else "world alone", "phase": "", "waiting_for": []}
     with Screen(scenario.duration_s) as screen:
-        for gate in gates(reader, world.names):
+        for gate in recorded_run.gates(reader, world.names):
             missing = [name for name in world.names if name not in gate.truth]
             if gate.t_ns != due_ns or missing:
                 what = f"no truth of {missing[0]} at" if gate.t_ns == due_ns else "nothing of"
@@ -283,7 +275,9 @@ class RerunBus(Bus):
         outputs: of the agents, compared with those on record.
     """
 
-    def __init__(self, world: World, agents: RecordedAgents, info: messages.Info, scenario: Scenario) -> None:
+    def __init__(
+        self, world: World, agents: recorded_run.RecordedAgents, info: messages.Info, scenario: Scenario
+    ) -> None:
         requests: defaultdict[int, list[tuple[str, ControlRequest]]] = defaultdict(list)
         for key, request in agents.requests:
             control = ControlRequest(request.op, request.args, request.source)
@@ -302,7 +296,7 @@ class RerunBus(Bus):
         self._withheld: dict[_Joined, run_messages.Join] = {}
         self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)
 
-    def fly_to(self, gate: GateInputs) -> None:
+    def fly_to(self, gate: recorded_run.GateInputs) -> None:
         """Receive the inputs of a gate, let the agents answer, and advance to that gate.
 
         Raises:
@@ -355,7 +349,7 @@ class RerunBus(Bus):
 
     def _feed(self, recorded: Recorded) -> None:
         """Repeat what another process published; that of agents that are run again is compared."""
-        key, message = recorded.key, decode_or_none(recorded)
+        key, message = recorded.key, recorded_run.decode_or_none(recorded)
         if message is None:  # the world refused it too
             return
         if key == keys.EVENT:
@@ -417,5 +411,5 @@ def _admitted(inputs: Sequence[Recorded]) -> set[_Joined]:
 
     Their joins are repeated in place. A join that was withheld for longer has its event in a later gate.
     """
-    events = (decode_or_none(recorded) for recorded in inputs if recorded.key == keys.EVENT)
+    events = (recorded_run.decode_or_none(recorded) for recorded in inputs if recorded.key == keys.EVENT)
     return {_joined(event) for event in events if event is not None and event.kind in JOINED}

@@ -322,11 +322,7 @@ class TableSurvey:
 
 
 class DecodedMessages:
-    """Selected messages of a record with their decoded content; those for which `decode` returns None are left out.
-
-    Attributes:
-        refused: messages left out so far.
-    """
+    """Selected messages of a record with their decoded content; those for which `decode` returns None are left out."""
 
     def __init__(
         self, messages: Iterable[Recorded], decode: Callable[[Recorded], Any], progress: Callable[[int], None]
@@ -334,7 +330,7 @@ class DecodedMessages:
         self._messages = messages
         self._decode = decode
         self._progress = progress
-        self.refused = 0
+        self.refused = 0  # messages left out so far
 
     def __iter__(self) -> Iterator[tuple[Recorded, Any]]:
         for count, recorded in enumerate(self._messages):

@@ -18,16 +18,7 @@ from typing import Any, NamedTuple
 import foxglove
 import msgspec
 import numpy as np
-from foxglove.channels import (
-    CameraCalibrationChannel,
-    CompressedImageChannel,
-    FrameTransformsChannel,
-    LocationFixChannel,
-    LogChannel,
-    PointCloudChannel,
-    PoseInFrameChannel,
-    SceneUpdateChannel,
-)
+from foxglove import channels
 from foxglove.messages import PoseInFrame
 
 from zsim.contract import keys, messages
@@ -190,11 +181,7 @@ def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: I
 
 
 class FoxgloveFile:
-    """An MCAP file that is being written; rotors by drone in the order of the scenario, spaces by cluster.
-
-    Attributes:
-        counts: messages by topic.
-    """
+    """An MCAP file that is being written; rotors by drone in the order of the scenario, spaces by cluster."""
 
     def __init__(
         self, path: Path, rotors: Mapping[str, Sequence[RotorDisc]], spaces: Mapping[str, ClusterSpace]
@@ -212,7 +199,7 @@ class FoxgloveFile:
         self._status: dict[str, Status] = {}
         self._next_ns: dict[str, int] = {}
         self._has_static_scene = False
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # messages by topic
 
     def close(self) -> None:
         """End the file; raise OSError if it could not be written."""
@@ -228,28 +215,32 @@ class FoxgloveFile:
         self._checked_file.check()
         self._status.update(instant.status)
         if not self._has_static_scene and instant.truth:
-            self._log(DRONES, SceneUpdateChannel, made.drones(instant.t_ns, self._rotors), instant.t_ns)
-            self._log(GROUND, SceneUpdateChannel, made.ground(instant.t_ns), instant.t_ns)
+            self._log(DRONES, channels.SceneUpdateChannel, made.drones(instant.t_ns, self._rotors), instant.t_ns)
+            self._log(GROUND, channels.SceneUpdateChannel, made.ground(instant.t_ns), instant.t_ns)
             self._has_static_scene = True
         self._write_frames(instant)
         for name in dict.fromkeys([*instant.truth, *instant.estimates]):
             self._write_drone(instant, name)
         for name, gps in instant.gps.items():
             fix = made.location_fix(gps, name, self._colours.get(name, GREY))
-            self._log(f"/drone/{name}/gps", LocationFixChannel, fix, gps.t_ns)
+            self._log(f"/drone/{name}/gps", channels.LocationFixChannel, fix, gps.t_ns)
         for name, state in instant.states.items():
             self._write_cluster(instant, name, state)
         for event in instant.events:
-            self._log(LOG, LogChannel, made.log_line(event), event.t_ns)
+            self._log(LOG, channels.LogChannel, made.log_line(event), event.t_ns)
         for key, info in instant.cameras:
             drone, frame = _camera_of(key)
             calibration = made.camera_calibration(info, frame)
-            self._log(f"/{frame}/calibration", CameraCalibrationChannel, calibration, info.t_ns)
+            self._log(f"/{frame}/calibration", channels.CameraCalibrationChannel, calibration, info.t_ns)
             placed = [(frame, info.position_m, info.orientation_wxyz)]
-            self._log(TF, FrameTransformsChannel, made.transforms(info.t_ns, placed, made.frame(drone)), info.t_ns)
+            self._log(
+                TF, channels.FrameTransformsChannel, made.transforms(info.t_ns, placed, made.frame(drone)), info.t_ns
+            )
         for key, image in instant.pictures:
             _, frame = _camera_of(key)
-            self._log(f"/{frame}/image", CompressedImageChannel, made.compressed_image(image, frame), image.t_ns)
+            self._log(
+                f"/{frame}/image", channels.CompressedImageChannel, made.compressed_image(image, frame), image.t_ns
+            )
         self._write_scene(instant)
 
     def _write_frames(self, instant: Instant) -> None:
@@ -261,7 +252,7 @@ class FoxgloveFile:
                 placed = made.cluster_frame(state.names, values)
                 frames += [(f"cluster/{name}{end}", *placed)] if placed else []
         if frames:
-            self._log(TF, FrameTransformsChannel, made.transforms(instant.t_ns, frames), instant.t_ns)
+            self._log(TF, channels.FrameTransformsChannel, made.transforms(instant.t_ns, frames), instant.t_ns)
 
     def _write_drone(self, instant: Instant, name: str) -> None:
         at, t_ns = made.timestamp(instant.t_ns), instant.t_ns
@@ -270,7 +261,7 @@ class FoxgloveFile:
             if state is not None:
                 placed = made.pose(state.position_m, state.orientation_wxyz)
                 message = PoseInFrame(timestamp=at, frame_id=made.WORLD, pose=placed)
-                self._log(topic, PoseInFrameChannel, message, t_ns)
+                self._log(topic, channels.PoseInFrameChannel, message, t_ns)
         status = self._status.get(name)
         values = made.drone_numbers(truth, estimate, status)
         encoded = self._drone.encode(values, (status.state if status else "",))
@@ -304,20 +295,20 @@ class FoxgloveFile:
     def _write_scene(self, instant: Instant) -> None:
         t_ns, truth = instant.t_ns, instant.truth
         if truth and self._is_due(TRAILS, t_ns, TRAIL_STEP_NS):
-            self._log(TRAILS, SceneUpdateChannel, self._trails.update(t_ns, truth, self._colours), t_ns)
+            self._log(TRAILS, channels.SceneUpdateChannel, self._trails.update(t_ns, truth, self._colours), t_ns)
         if truth and self._is_due(POINTS, t_ns):
             places = [(state.position_m, self._colours.get(d, GREY)) for d, state in truth.items()]
-            self._log(POINTS, PointCloudChannel, made.points(t_ns, places), t_ns)
+            self._log(POINTS, channels.PointCloudChannel, made.points(t_ns, places), t_ns)
         if instant.states and self._is_due(FORMATIONS, t_ns):
             desired = {c: m for c, state in instant.states.items() if (m := self._places(c, state)) is not None}
             scene = made.formations(t_ns, instant.states, truth, desired)
-            self._log(FORMATIONS, SceneUpdateChannel, scene, t_ns)
+            self._log(FORMATIONS, channels.SceneUpdateChannel, scene, t_ns)
             if desired:
                 places = [(place, MAGENTA) for each in desired.values() for place in each.tolist()]
-                self._log(DESIRED, PointCloudChannel, made.points(t_ns, places), t_ns)
+                self._log(DESIRED, channels.PointCloudChannel, made.points(t_ns, places), t_ns)
         if instant.estimates and self._is_due(ESTIMATES, t_ns):
             scene = made.ellipsoids(t_ns, instant.estimates, self._colours)
-            self._log(ESTIMATES, SceneUpdateChannel, scene, t_ns)
+            self._log(ESTIMATES, channels.SceneUpdateChannel, scene, t_ns)
 
     def _places(self, name: str, state: ClusterState) -> Any:
         """Return the desired positions of a cluster's drones (n, 3), None if they are unknown or singular."""

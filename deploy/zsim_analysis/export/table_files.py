@@ -154,11 +154,7 @@ class MatFile:
             subjects.setdefault(name, []).append(block)
 
     def finish(self) -> list[WrittenTable]:
-        """Write the file; return its variables.
-
-        Raises:
-            ReportError: a variable is larger than MATLAB loads.
-        """
+        """Write the file; return its variables. Raises ReportError: a variable is larger than MATLAB loads."""
         from scipy.io import savemat
 
         variables, written = {}, []

@@ -19,17 +19,7 @@ import numpy as np
 from foxglove import layouts
 
 from zsim.presentation import colours_of, rgb
-from zsim_analysis.export.foxglove_file import (
-    DESIRED,
-    DRONES,
-    ESTIMATES,
-    FORMATIONS,
-    GROUND,
-    LOG,
-    POINTS,
-    TRAILS,
-    ConvertedRun,
-)
+from zsim_analysis.export import foxglove_file
 from zsim_analysis.export.foxglove_messages import BODY, PACKAGE, WORLD, RotorDisc, arm_of, tidy
 
 CURVES: tuple[tuple[str, str, Literal["solid", "dashed"]], ...] = (
@@ -98,7 +88,7 @@ def _pictures(topics: Collection[str]) -> list[str]:
 # Foxglove
 
 
-def layout(run: ConvertedRun) -> str:
+def layout(run: foxglove_file.ConvertedRun) -> str:
     """Return Foxglove's layout of a file as JSON."""
     states = [(_path(f"/cluster/{name}/variables", "phase"), name) for name in run.variables]
     tabs = []
@@ -122,13 +112,19 @@ def layout(run: ConvertedRun) -> str:
         tabs.append(layouts.TabItem(title="cameras", content=_column(*cameras)))
     shown = {
         topic: layouts.BaseRendererSceneUpdateTopicSettings(visible=True)
-        for topic in (DRONES, GROUND, TRAILS, FORMATIONS, ESTIMATES)
+        for topic in (
+            foxglove_file.DRONES,
+            foxglove_file.GROUND,
+            foxglove_file.TRAILS,
+            foxglove_file.FORMATIONS,
+            foxglove_file.ESTIMATES,
+        )
         if topic in run.topics
     }
     camera = layouts.ThreeDeeCameraState(distance=35.0, phi=60.0, theta_offset=45.0, perspective=True)
     config = layouts.ThreeDeeConfig(follow_tf=WORLD, camera_state=camera, topics=dict(shown))
     scene = layouts.ThreeDeePanel(config=config, title="scene")
-    left = _column((3, scene), (1, layouts.LogPanel(config=layouts.LogConfig(topic_to_render=LOG))))
+    left = _column((3, scene), (1, layouts.LogPanel(config=layouts.LogConfig(topic_to_render=foxglove_file.LOG))))
     series = [layouts.StateTransitionsSeries(value=value, label=label, enabled=True) for value, label in states]
     transitions = layouts.StateTransitionsPanel(config=layouts.StateTransitionsConfig(paths=series, is_synced=True))
     right = _column(*([(2, layouts.TabContainer(tabs=tabs))] if tabs else []), (1, transitions))
@@ -164,12 +160,12 @@ def has_rerun() -> bool:
     return find_spec("rerun") is not None
 
 
-def write_blueprint(path: Path, application: str, run: ConvertedRun) -> None:
+def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRun) -> None:
     """Write Rerun's blueprint of a file; `application` is the file's name without its suffix, as Rerun calls it."""
     os.environ.setdefault("RUST_LOG", "error")  # otherwise Rerun warns of the entry name derived from an odd name
     import rerun.blueprint as rrb
 
-    left = rrb.Vertical(_scene(run), rrb.TextLogView(name="log", origin=LOG), row_shares=[3, 1])
+    left = rrb.Vertical(_scene(run), rrb.TextLogView(name="log", origin=foxglove_file.LOG), row_shares=[3, 1])
     views = []
     for title, curves in plots(run):
         series = _series(curves)
@@ -190,7 +186,7 @@ def write_blueprint(path: Path, application: str, run: ConvertedRun) -> None:
         shutil.copyfile(new, path)
 
 
-def plots(run: ConvertedRun) -> list[Plot]:
+def plots(run: foxglove_file.ConvertedRun) -> list[Plot]:
     """Return all plots of a blueprint: the clusters' variables, then the drones' numbers."""
     several = len(run.variables) > 1
     by_cluster = variable_plots(run.variables).items()
@@ -218,7 +214,7 @@ def _series(curves: Sequence[Curve]) -> dict[Any, list[Any]]:
     return series
 
 
-def _scene(run: ConvertedRun) -> Any:
+def _scene(run: foxglove_file.ConvertedRun) -> Any:
     """Return the view in space: the drones' meshes at their poses, the points, everything in W."""
     import rerun as rr
     import rerun.blueprint as rrb
@@ -232,7 +228,11 @@ def _scene(run: ConvertedRun) -> Any:
     return rrb.Spatial3DView(
         name="scene",
         origin="/",
-        contents=[*drawn, *(topic for topic in (POINTS, DESIRED) if topic in run.topics), "/tf"],
+        contents=[
+            *drawn,
+            *(topic for topic in (foxglove_file.POINTS, foxglove_file.DESIRED) if topic in run.topics),
+            "/tf",
+        ],
         overrides=drawn,
         spatial_information=rrb.SpatialInformation(target_frame=WORLD),
         eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=TARGET_M, eye_up=(0.0, 0.0, 1.0)),

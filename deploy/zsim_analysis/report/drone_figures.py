@@ -20,15 +20,7 @@ from scipy.special import chdtri
 from zsim.presentation import colours_of, drone_colours
 from zsim.scenario.obstacle import BOX, CENTRE, COSINE, HALF, SHAPE, SINE, row_of
 from zsim.scenario.scenario import Scenario
-from zsim_analysis.reading.drone_errors import (
-    DEGREES,
-    POSITION,
-    SIGMAS,
-    Distances,
-    EstimateErrors,
-    Separations,
-    VelocityResponse,
-)
+from zsim_analysis.reading import drone_errors
 from zsim_analysis.reading.formation import Formation, common_instants
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight, Track
 from zsim_analysis.report import figure_style as style
@@ -208,7 +200,7 @@ FLOOR = 0.1  # of NEES on its logarithmic axis
 
 
 def draw_estimates(
-    errors: Mapping[str, EstimateErrors],
+    errors: Mapping[str, drone_errors.EstimateErrors],
     colours: Mapping[str, str],
     window_s: tuple[float, float],
     marks: style.TimeMarks,
@@ -223,15 +215,15 @@ def draw_estimates(
         inside, known = each.share_inside(rows), each.nees[rows][np.isfinite(each.nees[rows])]
         for i, axes in enumerate(column[:-1]):
             style.dress(axes)
-            at, half = style.thinned(each.t_s, SIGMAS * each.sigma[:, i])
-            band = f"±{SIGMAS:g}σ as stated"
+            at, half = style.thinned(each.t_s, drone_errors.SIGMAS * each.sigma[:, i])
+            band = f"±{drone_errors.SIGMAS:g}σ as stated"
             axes.fill_between(at, -half, half, color=BAND_GREY, alpha=0.45, lw=0, zorder=1, label=band)
             axes.axhline(0, color=style.BLACK, lw=0.5, zorder=1)
             look: dict[str, Any] = {"color": colours[name], "lw": 0.6, "zorder": 3, "label": "estimate − truth"}
             style.line(axes, each.t_s, each.error[:, i], **look)
         _draw_nees(column[-1], each.t_s, each.nees, colours[name])
-        notes = [f"{100 * share:.0f} % in {SIGMAS:g}σ" for share in inside]
-        notes.append(f"mean {known.mean():.3g}, of {DEGREES}" if len(known) else "P is singular")
+        notes = [f"{100 * share:.0f} % in {drone_errors.SIGMAS:g}σ" for share in inside]
+        notes.append(f"mean {known.mean():.3g}, of {drone_errors.DEGREES}" if len(known) else "P is singular")
         column[0].set_title(name, loc="left", fontsize=style.PAPER_PT)
         for axes, note in zip(column, notes, strict=True):  # above the axes, where it covers no curve
             axes.set_title(note, loc="right", fontsize=SMALL_PT, pad=2.0)
@@ -241,7 +233,7 @@ def draw_estimates(
         reach = 0.0
         for each in errors.values():
             rows = each.t_s >= since_s
-            seen = np.maximum(np.abs(each.error[rows, i]), SIGMAS * each.sigma[rows, i])
+            seen = np.maximum(np.abs(each.error[rows, i]), drone_errors.SIGMAS * each.sigma[rows, i])
             reach = max(reach, float(np.nanmax(seen, initial=0.0)))
         if reach > 0:
             row[0].set_ylim(-1.05 * reach, 1.05 * reach)
@@ -251,7 +243,7 @@ def draw_estimates(
     return figure
 
 
-def _rows(errors: EstimateErrors, window_s: tuple[float, float]) -> np.ndarray:
+def _rows(errors: drone_errors.EstimateErrors, window_s: tuple[float, float]) -> np.ndarray:
     """Return which instants are within the window; all if none is."""
     rows = (errors.t_s >= window_s[0]) & (errors.t_s <= window_s[1])
     return rows if rows.any() else np.ones(len(rows), bool)
@@ -260,7 +252,7 @@ def _rows(errors: EstimateErrors, window_s: tuple[float, float]) -> np.ndarray:
 def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, of: int = 1) -> None:
     """Draw NEES, or its mean over `of` drones, with the range that holds nineteen of twenty consistent ones."""
     style.dress(axes)
-    low, high = (float(chdtri(of * DEGREES, share)) / of for share in (0.975, 0.025))
+    low, high = (float(chdtri(of * drone_errors.DEGREES, share)) / of for share in (0.975, 0.025))
     axes.axhspan(low, high, zorder=0.6, label=CONSISTENT, fc="none", ec=BAND_GREY, hatch="////", lw=0.0)
     style.line(axes, t_s, np.maximum(nees, FLOOR), color=colour, lw=0.6, zorder=3)
     axes.set_yscale("log")
@@ -268,7 +260,7 @@ def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, of: int = 1) ->
 
 
 def _draw_many_estimates(
-    errors: Mapping[str, EstimateErrors],
+    errors: Mapping[str, drone_errors.EstimateErrors],
     colours: Mapping[str, str],
     window_s: tuple[float, float],
     marks: style.TimeMarks,
@@ -277,7 +269,9 @@ def _draw_many_estimates(
     t_s = reduce(np.intersect1d, (each.t_s for each in errors.values()))  # at which all drones have estimates
     places = [np.searchsorted(each.t_s, t_s) for each in errors.values()]
     pairs = list(zip(errors.values(), places, strict=True))
-    distance = np.column_stack([np.linalg.norm(each.error[place][:, POSITION], axis=1) for each, place in pairs])
+    distance = np.column_stack(
+        [np.linalg.norm(each.error[place][:, drone_errors.POSITION], axis=1) for each, place in pairs]
+    )
     nees = np.column_stack([each.nees[place] for each, place in pairs]).mean(axis=1)
     figure = style.new_figure(style.PAGE_IN, 3.6)
     grid = figure.subplots(2, 2, width_ratios=(1.3, 1), sharex="col")
@@ -294,8 +288,10 @@ def _draw_many_estimates(
     statistics = []  # of each drone: RMS position error [m], the stated one [m], mean share of x, y, z within SIGMAS
     for each in errors.values():
         rows = _rows(each, window_s)
-        squares = (np.mean(np.sum(part[rows][:, POSITION] ** 2, axis=1)) for part in (each.error, each.sigma))
-        statistics.append((*map(np.sqrt, squares), each.share_inside(rows)[list(POSITION)].mean()))
+        squares = (
+            np.mean(np.sum(part[rows][:, drone_errors.POSITION] ** 2, axis=1)) for part in (each.error, each.sigma)
+        )
+        statistics.append((*map(np.sqrt, squares), each.share_inside(rows)[list(drone_errors.POSITION)].mean()))
     rms, stated, inside = np.array(statistics).T
     upper, lower = grid[:, 1]
     style.dress(upper, "RMS (m)")
@@ -303,9 +299,11 @@ def _draw_many_estimates(
     upper.plot(numbers, stated, "_", color=style.BLACK, ms=5, zorder=2, label="σ as stated", clip_on=False)
     upper.set_ylim(bottom=0)
     upper.set_title("each drone, within the window", fontsize=style.PAPER_PT)
-    style.dress(lower, f"x, y, z in {SIGMAS:g}σ (%)")
+    style.dress(lower, f"x, y, z in {drone_errors.SIGMAS:g}σ (%)")
     lower.scatter(numbers, 100 * inside, clip_on=False, **look)
-    lower.axhline(100 * INSIDE, color=style.BLACK, lw=0.7, ls="--", label=f"share of a normal error in {SIGMAS:g}σ")
+    lower.axhline(
+        100 * INSIDE, color=style.BLACK, lw=0.7, ls="--", label=f"share of a normal error in {drone_errors.SIGMAS:g}σ"
+    )
     lower.set_ylim(top=101)
     lower.set_xlabel("drone, in the order of the scenario", fontsize=style.PAPER_PT)
     style.letter_panels(grid.flat)
@@ -321,7 +319,7 @@ GAP_S = 0.5  # a drone without commands for longer is not flown by velocity, and
 
 
 def draw_velocities(
-    responses: Mapping[str, VelocityResponse], colours: Mapping[str, str], marks: style.TimeMarks
+    responses: Mapping[str, drone_errors.VelocityResponse], colours: Mapping[str, str], marks: style.TimeMarks
 ) -> Figure:
     """Return commanded and flown velocity of every drone; of many the spread of their difference."""
     if len(responses) > EACH_MAX:
@@ -341,7 +339,7 @@ def draw_velocities(
     return figure
 
 
-def _draw_many_velocities(responses: Mapping[str, VelocityResponse], marks: style.TimeMarks) -> Figure:
+def _draw_many_velocities(responses: Mapping[str, drone_errors.VelocityResponse], marks: style.TimeMarks) -> Figure:
     """Return the spread of flown − commanded over all drones."""
     t_s = reduce(np.union1d, (each.t_s for each in responses.values()))
     panels = ("horizontal (m/s)", "up (m/s)", "yaw rate (rad/s)")
@@ -362,7 +360,10 @@ def _draw_many_velocities(responses: Mapping[str, VelocityResponse], marks: styl
 
 
 def draw_distances(
-    distances: Distances, separations: Separations, colours: Mapping[str, str], marks: style.TimeMarks
+    distances: drone_errors.Distances,
+    separations: drone_errors.Separations,
+    colours: Mapping[str, str],
+    marks: style.TimeMarks,
 ) -> Figure:
     """Return the distances of every pair in the colours of both, and their limits; of many those to the nearest."""
     figure = style.new_figure(style.COLUMN_IN, 2.5)

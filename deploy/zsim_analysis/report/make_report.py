@@ -21,14 +21,7 @@ from zsim_analysis.reading.formation import Formation, formations_of, goal_error
 from zsim_analysis.reading.recorded_flight import RecordedFlight, read_flight
 from zsim_analysis.reading.shortfall import seconds_text, span_text
 from zsim_analysis.report import FORMATS
-from zsim_analysis.report.drone_figures import (
-    PAIRS_MAX,
-    draw_distances,
-    draw_drones,
-    draw_estimates,
-    draw_plan,
-    draw_velocities,
-)
+from zsim_analysis.report import drone_figures as drones
 from zsim_analysis.report.figure_style import DARK, TAKE_OVER, VERMILION, ReportFigure, mark_figure, time_marks
 from zsim_analysis.report.formation_figures import ROWS_MAX, draw_errors, draw_parameters, numbered, parameter_groups
 from zsim_analysis.report.paper import PAPER_NOTE, flies_paper_test
@@ -108,22 +101,22 @@ def _unmarked(
             "Plan view",
             "True paths from above, squares where they begin and dots where they end; black: desired centroid; grey: "
             "the formation at some instants of simulated time.",
-            draw_plan(flight, formations),
+            drones.draw_plan(flight, formations),
         )
-    if apart := distances(flight, PAIRS_MAX):
+    if apart := distances(flight, drones.PAIRS_MAX):
         what = "every two drones" if apart.pairs else "each drone to the nearest other one: median, 5 to 95 %, extremes"
         yield ReportFigure(
             "distances.png",
             "Distances between drones",
             f"True distance of {what}; below the first line the controller's guard parts them.",
-            draw_distances(apart, separations(flight), colours, marks),
+            drones.draw_distances(apart, separations(flight), colours, marks),
         )
     if has_truth:
         yield ReportFigure(
             "drones.png",
             "Drones",
             "True altitude, state of the firmware and battery of every drone.",
-            draw_drones(flight, marks),
+            drones.draw_drones(flight, marks),
         )
     if errors := estimate_errors(flight):
         yield ReportFigure(
@@ -133,7 +126,7 @@ def _unmarked(
             "of position and velocity squared and divided by its covariance: 6 on average where that is true. Shares "
             "and means, above the panels, are those of the window; the axes hold all since the engagement, and what is "
             "larger before it leaves them.",
-            draw_estimates(errors, colours, window_s, marks),
+            drones.draw_estimates(errors, colours, window_s, marks),
         )
     if responses := velocity_responses(flight):
         yield ReportFigure(
@@ -141,7 +134,7 @@ def _unmarked(
             "Commanded and flown velocity",
             "By the drone's heading. Flown: in truth; commanded: as sent by whoever flew the drone, without the delay "
             "of the link. Of many drones: median, 5 to 95 % and extremes of the difference.",
-            draw_velocities(responses, colours, marks),
+            drones.draw_velocities(responses, colours, marks),
         )
 
 

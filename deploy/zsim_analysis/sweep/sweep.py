@@ -209,11 +209,7 @@ class SweepFolder:
 
 
 def load(path: Path) -> SweepFolder:
-    """Return the sweep in a folder.
-
-    Raises:
-        RunError: its plan cannot be read.
-    """
+    """Return the sweep in a folder. Raises RunError: its plan cannot be read."""
     try:
         return SweepFolder(path, msgspec.json.decode((path / PLAN).read_bytes(), type=SweepPlan))
     except (OSError, msgspec.MsgspecError, ValueError) as error:
@@ -316,11 +312,7 @@ def read_journal(path: Path) -> list[Row]:
 
 
 def write_table(path: Path, rows: Iterable[Row], plan: SweepPlan, axes: Sequence[Axis]) -> None:
-    """Write the rows in the order of the runs, all or nothing.
-
-    Raises:
-        ReportError: it cannot be written.
-    """
+    """Write the rows in the order of the runs, all or nothing. Raises ReportError: it cannot be written."""
     ordered = sorted(rows, key=lambda row: row["run"])
     schema = _schema(ordered, axes).with_metadata({PLAN_METADATA: msgspec.json.encode(plan)})
     json_columns = [field.name for field in schema if field.metadata]
