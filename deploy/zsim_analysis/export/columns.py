@@ -8,6 +8,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from operator import attrgetter
 from typing import Any, Literal, NamedTuple
 
 import msgspec
@@ -26,7 +27,7 @@ from zsim_analysis.reading.recorded_run import decode_or_none
 CELLS = 100_000  # of a batch: some 5 MB as Python objects
 PROGRESS_EVERY = 10_000  # messages
 WHOLE_MAX = 2**63 - 1
-QUATERNION = "_wxyz"
+QUATERNION, NO_WORD = "_wxyz", r"\W"
 COUNTS = ("used", "refused")  # an estimate's counts of a sensor's samples
 _NUMERIC = inspect.IntType | inspect.FloatType
 
@@ -129,13 +130,13 @@ def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) 
     if open_kind and not names:
         return []
     if open_kind:
-        return [_named(name, names) if open_kind == "named" else _keyed(name, names, open_kind == "pairs")]
+        return [_open(name, names, open_kind)]
     if isinstance(info, inspect.UnionType):
         others = [each for each in info.types if not isinstance(each, inspect.NoneType)]
         info = others[0] if len(others) == 1 else info
     match info:
         case inspect.IntType():
-            return [_plain(name, "whole", lambda value: value if abs(value or 0) <= WHOLE_MAX else None)]
+            return [_plain(name, "whole", convert=lambda value: value if abs(value or 0) <= WHOLE_MAX else None)]
         case inspect.FloatType():
             return [_plain(name, "number")]
         case inspect.BoolType():
@@ -150,71 +151,56 @@ def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) 
 
         return [Columns(name, "number", tuple(components), vectors)]
     if isinstance(info, inspect.StructType) and all(isinstance(part.type, _NUMERIC) for part in info.fields):
-        return [_part(name, part.name) for part in info.fields]
+        return [_plain(f"{name}_{part.name}", "number", f"{name}.{part.name}") for part in info.fields]
     return [Columns(name, "text", (name,), lambda batch: [json_text(getattr(m, name)) for m in batch.messages])]
 
 
-def _plain(name: str, kind: Kind, convert: Callable[[Any], Any] = lambda value: value) -> Columns:
+def _plain(name: str, kind: Kind, path: str = "", convert: Callable[[Any], Any] = lambda value: value) -> Columns:
+    """Return the column of a field, or of what is at a path from the message, converted."""
+    get = attrgetter(path or name)
+
     def values(batch: RowBatch) -> Values:
-        return [None if (value := getattr(m, name)) is UNSET else convert(value) for m in batch.messages]
+        return [None if (value := get(message)) is UNSET else convert(value) for message in batch.messages]
 
     return Columns(name, kind, (name,), values)
 
 
-def _part(name: str, part: str) -> Columns:
-    """Return the column of a number inside a field that is a struct."""
-    column = f"{name}_{part}"
-    return Columns(column, "number", (column,), lambda batch: [getattr(getattr(m, name), part) for m in batch.messages])
+def _open(name: str, names: Sequence[str], kind: str) -> Columns:
+    """Return a column for each name, or key, of an open field; for pairs two: FIELD_KEY_used and FIELD_KEY_refused.
 
-
-def _named(name: str, names: Sequence[str]) -> Columns:
-    """Return a column for each of the messages' `names`, which may differ from message to message."""
-
-    def values(batch: RowBatch) -> Values:
-        table = np.full((len(batch.messages), len(names)), np.nan)
-        indices: dict[tuple[str, ...], list[int]] = {}
-        for row, message in zip(table, batch.messages, strict=True):
-            if message.names not in indices:
-                indices[message.names] = [names.index(each) for each in message.names]
-            row[indices[message.names]] = getattr(message, name)
-        return table
-
-    return Columns(name, "number", tuple(f"{name}_{_tidy(each)}" for each in names), values, tuple(names))
-
-
-def _keyed(name: str, names: Sequence[str], pairs: bool) -> Columns:
-    """Return a column for each key of a map, or two for a map of pairs: FIELD_KEY_used and FIELD_KEY_refused."""
-    ends = [f"_{end}" for end in COUNTS] if pairs else [""]
-    columns = tuple(f"{name}_{_tidy(key)}{end}" for key in names for end in ends)
-    places = {key: slice(i * len(ends), (i + 1) * len(ends)) for i, key in enumerate(names)}
+    The messages' `names` may differ from message to message.
+    """
+    ends = [f"_{end}" for end in COUNTS] if kind == "pairs" else [""]
+    columns = tuple(f"{name}_{re.sub(NO_WORD, '_', each)}{end}" for each in names for end in ends)
+    places = {each: slice(i * len(ends), (i + 1) * len(ends)) for i, each in enumerate(names)}
 
     def values(batch: RowBatch) -> Values:
         table = np.full((len(batch.messages), len(columns)), np.nan)
         for row, message in zip(table, batch.messages, strict=True):
-            for key, value in getattr(message, name).items():
-                row[places[key]] = value
+            content = getattr(message, name)
+            for each, value in zip(message.names, content, strict=True) if kind == "named" else content.items():
+                row[places[each]] = value
         return table
 
+    if kind == "named":
+        return Columns(name, "number", columns, values, names=tuple(names))
     return Columns(name, "number", columns, values, keys=places)
 
 
 def _components(name: str, info: inspect.Type) -> list[str]:
     """Return the columns of a field with a fixed number of numbers, none for any other field."""
     if isinstance(info, inspect.VarTupleType) and info.min_length == info.max_length == 36:
-        return [f"{name}_{i}{j}" for i in range(6) for j in range(6)]
-    if isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # of more rotors, the first four
-        return [f"{name}_{part}" for part in ROTORS]
-    if not isinstance(info, inspect.TupleType) or not all(isinstance(each, _NUMERIC) for each in info.item_types):
-        return []
-    count = len(info.item_types)
-    if name.endswith(QUATERNION):
-        return [f"{name.removesuffix(QUATERNION)}_{part}" for part in "wxyz"]
-    return [f"{name}_{part}" for part in ("xyz" if count == 3 else range(count))]
-
-
-def _tidy(name: str) -> str:
-    """Return a name with letters, digits and underscores only."""
-    return re.sub(r"\W", "_", name)
+        parts = [f"{i}{j}" for i in range(6) for j in range(6)]
+    elif isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # of more rotors, the first four
+        parts = list(ROTORS)
+    elif not isinstance(info, inspect.TupleType) or not all(isinstance(each, _NUMERIC) for each in info.item_types):
+        parts = []
+    elif name.endswith(QUATERNION):
+        name, parts = name.removesuffix(QUATERNION), list("wxyz")
+    else:
+        count = len(info.item_types)
+        parts = list("xyz") if count == 3 else [str(i) for i in range(count)]
+    return [f"{name}_{part}" for part in parts]
 
 
 def json_text(value: Any) -> str:
@@ -277,7 +263,16 @@ class TableSurvey:
         self.rows: Counter[type[Struct] | None] = Counter()
         for key in self.wanted:
             self.rows[self.kinds.get(key)] += counts[key]
-        self._names = self._open_names()
+        opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
+        self._names: dict[type[Struct], dict[str, dict[str, None]]] = {  # that occur in the open fields of all messages
+            kind: {field: {} for field in opens} for kind, opens in opened.items()
+        }
+        wanted = [key for key, kind in self.kinds.items() if opened[kind]]
+        for recorded in selection.messages(reader, wanted) if wanted else ():
+            if (message := decode_or_none(recorded)) is not None:
+                for field, open_kind in opened[type(message)].items():
+                    names = message.names if open_kind == "named" else getattr(message, field)
+                    self._names[type(message)][field].update(dict.fromkeys(names))
         self._tables: dict[type[Struct], tuple[Columns, ...]] = {}
 
     def table(self, kind: type[Struct]) -> tuple[Columns, ...]:
@@ -304,21 +299,6 @@ class TableSurvey:
         except REFUSALS:
             content = json_text({"hexadecimal": recorded.payload.hex()})
         return Foreign(recorded.t_ns, recorded.key, content)
-
-    def _open_names(self) -> dict[type[Struct], dict[str, dict[str, None]]]:
-        """Return the names, or keys, that occur in the open fields of all messages."""
-        opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
-        found: dict[type[Struct], dict[str, dict[str, None]]] = {
-            kind: {field: {} for field in opens} for kind, opens in opened.items()
-        }
-        wanted = [key for key, kind in self.kinds.items() if opened[kind]]
-        for recorded in self._selection.messages(self._reader, wanted) if wanted else ():
-            if (message := decode_or_none(recorded)) is None:
-                continue
-            for field, open_kind in opened[type(message)].items():
-                names = message.names if open_kind == "named" else getattr(message, field)
-                found[type(message)][field].update(dict.fromkeys(names))
-        return found
 
 
 class DecodedMessages:
@@ -351,28 +331,22 @@ def batches(
     Batches of wide tables have fewer rows. With `by_name`, each drone, cluster and process has tables of its own.
     """
     incomplete: dict[tuple[type[Struct], str], RowBatch] = {}
-    for recorded, message in _rows(decoded):
-        kind, name = type(message), subject(recorded.key)
-        only = name if by_name and kind is not Foreign else ""  # foreign names may be invalid as names of files
-        batch = incomplete.setdefault((kind, only), RowBatch(kind, only, [], [], []))
-        batch.names.append(name)
-        batch.messages.append(message)
-        batch.wall_ns.append(recorded.wall_ns)
-        if len(batch.names) * width(kind) >= CELLS:
-            yield incomplete.pop((kind, only))
-    yield from incomplete.values()
-
-
-def _rows(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[tuple[Recorded, Any]]:
-    """Yield messages, and a Sighting for each hat of Sightings."""
     for recorded, message in decoded:
-        if not isinstance(message, Sightings):
-            yield recorded, message
-            continue
-        source = message.source or ("world" if keys.is_sensor(recorded.key) else "")
-        head = (message.t_ns, message.seq, message.t_sample_ns, source, message.camera, len(message.seen))
-        for hat, seen in enumerate(message.seen):
-            numbers = (seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
-            yield recorded, Sighting(*head, hat, *numbers)
-        if not message.seen:
-            yield recorded, Sighting(*head)
+        name, rows = subject(recorded.key), [message]
+        if isinstance(message, Sightings):
+            source = message.source or ("world" if keys.is_sensor(recorded.key) else "")
+            head = (message.t_ns, message.seq, message.t_sample_ns, source, message.camera, len(message.seen))
+            rows = [
+                Sighting(*head, hat, seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
+                for hat, seen in enumerate(message.seen)
+            ] or [Sighting(*head)]
+        for row in rows:
+            kind = type(row)
+            only = name if by_name and kind is not Foreign else ""  # foreign names may be invalid as names of files
+            batch = incomplete.setdefault((kind, only), RowBatch(kind, only, [], [], []))
+            batch.names.append(name)
+            batch.messages.append(row)
+            batch.wall_ns.append(recorded.wall_ns)
+            if len(batch.names) * width(kind) >= CELLS:
+                yield incomplete.pop((kind, only))
+    yield from incomplete.values()

@@ -81,7 +81,12 @@ def convert(
                 check()
         finally:
             file.close()
-    return ConvertedRun(dict(sorted(file.counts.items())), file.variables(), rotors, decoded.refused)
+    return ConvertedRun(
+        dict(sorted(file.counts.items())),
+        {name: kind.numbers for name, kind in file.variables.items()},
+        rotors,
+        decoded.refused,
+    )
 
 
 @contextmanager
@@ -193,7 +198,7 @@ class FoxgloveFile:
         self._spaces = spaces
         self._colours = colours_of(rotors)
         self._channels: dict[str, Any] = {}
-        self._variables: dict[str, NumericMessageType] = {}
+        self.variables: dict[str, NumericMessageType] = {}  # of each cluster
         self._drone = NumericMessageType("Drone", made.DRONE_NUMBERS, ("state",))
         self._trails = made.DroneTrails()
         self._status: dict[str, Status] = {}
@@ -205,10 +210,6 @@ class FoxgloveFile:
         """End the file; raise OSError if it could not be written."""
         self._file.close()
         self._checked_file.close()
-
-    def variables(self) -> dict[str, tuple[str, ...]]:
-        """Return the names of the numeric fields of each cluster."""
-        return {name: numbers.numbers for name, numbers in self._variables.items()}
 
     def write(self, instant: Instant) -> None:
         """Write all messages of an instant; raise OSError if it cannot be written."""
@@ -268,12 +269,12 @@ class FoxgloveFile:
         self._log(f"/drone/{name}/numbers", self._drone, encoded, t_ns)
 
     def _write_cluster(self, instant: Instant, name: str, state: ClusterState) -> None:
-        if name not in self._variables:
+        if name not in self.variables:
             tidied = [made.tidy(each) for each in state.names]
             fields = [f"{what}_{each}" for what in ("desired", "estimated", "true") for each in tidied]
             kind = NumericMessageType(f"Cluster_{made.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
-            self._variables[name] = kind
-        numbers = self._variables[name]
+            self.variables[name] = kind
+        numbers = self.variables[name]
         values = [*state.desired, *state.value, *self._true(instant, name, state), state.margin]
         if len(values) == len(numbers.numbers):  # if the number of variables changes, only the first ones are written
             encoded = numbers.encode(values, (state.phase, state.reason))

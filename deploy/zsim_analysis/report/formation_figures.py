@@ -61,7 +61,7 @@ def draw_errors(
             _draw_no_goal(axes[0])
         draw_error(axes[-2], formation, name, every)
         draw_error(axes[-1], formation, name, rows)
-        _write_statistics(axes[-1], formation, name, formation.judged(window_s))
+        _write_statistics(axes[-1], formation, i, formation.judged(window_s))
         axes[0].set_ylabel(style.label(name), fontsize=style.PAPER_PT)
     for (measure, members), axes in zip(others.items(), grid[len(names) :], strict=True):
         if goal:
@@ -120,9 +120,9 @@ def _draw_others(axes: Axes, formation: Formation, members: Sequence[str], rows:
     style.scale(axes, errors[rows & formation.since_engaged].ravel())
 
 
-def _write_statistics(axes: Axes, formation: Formation, name: str, rows: np.ndarray) -> None:
+def _write_statistics(axes: Axes, formation: Formation, i: int, rows: np.ndarray) -> None:
     """Write standard deviations and means beside the axes, in the colours of their lines."""
-    i, missing = formation.column(name), "no data" if rows.any() else "not\nengaged"
+    missing = "no data" if rows.any() else "not\nengaged"
     for y, error, colour in ((0.75, formation.est_error, style.AMBER), (0.25, formation.true_error, style.BLUE)):
         known = error[rows, i][np.isfinite(error[rows, i])]
         text = f"std {known.std():.3g}\nmean {known.mean():+.2g}" if len(known) else missing

@@ -259,6 +259,7 @@ class SweepDesign:
         self.plan = plan
         self.axes: list[Axis] = [parse(text, plan.document) for text in plan.vary]
         self._grids = [axis for axis in self.axes if isinstance(axis, Grid)]
+        self._names = {grid.path: grid.names for grid in self._grids}
         self.points = math.prod(len(grid.values) for grid in self._grids)
         self.seeds = next((axis for axis in self.axes if isinstance(axis, Seeds)), None)
         self.paired = self.seeds is not None and self.seeds.paired
@@ -275,7 +276,6 @@ class SweepDesign:
         return [axis.path for axis in self.axes if axis.path != SEED]
 
     def point(self, run: int) -> int:
-        """Return the point of the grid that a run flies."""
         return run % self.points
 
     def at(self, point: int) -> dict[str, Any]:
@@ -293,10 +293,6 @@ class SweepDesign:
             point, place = divmod(point, len(grid.values))
             places.append((grid, place))
         return places[::-1]
-
-    @cached_property
-    def _names(self) -> dict[str, list[str]]:
-        return {grid.path: grid.names for grid in self._grids}
 
     def values(self, run: int) -> dict[str, Any]:
         """Return the values that a run sets, by path, in the order of the axes."""
