@@ -61,9 +61,7 @@ class FlightObserver(Protocol):
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None: ...
 
-    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Receive the world's messages of a gate."""
-        ...
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None: ...
 
 
 class InProcessFlight:
@@ -140,7 +138,6 @@ class _Progress:
         """Show nothing: it holds truth, status and sensors only."""
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Show a message of a watched key."""
         if key not in self._watched:
             return
         if isinstance(message, flight_messages.ClusterState):

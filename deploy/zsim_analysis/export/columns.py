@@ -43,7 +43,6 @@ class MessageSelection(NamedTuple):
     to_s: float | None = None  # of the last one
 
     def keys(self, reader: RecordReader) -> list[str]:
-        """Return the selected keys on record."""
         every = not self.expressions
         return [key for key in reader.topics() if every or any(keys.matches(each, key) for each in self.expressions)]
 
@@ -71,8 +70,6 @@ class RowBatch(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """The columns that one field of a message becomes."""
-
     name: str  # unique in the table
     kind: Kind  # of all its columns
     columns: tuple[str, ...]  # their names
@@ -282,7 +279,6 @@ class TableSurvey:
         return self._tables[kind]
 
     def width(self, kind: type[Struct]) -> int:
-        """Return the number of columns of a type's table."""
         return sum(len(each.columns) for each in self.table(kind))
 
     def rows_within(self, kind: type[Struct]) -> int:

@@ -73,7 +73,6 @@ class NumericMessageType:
         self.schema = _bytes(1, file)  # a FileDescriptorSet of this one message
 
     def encode(self, numbers: Iterable[float], texts: Iterable[str] = ()) -> bytes:
-        """Return a message of values in the order of the fields."""
         parts = [key + _FLOAT.pack(value) for key, value in zip(self._number_keys, numbers, strict=True)]
         encoded = [text.encode() for text in texts]
         parts += [key + _varint(len(text)) + text for key, text in zip(self._text_keys, encoded, strict=True)]
@@ -149,7 +148,6 @@ def colour(text: str, opacity: float = 1.0) -> fox.Color:
 
 
 def frame(drone: str) -> str:
-    """Return the name of a drone's frame B."""
     return f"drone/{drone}"
 
 
@@ -157,7 +155,6 @@ def frame(drone: str) -> str:
 
 
 def transforms(t_ns: int, frames: Iterable[FramePose], parent: str = WORLD) -> fox.FrameTransforms:
-    """Return the poses of frames in another one."""
     placed = []
     for child, position, orientation in frames:
         pose: dict[str, Any] = {"translation": vector(position), "rotation": quaternion(orientation)}
@@ -190,7 +187,6 @@ def location_fix(gps: Gps, drone: str, tint: str) -> fox.LocationFix:
 
 
 def compressed_image(image: CameraImage, frame_id: str) -> fox.CompressedImage:
-    """Return a picture, at the time of its exposure."""
     at = timestamp(max(0, image.t_sample_ns))
     return fox.CompressedImage(timestamp=at, frame_id=frame_id, data=image.data, format=image.format)
 
@@ -211,7 +207,6 @@ def camera_calibration(info: CameraInfo, frame_id: str) -> fox.CameraCalibration
 
 
 def log_line(event: Event) -> fox.Log:
-    """Return an event as a line of the log."""
     level = fox.LogLevel.Warning if event.kind in WARNINGS else fox.LogLevel.Info
     level = fox.LogLevel.Error if event.kind in FAILURES else level
     text = f"{event.kind}: {event.text}"
@@ -298,7 +293,6 @@ def _drone(at: fox.Timestamp, name: str, discs: Sequence[RotorDisc], mark: str) 
 
 
 def ground(t_ns: int) -> fox.SceneUpdate:
-    """Return a grid on the ground."""
     marks = range(-GROUND_M, GROUND_M + 1, GROUND_STEP_M)
     ends = [end for a in marks for end in ((a, -GROUND_M, 0), (a, GROUND_M, 0))]
     ends += [end for a in marks for end in ((-GROUND_M, a, 0), (GROUND_M, a, 0))]
@@ -348,7 +342,6 @@ class DroneTrails:
         self._length = round(TRAIL_S * 1e9) // TRAIL_STEP_NS + 1
 
     def update(self, t_ns: int, truth: Mapping[str, Truth], colours: Mapping[str, str]) -> fox.SceneUpdate:
-        """Add the positions of an instant, return the trails."""
         at, entities = timestamp(t_ns), []
         for name, state in truth.items():
             path = self._paths.setdefault(name, deque(maxlen=self._length))

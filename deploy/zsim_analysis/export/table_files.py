@@ -58,7 +58,6 @@ class TableFolder:
         self._written[file] = WrittenTable(file, before + len(batch.names), schema.names)
 
     def finish(self) -> list[WrittenTable]:
-        """Close all files; return the tables that were written."""
         self._stack.close()
         return sorted(self._written.values())
 
@@ -176,7 +175,6 @@ class MatFile:
         self._blocks.clear()
 
     def _struct(self, kind: type[Struct], name: str, blocks: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """Return the arrays of one drone, cluster or process."""
         struct: dict[str, Any] = {"name": name}
         for each in self._survey.table(kind)[1:]:
             values: Any = [block[each.name] for block in blocks]

@@ -187,7 +187,6 @@ def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRu
 
 
 def plots(run: foxglove_file.ConvertedRun) -> list[Plot]:
-    """Return all plots of a blueprint: the clusters' variables, then the drones' numbers."""
     several = len(run.variables) > 1
     by_cluster = variable_plots(run.variables).items()
     found = [
@@ -197,7 +196,6 @@ def plots(run: foxglove_file.ConvertedRun) -> list[Plot]:
 
 
 def _series(curves: Sequence[Curve]) -> dict[Any, list[Any]]:
-    """Return the visualizers of curves by their entity."""
     import rerun as rr
     from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 

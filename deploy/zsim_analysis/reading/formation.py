@@ -97,7 +97,6 @@ class Formation:
 
 
 def cluster_of(scenario: Scenario | None, name: str) -> Cluster | None:
-    """Return a cluster of a scenario; None without one of this name."""
     return next((each for each in scenario.clusters if each.name == name), None) if scenario else None
 
 

@@ -166,7 +166,6 @@ def _of_cluster(
 
 
 def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
-    """Return report.html."""
     return template("page.html.j2").render(
         summary=summary,
         facts=facts(summary),

@@ -283,11 +283,9 @@ class SweepDesign:
         return {grid.path: grid.values[place] for grid, place in self._places(point)}
 
     def names(self, point: int) -> dict[str, str]:
-        """Return the abbreviated values of a point by path, unique for each field."""
         return {grid.path: self._names[grid.path][place] for grid, place in self._places(point)}
 
     def _places(self, point: int) -> list[tuple[Grid, int]]:
-        """Return the axes of the grid, each with the index of a point's value."""
         places = []
         for grid in reversed(self._grids):
             point, place = divmod(point, len(grid.values))

@@ -65,8 +65,6 @@ def cores() -> int:
 
 
 class WorkerProcess:
-    """One process and its current task."""
-
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.link, far = context.Pipe()
@@ -113,8 +111,6 @@ class WorkerProcess:
 
 
 class ProcessPool:
-    """Flies tasks on worker processes."""
-
     def __init__(self, count: int, say: Callable[[str], None]) -> None:
         self._count = count
         self._say = say

@@ -138,7 +138,6 @@ class SweepScreen:
         self.console.print(cell(text), soft_wrap=True)
 
     def finished(self, failed: bool) -> None:
-        """Count a run."""
         self._done += 1
         self._failed += failed
         if not self.console.is_terminal and self._done < self._total and self._throttle.spend():
@@ -178,8 +177,6 @@ def span(seconds: float) -> str:
 
 
 class SweepFolder:
-    """A sweep on disk."""
-
     def __init__(self, path: Path, plan: SweepPlan) -> None:
         self.path = path
         self.plan = plan
@@ -192,7 +189,6 @@ class SweepFolder:
         return Journal(self.path / JOURNAL)
 
     def rows(self) -> list[Row]:
-        """Return the finished runs in their order."""
         rows = {row["run"]: row for row in (*read_table(self.path / TABLE), *read_journal(self.path / JOURNAL))}
         return [rows[run] for run in sorted(rows)]
 

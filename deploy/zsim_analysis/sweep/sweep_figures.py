@@ -114,7 +114,6 @@ def _draw_panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
 
 
 def _panel_grid(count: int, across: int, row_in: float) -> tuple[Figure, Any]:
-    """Return a figure and the axes of so many lettered panels."""
     rows = -(-count // across)
     figure = style.new_figure(style.PAGE_IN if across > 1 else style.COLUMN_IN, 0.8 + rows * row_in)
     grid = figure.subplots(rows, across, squeeze=False).ravel()
@@ -452,13 +451,11 @@ class GridAxis:
         return not self.field and sum(len(text) + 1 for text in self._labels) > TURNED_FROM
 
     def mark(self, axes: Axes, points: Sequence[int]) -> None:
-        """Draw a cross above axes at some points."""
         look: dict[str, Any] = {"color": MARK, "ms": 6, "mew": 1.6, "clip_on": False}
         for place in (self.places[point] for point in points if point in self.places):
             axes.plot([place.x], [ABOVE], "x", transform=axes.get_xaxis_transform(), **look)
 
     def dress(self, axes: Axes) -> None:
-        """Give complete axes this x axis."""
         if self.field:
             names = dict(zip(self._numbers, (each[self.field] for each in self._names), strict=True))
             if self._is_logarithmic:

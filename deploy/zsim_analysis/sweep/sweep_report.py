@@ -82,7 +82,6 @@ def _table(
 
 
 def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
-    """Return report.html."""
     points, axes = summary.flown[:POINTS_MAX], axes_of(summary)
     names = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in summary.known}
     errors = {f"{prefix}.true_rms": each.titled for prefix, each in names.items()}
@@ -166,7 +165,6 @@ def facts(summary: SweepSummary) -> list[tuple[str, str]]:
 
 
 def windows_of(summary: SweepSummary) -> str:
-    """Return the judged windows of all runs in words."""
     return span_text(summary.windows_s) if summary.windows_s else "not known"
 
 
@@ -183,7 +181,6 @@ def marks_of(summary: SweepSummary) -> list[str]:
 
 
 def notes(summary: SweepSummary) -> list[str]:
-    """Return what a reader should know about the figures."""
     lines = []
     if summary.finished < summary.runs:
         lines.append(f"{summary.runs - summary.finished} runs are not finished; the same command goes on with them.")
@@ -229,7 +226,6 @@ def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: d
 
 
 def overview(point: GridPoint, brief: bool = False) -> list[str]:
-    """Return the cells of OVERVIEW at a point: how its runs ended."""
     shares = []  # in percent, with their intervals unless brief
     for share in (point.ended_well, point.as_planned, point.without_collision):
         interval = f" [{100 * share.low:.3g}, {100 * share.high:.3g}]" if share and not brief else ""

@@ -105,7 +105,6 @@ def make_row(result: RunResult, varied: Mapping[str, Any], errors: Mapping[str, 
 
 
 def failed_row(task: Task, reason: str, **known: Any) -> Row:
-    """Return the row of a run that did not end well."""
     result = RunResult(run=task.run, point=task.point, seed=task.scenario.seed, failure=reason, **known)
     return make_row(result, task.varied, {})
 

@@ -187,12 +187,10 @@ class SweepSummary(Struct, frozen=True):
     window_notes: dict[str, int] = {}  # number of runs that ended well, by why their window is not that of the scenario
 
     def json(self) -> bytes:
-        """Return the text of summary.json; unknown values are null."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
     @property
     def flown(self) -> list[GridPoint]:
-        """The points with finished runs."""
         return [point for point in self.points if point.runs]
 
     @property
@@ -283,8 +281,6 @@ class SweepResults:
         return (float(start[known].min()), float(end[known].max())) if known.any() else None
 
     def summary(self) -> SweepSummary:
-        """Return the content of summary.json."""
-
         def texts(rows: Iterable[Row], column: str) -> list[str]:
             return [row[column] for row in rows if row.get(column)]
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
@@ -55,15 +56,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def counts(run: Path) -> dict[str, int]:
     """Return how many messages of each table are on record, repeats of commands for drivers left out."""
-    found: dict[str, int] = {}
+    found = Counter[str]()
     with RecordReader(run / "run.mcap") as reader:
         for key, count in reader.topics().items():
             kind = messages.type_of(key)
-            if kind is CameraImage or "/accepted/" in key:
-                continue
-            kind = Sighting if kind is Sightings else kind  # each has one hat here
-            name = table_name(kind) if kind else "foreign"
-            found[name] = found.get(name, 0) + count
+            if kind is not CameraImage and "/accepted/" not in key:
+                kind = Sighting if kind is Sightings else kind  # each has one hat here
+                found[table_name(kind) if kind else "foreign"] += count
     return found
 
 
