@@ -27,11 +27,7 @@ CURVES: tuple[tuple[str, str, Literal["solid", "dashed"]], ...] = (
     ("estimated", "#e69f00", "solid"),
     ("true", "#0072b2", "solid"),
 )
-DRONE_PLOTS = {
-    "altitude (m)": "true_z_m",
-    "error of the estimate (m)": "error_m",
-    "battery (%)": "battery_percent",
-}
+DRONE_PLOTS = {"altitude (m)": "true_z_m", "error of the estimate (m)": "error_m", "battery (%)": "battery_percent"}
 PLOTS_MAX = 12  # plotted variables of a cluster: those of the paper's three drones
 TAB = 3  # plots in a tab
 DRONES_MAX = 12  # plotted drones

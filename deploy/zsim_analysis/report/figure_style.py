@@ -124,11 +124,11 @@ def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
     axes.plot(*thinned(x, y), **style)
 
 
-def thinned(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
-    """Return a line of at most `points` points: minimum and maximum of each bin, so that no extreme is lost."""
-    if len(x) <= points:
+def thinned(x: Array, y: Array) -> tuple[Array, Array]:
+    """Return a line of at most POINTS points: minimum and maximum of each bin, so that no extreme is lost."""
+    if len(x) <= POINTS:
         return x, y
-    size = -(-len(x) // (points // 2))
+    size = -(-len(x) // (POINTS // 2))
     starts = np.arange(0, len(x), size)
     bins = np.full((len(starts), size), np.nan)
     bins.flat[: len(x)] = y

@@ -5,6 +5,7 @@ Order of this file: the figures; one quantity in a panel; means and their interv
 
 import re
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -131,7 +132,7 @@ def _draw_safety(results: SweepResults) -> Figure:
     axes, *others = figure.subplots(1, 1 + has_separations, squeeze=False).ravel()
     style.dress(axes, "share of runs")
     places = axis.places if axis else {0: Place(0.0, (-0.12, 0.12))}
-    counts = (results.ended_well, results.as_planned, results.without_collision)
+    counts = (results.ended_well, partial(results.count, "as_planned"), results.without_collision)
     for side, ((name, mark, own), counted) in enumerate(zip(SHARES, counts, strict=True), -1):
         for point, place in places.items():
             tint = axis.colour(place) if axis and len(axis.series) > 1 else own
@@ -226,11 +227,11 @@ def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> F
     return figure
 
 
-def slices(x: Samples, y: Samples, count: int = SLICES) -> Sequence[tuple[float, Samples]]:
-    """Return the mean x and the y of `count` groups of runs by rising x, of nearly equal sizes."""
+def slices(x: Samples, y: Samples) -> Sequence[tuple[float, Samples]]:
+    """Return the mean x and the y of SLICES groups of runs by rising x, of nearly equal sizes."""
     both = np.isfinite(x) & np.isfinite(y)
     order = np.argsort(x[both], kind="stable")
-    groups = [part for part in np.array_split(order, count) if len(part) >= 2]
+    groups = [part for part in np.array_split(order, SLICES) if len(part) >= 2]
     return [(float(x[both][part].mean()), y[both][part]) for part in groups]
 
 

@@ -40,7 +40,7 @@ class ConfidenceInterval(Struct, frozen=True):
     high: float
 
 
-def mean_interval(samples: Samples, level: float = LEVEL) -> ConfidenceInterval:
+def mean_interval(samples: Samples) -> ConfidenceInterval:
     """Return the mean of samples (n,) with Student's interval: mean ± t(n − 1) s / √n; none below RUNS_MIN samples.
 
     It holds for normal samples, and for others by the central limit theorem as n grows.
@@ -49,16 +49,16 @@ def mean_interval(samples: Samples, level: float = LEVEL) -> ConfidenceInterval:
     middle = float(np.mean(samples)) if n else math.nan
     if n < RUNS_MIN:
         return ConfidenceInterval(middle, math.nan, math.nan)
-    half = float(stdtrit(n - 1, (1 + level) / 2) * np.std(samples, ddof=1) / math.sqrt(n))
+    half = float(stdtrit(n - 1, (1 + LEVEL) / 2) * np.std(samples, ddof=1) / math.sqrt(n))
     return ConfidenceInterval(middle, middle - half, middle + half)
 
 
-def share_interval(count: int, of: int, level: float = LEVEL) -> ConfidenceInterval:
+def share_interval(count: int, of: int) -> ConfidenceInterval:
     """Return count / of with the exact interval of Clopper and Pearson (Biometrika 26, 1934); of > 0.
 
-    It covers the true share at least as often as `level` says, whatever the share and the number of runs.
+    It covers the true share at least as often as LEVEL says, whatever the share and the number of runs.
     """
-    tail = (1 - level) / 2
+    tail = (1 - LEVEL) / 2
     low = float(betaincinv(count, of - count + 1, tail)) if count else 0.0
     high = float(betaincinv(count + 1, of - count, 1 - tail)) if count < of else 1.0
     return ConfidenceInterval(count / of, low, high)
@@ -255,21 +255,16 @@ class SweepResults:
         collisions, crashed = self.values("collisions", point), self.values("crashed", point)
         return int(((collisions == 0) & (crashed != 1)).sum()), len(collisions)
 
-    def engaged(self, point: int | None = None) -> tuple[int, int]:
-        """Return how many runs that ended well had every cluster engaged, and how many have a cluster."""
-        engaged = self.values("engaged", point)
-        return int((engaged == 1).sum()), int(np.isfinite(engaged).sum())
-
-    def as_planned(self, point: int) -> tuple[int, int]:
-        """Return how many of a point's runs that ended well followed their plan, and how many are judged."""
-        planned = self.values("as_planned", point)
-        return int((planned == 1).sum()), int(np.isfinite(planned).sum())
+    def count(self, flag: str, point: int | None = None) -> tuple[int, int]:
+        """Return how many runs that ended well have a flag set, such as `as_planned`, and for how many it is known."""
+        flags = self.values(flag, point)
+        return int((flags == 1).sum()), int(np.isfinite(flags).sum())
 
     def never_as_planned(self) -> list[int]:
         """Return the points with finished runs of which none ended well and followed its plan."""
         points = []
         for point in range(self.design.points):
-            (well, runs), (planned, of) = self.ended_well(point), self.as_planned(point)
+            (well, runs), (planned, of) = self.ended_well(point), self.count("as_planned", point)
             if runs and not planned and (of or not well):  # without a cluster no run that ended well is judged
                 points.append(point)
         return points
@@ -291,7 +286,7 @@ class SweepResults:
 
         plan, rows = self.design.plan, self.rows
         well = [row for row, is_well in zip(rows, self.well, strict=True) if is_well]
-        engaged, of = self.engaged()
+        engaged, of = self.count("engaged")
         dates = sorted(row["date"] for row in rows if row.get("date"))
         return SweepSummary(
             scenario=str(plan.document["name"]),
@@ -321,8 +316,8 @@ class SweepResults:
 
     def _point(self, point: int) -> GridPoint:
         well, runs = self.ended_well(point)
-        engaged, of = self.engaged(point)
-        planned, judged = self.as_planned(point)
+        engaged, of = self.count("engaged", point)
+        planned, judged = self.count("as_planned", point)
         columns = (SEPARATION, *self.errors, *self.metrics)
         compared = (*self.metrics, SEPARATION, *(each for each in self.errors if each.endswith(".true_rms")))
         names = self.design.names(point)

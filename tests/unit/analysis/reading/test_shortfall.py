@@ -109,10 +109,7 @@ def by_phases(t_s: float) -> dict[str, Any]:
 
 
 WAY = [{"at_s": 0, "values": {"x_c": 5}}, {"at_s": 5, "values": {"x_c": 8}}, {"at_s": 10, "values": {"x_c": 5}}]
-TRAJECTORY = (
-    *SOON,
-    f"clusters.main.plan.trajectory={{start_s: 10, waypoints: {msgspec.json.encode(WAY).decode()}}}",
-)
+TRAJECTORY = (*SOON, f"clusters.main.plan.trajectory={{start_s: 10, waypoints: {msgspec.json.encode(WAY).decode()}}}")
 LATE = "clusters.main.plan.trajectory={start_s: 60, expressions: {x_c: '5*t'}}"
 TIMED = (*SOON, "clusters.main.plan.target_over_s=4")
 

@@ -89,10 +89,7 @@ def test_a_folder_goes_on_with_its_own_plan_and_refuses_any_other(tmp_path: Path
         assert folder.record(12) == out / "runs/000012"
     assert load(out).plan == longer
     for other in (of, plan("seed", runs=6, duration_s=3), plan(runs=6)):
-        with (
-            pytest.raises(RunError, match=r"sweep: .*--out"),
-            locked(out, other),
-        ):
+        with pytest.raises(RunError, match=r"sweep: .*--out"), locked(out, other):
             pass
     (tmp_path / "run").mkdir()
     (tmp_path / "run/run.mcap").touch()

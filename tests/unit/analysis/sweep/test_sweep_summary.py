@@ -10,6 +10,7 @@ from sweep_rows import made, plan, well
 from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign
 from zsim_analysis.sweep.sweep_summary import (
+    LEVEL,
     RUNS_MIN,
     FormationParameter,
     SweepResults,
@@ -22,11 +23,10 @@ from zsim_analysis.sweep.sweep_summary import (
 
 
 @pytest.mark.parametrize("n", [RUNS_MIN, 10, 200])
-@pytest.mark.parametrize("level", [0.9, 0.95, 0.99])
-def test_the_interval_of_a_mean_is_student_s(n: int, level: float) -> None:
+def test_the_interval_of_a_mean_is_student_s(n: int) -> None:
     samples = stream(n, "samples").normal(3.0, 2.0, n)
-    found = mean_interval(samples, level)
-    wanted = scipy.stats.t.interval(level, n - 1, samples.mean(), scipy.stats.sem(samples))
+    found = mean_interval(samples)
+    wanted = scipy.stats.t.interval(LEVEL, n - 1, samples.mean(), scipy.stats.sem(samples))
     assert (found.low, found.high) == pytest.approx(wanted, rel=1e-12)
     assert found.value == samples.mean()
 
@@ -41,13 +41,12 @@ def test_few_samples_have_a_mean_and_no_interval(n: int) -> None:
 
 
 @pytest.mark.parametrize(("count", "of"), [(0, 1), (1, 1), (0, 30), (30, 30), (1, 30), (17, 30), (999, 1000)])
-@pytest.mark.parametrize("level", [0.9, 0.95])
-def test_the_interval_of_a_share_is_the_exact_one(count: int, of: int, level: float) -> None:
-    found = share_interval(count, of, level)
-    wanted = scipy.stats.binomtest(count, of).proportion_ci(level, "exact")
+def test_the_interval_of_a_share_is_the_exact_one(count: int, of: int) -> None:
+    found = share_interval(count, of)
+    wanted = scipy.stats.binomtest(count, of).proportion_ci(LEVEL, "exact")
     assert (found.low, found.high) == pytest.approx((wanted.low, wanted.high), rel=1e-9)
     if count == 0:
-        assert found.high == pytest.approx(1 - ((1 - level) / 2) ** (1 / of), rel=1e-12)
+        assert found.high == pytest.approx(1 - ((1 - LEVEL) / 2) ** (1 / of), rel=1e-12)
 
 
 def test_a_spread() -> None:
