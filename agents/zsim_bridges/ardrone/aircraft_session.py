@@ -28,9 +28,16 @@ from zsim_bridges.ardrone.navdata import (
     NavdataError,
     StateBit,
 )
-from zsim_bridges.vehicle_links.aircraft_readings import STILL, AircraftPose, AircraftReadings
-from zsim_bridges.vehicle_links.driver_options import DriverOptions
-from zsim_bridges.vehicle_links.vehicle_session import AircraftState, Demand, UdpChannel, VehicleSession
+from zsim_bridges.vehicle_links.driver import DriverOptions
+from zsim_bridges.vehicle_links.vehicle_session import (
+    STILL,
+    AircraftPose,
+    AircraftReadings,
+    AircraftState,
+    Demand,
+    UdpChannel,
+    VehicleSession,
+)
 
 NAVDATA, AT = 0, 1  # channels
 REQUEST_NS = 100_000_000  # chosen as npm ar-drone: navdata is requested again after as long
@@ -98,14 +105,7 @@ class AircraftSettings(NamedTuple):
 
 
 class AircraftSession(VehicleSession):
-    """The session with one aircraft.
-
-    Args:
-        host: its address.
-        readings: what its navdata is turned into.
-        settings: that it is given.
-        ports: of navdata and AT commands.
-    """
+    """The session with one aircraft."""
 
     def __init__(
         self,
@@ -131,7 +131,6 @@ class AircraftSession(VehicleSession):
     def of_run(
         cls, info: Info, scenario: Scenario, options: DriverOptions, host: str, settings: AircraftSettings
     ) -> "AircraftSession":
-        """Return the session of a driver in a run."""
         origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
         place = options.origin_m or scenario.drone(options.drone).position_m
         yaw_rad = None if options.yaw_deg is None else math.radians(options.yaw_deg)
@@ -140,7 +139,6 @@ class AircraftSession(VehicleSession):
     # From the aircraft
 
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
-        """Take a datagram of the aircraft."""
         if channel != NAVDATA:
             return
         try:
@@ -176,7 +174,6 @@ class AircraftSession(VehicleSession):
     # To the aircraft
 
     def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
-        """Yield the datagrams that are due."""
         silent_ns = now_ns - max(self._received_ns or 0, self._requested_ns)
         if silent_ns >= REQUEST_NS:
             self._requested_ns = now_ns
@@ -228,12 +225,7 @@ class FlightCommands:
         self._rose_ns = -PULSES_NS  # when the emergency bit last did
 
     def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
-        """Yield the commands that are due; none if nothing is demanded.
-
-        Args:
-            emergency: whether the aircraft is in its emergency.
-            pose: of the aircraft.
-        """
+        """Yield the commands that are due; none if nothing is demanded. `emergency`: the aircraft is in its."""
         if now_ns - self._sent_ns < (PERIOD_NS if demand == self._last else CHANGED_NS):
             return
         self._last, self._sent_ns = demand, now_ns
@@ -295,19 +287,15 @@ class _Axis:
         self._then_ns = now_ns
         slope = VELOCITY_1_S * (wanted - self._reference)
         self._reference += dt_s * slope
-        error = self._reference_then(now_ns) - measured
-        accel = slope + DRAG_1_S * self._reference + VELOCITY_1_S * error + self._wind_m_s2
-        if abs(accel) < most_m_s2:
-            self._wind_m_s2 += INTEGRAL_1_S2 * error * dt_s
-        return accel
-
-    def _reference_then(self, now_ns: int) -> float:
-        """Return the reference that the velocity measured now answers to."""
         references = self._references
         references.append((now_ns, self._reference))
         while len(references) > 1 and references[1][0] <= now_ns - ANSWER_NS:
             references.popleft()
-        return references[0][1]
+        error = references[0][1] - measured  # from the reference that the velocity measured now answers to
+        accel = slope + DRAG_1_S * self._reference + VELOCITY_1_S * error + self._wind_m_s2
+        if abs(accel) < most_m_s2:
+            self._wind_m_s2 += INTEGRAL_1_S2 * error * dt_s
+        return accel
 
 
 class NavdataReadings(AircraftReadings):
@@ -336,7 +324,6 @@ class NavdataReadings(AircraftReadings):
         self._gps_ns: int | None = None
 
     def receive(self, packet: Navdata, now_ns: int) -> None:
-        """Take a packet that arrives now."""
         options, taken_ns = packet.options, now_ns
         if time := options.get(TIME):
             stamp_ns = (time.time >> SECONDS_SHIFT) * 1_000_000_000 + (time.time & MICROSECONDS) * 1_000
@@ -365,7 +352,10 @@ class NavdataReadings(AircraftReadings):
         dt_s = 0.0 if self._then_ns is None else (taken_ns - self._then_ns) * 1e-9
         self._then_ns = taken_ns
         if mag := options.get(MAGNETO):
-            self._align(yaw, self._magnetic_yaw(roll, pitch, _flipped((mag.mx, mag.my, mag.mz))), dt_s)
+            m = _flipped((mag.mx, mag.my, mag.mz))  # the field of the Earth in B
+            my, mz = m[1] * math.cos(roll) - m[2] * math.sin(roll), m[1] * math.sin(roll) + m[2] * math.cos(roll)
+            mx = m[0] * math.cos(pitch) + mz * math.sin(pitch)
+            self._align(yaw, self._north_rad - math.atan2(my, mx), dt_s)
         yaw += self._yaw_offset_rad or 0.0
         vx, vy, vz = own = _flipped((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
         velocity = vx * math.cos(yaw) - vy * math.sin(yaw), vx * math.sin(yaw) + vy * math.cos(yaw), vz
@@ -376,12 +366,6 @@ class NavdataReadings(AircraftReadings):
         rate = self._last["imu"][1] if "imu" in self._last else STILL
         self.pose = AircraftPose(taken_ns, position, velocity, (w, x, y, z), rate)
         self.read("flow", taken_ns, own, 1.0)
-
-    def _magnetic_yaw(self, roll: float, pitch: float, m: Vector) -> float:
-        """Return the heading by the field of the Earth seen in B."""
-        y, z = m[1] * math.cos(roll) - m[2] * math.sin(roll), m[1] * math.sin(roll) + m[2] * math.cos(roll)
-        x = m[0] * math.cos(pitch) + z * math.sin(pitch)
-        return self._north_rad - math.atan2(y, x)
 
     def _align(self, yaw: float, magnetic: float, dt_s: float) -> None:
         """Let the heading follow the magnetometer slowly; a stated one is kept."""
@@ -395,7 +379,7 @@ class NavdataReadings(AircraftReadings):
         self._yaw_offset_rad += min(1.0, YAW_1_S * max(0.0, dt_s)) * error
 
     def _on_gps(self, gps: Any, taken_ns: int) -> None:
-        """Take a fix once, and let the position follow it."""
+        """Read a fix once, and let the position follow it."""
         place = gps.latitude_deg, gps.longitude_deg, gps.elevation_m
         values = self.gps_values(place, gps.speed_m_s, math.radians(gps.degree), gps.ehpe_m, GPS_FIX, gps.satellites)
         before_ns, fix = self._gps_ns, (place, gps.speed_m_s, gps.degree)

@@ -390,8 +390,7 @@ def drive_mavlink(
 ) -> None:
     """Let a MAVLink vehicle (PX4, ArduPilot, or its simulator) fly as a drone of the run."""
     from zsim_bridges.mavlink.autopilot_session import AutopilotSession
-    from zsim_bridges.vehicle_links.driver import drive
-    from zsim_bridges.vehicle_links.driver_options import DriverOptions, check_host, position, udp_channel
+    from zsim_bridges.vehicle_links.driver import DriverOptions, check_host, drive, position, udp_channel
 
     options = DriverOptions(drone, *bounds, position(origin) if origin else None, None)
     channel = udp_channel(address, local_port)
@@ -422,8 +421,7 @@ def drive_ardrone(
 ) -> None:
     """Let an AR.Drone 2.0 fly as a drone of the run."""
     from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings
-    from zsim_bridges.vehicle_links.driver import drive
-    from zsim_bridges.vehicle_links.driver_options import DriverOptions, aircraft_host, check_host, position
+    from zsim_bridges.vehicle_links.driver import DriverOptions, aircraft_host, check_host, drive, position
 
     options = DriverOptions(drone, *bounds, position(origin) if origin else None, yaw)
     check_host(aircraft_host(address))

@@ -8,8 +8,7 @@ from fake_aircraft import FIELD_UT, STEP_NS, FakeAircraft
 
 from zsim.math.frames import heading
 from zsim_bridges.ardrone.aircraft_session import AircraftSession, AircraftSettings, NavdataReadings
-from zsim_bridges.vehicle_links.aircraft_readings import AircraftPose
-from zsim_bridges.vehicle_links.vehicle_session import Demand
+from zsim_bridges.vehicle_links.vehicle_session import AircraftPose, Demand
 
 ORIGIN = (-34.603, -58.368, 25.0)
 S = 1_000_000_000

@@ -4,8 +4,7 @@ import random
 
 import pytest
 
-from zsim_bridges.vehicle_links.aircraft_readings import ClockOffset
-from zsim_bridges.vehicle_links.vehicle_session import StreamLoss
+from zsim_bridges.vehicle_links.vehicle_session import ClockOffset, StreamLoss
 
 MS = 1_000_000
 
