@@ -7,7 +7,7 @@ where the aircraft was switched on. Source: AR.Drone Developer Guide SDK 2.0, ch
 import math
 from collections import deque
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import Info
@@ -73,51 +73,29 @@ GAP_S_MAX = 0.5  # s; over longer gaps nothing is integrated
 GPS_FIX = 3  # three-dimensional
 
 
-class AircraftSettings(NamedTuple):
-    """The configuration that an aircraft is given.
-
-    Attributes:
-        tilt_rad: euler_angle_max.
-        climb_m_s, yaw_rate_rad_s: control_vz_max, control_yaw.
-        altitude_m: altitude_max.
-        ultrasound: ultrasound_freq of its sonar: 7 (22.2 Hz) or 8 (25 Hz).
-    """
-
-    tilt_rad: float = 0.35  # outdoor default of the SDK
-    climb_m_s: float = 1.0  # likewise
-    yaw_rate_rad_s: float = 1.75  # indoor default of the SDK
-    altitude_m: float = 100.0  # no limit of its own: the driver's fence holds
-    ultrasound: int = 8  # default of the SDK
-
-    def entries(self) -> list[Config]:
-        """Return what is set: `outdoor` first, which brings limits of its own."""
-        entries = {
-            "general:navdata_demo": "FALSE",
-            "general:navdata_options": str(OPTIONS_MASK),
-            "control:outdoor": "TRUE",
-            "control:euler_angle_max": f"{self.tilt_rad:g}",
-            "control:control_vz_max": f"{1e3 * self.climb_m_s:g}",
-            "control:control_yaw": f"{self.yaw_rate_rad_s:g}",
-            "control:altitude_max": f"{1e3 * self.altitude_m:g}",
-            "pic:ultrasound_freq": str(self.ultrasound),
-        }
-        return [Config(0, key, value) for key, value in entries.items()]
+# What the aircraft is given; the limits are the SDK's own: of tilt and climb outdoors, of yaw rate indoors
+TILT_RAD, CLIMB_M_S, YAW_RATE_RAD_S = 0.35, 1.0, 1.75
+SETTINGS = {  # `outdoor` brings limits of its own, so that it comes first
+    "general:navdata_demo": "FALSE",
+    "general:navdata_options": str(OPTIONS_MASK),
+    "control:outdoor": "TRUE",
+    "control:euler_angle_max": f"{TILT_RAD:g}",
+    "control:control_vz_max": f"{1e3 * CLIMB_M_S:g}",
+    "control:control_yaw": f"{YAW_RATE_RAD_S:g}",
+    "control:altitude_max": "100000",  # mm; no limit of its own: the driver's fence holds
+}
 
 
 class AircraftSession(VehicleSession):
-    """The session with one aircraft."""
+    """The session with one aircraft, whose sonar has the `ultrasound` frequency 7 (22.2 Hz) or 8 (25 Hz)."""
 
-    def __init__(
-        self,
-        host: str,
-        readings: "NavdataReadings",
-        settings: AircraftSettings = AircraftSettings(),  # noqa: B008
-        ports: tuple[int, int] = (navdata.PORT, at_commands.PORT),
-    ) -> None:
-        super().__init__((UdpChannel(host, ports[0]), UdpChannel(host, ports[1])), readings, modulus=1 << 32)
+    def __init__(self, host: str, readings: "NavdataReadings", ultrasound: int) -> None:
+        channels = UdpChannel(host, navdata.PORT), UdpChannel(host, at_commands.PORT)
+        super().__init__(channels, readings, modulus=1 << 32)
         self._navdata = readings
-        self._commands = FlightCommands(settings)
-        self._entries = settings.entries()
+        self._commands = FlightCommands()
+        settings = SETTINGS | {"pic:ultrasound_freq": str(ultrasound)}
+        self._entries = [Config(0, key, value) for key, value in settings.items()]
         self._pending: deque[Config] = deque(self._entries)
         self._sequence = 0
         self._newest = 0
@@ -129,12 +107,12 @@ class AircraftSession(VehicleSession):
 
     @classmethod
     def of_run(
-        cls, info: Info, scenario: Scenario, options: DriverOptions, host: str, settings: AircraftSettings
+        cls, info: Info, scenario: Scenario, options: DriverOptions, host: str, ultrasound: int
     ) -> "AircraftSession":
         origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
         place = options.origin_m or scenario.drone(options.drone).position_m
         yaw_rad = None if options.yaw_deg is None else math.radians(options.yaw_deg)
-        return cls(host, NavdataReadings(origin, place, scenario.environment.magnetic_field_ut, yaw_rad), settings)
+        return cls(host, NavdataReadings(origin, place, scenario.environment.magnetic_field_ut, yaw_rad), ultrasound)
 
     # From the aircraft
 
@@ -217,8 +195,7 @@ class FlightCommands:
     Source: AR.Drone Developer Guide SDK 2.0, chapter 6.
     """
 
-    def __init__(self, settings: AircraftSettings) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self._axes = _Axis(), _Axis()
         self._sent_ns = -PERIOD_NS
         self._last: Demand | None = None
@@ -256,11 +233,11 @@ class FlightCommands:
         if demand.action != "fly" or pose is None:
             self._axes = _Axis(), _Axis()
             return HOVER
-        settings, wanted, yaw_rad = self._settings, demand.velocity_m_s, float(heading(pose.q_WB))
-        full = G_M_S2 * math.tan(settings.tilt_rad)
+        wanted, yaw_rad = demand.velocity_m_s, float(heading(pose.q_WB))
+        full = G_M_S2 * math.tan(TILT_RAD)
         x, y = (axis.accel(now_ns, wanted[k], pose.velocity_m_s[k], full) for k, axis in enumerate(self._axes))
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-        up, turn = wanted[2] / settings.climb_m_s, demand.yaw_rate_rad_s / settings.yaw_rate_rad_s
+        up, turn = wanted[2] / CLIMB_M_S, demand.yaw_rate_rad_s / YAW_RATE_RAD_S
         shares = (y * c - x * s) / full, (x * c + y * s) / full, up, turn
         left, forward, up, yaw_left = (max(-1.0, min(1.0, share)) for share in shares)
         return Pcmd(0, at_commands.PROGRESSIVE, -left, -forward, up, -yaw_left)

@@ -289,12 +289,12 @@ class DriverProcess:
 class DriverClock:
     """The clock of the driver, which goes at the rate of the run's, and the simulated time at its times."""
 
-    def __init__(self, rate: float, wall_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._rate, self._wall_ns = rate, wall_ns
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
         self._offset = ClockOffset()
 
     def now_ns(self) -> int:
-        return round(self._wall_ns() * self._rate)
+        return round(time.monotonic_ns() * self._rate)
 
     def on_gate(self, t_ns: int) -> None:
         self._offset.add(t_ns, self.now_ns())

@@ -115,18 +115,17 @@ class ClockOffset:
     is never negative. The delay of the fastest way is half of the shortest round trip, if round trips are measured.
     """
 
-    def __init__(self, window_ns: int = WINDOW_NS) -> None:
-        self._window_ns = window_ns
+    def __init__(self) -> None:
         self._least: deque[tuple[int, int]] = deque()  # arrivals and differences; both increase
         self._round_trips: deque[tuple[int, int]] = deque()
 
     def add(self, stamp_ns: int, arrival_ns: int) -> None:
         """Note a message that the other clock stamped and that arrived by this one."""
-        _keep_least(self._least, arrival_ns, arrival_ns - stamp_ns, self._window_ns)
+        _keep_least(self._least, arrival_ns, arrival_ns - stamp_ns)
 
     def add_round_trip(self, duration_ns: int, arrival_ns: int) -> None:
         """Note how long a request and its answer took together."""
-        _keep_least(self._round_trips, arrival_ns, duration_ns, self._window_ns)
+        _keep_least(self._round_trips, arrival_ns, duration_ns)
 
     @property
     def offset_ns(self) -> int:
@@ -158,12 +157,12 @@ class ClockOffset:
         return local_ns - self.offset_ns
 
 
-def _keep_least(kept: deque[tuple[int, int]], now_ns: int, value: int, window_ns: int) -> None:
+def _keep_least(kept: deque[tuple[int, int]], now_ns: int, value: int) -> None:
     """Add a value to a queue whose first entry is the least within a window."""
     while kept and kept[-1][1] >= value:
         kept.pop()
     kept.append((now_ns, value))
-    while now_ns - kept[0][0] > window_ns:
+    while now_ns - kept[0][0] > WINDOW_NS:
         kept.popleft()
 
 
