@@ -76,7 +76,7 @@ def verdict(record: Path) -> Verdict:
 
 def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Shortfall]:
     """Return the shortfalls of a flight, failures first; empty for one that flew its plan."""
-    lines = [*_incidents(flight), *_collisions(flight), *_missions(flight)]
+    lines = [*_incidents(flight), *_collisions_and_missions(flight)]
     lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
     lines += [*_overrides(flight), *_processes(flight)]
     if not flight.completeness.complete:
@@ -225,8 +225,11 @@ def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> s
     return f"; {', '.join(active.values())}" if active else ""
 
 
-def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield a line for each pair of drones, or of a drone and an obstacle, that touched."""
+def _collisions_and_missions(flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield each pair of drones, or of a drone and an obstacle, that touched, and the missions not flown to their end.
+
+    Of the missions that a bridge reported, the newest one of each drone counts.
+    """
     pairs: dict[frozenset[object], list[Event]] = {}
     for event in flight.events:
         if event.kind == "collision":
@@ -235,10 +238,6 @@ def _collisions(flight: RecordedFlight) -> Iterator[Shortfall]:
         t_s, more = first.t_ns / 1e9, f" ({1 + len(others)} contacts in all)" if others else ""
         pair = f"{first.subject}, {first.data.get('other', 'something')}"
         yield Shortfall("collision", pair, t_s, f"{first.text} at {seconds_text(t_s)} s{more}", True)
-
-
-def _missions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield each drone whose newest mission, of those reported by a bridge, was not flown to its end."""
     newest = {event.subject: event for event in flight.events if event.kind == "mission"}
     for drone, event in newest.items():
         data, t_s = event.data, event.t_ns / 1e9
