@@ -166,8 +166,20 @@ def parse(text: str, document: Mapping[str, Any] = NOTHING) -> Axis:
             if fault := first_fault(seed, _SEED_TYPE):
                 raise ValueError(f"{fault[1]}; or give seed={PAIRED}, which draws them")
         return Seeds(paired=True, values=seeds)
-    drawn = _DRAWN.fullmatch(values)
-    return _draw(path, drawn[1], drawn[2]) if drawn else Grid(path, _grid_values(values))
+    if (drawn := _DRAWN.fullmatch(values)) is None:
+        return Grid(path, _grid_values(values))
+    kind, arguments = drawn[1], drawn[2]
+    if kind not in ("uniform", "normal"):
+        raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
+    try:
+        first, second = (float(part) for part in arguments.split(","))
+    except ValueError:
+        raise ValueError(f"has {kind}({arguments[:40]}); must hold two numbers") from None
+    span = second - first if kind == "uniform" else second
+    if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
+        need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
+        raise ValueError(f"has {kind}({arguments[:40]}); must be finite numbers with {need}")
+    return Draw(path, kind, first, second)
 
 
 def _grid_values(text: str) -> tuple[Any, ...]:
@@ -181,20 +193,6 @@ def _grid_values(text: str) -> tuple[Any, ...]:
         if a == b and isinstance(a, bool) == isinstance(b, bool):
             raise ValueError(f"gives {show(a)} twice; every value once")
     return tuple(values)
-
-
-def _draw(path: str, kind: str, arguments: str) -> Draw:
-    if kind not in ("uniform", "normal"):
-        raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
-    try:
-        first, second = (float(part) for part in arguments.split(","))
-    except ValueError:
-        raise ValueError(f"has {kind}({arguments[:40]}); must hold two numbers") from None
-    span = second - first if kind == "uniform" else second
-    if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
-        need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
-        raise ValueError(f"has {kind}({arguments[:40]}); must be finite numbers with {need}")
-    return Draw(path, kind, first, second)
 
 
 def text_of(value: Any) -> str:
