@@ -70,9 +70,10 @@ def convert(
     decoded = DecodedMessages(selection.messages(reader, wanted), _decode, lambda done: progress(done, total))
     rotors = _rotors(info, scenario, dict.fromkeys(subject(key) for key in wanted if key.startswith("drone/")))
     spaces: dict[str, ClusterSpace] = {}
-    for cluster in scenario.clusters if scenario else ():
-        with suppress(ValueError, NotTrustedError):
-            spaces[cluster.name] = scenario_space(scenario, cluster)
+    if scenario:
+        for cluster in scenario.clusters:
+            with suppress(ValueError, NotTrustedError):
+                spaces[cluster.name] = scenario_space(scenario, cluster)
     file = FoxgloveFile(path, rotors, spaces)
     with deferred_signals() as check:
         try:
@@ -219,9 +220,11 @@ class FoxgloveFile:
             self._log(DRONES, channels.SceneUpdateChannel, made.drones(instant.t_ns, self._rotors), instant.t_ns)
             self._log(GROUND, channels.SceneUpdateChannel, made.ground(instant.t_ns), instant.t_ns)
             self._has_static_scene = True
-        frames = [(made.frame(d), t.position_m, t.orientation_wxyz) for d, t in instant.truth.items()]
-        estimates = instant.estimates.items()
-        frames += [(f"{made.frame(d)}/estimate", e.position_m, e.orientation_wxyz) for d, e in estimates]
+        frames: list[made.FramePose] = []
+        for name, truth in instant.truth.items():
+            frames.append((made.frame(name), truth.position_m, truth.orientation_wxyz))
+        for name, estimate in instant.estimates.items():
+            frames.append((f"{made.frame(name)}/estimate", estimate.position_m, estimate.orientation_wxyz))
         for name, state in instant.states.items():
             for end, values in (("", state.value), ("/desired", state.desired)):
                 if placed := made.cluster_frame(state.names, values):
