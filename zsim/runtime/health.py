@@ -22,9 +22,6 @@ class HealthMeter:
     """Counters of one process.
 
     Args:
-        role: of the process.
-        wall_s: monotonic wall time.
-        host: the name of its host; None for the system's.
         reads: the expressions that it subscribes to, as its session keeps them.
 
     Attributes:
@@ -51,7 +48,6 @@ class HealthMeter:
         self.link_lost = False
 
     def step(self, duration_ns: int) -> None:
-        """Note how long one step took."""
         self._steps_us.append(duration_ns / 1000)
 
     def due(self) -> bool:
@@ -59,7 +55,6 @@ class HealthMeter:
         return self._limit.spend()
 
     def message(self, t_ns: int, seq: int) -> Health:
-        """Return the message of `process/{p}/health`."""
         steps = sorted(self._steps_us) or [0.0]
         return Health(
             t_ns=t_ns,

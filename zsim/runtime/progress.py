@@ -5,7 +5,6 @@ A world that a launcher started writes it as JSON lines (`JsonProgress`); otherw
 
 import json
 import math
-import re
 import sys
 import threading
 from collections.abc import Callable
@@ -16,14 +15,13 @@ from rich.live import Live
 from rich.text import Text
 
 from zsim.contract.flight_messages import ClusterState
-from zsim.errors import printable
+from zsim.errors import printable, without_figures
 
 PERIOD_S = 0.2  # wall time between two updates
 SLOW_S = 3.0  # wall time; what is compiled already is loaded within two, unless the machine is busy
 SLOW_NOTICE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
 REPEATED_S = 10.0  # simulated time; as often as the clock is a line where there is no live one
 REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
-_NUMBER = re.compile(r"-?[0-9][0-9.]*")
 DRIVERS, COMINGS = "driver.", ("join", "leave")  # they are started by hand, by people who look here
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
@@ -43,12 +41,7 @@ class ProgressSink(Protocol):
 
 
 class SlowStart:
-    """Shows a line when a start takes long, which nearly always is because something is compiled.
-
-    Args:
-        say: shows it, from a thread of its own.
-        text: the line.
-    """
+    """Shows a line, from a thread of its own, when a start takes long: nearly always something is being compiled."""
 
     def __init__(self, say: Callable[[str], None], text: str = SLOW_NOTICE) -> None:
         self._timer = threading.Timer(SLOW_S, say, args=(text,))
@@ -69,7 +62,7 @@ class HoldReasons:
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
         """Return a line with the reason of a state if it has been the same, but for its numbers, for REASON_NS."""
-        shape = _NUMBER.sub("#", state.reason)
+        shape = without_figures(state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
             self._since[cluster] = (shape, state.t_ns)
@@ -109,20 +102,20 @@ class JsonProgress:
     """Writes progress as JSON lines for a launcher."""
 
     def clock(self, line: dict[str, Any]) -> None:
-        self._write({"clock": line})
+        self._write("clock", line)
 
     def event(self, line: dict[str, Any]) -> None:
-        self._write({"event": line})
+        self._write("event", line)
 
     def health(self, line: dict[str, Any]) -> None:
-        self._write({"health": line})
+        self._write("health", line)
 
     def say(self, text: str) -> None:
-        self._write({"say": text})
+        self._write("say", text)
 
-    def _write(self, line: dict[str, Any]) -> None:
+    def _write(self, kind: str, content: Any) -> None:
         try:
-            sys.stdout.write(json.dumps(line) + "\n")
+            sys.stdout.write(json.dumps({kind: content}) + "\n")
             sys.stdout.flush()
         except (BrokenPipeError, ValueError):
             return  # the launcher is gone; its stop channel ends this process
@@ -197,7 +190,7 @@ class Screen:
                 self.say(text)
 
     def health(self, line: dict[str, Any]) -> None:
-        """Do nothing: the one live line has no room for it; `zsim up` has a table."""
+        """The one live line has no room for it; `zsim up` has a table."""
 
 
 def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> str:
@@ -214,11 +207,7 @@ def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> st
     waiting = [w for w in line["waiting_for"] if line["state"] == "waiting" or w["since_wall_s"] > 0.5]
     waiting = [w for w in waiting if not w.get("held_by")] or waiting  # causes alone
     if waiting:
-        named = ", ".join(_name(w) for w in waiting[:4]) + (" …" if len(waiting) > 4 else "")
-        text += f"  waiting for {named}"
+        places = [f"{w['name']} on {w['host']}" if w["host"] else w["name"] for w in waiting[:4]]
+        named = ", ".join(f"{place} ({w['since_wall_s']:.1f} s)" for place, w in zip(places, waiting, strict=False))
+        text += f"  waiting for {named}{' …' if len(waiting) > 4 else ''}"
     return text
-
-
-def _name(waiting: dict[str, Any]) -> str:
-    host = f" on {waiting['host']}" if waiting["host"] else ""
-    return f"{waiting['name']}{host} ({waiting['since_wall_s']:.1f} s)"
