@@ -27,7 +27,6 @@ HELD_BYTES = 16_384  # hashed in one go, which takes as long as a few instants
 
 @cache
 def parts() -> dict[str, str]:
-    """Return the parts of the fingerprint by name."""
     versions = {package: _version(package) for package in PACKAGES}
     return {
         "zsim": __version__,
@@ -188,6 +187,5 @@ class TruthHash:
         self._held = 0
 
     def hexdigest(self) -> str:
-        """Return the hash of all rows, as hexadecimal digits."""
         self.flush()
         return self._hash.hexdigest()

@@ -182,7 +182,6 @@ class ClusterState(Message, frozen=True):
     plan_step: Count = 0
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return length_fault(self, ("names", "value", "desired", "desired_rate"), 4 * len(self.drones))
 
 
@@ -203,7 +202,6 @@ class CameraImage(Message, frozen=True, kw_only=True):
     data: Annotated[bytes, Meta(max_length=PICTURE_MAX)]
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         if self.data.startswith(JPEG_BEGINS):
             return None
         return f"data begins with {self.data[:8].hex(' ') or 'nothing'}; must be a JPEG, which begins with ff d8 ff"
@@ -310,7 +308,6 @@ class ViewCluster(Message, frozen=True):
     reason: str
 
     def fault(self) -> str | None:
-        """Return a fault that the types cannot express."""
         return length_fault(self, ("value", "desired"), len(self.names))
 
 

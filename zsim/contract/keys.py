@@ -112,17 +112,14 @@ def command(drone: str, kind: str) -> str:
 
 
 def accepted(drone: str, kind: str) -> str:
-    """Return the key on which the world repeats a command to an external drone that it accepts."""
     return f"drone/{drone}/accepted/{kind}"
 
 
 def link(drone: str) -> str:
-    """Return the key on which a driver publishes the state of its link to an external drone."""
     return f"drone/{drone}/link"
 
 
 def driver(drone: str) -> str:
-    """Return the key on which the driver of an external drone answers requests."""
     return f"drone/{drone}/driver"
 
 
@@ -140,7 +137,6 @@ def detections(drone: str) -> str:
 
 
 def gate(drone: str) -> str:
-    """Return the key of the world's messages about one drone at a gate."""
     return f"{GATE}/{drone}"
 
 
@@ -153,7 +149,6 @@ def cluster_control(cluster: str) -> str:
 
 
 def cluster_request(cluster: str) -> str:
-    """Return the key on which a controller publishes the requests that it took."""
     return f"cluster/{cluster}/request"
 
 
@@ -162,7 +157,6 @@ def cluster_view(cluster: str) -> str:
 
 
 def estimates_view(process_name: str) -> str:
-    """Return the key on which an estimator publishes its estimates for displays."""
     return f"view/estimates/{process_name}"
 
 
@@ -212,12 +206,10 @@ def thing(key: str) -> str:
 
 
 def leaf(key: str) -> str:
-    """Return the last part of a key."""
     return key.rsplit("/", 1)[-1]
 
 
 def is_command(key: str) -> bool:
-    """Tell whether a key is that of commands to a drone."""
     return key.startswith("drone/") and "/cmd/" in key
 
 
@@ -234,7 +226,6 @@ def is_sensor(expression: str) -> bool:
 
 
 def is_status(key: str) -> bool:
-    """Tell whether a key is a drone's status."""
     return key.endswith("/sensor/status")
 
 

@@ -206,13 +206,11 @@ def output_type(key: str) -> type[Struct]:
 
 
 def fields(kind: type[Struct]) -> Iterable[str]:
-    """Return the names of a message's fields in order."""
     return kind.__struct_fields__
 
 
 @lru_cache(maxsize=KEYS_KEPT)
 def encoding(key: str) -> str:
-    """Return the Zenoh encoding of a key's messages."""
     kind = type_of(key)
     return f"application/msgpack;{kind.__name__}" if kind else "application/msgpack"
 

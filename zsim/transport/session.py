@@ -32,10 +32,10 @@ class ReceivedSample(NamedTuple):
 
 
 class FarEnd(NamedTuple):
-    """A session at the other end of a link, by Zenoh's name of it, and whether others may be behind it."""
+    """A session at the other end of a link."""
 
-    session: str
-    is_router: bool
+    session: str  # Zenoh's name of it
+    is_router: bool  # whether others may be behind it
 
 
 class RawSample(NamedTuple):
@@ -70,20 +70,8 @@ def _raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
     )
 
 
-def _raw_reply(reply: zenoh.Reply, prefix: str) -> RawSample:
-    """Return the sample in a reply, or its refusal; `prefix` is removed from its key."""
-    if reply.ok is not None:
-        return _raw_sample(reply.ok, prefix)
-    assert reply.err is not None
-    return RawSample("ERROR", "", reply.err.payload.to_bytes(), str(reply.err.encoding), None)
-
-
 def check_expression(expression: str) -> None:
-    """Check that a text is a key expression.
-
-    Raises:
-        SessionError: it is none; says what was found and what is allowed.
-    """
+    """Raise SessionError if a text is no key expression."""
     with _key_errors(expression):
         zenoh.KeyExpr(expression)
 
@@ -264,24 +252,22 @@ class Session:
                 undeclare()
 
     def _keep(self, declared: Any) -> Any:
-        """Return what has been declared, to be undeclared with everything else."""
         self._declared[id(declared)] = declared.undeclare
         return declared
 
     def _refusal(self, act: Act, expression: str) -> str | None:
-        """Return why access control at the other end would drop what we do, None if it permits it."""
-        if self.permissions is None:
+        """Return why access control at the other end would silently drop what we do, None if it permits it."""
+        with _key_errors(expression):
+            wanted = zenoh.KeyExpr(self._prefix + expression) if self.permissions else None
+        if self.permissions is None or wanted is None:
             return None
-        wanted = zenoh.KeyExpr(self._prefix + expression)
         if any(zenoh.KeyExpr(each).includes(wanted) for each in self.permissions.allowed.get(act, ())):
             return None
         return self.permissions.denial(act, expression, self._prefix)
 
     def _check(self, act: Act, expression: str) -> None:
-        """Refuse what access control at the other end would drop silently."""
-        with _key_errors(expression):
-            if fault := self._refusal(act, expression):
-                raise SessionError(fault)
+        if fault := self._refusal(act, expression):
+            raise SessionError(fault)
 
     # Publishing
 
@@ -315,13 +301,9 @@ class Session:
         return publisher
 
     def has_subscribers(self, key: str) -> bool:
-        """Tell whether anybody subscribes to a key of ours."""
-        if key not in self._matching:
-            self._follow_subscribers(key)
-        return self._matching[key]
-
-    def _follow_subscribers(self, key: str) -> None:
-        """Keep up to date whether a key has subscribers: Zenoh takes too long to be asked at each gate."""
+        """Tell whether anybody subscribes to a key of ours; kept up to date, as Zenoh is too slow for each gate."""
+        if key in self._matching:
+            return self._matching[key]
         publisher = self._publishers.get(key) or self._declare(key)
 
         def note(status: Any) -> None:
@@ -332,6 +314,7 @@ class Session:
         status: Any = publisher.matching_status  # the stub says bool; it is an object that has one
         if status.matching:  # and never False: the listener's thread may have noted a subscriber meanwhile
             self._matching[key] = True
+        return self._matching[key]
 
     def put_sample(self, key: str, payload: bytes, encoding: str) -> None:
         """Publish a payload of any encoding on any of many keys, without declaring a publisher.
@@ -362,32 +345,26 @@ class Session:
     def put_cached(self, key: str, payload: bytes, encoding: str = "", attachment: bytes = b"") -> None:
         """Publish a payload, and keep it for later subscribers that query it, as Zenoh's advanced subscribers do.
 
+        Samples are numbered, since no session here stamps them.
+
         Raises:
             SessionError: it is no key.
         """
         with _key_errors(key):
-            publisher = self._cached_publishers.get(key) or self._declare_cached(key, encoding)
-            publisher.put(payload, attachment=attachment)
-
-    def _declare_cached(self, key: str, encoding: str) -> zenoh.ext.AdvancedPublisher:
-        """Return a publisher that keeps its last sample; samples are numbered, since no session here stamps them."""
-        publisher = zenoh.ext.declare_advanced_publisher(
-            self._raw,
-            self._prefix + key,
-            encoding=zenoh.Encoding(encoding),
-            cache=zenoh.ext.CacheConfig(1),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
-            publisher_detection=True,
-        )
-        self._cached_publishers[key] = self._keep(publisher)
-        return publisher
+            if key not in self._cached_publishers:
+                publisher = zenoh.ext.declare_advanced_publisher(
+                    self._raw,
+                    self._prefix + key,
+                    encoding=zenoh.Encoding(encoding),
+                    cache=zenoh.ext.CacheConfig(1),
+                    sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+                    publisher_detection=True,
+                )
+                self._cached_publishers[key] = self._keep(publisher)
+            self._cached_publishers[key].put(payload, attachment=attachment)
 
     def delete(self, key: str) -> None:
-        """Publish that a key has no value any more.
-
-        Raises:
-            SessionError: it is no key.
-        """
+        """Publish that a key has no value any more; SessionError if it is no key."""
         with _key_errors(key):
             self._raw.delete(self._prefix + key)
 
@@ -405,7 +382,7 @@ class Session:
             return self._keep(Subscription(self._raw, self._prefix, expression))
 
     def subscribe_remote(self, without: tuple[str, ...]) -> Subscription:
-        """Return a subscription to all that other sessions publish, except pictures and keys with these prefixes.
+        """Return a subscription to all that other sessions publish, but for pictures and keys with these prefixes.
 
         A waiting `receive` cannot be woken.
         """
@@ -447,23 +424,21 @@ class Session:
         with _key_errors(expression):
             selector = zenoh.Selector(self._prefix + expression, parameters)
             replies = self._raw.get(selector, timeout=timeout_s, **body)
-        return [_raw_reply(reply, self._prefix) for reply in replies]
+        found = []
+        for reply in replies:
+            if reply.ok is not None:
+                found.append(_raw_sample(reply.ok, self._prefix))
+            elif reply.err is not None:
+                found.append(RawSample("ERROR", "", reply.err.payload.to_bytes(), str(reply.err.encoding), None))
+        return found
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample]:
-        """Return the last values of the keys of an expression.
-
-        Raises:
-            SessionError: it is no key expression.
-        """
+        """Return the last values of the keys of an expression."""
         replies = self.query(expression, timeout_s=timeout_s)
         return [ReceivedSample(reply.key, reply.payload) for reply in replies if reply.kind != "ERROR"]
 
     def get_surely(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample] | None:
-        """Return the last values of the keys of an expression; None if a process did not reply in time.
-
-        Raises:
-            SessionError: it is no key expression.
-        """
+        """Return the last values of the keys of an expression; None if a process did not reply in time."""
         replies = self.query(expression, timeout_s=timeout_s)
         if any(reply.kind == "ERROR" for reply in replies):  # Zenoh's own "Timeout" among them
             return None
@@ -482,9 +457,8 @@ class Session:
         except (OverflowError, UnicodeEncodeError) as error:
             allowed = "must hold whole numbers of 64 bits, and text in UTF-8"
             raise SessionError(f"{key}: {op} cannot be sent ({error}); {allowed}") from error
-        with _key_errors(key):
-            if fault := self._refusal("ask", key):
-                return Unanswered(ok=False, error=fault)
+        if fault := self._refusal("ask", key):
+            return Unanswered(ok=False, error=fault)
         start_s = time.monotonic()
         for reply in self.query(key, payload=payload, timeout_s=timeout_s):
             if reply.kind != "ERROR":
@@ -494,13 +468,7 @@ class Session:
         return Unanswered(ok=False, error=f"{key}: {what}; is it running?")
 
     def declare_queryable(self, expression: str, callback: Callable[[Query], None], complete: bool = False) -> None:
-        """Call back, in a thread of Zenoh's, for every query on an expression.
-
-        Args:
-            expression: what is answered on.
-            callback: takes each query.
-            complete: whether no other process need be asked about it.
-        """
+        """Call back, in a thread of Zenoh's, for every query; `complete` if no other process need be asked about it."""
         queryable = self._raw.declare_queryable(
             self._prefix + expression, lambda query: callback(Query(query, self._prefix)), complete=complete
         )
@@ -533,11 +501,10 @@ class Session:
 
     def on_link(self, callback: Callable[[bool], None]) -> None:
         """Call back with True when a transport to another process opens and False when one closes."""
-
-        def forward(event: zenoh.TransportEvent) -> None:
-            callback(event.kind == zenoh.SampleKind.PUT)
-
-        self._keep(self._raw.info.declare_transport_events_listener(forward, history=True))
+        listener = self._raw.info.declare_transport_events_listener(
+            lambda event: callback(event.kind == zenoh.SampleKind.PUT), history=True
+        )
+        self._keep(listener)
 
     def far_ends(self) -> dict[str, FarEnd]:
         """Return who is at the other end of each link, by its address there, e.g. "192.168.1.2:41000"."""
@@ -548,7 +515,6 @@ class Session:
         }
 
     def links(self) -> int:
-        """Return how many other processes this one has a transport to."""
         return len(self._raw.info.peers_zid()) + len(self._raw.info.routers_zid())
 
 
