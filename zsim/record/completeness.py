@@ -50,9 +50,14 @@ class GateCount:
         self._step, self._seq = (after.step, after.seq) if after else (-1, -1)
 
     def add(self, clock: run_messages.Clock) -> GateGap | None:
-        """Count the gate of a clock; return what is missing before it."""
-        gap = self.gap_before(clock)
-        if gap is not None:
+        """Count the gate of a clock; return the gates that are missing between the last one and this.
+
+        Nothing is missing before a clock with the next number, however far a replay has moved the time.
+        """
+        gap, missing = None, clock.step - self._step - 1
+        if missing > 0 and clock.seq != self._seq + 1:
+            gate_ns = clock.t_ns // clock.step
+            gap = GateGap(missing, clock.t_ns - missing * gate_ns, clock.t_ns - gate_ns)
             self.gaps.append(gap)
         self.gates += clock.step != self._step
         self.ended = clock.state == "stopped"
@@ -62,17 +67,6 @@ class GateCount:
     def misses(self, clock: run_messages.Clock) -> bool:
         """Tell whether a clock is missing before this one, of a gate or of a pause."""
         return clock.seq > self._seq + 1
-
-    def gap_before(self, clock: run_messages.Clock) -> GateGap | None:
-        """Return the gates that are missing between the clock that was added last and this one.
-
-        Nothing is missing before a clock with the next number, however far a replay has moved the time.
-        """
-        missing = clock.step - self._step - 1
-        if missing <= 0 or clock.seq == self._seq + 1:
-            return None
-        gate_ns = clock.t_ns // clock.step
-        return GateGap(missing, clock.t_ns - missing * gate_ns, clock.t_ns - gate_ns)
 
 
 class Completeness(Struct, frozen=True):
@@ -98,7 +92,6 @@ class Completeness(Struct, frozen=True):
 
     @property
     def complete(self) -> bool:
-        """Tell whether nothing is missing."""
         return not self.faults()
 
     @property
@@ -129,7 +122,6 @@ class _Numbered(Struct):
     seq: int
 
 
-_decode_numbered = msgspec.msgpack.Decoder(_Numbered).decode
 UNREAD = -1  # in place of a number that stands otherwise than our own encoder writes it
 _WIDTH = np.full(256, -1, dtype=np.int64)  # bytes of an unsigned integer behind its first byte, by that (MessagePack)
 _WIDTH[:0x80] = 0
@@ -167,13 +159,14 @@ class _Numbers:
     def __init__(self) -> None:
         self._channels: list[NDArray[np.int64]] = []
         self._numbers: list[NDArray[np.int64]] = []
+        self._decode = msgspec.msgpack.Decoder(_Numbered).decode
 
     def add(self, spans: MessageSpans, rows: NDArray[np.bool_]) -> None:
         """Add the numbers of some messages of a chunk."""
         read = np.where(rows, sequence_numbers(spans), 0)
         for m in np.flatnonzero(read < 0).tolist():  # by another encoder, or garbage, which has no number
             with suppress(*messages.REFUSALS, OverflowError):
-                read[m] = _decode_numbered(spans.content[spans.start[m] : spans.end[m]]).seq
+                read[m] = self._decode(spans.content[spans.start[m] : spans.end[m]]).seq
         rows = rows & (read >= 0)
         self._channels.append(spans.channel[rows])
         self._numbers.append(read[rows])
@@ -205,7 +198,10 @@ def completeness(
             more.
         take: called with key and payload of each of these, in the order in which they were written.
     """
-    info = _info(reader)
+    info: messages.Info | None = None
+    with suppress(DecodeError):
+        info = messages.decode(keys.INFO, last.payload) if (last := reader.last(keys.INFO)) else None
+    # a replay has clocks of its own, and numbers of the run that it played
     is_replay = info is not None and bool(info.replay_of)
     external = {drone.name for drone in (info.drones if info else ()) if drone.body is not msgspec.UNSET}
     names = reader.channels()
@@ -250,22 +246,9 @@ def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool
 
 
 def record_completeness(path: Path) -> Completeness:
-    """Return what is missing from the record at a path.
-
-    Raises:
-        RecordError: there is none, or it cannot be read.
-    """
+    """Return what is missing from the record at a path; RecordError if there is none, or it cannot be read."""
     with RecordReader(path) as reader:
         return completeness(reader)
-
-
-def _info(reader: RecordReader) -> messages.Info | None:
-    """Return the `world/info` of a record: a replay has clocks of its own, and numbers of the run that it played."""
-    info = reader.last(keys.INFO)
-    try:
-        return messages.decode(keys.INFO, info.payload) if info else None
-    except DecodeError:
-        return None
 
 
 def _is_numbered(key: str, external: Container[str]) -> bool:

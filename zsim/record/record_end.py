@@ -11,6 +11,7 @@ from io import FileIO
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
+import numpy as np
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics, SummaryOffset
@@ -20,15 +21,16 @@ from zsim.record.mcap_layout import (
     MAGIC,
     RecordSpan,
     Source,
+    check_magic,
     chunk_head,
     content_of,
     crc_until,
     groups,
+    index_record,
     indexes_of,
     is_complete,
     opening,
     packed,
-    packed_indexes,
     places,
     unpacked,
 )
@@ -38,11 +40,7 @@ _FOOTER_LENGTH = 20
 
 
 def finish(file: FileIO) -> None:
-    """Write summary and footer at the end of a file opened for reading and writing, unbuffered.
-
-    Raises:
-        OSError: no room.
-    """
+    """Write summary and footer at the end of a file opened for reading and writing, unbuffered; OSError if no room."""
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary = _summary(source)
         data_end = packed(DataEnd(crc_until(source, len(source))))
@@ -109,11 +107,7 @@ def _summary(source: Source) -> dict[Opcode, bytes]:
 
 
 def finish_bare(file: FileIO) -> None:
-    """Write the shortest end that MCAP allows, 50 bytes without a summary.
-
-    Raises:
-        OSError: no room.
-    """
+    """Write the shortest end that MCAP allows, 50 bytes without a summary; OSError if there is no room."""
     file.seek(0, 2)
     write_all(file, packed(DataEnd(0)) + packed(Footer(0, 0, 0)) + MAGIC)
 
@@ -149,45 +143,27 @@ def repair(path: str | Path) -> bool:
 
 
 def cut_off(file: FileIO, path: Path) -> None:
-    """Cut a record behind its last whole chunk, so that it can be continued from there.
+    """Cut a record behind its last whole chunk, or else its header, so that it can be continued from there.
 
     Raises:
         RecordError: no record.
         OSError: it cannot be written.
     """
-    end, indexes = 0, b""
+    end, tail = 0, opening()
     if file.seek(0, 2):
         with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
             check_magic(source, path)
-            end, indexes = _last_whole(source)
+            last: RecordSpan | None = None
+            for place in places(source):
+                if place.opcode == Opcode.DATA_END:
+                    break
+                if last is None or place.opcode == Opcode.CHUNK:
+                    last = place
+            if last is not None:  # the cut may have taken the indexes of its chunk
+                content = content_of(source, last) if last.opcode == Opcode.CHUNK else None
+                found = indexes_of(content or b"").items()
+                end = last.end
+                tail = b"".join(index_record(channel, np.array(own, "<u8").tobytes()) for channel, own in found)
     file.truncate(end)
     file.seek(end)
-    write_all(file, indexes if end else opening())
-
-
-def _last_whole(source: Source) -> tuple[int, bytes]:
-    """Return where the last whole chunk ends, and its message indexes, which the cut may have taken.
-
-    A file cut before its first chunk ends after its header, and at 0 when even that is not whole.
-    """
-    last: RecordSpan | None = None
-    for place in places(source):
-        if place.opcode == Opcode.DATA_END:
-            break
-        if last is None or place.opcode == Opcode.CHUNK:
-            last = place
-    if last is None:
-        return 0, b""
-    content = content_of(source, last) if last.opcode == Opcode.CHUNK else None
-    return last.end, b"".join(packed_indexes(indexes_of(content or b"")))
-
-
-def check_magic(source: Source, path: Path) -> None:
-    """Refuse what is not the beginning of an MCAP file.
-
-    Raises:
-        RecordError: with what was found.
-    """
-    beginning = source[: len(MAGIC)]
-    if not MAGIC.startswith(beginning):
-        raise RecordError(f"{path}: begins with {beginning!r}; is no MCAP record")
+    write_all(file, tail)

@@ -22,9 +22,9 @@ from zsim.record.mcap_layout import (
     MESSAGE,
     PIECE_BYTES,
     Index,
-    RecordGroup,
     RecordSpan,
     Source,
+    check_magic,
     chunk_head,
     content_of,
     crc_until,
@@ -37,7 +37,6 @@ from zsim.record.mcap_layout import (
     unmap,
     unpacked,
 )
-from zsim.record.record_end import check_magic
 
 SHOWN = 3  # gaps, or damaged chunks, in one line; how many more there are is shown
 CRC = struct.Struct("<I")  # of all that stands before the data's end; MCAP has 0 where none was computed
@@ -77,6 +76,8 @@ _Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, messag
 class RecordReader:
     """A record as it is on disk when it is opened; a writer may be appending to it.
 
+    Reading raises RecordError for chunks that another tool has compressed in a way that is not ours.
+
     Attributes:
         complete: the record was closed, not cut.
         damaged: what was skipped so far, each with its place: chunks whose checksum differs, and, as one, everything
@@ -91,7 +92,12 @@ class RecordReader:
         """
         self.path = Path(path)
         self._counts: Counter[int] = Counter()
-        self._source = _mapped(self.path)
+        try:
+            with open(path, "rb") as file:
+                empty = not self.path.stat().st_size
+                self._source: Source = b"" if empty else mmap(file.fileno(), 0, access=ACCESS_READ)
+        except OSError as error:
+            raise RecordError(f"{path}: cannot be read ({error.strerror})") from error
         check_magic(self._source, self.path)
         self.complete = is_complete(self._source)
         self._keys: dict[int, str] = {}
@@ -114,9 +120,6 @@ class RecordReader:
             by_time: in order of simulated time, messages of one time as they were written; otherwise all as
                 they were written. In memory are the chunks that overlap in time, and stragglers one by one.
             from_ns: chunks with older messages only are skipped; a chunk spans a quarter of a wall second.
-
-        Raises:
-            RecordError: compressed by another tool in a way that is not ours.
         """
         wanted = {number: key for number, key in self._keys.items() if keys is None or key in keys}
         late = (chunk for chunk in self._chunks if chunk.last_ns >= from_ns)
@@ -127,15 +130,10 @@ class RecordReader:
         return self.messages()
 
     def channels(self) -> dict[int, str]:
-        """Return the key of each channel, by its number."""
         return dict(self._keys)
 
     def spans(self, wanted: Collection[int]) -> Iterator[MessageSpans]:
-        """Yield where the payloads of some channels are, a chunk at a time: for reading many messages as arrays.
-
-        Raises:
-            RecordError: compressed by another tool in a way that is not ours.
-        """
+        """Yield where the payloads of some channels are, a chunk at a time: for reading many messages as arrays."""
         mapped = 0
         for chunk in self._chunks:
             if chunk.channels.isdisjoint(wanted):
@@ -176,9 +174,8 @@ class RecordReader:
     def damaged(self) -> tuple[str, ...]:
         """Return the damage found so far; everything behind unreadable records is one entry."""
         heads = [(place.start, chunk_head(self._source, place)) for place in sorted(self._damaged)]
-        chunks = [
-            f"the chunk at byte {at}, {head.first_ns / 1e9:.2f} to {head.last_ns / 1e9:.2f} s" for at, head in heads
-        ]
+        span = "the chunk at byte {}, {:.2f} to {:.2f} s"
+        chunks = [span.format(at, head.first_ns / 1e9, head.last_ns / 1e9) for at, head in heads]
         return tuple(chunks if self._rest is None else [*chunks, f"everything from byte {self._rest} on"])
 
     def differs(self) -> bool:
@@ -214,7 +211,6 @@ class RecordReader:
         return None
 
     def close(self) -> None:
-        """Close the file."""
         if isinstance(self._source, mmap):
             self._source.close()
 
@@ -244,21 +240,17 @@ class RecordReader:
         chunk_groups = [group for group in groups(self._source, found) if group.place.opcode == Opcode.CHUNK]
         for _ in found:  # of the summary
             continue
-        for group in chunk_groups:
-            cut = group is chunk_groups[-1] and not self.complete
-            counts = self._counted(group) if cut else {index.channel: index.messages for index in group.indexes}
+        for place, indexes, _ in chunk_groups:
+            counts = {index.channel: index.messages for index in indexes}
+            if place is chunk_groups[-1].place and not self.complete:  # its indexes may have been cut
+                content = content_of(self._source, place)
+                if content is None:
+                    self._damaged.add(place)
+                counts = {channel: len(entries) // 2 for channel, entries in indexes_of(content or b"").items()}
+                indexes = ()
             self._counts.update(counts)
-            channels = frozenset(counts)
-            head = chunk_head(self._source, group.place)
-            known_channels = known.setdefault(channels, channels)
-            yield _Chunk(group.place, head.first_ns, head.last_ns, known_channels, () if cut else group.indexes)
-
-    def _counted(self, group: RecordGroup) -> dict[int, int]:
-        """Return the messages per channel of a chunk whose message indexes may have been cut."""
-        content = content_of(self._source, group.place)
-        if content is None:
-            self._damaged.add(group.place)
-        return {channel: len(entries) // 2 for channel, entries in indexes_of(content or b"").items()}
+            head, channels = chunk_head(self._source, place), frozenset(counts)
+            yield _Chunk(place, head.first_ns, head.last_ns, known.setdefault(channels, channels), indexes)
 
     def _as_written(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         for chunk in chunks:
@@ -266,14 +258,20 @@ class RecordReader:
             if content is None:
                 self._damaged.add(chunk.place)
                 continue
-            if chunk.channels <= wanted.keys():
-                yield from _recorded(content, wanted)
+            unpack, payload, head = MESSAGE.unpack_from, MESSAGE.size, HEAD.size
+            if chunk.channels <= wanted.keys():  # without its indexes
+                at, end = 0, len(content) - payload
+                while at <= end:
+                    opcode, length, number, _, t_ns, wall_ns = unpack(content, at)
+                    after = at + head + length
+                    if number in wanted and opcode == Opcode.MESSAGE:
+                        yield Recorded(wanted[number], content[at + payload : after], t_ns, wall_ns)
+                    at = after
                 continue
             channel, places = self._indexed(chunk, content)
             for at in np.sort(places[np.isin(channel, list(wanted))]).tolist():
-                _, length, number, _, t_ns, wall_ns = MESSAGE.unpack_from(content, at)
-                payload = content[at + MESSAGE.size : at + HEAD.size + length]
-                yield Recorded(wanted[number], payload, t_ns, wall_ns)
+                _, length, number, _, t_ns, wall_ns = unpack(content, at)
+                yield Recorded(wanted[number], content[at + payload : at + head + length], t_ns, wall_ns)
 
     def _by_time(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         """Yield by time, holding no more chunks in memory than overlap in time, and stragglers."""
@@ -303,40 +301,13 @@ class RecordReader:
             if chunk.first_ns >= chunks[number - 1].last_ns - OVERLAP_NS:
                 continue
             entries = [(m.t_ns, number, m) for m in self._as_written([chunk], wanted)]
-            floor_ns = _floor_ns([t_ns for t_ns, _, _ in entries])
+            floor_ns = 0  # before most of its times, robust against a few outliers on either side
+            if times := sorted(t_ns for t_ns, _, _ in entries):
+                middle, late = times[len(times) // 2], times[3 * len(times) // 4]
+                floor_ns = middle - 3 * (late - middle) - OVERLAP_NS  # evenly spread, 2 (late - middle) do
             strays += (each for each in entries if each[0] < floor_ns)
             floors[number] = min((t_ns for t_ns, _, _ in entries if t_ns >= floor_ns), default=chunk.first_ns)
         return strays, floors
-
-
-def _recorded(content: bytes, wanted: dict[int, str]) -> Iterator[Recorded]:
-    """Yield the messages of a chunk's content."""
-    at, end = 0, len(content) - MESSAGE.size
-    unpack, payload, head = MESSAGE.unpack_from, MESSAGE.size, HEAD.size
-    while at <= end:
-        opcode, length, channel, _, t_ns, wall_ns = unpack(content, at)
-        after = at + head + length
-        if channel in wanted and opcode == Opcode.MESSAGE:
-            yield Recorded(wanted[channel], content[at + payload : after], t_ns, wall_ns)
-        at = after
-
-
-def _floor_ns(times: list[int]) -> int:
-    """Return a time before most of some times, robust against a few outliers on either side."""
-    if not times:
-        return 0
-    ordered = sorted(times)
-    middle, late = ordered[len(times) // 2], ordered[3 * len(times) // 4]
-    return middle - 3 * (late - middle) - OVERLAP_NS  # evenly spread, they begin at middle - 2 (late - middle)
-
-
-def _mapped(path: Path) -> Source:
-    """Return the bytes of a file without reading them yet."""
-    try:
-        with open(path, "rb") as file:
-            return mmap(file.fileno(), 0, access=ACCESS_READ) if path.stat().st_size else b""
-    except OSError as error:
-        raise RecordError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def record_notes(reader: RecordReader) -> list[str]:
