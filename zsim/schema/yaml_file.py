@@ -92,9 +92,6 @@ class _Reader:
     Refused are aliases, which can expand without end, tags, directives, keys that are given twice, and a depth or a
     number of values for which C code has no limit of its own. Words mean what YAML 1.2 says (its core schema, section
     10.3.2): 1e3 and 010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
-
-    Args:
-        text: to be read.
     """
 
     def __init__(self, text: str) -> None:
@@ -114,13 +111,11 @@ class _Reader:
         return content
 
     def _after(self, kind: type[Any]) -> Any:
-        """Return the event that follows the next one, which is of a kind."""
         event = next(self._events)
         assert isinstance(event, kind), event
         return next(self._events)
 
     def _node(self, event: Any, depth: int) -> Any:
-        """Return what begins with an event."""
         self._count += 1
         if isinstance(event, AliasEvent):
             raise _refusal("aliases are not allowed", event)
@@ -167,7 +162,6 @@ def _word(text: str) -> Any:
 
 
 def _whole(text: str) -> int:
-    """Return a whole number: decimal, 0o for octal, 0x for hexadecimal."""
     return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
 
 
