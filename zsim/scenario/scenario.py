@@ -283,11 +283,9 @@ class Scenario(Spec, frozen=True, kw_only=True):
     report: Figures = field(default_factory=Figures)
 
     def drone(self, name: str) -> Drone:
-        """Return the drone of that name; KeyError if there is none."""
         return {drone.name: drone for drone in self.drones}[name]
 
     def cluster(self, name: str) -> Cluster:
-        """Return the cluster of that name; KeyError if there is none."""
         return {cluster.name: cluster for cluster in self.clusters}[name]
 
     def own_code(self) -> list[str]:
@@ -305,7 +303,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
 
     def gates(self, role: str) -> bool:
         """Tell whether the run waits for the processes of a role that is no agent's."""
-        return self.processes.gates(role)
+        return self.processes.gating is not UNSET and role in self.processes.gating
 
 
 _SECTIONS = ("limits", "aerodynamics")
