@@ -100,7 +100,7 @@ def on_overdue(
 
 
 def lets_drop(actions: Mapping[str, str], name: str) -> bool:
-    """Tell whether `on_death` or `on_overdue` explicitly lets a run go on without a process; that is then no failure."""
+    """Tell whether `on_death` or `on_overdue` explicitly lets a run go on without a process: that is no failure."""
     return (actions.get(name) or actions.get(name.partition(".")[0])) == "drop"
 
 

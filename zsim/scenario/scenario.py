@@ -302,8 +302,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         return [drone.name for drone in self.drones if drone.is_external]
 
     def gates(self, role: str) -> bool:
-        """Tell whether the run waits for the processes of a role that is no agent's."""
-        return self.processes.gating is not UNSET and role in self.processes.gating
+        return self.processes.gates(role)
 
 
 _SECTIONS = ("limits", "aerodynamics")
