@@ -114,11 +114,7 @@ class GateMessages:
 
     @classmethod
     def unpack(cls, payload: bytes, table: tuple[str, ...]) -> "GateMessages":
-        """Return what `pack` has packed; not checked yet.
-
-        Raises:
-            DecodeError: the payload is anything else.
-        """
+        """Return what `pack` has packed; not checked yet; DecodeError if the payload is anything else."""
         try:
             p = _decode_gate(payload)
         except REFUSALS as error:
@@ -142,8 +138,7 @@ class GateMessages:
     def check(self) -> None:
         """Refuse columns that point outside of table or buffer, and stamps that are no times.
 
-        Raises:
-            DecodeError: with what is wrong.
+        DecodeError with what is wrong.
         """
         which, stamps, ends = self.which.tolist(), self.stamps.tolist(), self.ends.tolist()
         if not ends or ends[-1] != len(self.buffer) or min(map(sub, ends, [0, *ends])) < GAP:
@@ -162,11 +157,7 @@ class GateMessages:
         return [(table[p], data[start + GAP : end]) for p, (start, end) in zip(places, bounds, strict=True)]
 
     def decoded(self) -> Iterator[tuple[str, Any]]:
-        """Yield keys and messages.
-
-        Raises:
-            DecodeError: one is no message of its key.
-        """
+        """Yield keys and messages; DecodeError if one is no message of its key."""
         for key, payload in self.pairs:
             yield key, messages.decode(key, payload)
 
@@ -212,11 +203,7 @@ def encode_batch(passed: Pairs) -> bytes:
 
 
 def decode_batch(payload: bytes) -> Pairs:
-    """Return the [key, payload] pairs of a batch.
-
-    Raises:
-        DecodeError: it is no batch.
-    """
+    """Return the [key, payload] pairs of a batch; DecodeError if it is no batch."""
     try:
         return _decode_batch(payload)
     except REFUSALS as error:
@@ -224,11 +211,7 @@ def decode_batch(payload: bytes) -> Pairs:
 
 
 def pairs_of(result: Any) -> Pairs:
-    """Return the [key, payload] pairs in the result of an answer.
-
-    Raises:
-        DecodeError: the payload is anything else.
-    """
+    """Return the [key, payload] pairs in the result of an answer; DecodeError if the payload is anything else."""
     try:
         return msgspec.convert(result, Pairs, builtin_types=(bytes,))  # or texts would pass as base64
     except REFUSALS as error:

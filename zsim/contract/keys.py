@@ -74,11 +74,7 @@ def on(
 
 
 def name(text: str, what: str = "name") -> str:
-    """Return `text` if it is a name of the contract.
-
-    Raises:
-        BadNameError: with what was found and what is allowed.
-    """
+    """Return `text` if it is a name of the contract; BadNameError with what was found and what is allowed."""
     if not isinstance(text, str) or not NAME.fullmatch(text):
         raise BadNameError(f"{what} is {text!r}; must be 1 to 32 of a-z 0-9 _ . -")
     return text

@@ -191,11 +191,7 @@ def is_output(key: str) -> bool:
 
 
 def output_type(key: str) -> type[Struct]:
-    """Return the message that an agent may return on a key from a step.
-
-    Raises:
-        DecodeError: none; one line.
-    """
+    """Return the message that an agent may return on a key from a step; DecodeError if none."""
     kind = type_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
@@ -218,8 +214,7 @@ def encoding(key: str) -> str:
 def decode(key: str, payload: bytes) -> Any:
     """Return the message on `key`, checked for type, shape and finiteness.
 
-    Raises:
-        DecodeError: names key, field, found and allowed.
+    DecodeError that names key, field, found and allowed.
     """
     kind, read = _reader_of(key)
     if kind is None:
@@ -342,8 +337,7 @@ _EVENT_DATA: dict[str, type[Struct]] = {
 def read_event(payload: bytes) -> WorldEvent | None:
     """Return an event of a kind that processes act on, its data checked; None for an event of another kind.
 
-    Raises:
-        DecodeError: it is no event, or its data is not what its kind has.
+    DecodeError if it is no event, or its data is not what its kind has.
     """
     event: run_messages.Event = decode(keys.EVENT, payload)
     kind = _EVENT_DATA.get(event.kind)

@@ -145,9 +145,7 @@ def repair(path: str | Path) -> bool:
 def cut_off(file: FileIO, path: Path) -> None:
     """Cut a record behind its last whole chunk, or else its header, so that it can be continued from there.
 
-    Raises:
-        RecordError: no record.
-        OSError: it cannot be written.
+    RecordError if no record; OSError if it cannot be written.
     """
     end, tail = 0, opening()
     if file.seek(0, 2):

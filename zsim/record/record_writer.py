@@ -56,8 +56,7 @@ class RecordWriter:
     def __init__(self, path: str | Path, goes_on: bool = False) -> None:
         """Create the file, or continue one whose writer died behind its last whole chunk; none is overwritten.
 
-        Raises:
-            RecordError: the file exists, cannot be continued, or cannot be written.
+        RecordError if the file exists, cannot be continued, or cannot be written.
         """
         self.path = Path(path)
         self.has_former = False

@@ -145,8 +145,7 @@ class Bus:
     def end(self) -> None:
         """Let every agent leave, and publish the world's last messages.
 
-        Raises:
-            UserCodeError: a user's class failed before the end; everything has been published nevertheless.
+        UserCodeError if a user's class failed before the end; everything has been published nevertheless.
         """
         self._coordinator.publish_end()
         self._spread()

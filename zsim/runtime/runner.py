@@ -324,11 +324,7 @@ class RunnerInputs:
         self._link.declare_process(self._agent.name)
 
     def wait(self) -> None:
-        """Wait for what completes the next gate, or until woken.
-
-        Raises:
-            SessionError: the session was closed meanwhile.
-        """
+        """Wait for what completes the next gate, or until woken; SessionError if the session was closed meanwhile."""
         wanted = self.inbox.last_missing() or self._agent.gate_keys[-1]
         expression = self._agent.reads[self._expressions.readers(wanted)[0]]
         self._blocking = self._subscriptions[expression if expression in self._subscriptions else self._gate_key]

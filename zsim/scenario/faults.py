@@ -423,11 +423,7 @@ _OPTIONS = {"--for": "for_s", "--at": "at_s"}
 
 
 def typed_duration_s(text: str) -> float:
-    """Return the duration in a text such as 10s, 500ms or 2min.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return the duration in a text such as 10s, 500ms or 2min; ValueError if it is none."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(ms|s|min|)", text.strip())
     if not match:
         raise ValueError(f"is {text[:40]!r}; must be a duration such as 10s, 500ms or 2min")
@@ -437,8 +433,7 @@ def typed_duration_s(text: str) -> float:
 def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
     """Return the parameters in words NAME=VALUE; values are YAML.
 
-    Raises:
-        ValueError: one is no such word, is given twice, or is given by an argument or option instead.
+    ValueError if one is no such word, is given twice, or is given by an argument or option instead.
     """
     values: dict[str, Any] = {}
     for text in words:

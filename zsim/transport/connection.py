@@ -227,8 +227,7 @@ def _no_link(endpoint: str) -> str:
 def read_permissions(link: Session) -> Permissions | None:
     """Return what access control at the other end permits us, None where nobody answers that.
 
-    Raises:
-        SessionError: it does not let us in.
+    SessionError if it does not let us in.
     """
     for sample in link.get(keys.access(link.process), timeout_s=ANSWER_S):
         permissions = messages.decode_as(Permissions, sample.payload, sample.key)

@@ -118,8 +118,7 @@ class Subscription:
     def receive(self) -> ReceivedSample | None:
         """Wait for one message; None when woken by `wake`.
 
-        Raises:
-            SessionError: the session, or the subscription, was closed meanwhile.
+        SessionError if the session, or the subscription, was closed meanwhile.
         """
         try:
             return self._take(self._handler.recv())
@@ -168,11 +167,7 @@ class Query:
         self.attachment = raw.attachment.to_bytes() if raw.attachment is not None else b""
 
     def request(self) -> ControlRequest:
-        """Return the request in it.
-
-        Raises:
-            DecodeError: it holds none.
-        """
+        """Return the request in it; DecodeError if it holds none."""
         return messages.decode_as(ControlRequest, self.payload, self.expression)
 
     def reply(self, key: str, payload: bytes) -> None:
@@ -272,11 +267,7 @@ class Session:
     # Publishing
 
     def put(self, key: str, message: Struct) -> None:
-        """Publish a message on its key.
-
-        Raises:
-            SessionError: our certificate does not permit us to publish there.
-        """
+        """Publish a message on its key; SessionError if our certificate does not permit us to publish there."""
         self.put_raw(key, messages.encode(message))
 
     def put_raw(self, key: str, payload: bytes) -> None:
@@ -319,8 +310,7 @@ class Session:
     def put_sample(self, key: str, payload: bytes, encoding: str) -> None:
         """Publish a payload of any encoding on any of many keys, without declaring a publisher.
 
-        Raises:
-            SessionError: it is no key.
+        SessionError if it is no key.
         """
         picture = keys.is_picture(key)
         with _key_errors(key):
@@ -329,8 +319,7 @@ class Session:
     def declare_publisher(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
         """Return a function that publishes (payload, attachment) on one key; a full link drops it.
 
-        Raises:
-            SessionError: it is no key, or our certificate does not permit us to publish there.
+        SessionError if it is no key, or our certificate does not permit us to publish there.
         """
         self._check("publish", key)
         with _key_errors(key):
@@ -373,8 +362,7 @@ class Session:
     def subscribe(self, expression: str) -> Subscription:
         """Return a subscription to everything that others publish on an expression, in order.
 
-        Raises:
-            SessionError: it is no key expression, or our certificate does not permit us to read it.
+        SessionError if it is no key expression, or our certificate does not permit us to read it.
         """
         self._check("read", expression)
         self.reads.append(expression)
@@ -392,8 +380,7 @@ class Session:
     def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> Callable[[], None]:
         """Call back, in a thread of Zenoh's, for everything on an expression until the returned function is called.
 
-        Raises:
-            SessionError: it is no key expression, or our certificate does not permit us to read it.
+        SessionError if it is no key expression, or our certificate does not permit us to read it.
         """
         self._check("read", expression)
         self.reads.append(expression)
@@ -415,11 +402,7 @@ class Session:
     def query(
         self, expression: str, parameters: str = "", payload: bytes = b"", encoding: str = "", timeout_s: float = 2.0
     ) -> list[RawSample]:
-        """Return all replies to a query, refusals among them.
-
-        Raises:
-            SessionError: it is no key expression.
-        """
+        """Return all replies to a query, refusals among them; SessionError if it is no key expression."""
         body: dict[str, Any] = {"payload": payload, "encoding": zenoh.Encoding(encoding)} if payload else {}
         with _key_errors(expression):
             selector = zenoh.Selector(self._prefix + expression, parameters)
@@ -449,8 +432,7 @@ class Session:
     ) -> ControlAnswer:
         """Send a request to `key` and return its answer; `Unanswered` if none comes, or we may not ask there.
 
-        Raises:
-            SessionError: it is no key, or the arguments cannot be encoded.
+        SessionError if it is no key, or the arguments cannot be encoded.
         """
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
@@ -561,11 +543,7 @@ def _flow(view: bool, drop: bool) -> dict[str, Any]:
 
 
 def config_of(settings: Settings, identity: Identity) -> zenoh.Config:
-    """Return the configuration of a session.
-
-    Raises:
-        SessionError: Zenoh refuses a setting.
-    """
+    """Return the configuration of a session; SessionError if Zenoh refuses a setting."""
     config = zenoh.Config()
     for path, value in settings.items():
         try:

@@ -202,8 +202,7 @@ def _name(certificate: dict[str, Any]) -> str:
 def _read_own(identity: Identity) -> dict[str, Any]:
     """Return the content of a process's own certificate, by a handshake with itself in memory.
 
-    Raises:
-        ssl.SSLError: key, certificate and authority do not belong together.
+    ssl.SSLError if key, certificate and authority do not belong together.
     """
     server_side = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_side.load_cert_chain(*identity.files[1:])

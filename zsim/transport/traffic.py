@@ -39,8 +39,7 @@ class Traffic:
     def receive(self) -> list[Passed]:
         """Wait for what passes next; nothing when woken by `wake`.
 
-        Raises:
-            SessionError: the session, or this subscription, was closed meanwhile.
+        SessionError if the session, or this subscription, was closed meanwhile.
         """
         sample = self._subscription.receive()
         return list(self._opened(sample.payload)) if sample is not None else []

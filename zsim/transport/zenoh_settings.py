@@ -63,8 +63,7 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
 def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
     """Return what a hub or a router has in addition: it needs its port, and gives up on a reader that takes nothing.
 
-    Raises:
-        SessionError: endpoints and identity do not go together, or a file of the identity cannot be used.
+    SessionError if endpoints and identity do not go together, or a file of the identity cannot be used.
     """
     return {
         "listen/endpoints": json.dumps(list(endpoints)),
@@ -147,8 +146,7 @@ def refusal(path: str, value: str, identity: Identity) -> str:
 def read_access(identity: Identity) -> Any:
     """Return the access control in a file; Zenoh checks its content.
 
-    Raises:
-        SessionError: it cannot be read, or is not JSON.
+    SessionError if it cannot be read, or is not JSON.
     """
     assert identity.access is not None
     try:
