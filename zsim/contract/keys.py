@@ -35,21 +35,13 @@ AnyMessage = TypeVar("AnyMessage", bound=type[Struct])
 
 
 class Topic(NamedTuple):
-    """What the contract says about a key.
+    """What the contract says about a key."""
 
-    Attributes:
-        message: type of its messages; None for a family of keys whose members declare theirs.
-        writers: roles that publish it; "each" stands for every process, on the keys of its own name.
-        readers: roles that subscribe to it, besides recorders and operators, who read everything.
-        last: who answers a get with the last message: "world", "writer", or nobody ("").
-        is_output: whether the world counts its messages among those that a process announces with its done.
-    """
-
-    message: Any
-    writers: tuple[str, ...]
-    readers: tuple[str, ...]
-    last: str
-    is_output: bool
+    message: Any  # type of its messages; None for a family of keys whose members declare theirs
+    writers: tuple[str, ...]  # roles that publish it; "each" stands for every process, on the keys of its own name
+    readers: tuple[str, ...]  # roles that subscribe to it, besides recorders and operators, who read everything
+    last: str  # who answers a get with the last message: "world", "writer", or nobody ("")
+    is_output: bool  # whether the world counts its messages among those that a process announces with its done
 
 
 TOPICS: dict[str, Topic] = {}  # topics by key, `*` in place of a name

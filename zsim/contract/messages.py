@@ -300,20 +300,14 @@ class RunEnd(Struct, frozen=True):
 
 
 class ProcessEntry(Struct, frozen=True):
-    """A process has joined.
-
-    Attributes:
-        from_ns: first gate that it is waited for.
-        done_ns: newest gate that it, or its former incarnation, is through with; -1 for none.
-        former_pid: of the incarnation whose place it takes.
-    """
+    """A process has joined."""
 
     incarnation: int
     host: str
     pid: int
-    from_ns: Count
-    done_ns: Whole = -1
-    former_pid: int | None = None
+    from_ns: Count  # first gate that it is waited for
+    done_ns: Whole = -1  # newest gate that it, or its former incarnation, is through with; -1 for none
+    former_pid: int | None = None  # of the incarnation whose place it takes
 
 
 class WorldEvent(NamedTuple):

@@ -70,25 +70,15 @@ class GateCount:
 
 
 class Completeness(Struct, frozen=True):
-    """What a record contains, and what is missing.
+    """What a record contains, and what is missing."""
 
-    Attributes:
-        gates: on record.
-        gaps: gates that are missing.
-        messages_missing: of the world, by their numbers; those of missing gates among them.
-        ended: the end of the run is on record.
-        closed: its writer has closed it; it was not cut.
-        last_ns: its last gate [ns].
-        damaged: what cannot be read of it, each with its place.
-    """
-
-    gates: int = 0
-    gaps: tuple[GateGap, ...] = ()
-    messages_missing: int = 0
-    ended: bool = True
-    closed: bool = True
-    last_ns: int = 0
-    damaged: tuple[str, ...] = ()
+    gates: int = 0  # on record
+    gaps: tuple[GateGap, ...] = ()  # gates that are missing
+    messages_missing: int = 0  # of the world, by their numbers; those of missing gates among them
+    ended: bool = True  # the end of the run is on record
+    closed: bool = True  # its writer has closed it; it was not cut
+    last_ns: int = 0  # its last gate [ns]
+    damaged: tuple[str, ...] = ()  # what cannot be read of it, each with its place
 
     @property
     def complete(self) -> bool:

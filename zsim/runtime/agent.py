@@ -36,31 +36,21 @@ class Output(NamedTuple):
 
 
 class Agent(ABC):
-    """Base class of everything that takes part in the lockstep.
+    """Base class of everything that takes part in the lockstep."""
 
-    Attributes:
-        name: process name `role.thing`, e.g. `estimator.drone1`.
-        period_ns: how often it publishes done; a multiple of the gate.
-        reads: key expressions it subscribes to.
-        gate_keys: keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status.
-        counted: drones of which it reads all sensors, so that what their status counts is waited for.
-        uncounted: keys whose messages belong to no gate: a late one is handed over with the next gate.
-        writes: keys that it publishes at every gate and that others of its process may read.
-        serves: names of processes whose work it does beside its own.
-        takes_gates: whether it takes the world's messages of a gate as columns and one buffer, in `receive_gate`.
-        repeats: keys of its outputs that carry the requests that it took, for `repeat`.
-    """
-
-    name: str
-    period_ns: int
-    reads: tuple[str, ...]
-    gate_keys: tuple[str, ...]
+    name: str  # process name `role.thing`, e.g. `estimator.drone1`
+    period_ns: int  # how often it publishes done; a multiple of the gate
+    reads: tuple[str, ...]  # key expressions it subscribes to
+    gate_keys: tuple[str, ...]  # keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status
+    # drones of which it reads all sensors, so that what their status counts is waited for
     counted: tuple[str, ...] = ()
+    # keys whose messages belong to no gate: a late one is handed over with the next gate
     uncounted: tuple[str, ...] = ()
-    writes: tuple[str, ...] = ()
-    serves: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()  # keys that it publishes at every gate and that others of its process may read
+    serves: tuple[str, ...] = ()  # names of processes whose work it does beside its own
+    # whether it takes the world's messages of a gate as columns and one buffer, in `receive_gate`
     takes_gates: bool = False
-    repeats: tuple[str, ...] = ()
+    repeats: tuple[str, ...] = ()  # keys of its outputs that carry the requests that it took, for `repeat`
     _links: LinkFaults | None = None
 
     def __init__(self) -> None:

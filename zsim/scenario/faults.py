@@ -34,26 +34,17 @@ COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may have; the r
 
 
 class FaultParameter(NamedTuple):
-    """One number, vector, word or map of a kind.
-
-    Attributes:
-        unit: of the number or vector; empty for one without.
-        least, most: limits, each of a vector's entries.
-        above: whether `least` itself is not allowed.
-        choices: of a word.
-        default: where it is left out; `required` then says that it may not be.
-        description: what it is, for tables.
-    """
+    """One number, vector, word or map of a kind."""
 
     name: str
     shape: Shape
-    description: str
-    unit: str = ""
-    least: float = -1e9
+    description: str  # what it is, for tables
+    unit: str = ""  # of the number or vector; empty for one without
+    least: float = -1e9  # limits, each of a vector's entries
     most: float = 1e9
-    above: bool = False
-    choices: tuple[str, ...] = ()
-    default: Any = None
+    above: bool = False  # whether `least` itself is not allowed
+    choices: tuple[str, ...] = ()  # of a word
+    default: Any = None  # where it is left out; `required` then says that it may not be
     required: bool = True
 
 
@@ -94,19 +85,12 @@ _RADIO = (
 
 
 class SensorPart(NamedTuple):
-    """Numbers of a sensor that a fault strikes together.
+    """Numbers of a sensor that a fault strikes together."""
 
-    Attributes:
-        sensor: its name.
-        label: what the part is called.
-        channel: that of its first numbers, which a bias is added to.
-        first, width: place of its numbers among those of the sensor.
-    """
-
-    sensor: str
-    label: str
-    channel: Channel
-    first: int
+    sensor: str  # its name
+    label: str  # what the part is called
+    channel: Channel  # that of its first numbers, which a bias is added to
+    first: int  # place of its numbers among those of the sensor
     width: int
 
 
@@ -257,20 +241,15 @@ def acts(fault: Fault, gate_ns: int) -> bool:
 
 
 class Known(NamedTuple):
-    """Names that a target may have, and the kinds of faults of the run.
-
-    Attributes:
-        processes: those that take part, besides estimators and controllers.
-        rotors: of each drone; none of one whose vehicle is a module that is not read here.
-        external: drones whose bodies and sensors nobody simulates.
-    """
+    """Names that a target may have, and the kinds of faults of the run."""
 
     drones: tuple[str, ...]
     clusters: tuple[str, ...]
-    processes: tuple[str, ...] = ()
+    processes: tuple[str, ...] = ()  # those that take part, besides estimators and controllers
     kinds: Mapping[str, FaultKind] = KINDS
+    # of each drone; none of one whose vehicle is a module that is not read here
     rotors: Mapping[str, tuple[str, ...]] = {}
-    external: tuple[str, ...] = ()
+    external: tuple[str, ...] = ()  # drones whose bodies and sensors nobody simulates
 
     def things(self) -> dict[str, tuple[str, ...]]:
         """Return what the processes of each role with agents may be named after."""

@@ -18,22 +18,15 @@ OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "ro
 
 
 class Role(NamedTuple):
-    """A role.
+    """A role."""
 
-    Attributes:
-        extra: of the distribution, that a host of it needs; empty for none.
-        on_death: what the death of a process means for a run where the scenario does not say.
-        about: what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent.
-        agent: `package.module:Class` of the agent, made of world/info, scenario and name.
-        joint: one agent may do the work of many, made of all their names.
-        on_overdue: what follows where it does not come back and the scenario does not say; `drop` where nothing waits.
-    """
-
-    extra: str
-    on_death: OnDeath
+    extra: str  # of the distribution, that a host of it needs; empty for none
+    on_death: OnDeath  # what the death of a process means for a run where the scenario does not say
+    # what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent
     about: Literal["drone", "cluster"] | None = None
-    agent: str = ""
-    joint: bool = False
+    agent: str = ""  # `package.module:Class` of the agent, made of world/info, scenario and name
+    joint: bool = False  # one agent may do the work of many, made of all their names
+    # what follows where it does not come back and the scenario does not say; `drop` where nothing waits
     on_overdue: OnOverdue = "end"
 
 

@@ -39,23 +39,14 @@ class FarEnd(NamedTuple):
 
 
 class RawSample(NamedTuple):
-    """A publication, or a reply to a query, with all that Zenoh knows of it.
+    """A publication, or a reply to a query, with all that Zenoh knows of it."""
 
-    Attributes:
-        kind: "PUT" or "DELETE"; "ERROR" for a reply that refuses, which has no key.
-        key: without the prefix of the session that received it.
-        payload: as sent.
-        encoding: Zenoh's text of it, e.g. "application/msgpack;Imu".
-        timestamp: of Zenoh, as text; None where nobody stamped it.
-        attachment: what was sent beside the payload; empty where nothing was.
-    """
-
-    kind: str
-    key: str
-    payload: bytes
-    encoding: str
-    timestamp: str | None
-    attachment: bytes = b""
+    kind: str  # "PUT" or "DELETE"; "ERROR" for a reply that refuses, which has no key
+    key: str  # without the prefix of the session that received it
+    payload: bytes  # as sent
+    encoding: str  # Zenoh's text of it, e.g. "application/msgpack;Imu"
+    timestamp: str | None  # of Zenoh, as text; None where nobody stamped it
+    attachment: bytes = b""  # what was sent beside the payload; empty where nothing was
 
 
 def _raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:

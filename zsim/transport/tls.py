@@ -40,21 +40,13 @@ _MISNAMED = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISM
 
 
 class Identity(NamedTuple):
-    """The identity that a process is started with: its host, its certificate, and whom it admits.
+    """The identity that a process is started with: its host, its certificate, and whom it admits."""
 
-    Attributes:
-        host: the name that its messages give.
-        tls: folder with ca.pem, certificate.pem and key.pem; None goes without TLS.
-        access: file with Zenoh's access control, for a process that listens; None admits everybody.
-        insecure: whether links may leave the machine without TLS.
-        process: name that the certificate must have; empty for any.
-    """
-
-    host: str = socket.gethostname()
-    tls: Path | None = None
-    access: Path | None = None
-    insecure: bool = False
-    process: str = ""
+    host: str = socket.gethostname()  # the name that its messages give
+    tls: Path | None = None  # folder with ca.pem, certificate.pem and key.pem; None goes without TLS
+    access: Path | None = None  # file with Zenoh's access control, for a process that listens; None admits everybody
+    insecure: bool = False  # whether links may leave the machine without TLS
+    process: str = ""  # name that the certificate must have; empty for any
 
     @property
     def files(self) -> tuple[Path, Path, Path]:
@@ -218,19 +210,12 @@ def _read_own(identity: Identity) -> dict[str, Any]:
 
 
 class Permissions(Struct, frozen=True):
-    """What one process may do at the process that listens; expressions include the federation's name.
+    """What one process may do at the process that listens; expressions include the federation's name."""
 
-    Attributes:
-        listener: name of the process that listens.
-        process: name in the certificate.
-        allowed: expressions by act; empty for a process that is not admitted.
-        known: names that are admitted, where this one is not.
-    """
-
-    listener: str
-    process: str
-    allowed: dict[Act, tuple[str, ...]] = {}
-    known: tuple[str, ...] = ()
+    listener: str  # name of the process that listens
+    process: str  # name in the certificate
+    allowed: dict[Act, tuple[str, ...]] = {}  # expressions by act; empty for a process that is not admitted
+    known: tuple[str, ...] = ()  # names that are admitted, where this one is not
 
     def refusal(self) -> str | None:
         """Return why the process is not admitted, None if it is."""
