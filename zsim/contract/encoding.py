@@ -121,7 +121,6 @@ class Layouts:
 
 
 def array_head(size: int) -> bytes:
-    """Return msgpack's header of an array."""
     return packed([0] * size)[:-size]
 
 
@@ -136,7 +135,6 @@ def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: ND
 
     Args:
         program, words: see Layouts.
-        kind: of the message.
         ints: its whole numbers (I,); bits: its floats (F,) as uint64.
         out: uint8, with room enough.
     """
@@ -183,7 +181,6 @@ def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints:
 
     Args:
         program: see Layouts.
-        kind: of the message.
         data: uint8; the message is what stands in [start, end).
         ints: takes its whole numbers (I,); bits: its floats (F,) as uint64.
     """

@@ -177,7 +177,6 @@ class TruthHash:
             self.flush()
 
     def flush(self) -> None:
-        """Hash the rows that were added."""
         if not self._held or not self._rows.size:  # of a run whose drones are all external there is nothing
             self._held = 0
             return

@@ -315,13 +315,11 @@ _triangle = itemgetter(0, 1, 2, 7, 8, 14)  # of the position, in the 6 x 6 covar
 
 
 def estimate_view(drone: str, estimate: Any) -> EstimateView:
-    """Return a drone's estimate, a message Estimate or an object with its fields, for displays."""
     e = estimate
     return EstimateView(drone, e.position_m, _triangle(e.covariance), e.yaw_rad, e.yaw_sigma_rad, e.sensors)
 
 
 def cluster_view(state: ClusterState, t_ns: int, seq: int) -> ViewCluster:
-    """Return a formation's state for displays, as message number `seq` of the view."""
     return ViewCluster(t_ns, seq, state.phase, state.names, state.value, state.desired, state.reason)
 
 

@@ -45,7 +45,6 @@ def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]
 
 
 def run_key_table(info: messages.Info) -> tuple[str, ...]:
-    """Return the keys of the world's messages about the drones of a run."""
     beside = [sensor.name for sensor in info.own_sensors] + [keys.SIGHTINGS] * (info.sightings is True)
     return key_table([drone.name for drone in info.drones], beside)
 
@@ -150,7 +149,6 @@ class GateMessages:
 
     @cached_property
     def pairs(self) -> Pairs:
-        """Keys and payloads, as on the wire."""
         data, table = bytes(self.buffer), self.table
         places: list[int] = self.which.tolist()
         bounds = pairwise([0, *self.ends.tolist()])
@@ -162,7 +160,6 @@ class GateMessages:
             yield key, messages.decode(key, payload)
 
     def payload(self, m: int) -> bytes:
-        """Return the payload of one message."""
         start: int = self.ends.item(m - 1) if m else 0
         return bytes(self.buffer[start + GAP : self.ends.item(m)])
 
@@ -198,7 +195,6 @@ def _refuse(reason: str) -> NoReturn:
 
 
 def encode_batch(passed: Pairs) -> bytes:
-    """Return the payload that carries (key, payload) in the order in which they passed."""
     return _encode(passed)
 
 

@@ -173,7 +173,6 @@ def session_token(process: str, session: str) -> str:
 
 
 def session_of(token_key: str) -> str:
-    """Return the session that a token is about, empty if it is about none."""
     head, _, session = token_key.rpartition("/session/")
     return session if head else ""
 
@@ -189,7 +188,6 @@ def parts(key: str) -> tuple[str, str, str]:
 
 
 def thing(key: str) -> str:
-    """Return the second part of a key: the drone, cluster or process that it is about."""
     return key.split("/", 2)[1]
 
 
@@ -202,7 +200,6 @@ def is_command(key: str) -> bool:
 
 
 def is_accepted(key: str) -> bool:
-    """Tell whether a key carries the commands to an external drone that the world has accepted."""
     kind, _, what = parts(key)
     return kind == "drone" and what.startswith("accepted/")
 

@@ -119,7 +119,6 @@ class Info(Message, frozen=True):
 
     @property
     def own_sensors(self) -> tuple[SensorInfo, ...]:
-        """The sensors beside the contract's, in the order of their messages."""
         return () if self.user_sensors is UNSET else self.user_sensors
 
 
@@ -137,7 +136,6 @@ _OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest I
 
 
 def _plain(value: Any) -> Any:
-    """Return a number or array of numpy as plain numbers, which msgspec can encode."""
     to_plain = getattr(value, "tolist", None)
     if to_plain is None:
         raise TypeError(f"a value is of type {type(value).__name__}; must be a number, text, list or map")
@@ -179,7 +177,6 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
 
 
 def types_by_shape() -> dict[str, type[Struct]]:
-    """Return the contract's message types by the shape of their key, for documentation and for tests."""
     return {shape: topic.message for shape, topic in TOPICS.items() if topic.message}
 
 

@@ -65,7 +65,6 @@ class GateCount:
         return gap
 
     def misses(self, clock: run_messages.Clock) -> bool:
-        """Tell whether a clock is missing before this one, of a gate or of a pause."""
         return clock.seq > self._seq + 1
 
 
@@ -89,7 +88,6 @@ class Completeness(Struct, frozen=True):
         return sum(gap.gates for gap in self.gaps)
 
     def faults(self) -> list[str]:
-        """Return what is missing, a text each; empty if the record is complete."""
         faults = []
         if self.gaps:
             of = self.gates + self.gates_missing
@@ -152,7 +150,6 @@ class _Numbers:
         self._decode = msgspec.msgpack.Decoder(_Numbered).decode
 
     def add(self, spans: MessageSpans, rows: NDArray[np.bool_]) -> None:
-        """Add the numbers of some messages of a chunk."""
         read = np.where(rows, sequence_numbers(spans), 0)
         for m in np.flatnonzero(read < 0).tolist():  # by another encoder, or garbage, which has no number
             with suppress(*messages.REFUSALS, OverflowError):

@@ -113,7 +113,6 @@ class RecordGroup(NamedTuple):
 
 
 def opening() -> bytes:
-    """Return the bytes with which every record begins."""
     return MAGIC + packed(Header(profile="", library=f"{OURS.decode()}{__version__}"))
 
 
@@ -235,7 +234,6 @@ def content_of(source: Source, place: RecordSpan) -> bytes | None:
 
 
 def crc_until(source: Source, end: int) -> int:
-    """Return the check sum of the first bytes of a file."""
     crc = 0
     for start in range(0, end, PIECE_BYTES):
         with memoryview(source) as whole, whole[start : min(end, start + PIECE_BYTES)] as piece:

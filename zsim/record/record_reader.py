@@ -320,6 +320,5 @@ def record_notes(reader: RecordReader) -> list[str]:
 
 
 def shown(texts: Sequence[str]) -> str:
-    """Return the first few of many texts, and the number of the rest."""
     more = len(texts) - SHOWN
     return ", ".join(texts[:SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -139,7 +139,6 @@ class RecordWriter:
             self.add(key, payload, messages.encoding(key), t_ns, wall_ns)
 
     def _end_if_full(self, wall_ns: int) -> None:
-        """End the open chunk if it is large or old."""
         if self._open.size >= CHUNK_BYTES or wall_ns - self._open.since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 
@@ -158,7 +157,6 @@ class RecordWriter:
             self._end_chunk()
 
     def flush(self) -> None:
-        """Put everything taken so far on disk."""
         if self._open.size:
             self._end_chunk()
 
@@ -293,7 +291,6 @@ class OpenChunk:
         self._log, self._published = array("Q"), array("Q")
 
     def add(self, channel: int, payload: bytes, t_ns: int, wall_ns: int) -> None:
-        """Take one message; its times are such as MCAP can hold."""
         start = self.size + MESSAGE.size
         if start == MESSAGE.size:
             self.since_ns = wall_ns
@@ -364,7 +361,6 @@ class Content:
         return before + came
 
     def indexes(self) -> Iterator[bytes]:
-        """Yield the message index records."""
         places = self._starts[self._order].astype("Q")
         entries = np.column_stack((self._log[self._order], places)).astype("<u8").tobytes()
         came = np.bincount(self._channels)
@@ -384,7 +380,6 @@ def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
     """Cut a record before the last message of a key, so that its run can be resumed; return whether there was one.
 
     Args:
-        key: of the message.
         is_it: tells by the payload whether it is the wanted one.
 
     Raises:

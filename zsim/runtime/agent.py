@@ -165,7 +165,6 @@ class Agent(ABC):
         return
 
     def control_keys(self) -> tuple[str, ...]:
-        """Return the keys on which it answers requests."""
         return ()
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
@@ -173,7 +172,6 @@ class Agent(ABC):
         return ControlAnswer(ok=False, error=f"{key}: {self.name} answers no requests")
 
     def warm_start_keys(self) -> tuple[str, ...]:
-        """Return the keys whose last values a restarted process takes over before anything else."""
         return ()
 
     def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - taking over nothing is a choice
@@ -354,12 +352,10 @@ class AgentGroup(Agent):
         next(member for member in self._members if key in member.repeats).repeat(key, message)
 
     def _owner(self, key: str) -> Agent:
-        """Return the member that takes over the last value of a key."""
         return next(member for member in self._members if key in member.warm_start_keys())
 
 
 def _joined(parts: Any) -> tuple[str, ...]:
-    """Return everything that is in any of the parts, once, in order."""
     return tuple(dict.fromkeys(each for part in parts for each in part))
 
 

@@ -21,8 +21,6 @@ GATES_MAX = 10  # of the world in a row, where commands are delayed by as many
 
 
 class SteppedWorld(Protocol):
-    """What the bus needs of a world: see `Coordinator` in zsim_world."""
-
     run_id: str
 
     @property
@@ -38,8 +36,6 @@ class SteppedWorld(Protocol):
 
 
 class _Route(NamedTuple):
-    """Where the messages of a key go."""
-
     inboxes: tuple[Inbox, ...]  # of the agents that read them
     is_counted: bool  # whether the world counts them among the outputs of their sender
     is_relayed: bool  # whether that is all that it does with them
@@ -49,9 +45,7 @@ class Bus:
     """The keys of one process: every message goes to the sink, the world and the inboxes that read it.
 
     Args:
-        coordinator: the world of the run.
         agents: in the order in which they are stepped.
-        wall_ns: monotonic wall time.
         sink: takes every message in order of publication.
         gate_sink: takes the world's messages of a gate; without it the sink is given each one decoded.
     """

@@ -37,7 +37,6 @@ def is_held(key: str, gate_keys: Container[str], uncounted: Container[str]) -> b
 
 
 def canonical(entry: Input) -> tuple[int, str, int]:
-    """Return what inputs are sorted by: time, key and number."""
     key, message = entry
     return message.t_ns, key, message.seq
 
@@ -171,7 +170,6 @@ class Inbox:
         return t_ns
 
     def latest_gate_ns(self) -> int | None:
-        """Return the latest gate for which a closing message has come."""
         return self._gates[-1] if self._gates else None
 
     def missing(self, t_ns: int) -> str | None:
@@ -337,7 +335,6 @@ class RoutingTable:
                     self._starred[len(chunks)].add(starred)
 
     def readers(self, key: str) -> tuple[int, ...]:
-        """Return the places of those who read a key, in order."""
         known = self._known.get(key)
         if known is not None:
             return known
@@ -354,7 +351,6 @@ class RoutingTable:
         return readers
 
     def readers_of_any(self, of: Iterable[str]) -> tuple[int, ...]:
-        """Return the places of those who read one of some keys at least, in order."""
         return tuple(sorted({reader for key in of for reader in self.readers(key)}))
 
 

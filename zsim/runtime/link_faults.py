@@ -117,7 +117,6 @@ def total_delay_ns(
 
 
 def distance_between(a: Point | None, b: Point | None) -> float | None:
-    """Return the distance of two points [m], None where one is not known."""
     return math.dist(a, b) if a is not None and b is not None else None
 
 
@@ -125,7 +124,6 @@ class LinkFaults:
     """Holds back, of the messages of a gate for one receiver, what its links deliver later or never.
 
     Args:
-        info: of the run.
         names: of the receiver; an estimator of several drones has the name of each one's.
     """
 
@@ -139,7 +137,6 @@ class LinkFaults:
         self._positions: dict[str, Point] = {}
 
     def update(self, faults: Faults) -> None:
-        """Take the list of faults, unless a newer one has come before."""
         if self._list and faults.seq <= self._list.seq:
             return
         self._list = faults
@@ -197,13 +194,11 @@ class LinkFaults:
         return total_delay_ns(filter(acts, acting), self._seed, to, key, message, distance_m)
 
     def snapshot(self) -> State:
-        """Return its faults, what it holds back, and where drones were."""
         later = [[gate_ns, key, messages.encode(message)] for gate_ns, key, message in self._later]
         positions = {drone: list(place) for drone, place in self._positions.items()}
         return {"later": later, "positions": positions, "list": messages.encode(self._list) if self._list else None}
 
     def restore(self, state: State) -> None:
-        """Take over the state of the receiver's predecessor."""
         if state["list"]:
             self.update(messages.decode(keys.FAULTS, state["list"]))
         self._later = [(gate_ns, key, messages.decode(key, payload)) for gate_ns, key, payload in state["later"]]

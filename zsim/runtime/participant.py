@@ -43,8 +43,6 @@ class Participant:
     """One process in one run.
 
     Args:
-        link: an open session.
-        info: of the run.
         name: process name, role.thing.
         serves: names of processes whose work it does.
         slack_ns: how far the world may be ahead of what it has reported as done; 0 for a process that never gates.
@@ -120,7 +118,6 @@ class Participant:
         self.join()
 
     def join(self, again: bool = False) -> None:
-        """Publish join; `again` as a new incarnation."""
         if again:
             self._renew_incarnation()
         self.publish("join", self._membership.join(self.now_ns))
@@ -152,7 +149,6 @@ class Participant:
             self.publish("health", self.health.message(self.now_ns, self.next_seq("health")))
 
     def publish(self, kind: str, message: Struct) -> None:
-        """Publish a message on one of the process's own keys."""
         self._link.put(keys.process(self.name, kind), message)
 
     # What it is told
@@ -172,7 +168,6 @@ class Participant:
         return clock
 
     def take_event(self, payload: bytes) -> None:
-        """Take a message on `world/event`."""
         entry = self.entry_in(payload)
         if entry is not None:
             self.take_entry(entry)
@@ -203,7 +198,6 @@ class Participant:
             self.end_reason = f"another process of this name joined from {self.successor}"
 
     def is_own(self, entry: ProcessEntry) -> bool:
-        """Tell whether an entry is that of the newest incarnation of this process."""
         return entry.incarnation == self._membership.incarnation
 
 
@@ -213,12 +207,8 @@ class AgentParticipant(Participant):
     Whatever the world does not answer is asked for again, until it does (`settle`).
 
     Args:
-        link: an open session.
-        info: of the run.
         agent: whose name and sequence numbers it uses.
         take_in: takes the messages that a replay brings.
-        say: called with lines for the user.
-        wall_s: monotonic wall time.
         stopped: tells whether the process is to end.
 
     Attributes:
@@ -464,7 +454,6 @@ class AgentParticipant(Participant):
         self._missed_since_ns = self.done_ns
 
     def ask_faults(self) -> None:
-        """Ask which faults are injected."""
         for sample in self._link.get(keys.FAULTS):
             self._take_in(sample)
 
@@ -482,5 +471,4 @@ class AgentParticipant(Participant):
 
 
 def _counted(outputs: Sequence[Output]) -> int:
-    """Return how many outputs the world counts."""
     return sum(messages.is_output(key) for key, _ in outputs)

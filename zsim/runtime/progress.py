@@ -49,7 +49,6 @@ class SlowStart:
         self._timer.start()
 
     def over(self) -> None:
-        """Show nothing any more: it has started, or failed to."""
         self._timer.cancel()
 
 
@@ -81,7 +80,6 @@ class RepeatedEvents:
         self._counted: dict[tuple[str, str], tuple[float, float, int]] = {}
 
     def lines(self, t_s: float, kind: str, text: str) -> list[str]:
-        """Return the lines to show now that an event has come."""
         lines = self.over(t_s)
         first = self._counted.get((kind, text))
         self._counted[kind, text] = (first[0], t_s, first[2] + 1) if first else (t_s, t_s, 1)
@@ -125,7 +123,6 @@ class PipedConsole(Console):
     """A console whose reader may go away: what nobody reads is dropped, and nothing fails because of it."""
 
     def on_broken_pipe(self) -> None:
-        """Write nothing more."""
         self.quiet = True
 
 
@@ -159,7 +156,6 @@ class Screen:
             self.say(text)
 
     def say(self, text: str) -> None:
-        """Show a line that stays."""
         if self.console.quiet:
             self._live.stop()
             self.console.quiet = False

@@ -36,11 +36,7 @@ class Runner:
     """One agent on one session.
 
     Args:
-        link: an open session.
-        info: of the run.
-        agent: what to run.
         stopped: asked every TICK_S; True ends the process with a bye.
-        say: called with lines for the user.
         deserted: asked at the end; True leaves without a bye, as a process that dies, so that the world waits for a
             successor.
         snapshot_ns: simulated time between two snapshots of the agent; 0 for none.
@@ -334,7 +330,6 @@ class RunnerInputs:
             self._open(sample)
 
     def wake(self) -> None:
-        """Let a `wait` of another thread return."""
         for subscription in list(self._subscriptions.values()):
             subscription.wake()
 

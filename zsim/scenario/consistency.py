@@ -318,7 +318,6 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
 
 
 def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
-    """Yield where a sensor of one name has messages of two kinds, or its message the name of another."""
     first: dict[str, tuple[int, str]] = {}
     fields_of: dict[str, dict[str, str]] = {}
     taken = {kind.__name__ for kind in messages.types_by_shape().values()}
@@ -352,7 +351,6 @@ def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
 
 
 def _shape_faults(cluster: Any, drones: _Entries) -> Iterator[Fault]:
-    """Yield what is wrong with the groups and templates of a cluster."""
     if not _known(cluster.drones, cluster.groups) or None in cluster.groups:
         return
     placed = {drone.name: drone.position_m for _, drone in drones if _known(drone.name)}
@@ -438,7 +436,6 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
 def _injected_faults(
     scenario: Any, drones: _Entries, clusters: _Entries, vehicles: Mapping[str, Vehicle]
 ) -> Iterator[Fault]:
-    """Yield what is wrong with the faults that a scenario injects, where their possible targets are known."""
     if any(item.name is None for _, item in [*drones, *clusters]) or not drones:
         return
     expected = scenario.processes and scenario.processes.expect

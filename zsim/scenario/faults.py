@@ -109,7 +109,6 @@ def sensor_parts(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, S
 
 
 def _sensor_kinds(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, FaultKind]:
-    """Return the kinds of faults that sensors have."""
     dropouts, stuck, biases, noises = {}, {}, {}, {}
     for name, sensor in sensors.items():
         label = sensor.label or name
@@ -162,12 +161,10 @@ KINDS: dict[str, FaultKind] = {
 
 
 def kinds_of(own: Mapping[str, Declaration]) -> dict[str, FaultKind]:
-    """Return the kinds of faults of a run: KINDS, and those of its users' sensors."""
     return {**KINDS, **_sensor_kinds(own)} if own else KINDS
 
 
 def expected(p: FaultParameter) -> str:
-    """Return in words what a parameter may be."""
     unit = f" {p.unit}" if p.unit else ""
     if p.shape == "choice":
         return f"one of {', '.join(p.choices)}"
@@ -252,11 +249,9 @@ class Known(NamedTuple):
     external: tuple[str, ...] = ()  # drones whose bodies and sensors nobody simulates
 
     def things(self) -> dict[str, tuple[str, ...]]:
-        """Return what the processes of each role with agents may be named after."""
         return {name: self.drones if role.about == "drone" else self.clusters for name, role in AGENTS.items()}
 
     def takes_part(self, process: str) -> bool:
-        """Tell whether a process is in the lockstep, by its name."""
         role, _, thing = process.partition(".")
         return thing in self.things().get(role, ()) or process in self.processes
 
@@ -454,7 +449,6 @@ def typed_rest(text: str) -> dict[str, Any]:
 
 
 def _words(text: str) -> list[str]:
-    """Return the words of a text; words inside brackets are kept together."""
     words: list[str] = []
     depth = 0
     try:

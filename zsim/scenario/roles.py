@@ -50,12 +50,10 @@ AGENTS = {name: role for name, role in ROLES.items() if role.about}
 
 
 def things(role: str, scenario: Scenario) -> list[str]:
-    """Return the names of the drones or clusters that a role with agents is about."""
     return [entry.name for entry in getattr(scenario, f"{AGENTS[role].about}s")]
 
 
 def agent_names(scenario: Scenario) -> list[str]:
-    """Return the names of all processes with agents that a scenario has, role by role."""
     return [f"{role}.{thing}" for role in AGENTS for thing in things(role, scenario)]
 
 
@@ -113,7 +111,6 @@ def check_pace(scenario: Scenario, mode: str) -> None:
 
 
 def drivers_of(scenario: Scenario) -> list[str]:
-    """Return the names of the processes that publish the external drones."""
     return [f"{DRIVER}.{drone}" for drone in scenario.external()]
 
 
@@ -211,7 +208,6 @@ def _granted(role: str, **names: Sequence[str]) -> Rights:
 
 
 def watched_drones(thing: str, scenario: Scenario) -> list[str]:
-    """Return the drones of a camera or detector: the one it is named after, or all that have cameras."""
     names = [drone.name for drone in scenario.drones]
     return [thing] if thing in names else [drone.name for drone in scenario.drones if drone.sensors.cameras()]
 

@@ -29,7 +29,6 @@ def load(path: str | Path, overrides: Iterable[str] = (), modules: Iterable[Path
     """Return the resolved scenario of a YAML file; classes that it names may stand in modules beside it.
 
     Args:
-        path: the file.
         overrides: texts `a.b.c=value` as given to `--set`, applied in order.
         modules: further folders in which the modules may stand.
         values: top-level fields that replace the file's, None being ignored (`seed=3`).
@@ -65,7 +64,6 @@ def to_text(scenario: Scenario) -> str:
 
 
 def sha256(text: str) -> str:
-    """Return the hash that names a resolved scenario, from its text."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -124,7 +122,6 @@ def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: b
 
 
 def with_defaults(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return a section with defaults for the fields that it does not give; nested sections are merged."""
     merged = dict(base)
     for key, value in over.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)

@@ -145,7 +145,6 @@ def _scalar_fault(value: Any, info: types.Type) -> str | None:
 
 
 def _expected(info: types.Type) -> str:
-    """Say in words what is allowed."""
     if isinstance(info, types.Metadata):
         return _expected(info.type)
     if isinstance(info, types.FloatType | types.IntType):
@@ -211,7 +210,6 @@ def field_path(path: str, name: Any) -> str:
 
 
 def show(value: Any) -> str:
-    """Return what was found, short enough for one line."""
     if isinstance(value, dict | list | tuple | set) and len(value) > SHOWN_MAX:
         return f"{'a map' if isinstance(value, dict) else 'a list'} of {len(value)} entries"
     try:
@@ -235,5 +233,4 @@ def _as_json(value: Any) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names for an error, the first 20 of them."""
     return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")

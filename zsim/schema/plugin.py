@@ -55,7 +55,6 @@ def search(*places: Path) -> None:
 
 
 def folders() -> tuple[Path, ...]:
-    """Return the folders that are searched for modules besides Python's own."""
     return tuple(map(Path, filter(None, os.environ.get(FOLDERS, "").split(os.pathsep))))
 
 
@@ -85,7 +84,6 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
     """Return the class of a name `package.module:Class`.
 
     Args:
-        name: the class.
         where: file and path of the field that names it, for the fault.
         kind: class or Protocol whose public methods it must have.
         is_constructed: whether its constructor is called as that of `kind`.
@@ -134,7 +132,6 @@ def is_own(kind: type) -> bool:
 
 
 def full_name(kind: type) -> str:
-    """Return the name of a class as a scenario has it: `package.module:Class`."""
     return f"{kind.__module__}:{kind.__qualname__}"
 
 

@@ -31,7 +31,6 @@ def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any
     """Return the map that a YAML file holds.
 
     Args:
-        path: the file.
         example: a file of that kind, named to whoever gave another one.
         refuse: the error to raise, with a line for each fault.
     """
@@ -64,7 +63,6 @@ def parse(text: str, source: str, example: str, refuse: type[DocumentError]) -> 
 
 
 def dump(plain: Any) -> str:
-    """Return YAML text; the same content gives the same text."""
     return yaml.dump(plain, Dumper=_Dumper, sort_keys=True, default_flow_style=None, width=120)
 
 
@@ -154,7 +152,6 @@ def _refusal(problem: str, event: Any) -> MarkedYAMLError:
 
 
 def _word(text: str) -> Any:
-    """Return what a text without quotes means."""
     for _, pattern, first, meaning in _WORDS:
         if text[:1] in first and pattern.match(text):
             return meaning(text)

@@ -79,11 +79,7 @@ class LinkWatch:
     """Watches the links of the hub, in a thread of its own while it is entered.
 
     Args:
-        link: the listening session.
-        tokens: of all processes.
         awaited: returns the participants that must not lose anything.
-        sockets: of this process.
-        wall_s: monotonic.
 
     Attributes:
         closed: links that were closed, in order, one of a session in TOLD_S; to be taken from it.
@@ -205,7 +201,6 @@ class SessionTokens:
     `process/{p}/session/{session}`.
 
     Args:
-        link: the listening session.
     """
 
     def __init__(self, link: Session) -> None:
@@ -222,7 +217,6 @@ class SessionTokens:
         return self._sessions.get(process, Sessions())
 
     def shown(self) -> list[str]:
-        """Return the processes of which sessions are known."""
         return list(self._sessions)
 
     def is_alive(self, process: str) -> bool:
@@ -230,7 +224,6 @@ class SessionTokens:
         return process in self._alive or process in self._sessions
 
     def processes(self, session: str) -> tuple[str, ...]:
-        """Return the processes that a session stands for."""
         return tuple(process for process, sessions in list(self._sessions.items()) if session in sessions)
 
     def _on_token(self, key: str, alive: bool) -> None:
@@ -275,7 +268,6 @@ class LinkSockets:
         return waiting
 
     def progress(self, address: str) -> Progress:
-        """Return how far a far end has come."""
         with suppress(OSError), self._open(address) as connection:
             info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO.size)
             round_trip_us, acknowledged = TCP_INFO.unpack(info)

@@ -162,7 +162,6 @@ class Query:
         return messages.decode_as(ControlRequest, self.payload, self.expression)
 
     def reply(self, key: str, payload: bytes) -> None:
-        """Add one reply."""
         if self._raw is not None:
             self._raw.reply(self._prefix + key, payload, encoding=zenoh.Encoding(messages.encoding(key)))
 
@@ -173,7 +172,6 @@ class Query:
         self.end()
 
     def answer(self, answer: ControlAnswer) -> None:
-        """Reply to a request and end it."""
         if self._raw is not None:
             encoding = zenoh.Encoding("application/msgpack;ControlAnswer")
             self._raw.reply(self._prefix + self.expression, messages.encode(answer), encoding=encoding)
@@ -228,7 +226,6 @@ class Session:
         return session
 
     def zid(self) -> str:
-        """Return Zenoh's name of this session: hexadecimal digits."""
         return str(self._raw.info.zid())
 
     def undeclare_all(self) -> None:
@@ -267,7 +264,6 @@ class Session:
         publisher.put(payload)
 
     def put_all(self, encoded: Sequence[tuple[str, bytes]]) -> None:
-        """Publish many encoded payloads in one go."""
         for key, payload in encoded:  # not by put_raw: thousands of messages a gate
             publisher = self._publishers.get(key) or self._declare(key)
             publisher.put(payload)
@@ -468,7 +464,6 @@ class Session:
         self._keep(self._raw.liveliness().declare_subscriber(self._prefix + expression, forward, history=True))
 
     def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
-        """Return the keys of the tokens that exist now."""
         replies = self._raw.liveliness().get(self._prefix + expression, timeout=timeout_s)
         return [str(r.ok.key_expr).removeprefix(self._prefix) for r in replies if r.ok is not None]
 

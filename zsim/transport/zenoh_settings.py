@@ -98,7 +98,6 @@ def hub(timing: Mode) -> Settings:
 
 
 def upstream(endpoint: str, identity: Identity) -> Settings:
-    """Return what a router has in addition: it keeps trying to reach its upstream."""
     return connecting(endpoint, identity, 0.0) | {"connect/exit_on_failure": "false", "connect/timeout_ms": "-1"}
 
 
@@ -160,7 +159,6 @@ def read_access(identity: Identity) -> Any:
 
 
 def hub_files(clients: int) -> int:
-    """Return how many files a hub needs for a number of processes that connect to it."""
     return SESSION_FILES + CLIENT_FILES * (clients + SPARE_CLIENTS)
 
 
@@ -175,7 +173,6 @@ def launcher_files(roles: int, names: int) -> int:
 
 
 def host_launcher_files(roles: int, hosts: int) -> int:
-    """Return how many files the launcher of a run on several hosts needs."""
     return SESSION_FILES + ROLE_FILES * roles + HOST_FILES * hosts
 
 
