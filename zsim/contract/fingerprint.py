@@ -58,9 +58,6 @@ class Membership:
         period_ns: how often it says done; 0 for never.
         slack_ns: by how much the world may be ahead of the dones of one without a period; 0 for any.
         calculates: whether its results depend on its arithmetic; else it states no fingerprint.
-
-    Attributes:
-        incarnation: a random number of the process; 0 where none is ever restarted.
     """
 
     def __init__(
@@ -77,7 +74,7 @@ class Membership:
         self._name, self._host, self._run_id, self._next_seq = name, host, run_id, next_seq
         self._serves, self._period_ns, self._slack_ns = serves, period_ns, slack_ns
         self._calculates = calculates
-        self.incarnation = 0
+        self.incarnation = 0  # a random number of the process; 0 where none is ever restarted
 
     def join(self, t_ns: int = 0) -> Join:
         return Join(

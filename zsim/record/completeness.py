@@ -36,17 +36,12 @@ class GateCount:
 
     Args:
         after: the clock after which counting begins; the start of the run by default.
-
-    Attributes:
-        gates: number of gates so far.
-        gaps: gaps so far.
-        ended: whether the clock has stopped.
     """
 
     def __init__(self, after: run_messages.Clock | None = None) -> None:
-        self.gates = 0
-        self.gaps: list[GateGap] = []
-        self.ended = False
+        self.gates = 0  # number of gates so far
+        self.gaps: list[GateGap] = []  # gaps so far
+        self.ended = False  # whether the clock has stopped
         self._step, self._seq = (after.step, after.seq) if after else (-1, -1)
 
     def add(self, clock: run_messages.Clock) -> GateGap | None:

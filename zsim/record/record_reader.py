@@ -79,7 +79,6 @@ class RecordReader:
     Reading raises RecordError for chunks that another tool has compressed in a way that is not ours.
 
     Attributes:
-        complete: the record was closed, not cut.
         damaged: what was skipped so far, each with its place: chunks whose checksum differs, and, as one, everything
             behind an invalid length.
     """
@@ -98,7 +97,7 @@ class RecordReader:
         except OSError as error:
             raise RecordError(f"{path}: cannot be read ({error.strerror})") from error
         check_magic(self._source, self.path)
-        self.complete = is_complete(self._source)
+        self.complete = is_complete(self._source)  # the record was closed, not cut
         self._keys: dict[int, str] = {}
         self._data_end: RecordSpan | None = None
         self._rest: int | None = None  # from where on nothing can be read, if so

@@ -47,10 +47,6 @@ class RecordWriter:
     The file is readable at any moment, whatever happens to this process: a chunk and its indexes are one write. Memory
     holds the open chunk and the names of the keys, however long the run. When the disk is full or gone, every method
     raises RecordError; the file was closed at its last whole chunk.
-
-    Attributes:
-        has_former: whether the file had messages of a former writer.
-        refused: messages on keys beyond the 65 535 that a record can hold.
     """
 
     def __init__(self, path: str | Path, goes_on: bool = False) -> None:
@@ -59,8 +55,8 @@ class RecordWriter:
         RecordError if the file exists, cannot be continued, or cannot be written.
         """
         self.path = Path(path)
-        self.has_former = False
-        self.refused = 0
+        self.has_former = False  # whether the file had messages of a former writer
+        self.refused = 0  # messages on keys beyond the 65 535 that a record can hold
         self._channels: dict[str, int] = {}  # by key, counted from 1
         self._gate_channels = PerPattern(self._channels_of)
         self._schemas: dict[str, int] = {}

@@ -26,8 +26,6 @@ class HealthMeter:
 
     Attributes:
         received, refused, dropped: messages taken in, messages not decodable, and gates given up.
-        lag_ns: how far the newest gate is ahead of the one just handled.
-        link_lost: whether the world cannot be reached now.
     """
 
     def __init__(
@@ -44,8 +42,8 @@ class HealthMeter:
         self._limit = RateLimit(PERIOD_S, now=wall_s)
         self._limit.spend()  # the first is due in a second
         self.received = self.refused = self.dropped = 0
-        self.lag_ns = 0
-        self.link_lost = False
+        self.lag_ns = 0  # how far the newest gate is ahead of the one just handled
+        self.link_lost = False  # whether the world cannot be reached now
 
     def step(self, duration_ns: int) -> None:
         self._steps_us.append(duration_ns / 1000)

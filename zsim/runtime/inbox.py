@@ -61,7 +61,6 @@ class Inbox:
         duplicates: messages that came again before their gate was taken.
         late: messages that came when their gate had been taken.
         taken_ns: the gate that was taken last, below 0 before the first.
-        may_skip: whether all closing keys are of publishers that may skip gates.
     """
 
     def __init__(
@@ -96,6 +95,7 @@ class Inbox:
         self._uncounted = frozenset(uncounted)
         self._belated: dict[tuple[str, int], Input] = {}
         self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
+        # whether all closing keys are of publishers that may skip gates
         self.may_skip = len(self._sparse) == len(self._closing)
         self.duplicates = self.late = 0
 
@@ -259,17 +259,13 @@ class _Meter:
 
     The first gate of a late joiner is not compared, since it began before the joiner was there; a status with
     seq 0 counts from the beginning.
-
-    Attributes:
-        came: stamps of the drone's messages that wait, sorted.
-        counts: stamps of the drone's statuses that wait, and what they count; a meter without any is not short.
-        partial: whether nothing is compared yet.
     """
 
     def __init__(self) -> None:
-        self.came: list[int] = []
+        self.came: list[int] = []  # stamps of the drone's messages that wait, sorted
+        # stamps of the drone's statuses that wait, and what they count; a meter without any is not short
         self.counts: list[tuple[int, int]] = []
-        self.partial = True
+        self.partial = True  # whether nothing is compared yet
 
     def count(self, status: Any) -> None:
         self.counts.append((status.t_ns, status.count))

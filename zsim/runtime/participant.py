@@ -50,15 +50,9 @@ class Participant:
         calculates: whether its results depend on its arithmetic; otherwise its join states no fingerprint.
 
     Attributes:
-        gates: whether the world waits for it; it then announces itself once it has subscribed to all that it needs.
-        now_ns: simulated time of the newest clock received.
-        done_ns: newest gate that it is done with, -1 before the first.
-        health: counters that it publishes.
         admitted: whether the world has admitted its newest incarnation.
-        must_rejoin: whether the world may have taken it for dead, or another process for it.
         successor: host and pid of the process that has taken over the name; empty while it has the name.
         end_reason: why it has nothing left to do in this run; empty while the run goes on.
-        next_seq: returns the number of its next message of a kind, from 0.
     """
 
     def __init__(
@@ -74,13 +68,14 @@ class Participant:
         next_seq: Callable[[str], int] | None = None,
     ) -> None:
         self.name = name
+        # whether the world waits for it; it then announces itself once it has subscribed to all that it needs
         self.gates = slack_ns > 0
-        self.now_ns = 0
-        self.done_ns = -1
-        self.health = HealthMeter(name.split(".", 1)[0], host=link.host, reads=link.reads)
-        self.must_rejoin = False
+        self.now_ns = 0  # simulated time of the newest clock received
+        self.done_ns = -1  # newest gate that it is done with, -1 before the first
+        self.health = HealthMeter(name.split(".", 1)[0], host=link.host, reads=link.reads)  # counters that it publishes
+        self.must_rejoin = False  # whether the world may have taken it for dead, or another process for it
         self.successor = self.end_reason = ""
-        self.next_seq = next_seq or self._count
+        self.next_seq = next_seq or self._count  # returns the number of its next message of a kind, from 0
         self._link, self._info = link, info
         others = tuple(each for each in serves if each != name)
         own = (name, link.host, info.run_id, self.next_seq)
@@ -210,11 +205,6 @@ class AgentParticipant(Participant):
         agent: whose name and sequence numbers it uses.
         take_in: takes the messages that a replay brings.
         stopped: tells whether the process is to end.
-
-    Attributes:
-        published_ns: gate up to which the predecessor has published all outputs; they are not published again.
-        awaited: whether the world has still to admit this process.
-        failure: why it cannot take part any longer; None while it can.
     """
 
     def __init__(
@@ -244,9 +234,10 @@ class AgentParticipant(Participant):
         self._missed_since_ns: int | None = None
         self._asked_ns, self._asked = -1, 0
         self._retry_s = 0.0
+        # gate up to which the predecessor has published all outputs; they are not published again
         self.published_ns = -1
-        self.awaited = False
-        self.failure: RunError | None = None
+        self.awaited = False  # whether the world has still to admit this process
+        self.failure: RunError | None = None  # why it cannot take part any longer; None while it can
 
     # Taking over from a predecessor
 

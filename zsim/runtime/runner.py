@@ -40,9 +40,6 @@ class Runner:
         deserted: asked at the end; True leaves without a bye, as a process that dies, so that the world waits for a
             successor.
         snapshot_ns: simulated time between two snapshots of the agent; 0 for none.
-
-    Attributes:
-        killed: whether a fault has ended it, without a bye; its process is to die as well.
     """
 
     def __init__(
@@ -79,7 +76,7 @@ class Runner:
         self._end_wall_s = 0.0
         self._leave: str | None = None
         self._over = threading.Event()
-        self.killed = False
+        self.killed = False  # whether a fault has ended it, without a bye; its process is to die as well
 
     def run(self) -> str:
         """Take part until the run ends; return why it left.

@@ -80,9 +80,6 @@ class LinkWatch:
 
     Args:
         awaited: returns the participants that must not lose anything.
-
-    Attributes:
-        closed: links that were closed, in order, one of a session in TOLD_S; to be taken from it.
     """
 
     def __init__(
@@ -106,6 +103,7 @@ class LinkWatch:
         self._kept_out_s: dict[str, float] = {}
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="links", daemon=True)
+        # links that were closed, in order, one of a session in TOLD_S; to be taken from it
         self.closed: deque[ClosedLink] = deque()
 
     def __enter__(self) -> "LinkWatch":

@@ -146,13 +146,13 @@ class Query:
     """A query to be answered once.
 
     Attributes:
-        expression: the keys that are queried, without the prefix of the session.
         payload, attachment: as sent; empty where nothing was.
     """
 
     def __init__(self, raw: zenoh.Query, prefix: str) -> None:
         self._raw: zenoh.Query | None = raw
         self._prefix = prefix
+        # the keys that are queried, without the prefix of the session
         self.expression = str(raw.key_expr).removeprefix(prefix)
         self.payload = raw.payload.to_bytes() if raw.payload is not None else b""
         self.attachment = raw.attachment.to_bytes() if raw.attachment is not None else b""
@@ -189,25 +189,18 @@ class Unanswered(ControlAnswer, frozen=True):
 
 
 class Session:
-    """A Zenoh session; `open_session` opens and closes it.
-
-    Attributes:
-        federation: prefix of all keys.
-        host: the name of this process's host, as its messages give it.
-        process: the name in its certificate; empty without one.
-        guarded: whether access control is enforced here.
-        permissions: what access control at the other end permits this process; None where it has none, or is not asked.
-        reads: the expressions that it has subscribed to so far.
-    """
+    """A Zenoh session; `open_session` opens and closes it."""
 
     def __init__(self, raw: zenoh.Session, federation: str, identity: Identity) -> None:
         self._raw = raw
-        self.federation = federation
-        self.host = identity.host
+        self.federation = federation  # prefix of all keys
+        self.host = identity.host  # the name of this process's host, as its messages give it
+        # the name in its certificate; empty without one
         self.process = tls.own_name(identity) if identity.tls is not None else ""
-        self.guarded = identity.access is not None
+        self.guarded = identity.access is not None  # whether access control is enforced here
+        # what access control at the other end permits this process; None where it has none, or is not asked
         self.permissions: Permissions | None = None
-        self.reads: list[str] = []
+        self.reads: list[str] = []  # the expressions that it has subscribed to so far
         self._prefix = f"{federation}/" if federation else ""
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._cached_publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
